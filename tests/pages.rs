@@ -1,21 +1,21 @@
-//! Every command of README.md, CONTRIBUTING.md and the pages below docs/, as it stands there. Python blocks are run by
-//! `python/tests/test_docs.py`.
+//! Tests the commands and links in README.md, CONTRIBUTING.md and the pages below docs/.
 //!
-//! The blocks of a page are run in order, in a folder of its own that is empty but for the repository's `configs/`:
+//! `python/tests/test_docs.py` runs the Python blocks. This test runs the other blocks of a page in order, in an empty
+//! directory with a copy of the repository's `configs/`:
 //!
-//! - A fenced block without a language (or `sh`), and an indented one, holds commands, each a line of its own (`\` goes on
-//!   in the next). What is printed, and what is not for a shell, has a language: `text`, `toml`, `yaml`.
-//! - A `toml` block is a file where the paragraph before it names one (`` `sweep.toml` ``).
-//! - `<!-- not run: WHY -->` before a block leaves it out.
-//! - `<!-- short: FLAGS -->` before a block of long studies runs it with these flags, each with a value. They replace those of a
-//!   command, or are added where the command takes them.
-//! - `<!-- output -->` before a `text` block holds the block to what the last command printed: its lines are printed in this
-//!   order, with others between them or not; `…` stands for any part of a line.
+//! - A fenced block without a language, one marked `sh`, and an indented block contain commands, one per line. `\`
+//!   continues a line. Output and other text has a language: `text`, `toml`, `yaml`.
+//! - A `toml` block is written to the file that the paragraph before it names (`` `sweep.toml` ``), if any.
+//! - `<!-- not run: WHY -->` before a block skips it.
+//! - `<!-- short: FLAGS -->` before a block of long studies shortens its commands with these flags, each with a value.
+//!   They replace the same flags of a command, or are added if the command takes them.
+//! - `<!-- output -->` before a `text` block compares it with what the last command printed. Its lines have to be
+//!   printed in this order; other lines may be between them. `…` matches any part of a line.
 //!
-//! `FLOTILLA_PAGE=first-run` runs the pages with this in their names.
+//! Skipped commands, and commands inside a text (`` `flotilla …` ``), are only parsed: the program must accept their
+//! flags. A word in capitals is a placeholder for a value.
 //!
-//! Commands that are not run, and those inside a text (`` `flotilla …` ``), have to be such that the program takes their
-//! flags; a word in capitals stands for a value there.
+//! `FLOTILLA_PAGE=first-run` selects the pages with this in their names.
 
 #![cfg(feature = "cli")]
 
@@ -31,7 +31,7 @@ use clap::error::{ContextKind, ContextValue, ErrorKind};
 use tempfile::TempDir;
 
 /// The time limit of one command.
-const PATIENCE: Duration = Duration::from_secs(300);
+const TIME_LIMIT: Duration = Duration::from_secs(300);
 
 fn pages() -> Vec<PathBuf> {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
@@ -51,33 +51,33 @@ fn pages() -> Vec<PathBuf> {
     pages
 }
 
-/// A block of code, its lines each with its number in the page.
+/// A code block. Each line comes with its number in the page.
 #[derive(Debug, Default, PartialEq)]
 struct Block {
     language: String,
-    /// Why it is left out.
+    /// The reason why the block is skipped.
     not_run: Option<String>,
-    /// Flags that make its commands short.
+    /// Flags that shorten its commands.
     short: Option<String>,
-    /// Whether the last command printed this.
+    /// Whether the block is compared with the last command's output.
     output: bool,
-    /// The file that a `toml` block is.
+    /// The file that a `toml` block is written to.
     file: Option<String>,
     lines: Vec<(usize, String)>,
 }
 
 impl Block {
-    /// The commands, each with its line's number.
+    /// Returns the commands, each with the number of its first line.
     fn commands(&self) -> Vec<(usize, String)> {
         let mut commands: Vec<(usize, String)> = Vec::new();
-        let mut goes_on = false;
+        let mut continues = false;
         for (number, line) in &self.lines {
-            match commands.last_mut().filter(|_| goes_on) {
+            match commands.last_mut().filter(|_| continues) {
                 Some((_, command)) => *command += line,
                 None => commands.push((*number, line.clone())),
             }
-            goes_on = line.ends_with('\\');
-            if let Some((_, command)) = commands.last_mut().filter(|_| goes_on) {
+            continues = line.ends_with('\\');
+            if let Some((_, command)) = commands.last_mut().filter(|_| continues) {
                 command.pop();
             }
         }
@@ -86,8 +86,8 @@ impl Block {
     }
 }
 
-/// The blocks of a page, and its commands in back-ticks.
-fn read(text: &str) -> (Vec<Block>, Vec<(usize, String)>) {
+/// Returns the code blocks of a page, and its commands in back-ticks.
+fn parse_page(text: &str) -> (Vec<Block>, Vec<(usize, String)>) {
     let (mut blocks, mut inline): (Vec<Block>, _) = (vec![], vec![]);
     let (mut next, mut paragraph, mut in_list) = (Block::default(), String::new(), false);
     let mut lines = (1..).zip(text.lines()).peekable();
@@ -95,9 +95,9 @@ fn read(text: &str) -> (Vec<Block>, Vec<(usize, String)>) {
     while let Some((number, line)) = lines.next() {
         let comment = line.trim().strip_prefix("<!--").and_then(|line| line.strip_suffix("-->")).map(str::trim);
         if let Some(comment) = comment {
-            let why = |kind: &str| comment.strip_prefix(kind).map(|why| why.trim().to_string());
-            next.not_run = why("not run:").or(next.not_run);
-            next.short = why("short:").or(next.short);
+            let value = |kind: &str| comment.strip_prefix(kind).map(|value| value.trim().to_string());
+            next.not_run = value("not run:").or(next.not_run);
+            next.short = value("short:").or(next.short);
             next.output |= comment == "output";
         } else if let Some(fence) = line.trim_start().strip_prefix("```") {
             let mut block = Block { language: fence.trim().into(), ..std::mem::take(&mut next) };
@@ -130,7 +130,7 @@ fn read(text: &str) -> (Vec<Block>, Vec<(usize, String)>) {
 }
 
 /// Returns the error in the flags of a command, if any.
-fn misread(command: &str) -> Option<String> {
+fn flag_error(command: &str) -> Option<String> {
     let (mut words, mut quote) = (vec![String::new()], None);
     for c in command.chars() {
         match quote {
@@ -142,19 +142,19 @@ fn misread(command: &str) -> Option<String> {
     }
     words.retain(|word| !word.is_empty());
     let error = flotilla::cli::command().try_get_matches_from(words).err()?;
-    let stands_for_a_value = |value: &str| {
+    let is_placeholder = |value: &str| {
         value.contains(['$', '{', '…']) || value.contains(char::is_uppercase) && !value.contains(char::is_lowercase)
     };
     match (error.kind(), error.get(ContextKind::InvalidValue)) {
-        // In a text not all that a command needs has to be said.
+        // A command inside a text may omit required arguments.
         (ErrorKind::DisplayHelp | ErrorKind::DisplayVersion | ErrorKind::MissingRequiredArgument, _) => None,
-        (_, Some(ContextValue::String(value))) if stands_for_a_value(value) => None,
+        (_, Some(ContextValue::String(value))) if is_placeholder(value) => None,
         _ => Some(error.to_string()),
     }
 }
 
-/// The program's commands in a line for a shell.
-fn calls(line: &str) -> Vec<String> {
+/// Returns the calls of the program in a line of shell script.
+fn program_calls(line: &str) -> Vec<String> {
     let line = line.split(" #").next().unwrap_or_default().split(" ::: ").next().unwrap_or_default();
     let mut line = line.replace("cargo run --release -- ", "flotilla ");
     while let Some((start, end)) =
@@ -166,7 +166,7 @@ fn calls(line: &str) -> Vec<String> {
     parts.collect()
 }
 
-/// Returns a command with flags that make it short.
+/// Returns the command with its flags replaced by `flags`, or extended with those that it takes.
 fn shortened(command: &str, flags: &str) -> String {
     let mut command = command.split(" #").next().unwrap_or_default().trim_end().to_string();
     if !command.starts_with("flotilla ") {
@@ -183,17 +183,17 @@ fn shortened(command: &str, flags: &str) -> String {
             None => parts.extend([name, value]),
         }
         let after = parts.join(" ");
-        if place.is_some() || misread(&after).is_none() {
+        if place.is_some() || flag_error(&after).is_none() {
             command = after;
         }
     }
     command
 }
 
-/// Runs a command as a shell does, and returns what it printed, as an error if it failed.
+/// Runs a command with `bash`. Returns what it printed, as an error if it failed.
 fn run(command: &str, folder: &Path) -> Result<String, String> {
-    let said = folder.join(".said");
-    let output = fs::File::create(&said).unwrap();
+    let log = folder.join(".log");
+    let output = fs::File::create(&log).unwrap();
     let mut bash = support::shell("bash", command);
     bash.current_dir(folder).stdin(Stdio::null());
     let mut child = bash.stderr(output.try_clone().unwrap()).stdout(output).spawn().unwrap();
@@ -201,22 +201,22 @@ fn run(command: &str, folder: &Path) -> Result<String, String> {
     let status = loop {
         match child.try_wait().unwrap() {
             Some(status) => break status.to_string(),
-            None if start.elapsed() > PATIENCE => {
+            None if start.elapsed() > TIME_LIMIT => {
                 let _ = child.kill();
                 let _ = child.wait();
-                break format!("it was ended after {PATIENCE:?}");
+                break format!("killed after {TIME_LIMIT:?}");
             }
             None => std::thread::sleep(Duration::from_millis(5)),
         }
     };
-    let printed = fs::read_to_string(&said).unwrap_or_default();
+    let printed = fs::read_to_string(&log).unwrap_or_default();
     if status == "exit status: 0" { Ok(printed) } else { Err(format!("{status}\n{printed}")) }
 }
 
-/// The first line of a block that was not printed, after the lines before it.
+/// Returns the first line of an output block that is missing from the printed lines, in their order.
 fn not_printed<'a>(block: &'a Block, printed: &str) -> Option<&'a (usize, String)> {
     let mut printed = printed.lines();
-    let is = |line: &str, shown: &str| {
+    let matches = |line: &str, shown: &str| {
         let mut rest = line.trim_end();
         let parts: Vec<_> = shown.trim_end().split('…').collect();
         let (first, others) = parts.split_first().unwrap();
@@ -228,7 +228,7 @@ fn not_printed<'a>(block: &'a Block, printed: &str) -> Option<&'a (usize, String
         }
         rest.is_empty() || parts.last().is_some_and(|last| last.is_empty())
     };
-    block.lines.iter().find(|(_, shown)| !shown.trim().is_empty() && !printed.any(|line| is(line, shown)))
+    block.lines.iter().find(|(_, shown)| !shown.trim().is_empty() && !printed.any(|line| matches(line, shown)))
 }
 
 fn copy(from: &Path, to: &Path) {
@@ -242,34 +242,36 @@ fn copy(from: &Path, to: &Path) {
     }
 }
 
-/// The result of a page.
+/// What happened to the commands of a page.
 #[derive(Default)]
-struct Tried {
+struct PageResult {
     ran: usize,
     parsed: usize,
     left_out: Vec<String>,
     failed: Vec<String>,
 }
 
-fn try_page(name: &str, text: &str) -> Tried {
+fn check_page(name: &str, text: &str) -> PageResult {
     let folder: TempDir = tempfile::tempdir().unwrap();
     copy(&Path::new(env!("CARGO_MANIFEST_DIR")).join("configs"), &folder.path().join("configs"));
-    let mut tried = Tried::default();
-    let (blocks, inline) = read(text);
-    let parse = |tried: &mut Tried, number: usize, command: &str| {
-        tried.parsed += 1;
-        if let Some(error) = misread(command) {
-            tried.failed.push(format!("{name}:{number}: {command}\n{error}"));
+    let mut result = PageResult::default();
+    let (blocks, inline) = parse_page(text);
+    let parse = |result: &mut PageResult, number: usize, command: &str| {
+        result.parsed += 1;
+        if let Some(error) = flag_error(command) {
+            result.failed.push(format!("{name}:{number}: {command}\n{error}"));
         }
     };
-    inline.iter().for_each(|(number, command)| parse(&mut tried, *number, command));
+    inline.iter().for_each(|(number, command)| parse(&mut result, *number, command));
     let (mut broken, mut printed, mut after_python) = (false, String::new(), false);
     for block in blocks {
-        // The Python package's tests run Python and compare what it prints.
+        // The Python package's tests run Python blocks and compare their output.
         after_python = block.language == "python" || after_python && block.output;
         if block.output && !broken && !after_python {
             if let Some((number, line)) = not_printed(&block, &printed) {
-                tried.failed.push(format!("{name}:{number}: {line}\nis not what the last command printed:\n{printed}"));
+                result.failed.push(format!(
+                    "{name}:{number}: {line}\nwas not printed by the last command, which printed:\n{printed}"
+                ));
             }
             continue;
         }
@@ -278,7 +280,7 @@ fn try_page(name: &str, text: &str) -> Tried {
             "toml" => {
                 let line = block.lines.first().map_or(0, |(number, _)| *number);
                 if let Err(error) = text().parse::<toml::Table>() {
-                    tried.failed.push(format!("{name}:{line}: it is not TOML: {error}"));
+                    result.failed.push(format!("{name}:{line}: not TOML: {error}"));
                 }
                 if let Some(file) = &block.file {
                     fs::write(folder.path().join(file), text()).unwrap();
@@ -290,58 +292,59 @@ fn try_page(name: &str, text: &str) -> Tried {
         }
         for (number, command) in block.commands() {
             if let Some(why) = &block.not_run {
-                calls(&command).iter().for_each(|call| parse(&mut tried, number, call));
-                tried.left_out.push(format!("{name}:{number}: {command}  ({why})"));
+                program_calls(&command).iter().for_each(|call| parse(&mut result, number, call));
+                result.left_out.push(format!("{name}:{number}: {command}  ({why})"));
             } else if !broken {
-                tried.ran += 1;
+                result.ran += 1;
                 let command = block.short.as_ref().map_or(command.clone(), |flags| shortened(&command, flags));
                 match run(&command, folder.path()) {
                     Ok(output) => printed = output,
                     Err(output) => {
-                        tried.failed.push(format!("{name}:{number}: {command}\n{output}"));
-                        // What follows would fail for want of this.
+                        result.failed.push(format!("{name}:{number}: {command}\n{output}"));
+                        // Later commands may depend on this one, so they are not run.
                         broken = true;
                     }
                 }
             }
         }
     }
-    tried
+    result
 }
 
 #[test]
-fn every_command_of_the_pages_does_what_it_says() {
-    let (mut failed, mut told) = (Vec::new(), String::new());
-    let mut all = 0;
+fn every_command_on_the_pages_works() {
+    let (mut failed, mut summary) = (Vec::new(), String::new());
+    let mut ran = 0;
     let only = std::env::var("FLOTILLA_PAGE").unwrap_or_default();
     for page in pages() {
         let name = page.strip_prefix(env!("CARGO_MANIFEST_DIR")).unwrap().display().to_string();
         if !name.contains(&only) {
             continue;
         }
-        let mut tried = try_page(&name, &fs::read_to_string(&page).unwrap());
-        all += tried.ran;
-        told += &format!(
-            "{name}: {} commands run, {} only read, {} left out\n",
-            tried.ran,
-            tried.parsed,
-            tried.left_out.len()
+        let mut result = check_page(&name, &fs::read_to_string(&page).unwrap());
+        ran += result.ran;
+        summary += &format!(
+            "{name}: {} commands run, {} only parsed, {} left out\n",
+            result.ran,
+            result.parsed,
+            result.left_out.len()
         );
-        tried.left_out.iter().for_each(|line| told += &format!("  left out {line}\n"));
-        failed.append(&mut tried.failed);
+        result.left_out.iter().for_each(|line| summary += &format!("  left out {line}\n"));
+        failed.append(&mut result.failed);
     }
-    // Straight to the stream: what a passing test prints by macro is not shown.
-    write!(std::io::stderr(), "\n{told}").unwrap();
+    // Written to the stream directly, because the output of `eprintln!` in a passing test is hidden.
+    write!(std::io::stderr(), "\n{summary}").unwrap();
     assert!(failed.is_empty(), "{} commands of the pages fail:\n\n{}", failed.len(), failed.join("\n\n"));
-    assert!(all >= 10 || !only.is_empty(), "only {all} commands were found");
+    assert!(ran >= 10 || !only.is_empty(), "only {ran} commands were found");
 }
 
 #[test]
-fn what_fails_in_a_page_is_told_with_its_place() {
-    let page = "# Page\n\n`few.toml` is\n\n```toml\n[x]\n```\n\n```\ncat few.toml # it is there\ntrue \\\n  && ls configs\n\
-                flotilla chekc x\n```\n\n    false\n\n<!-- not run: WHY -->\n\n```\nflotilla check --sed 1\n```\n\
+fn failures_are_reported_with_page_and_line() {
+    let page = "# Page\n\n`few.toml` is\n\n```toml\n[x]\n```\n\n```\ncat few.toml # it is there\n\
+                true \\\n  && ls configs\nflotilla chekc x\n```\n\n    false\n\n<!-- not run: WHY -->\n\n\
+                ```\nflotilla check --sed 1\n```\n\
                 Text `flotilla train CONFIG --trials N`, `flotilla plot --ot x`.\n\n```text\nno command\n```\n";
-    let Tried { ran, failed, left_out, parsed } = try_page("p.md", page);
+    let PageResult { ran, failed, left_out, parsed } = check_page("p.md", page);
     assert_eq!((ran, parsed), (3, 3), "{failed:?}");
     assert_eq!(left_out, ["p.md:21: flotilla check --sed 1  (WHY)"]);
     let places: Vec<_> = failed.iter().map(|failed| failed.lines().next().unwrap()).collect();
@@ -351,47 +354,47 @@ fn what_fails_in_a_page_is_told_with_its_place() {
 }
 
 #[test]
-fn a_long_command_is_run_in_short() {
+fn short_flags_replace_or_extend_those_of_a_command() {
     let flags = "--trials 2 --population 20";
     let short = |command| shortened(command, flags);
     assert_eq!(short("flotilla paper --trials 200 --out a # b"), "flotilla paper --trials 2 --out a");
     assert_eq!(short("flotilla train c.toml --population 5000"), "flotilla train c.toml --population 20 --trials 2");
     assert_eq!(short("flotilla compare a --csv"), "flotilla compare a --csv");
     let page = "<!-- short: --teams 2 -->\n```\nfalse\n```\n";
-    assert_eq!(try_page("p.md", page).failed.len(), 1);
+    assert_eq!(check_page("p.md", page).failed.len(), 1);
 }
 
 #[test]
-fn output_of_python_is_left_to_pythons_tests() {
+fn output_of_python_blocks_is_not_compared() {
     let page = "```\necho one\n```\n\n```python\nprint(2)\n```\n\n<!-- output -->\n\n```text\n2\n```\n";
-    assert!(try_page("p.md", page).failed.is_empty());
+    assert!(check_page("p.md", page).failed.is_empty());
     let page = page.replace("python\nprint(2)", "\necho two");
-    assert_eq!(try_page("p.md", &page).failed.len(), 1);
+    assert_eq!(check_page("p.md", &page).failed.len(), 1);
 }
 
 #[test]
 fn output_that_differs_is_reported() {
     let page = "```\nprintf 'one 1\\ntwo 2\\nthree 3\\n'\n```\n\n<!-- output -->\n\n```text\none 1\nth…3\n```\n";
-    assert!(try_page("p.md", page).failed.is_empty());
+    assert!(check_page("p.md", page).failed.is_empty());
     for (from, to) in [("one 1\nth…3", "th…3\none 1"), ("th…3", "th…4"), ("one 1\n", "one\n")] {
         let page =
             page.replace(&format!("text\n{}", "one 1\nth…3"), &format!("text\n{}", "one 1\nth…3".replace(from, to)));
-        assert_eq!(try_page("p.md", &page).failed.len(), 1, "{page}");
+        assert_eq!(check_page("p.md", &page).failed.len(), 1, "{page}");
     }
 }
 
-/// The anchor that a heading gets.
+/// Returns the anchor that GitHub gives a heading.
 fn anchor(heading: &str) -> String {
     let kept = heading.trim().to_lowercase();
     kept.chars().filter(|c| c.is_alphanumeric() || " -_".contains(*c)).map(|c| if c == ' ' { '-' } else { c }).collect()
 }
 
-/// The relative links of a page that lead nowhere.
+/// Returns the relative links of a page whose file or anchor does not exist.
 fn broken_links(page: &Path) -> Vec<String> {
     let anchors = |text: &str| -> Vec<String> {
         text.lines().filter(|line| line.starts_with('#')).map(|line| anchor(line.trim_start_matches('#'))).collect()
     };
-    // What only the site shows leads to what only the site has; `tests/site.py` follows those links.
+    // Comments that start with `site:` appear only on the site. `tests/site.py` checks their links.
     let text = fs::read_to_string(page).unwrap().replace("<!-- site:", "\0<!--");
     let text: String = text
         .split('\0')
@@ -412,7 +415,7 @@ fn broken_links(page: &Path) -> Vec<String> {
 }
 
 #[test]
-fn every_link_of_the_pages_leads_somewhere() {
+fn every_relative_link_has_a_target() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
     let others = [
         "CHANGELOG.md",

@@ -1,5 +1,7 @@
-//! What comes home of a GPU's episodes: scores are the same from whole and from packed records, whatever matters of them,
-//! and little goes over the bus.
+//! Tests how a GPU's records are copied to the host.
+//!
+//! Packed records drop the sets of agents that change no score. Scores have to equal those from whole records, and
+//! packed records have to be small.
 
 #![cfg(feature = "cli")]
 
@@ -18,7 +20,7 @@ use flotilla::trainer::Trainer;
 use flotilla::verify::KINDS;
 use flotilla::world::World;
 
-/// Some teams of one world; their policies' weights are random, or all 0.
+/// Teams of one world, of five policies with random weights or with all weights 0.
 struct Teams {
     world: World,
     weights: Vec<f32>,
@@ -41,15 +43,15 @@ impl Teams {
         Group { world, starts, weights, policies: 5, sharing, teams, fitnesses }
     }
 
-    /// Bytes of their whole record.
-    fn whole(&self) -> u64 {
+    /// Returns the size of the unpacked record in bytes.
+    fn unpacked_bytes(&self) -> u64 {
         let words = self.world.set_words() + self.world.leaders() * self.world.followers();
         (self.choice.len() / self.world.leaders() * words * 4) as u64
     }
 }
 
-/// The fitnesses that a group is scored by: those that a packed record answers come by turns, from `first` on; or Dt,
-/// which none does.
+/// Returns the fitnesses that a group is scored by. Those that a packed record suffices for take turns, starting from
+/// `first`. [`DT`] selects Dt, which needs the whole record.
 fn fitnesses_of(group: usize, first: usize) -> &'static [Fitness] {
     let (packed, dt) = KINDS.split_at(5);
     if first == DT { dt[0] } else { packed[(group + first) % packed.len()] }
@@ -57,24 +59,25 @@ fn fitnesses_of(group: usize, first: usize) -> &'static [Fitness] {
 
 const DT: usize = usize::MAX;
 
-/// Plays all teams as one batch, the fitnesses of the groups by turns from `first` on.
-fn scores(backend: &mut dyn Backend, all: &[Teams], first: usize) -> Vec<GroupScores> {
-    let groups: Vec<_> = all.iter().enumerate().map(|(index, teams)| teams.group(fitnesses_of(index, first))).collect();
+/// Plays all teams as one batch. Returns their scores by [`fitnesses_of`] each group.
+fn scores(backend: &mut dyn Backend, batch: &[Teams], first: usize) -> Vec<GroupScores> {
+    let groups: Vec<_> =
+        batch.iter().enumerate().map(|(index, teams)| teams.group(fitnesses_of(index, first))).collect();
     backend.play(&groups).unwrap()
 }
 
-/// The same from the whole record, traced on the CPU.
-fn expected(all: &[Teams], first: usize) -> Vec<GroupScores> {
-    let of_group = |(index, teams): (usize, &Teams)| {
+/// Returns the same scores from whole records, which the CPU traces.
+fn expected(batch: &[Teams], first: usize) -> Vec<GroupScores> {
+    let group_scores = |(index, teams): (usize, &Teams)| {
         let group = teams.group(SCORES_AND_DT);
         let (world, leaders, mut credit) = (group.world, group.world.leaders(), Credit::default());
         let mut scores = GroupScores::default();
         for (team, teams) in group.teams.chunks(leaders).enumerate() {
             let trace = Cpu::default().trace(&Group { teams, ..group }).unwrap();
             for (place, &fitness) in fitnesses_of(index, first).iter().enumerate() {
-                let mut one = vec![0.0; leaders];
-                let observed = credit.score(&trace.episode(world, 0), world, fitness, &mut one);
-                scores.scores.extend(one);
+                let mut slot_scores = vec![0.0; leaders];
+                let observed = credit.score(&trace.episode(world, 0), world, fitness, &mut slot_scores);
+                scores.scores.extend(slot_scores);
                 match place {
                     0 => scores.observed.push(observed),
                     _ => assert_eq!(scores.observed[team], observed),
@@ -83,10 +86,10 @@ fn expected(all: &[Teams], first: usize) -> Vec<GroupScores> {
         }
         scores
     };
-    all.iter().enumerate().map(of_group).collect()
+    batch.iter().enumerate().map(group_scores).collect()
 }
 
-/// Whether every team observed so many POIs.
+/// Whether every team observed this many POIs.
 fn all_observed(scores: &[GroupScores], pois: u32) -> bool {
     scores.iter().flat_map(|scores| &scores.observed).all(|&observed| observed == pois)
 }
@@ -100,8 +103,8 @@ fn status(workgroups: u64) -> u64 {
     4 * workgroups
 }
 
-/// Bytes that came from the device since the last call.
-fn down(backend: &mut GpuBackend) -> u64 {
+/// Returns the bytes copied from the device since the last call.
+fn downloaded(backend: &mut GpuBackend) -> u64 {
     backend.take_stages().traffic.down
 }
 
@@ -109,13 +112,13 @@ fn config(text: &str) -> Config {
     Config::parse(text, "records.toml").unwrap()
 }
 
-/// `[[x, y], …]`, a step apart from each other.
+/// Returns `[[x, y], …]` with equal distances.
 fn line(count: usize, [x, y]: [f64; 2], [dx, dy]: [f64; 2]) -> String {
     let places = (0..count).map(|i| format!("[{:?}, {:?}]", x + i as f64 * dx, y + i as f64 * dy));
     format!("[{}]", places.collect::<Vec<_>>().join(", "))
 }
 
-/// Random worlds; more agents than a word has bits, more leaders than a byte tells apart, more POIs than threads.
+/// Random worlds, and two unusual ones: more than 64 agents, more than 256 leaders, and more POIs than threads.
 fn worlds() -> Vec<Config> {
     let odd = [
         format!(
@@ -134,7 +137,7 @@ fn worlds() -> Vec<Config> {
     ];
     let random = (0..28).map(|seed| {
         let mut config = sample::world(seed);
-        // By such rules no record is packed.
+        // Worlds with windows or an order are not packed.
         config.world.windows.clear();
         config.world.after.clear();
         config
@@ -144,27 +147,30 @@ fn worlds() -> Vec<Config> {
 
 #[test]
 fn scores_are_the_same_from_whole_and_packed_records() {
-    let all: Vec<Teams> = worlds().iter().map(|config| Teams::new(config, 37, true)).collect();
-    let expected: Vec<Vec<GroupScores>> = (0..2).map(|first| expected(&all, first)).collect();
-    let different = expected[0].iter().flat_map(|scores| &scores.observed).filter(|&&observed| observed > 0).count();
-    assert!(different > 100, "only {different} teams observe anything");
+    let batch: Vec<Teams> = worlds().iter().map(|config| Teams::new(config, 37, true)).collect();
+    let expected: Vec<Vec<GroupScores>> = (0..2).map(|first| expected(&batch, first)).collect();
+    let observing = expected[0].iter().flat_map(|scores| &scores.observed).filter(|&&observed| observed > 0).count();
+    assert!(observing > 100, "only {observing} teams observe a POI");
     for (request, info) in support::adapters("scores_are_the_same_from_whole_and_packed_records") {
         for (first, expected) in expected.iter().enumerate() {
             for (records, bytes) in [(Records::Whole, 1 << 28), (Records::Packed, 1 << 28), (Records::Packed, 1 << 15)]
             {
                 let mut backend = open(&request, records).batched(bytes).playing(Kernel::Generic);
-                let found = scores(&mut backend, &all, first);
-                assert!(found == *expected, "{info}: fitnesses from {first} on, {records:?}, batches of {bytes} bytes");
+                let actual = scores(&mut backend, &batch, first);
+                assert!(
+                    actual == *expected,
+                    "{info}: fitnesses from {first} on, {records:?}, batches of {bytes} bytes"
+                );
             }
         }
         let mut checked = open(&Request { checked: true, ..request }, Records::Packed);
-        assert!(scores(&mut checked, &all, 0) == expected[0], "{info}: checked");
+        assert!(scores(&mut checked, &batch, 0) == expected[0], "{info}: checked");
     }
 }
 
-/// The canary: each part of the rule, changed in the shader, changes scores.
+/// A canary: each edit to the packing shader must change scores. Without it, the other tests might pass by chance.
 #[test]
-fn a_changed_rule_is_noticed() {
+fn an_edited_packing_rule_changes_scores() {
     type Edit = fn(String) -> String;
     let edits: [Edit; 4] = [
         |text| text.replace("size >= enough", "size > enough"),
@@ -172,23 +178,23 @@ fn a_changed_rule_is_noticed() {
         |text| text.replace("step < sizes.steps", "step + 1u < sizes.steps"),
         |text| text.replace("if steps > most", "if steps >= most"),
     ];
-    let all: Vec<Teams> = worlds().iter().map(|config| Teams::new(config, 37, true)).collect();
-    let expected = expected(&all, 0);
-    for (request, info) in support::adapters("a_changed_rule_is_noticed") {
+    let batch: Vec<Teams> = worlds().iter().map(|config| Teams::new(config, 37, true)).collect();
+    let expected = expected(&batch, 0);
+    for (request, info) in support::adapters("an_edited_packing_rule_changes_scores") {
         for (index, edit) in edits.into_iter().enumerate() {
             // SAFETY: the edits change comparisons and shorten a loop; every index stays in bounds.
             #[expect(unsafe_code, reason = "an edited shader is compiled without bounds checks")]
             let mut backend = unsafe { open(&request, Records::Packed).edited(edit) };
-            assert!(scores(&mut backend, &all, 0) != expected, "{info}: edit {index} was not noticed");
+            assert!(scores(&mut backend, &batch, 0) != expected, "{info}: edit {index} changed no score");
         }
     }
 }
 
-/// Agents in single file at a steady pace: at every step another one is at the POI, so every set matters, the packed record
-/// is as large as the whole one, and does not fit. Then nobody comes near a POI, and nothing matters.
+/// Agents follow each other past a POI at a steady speed. At every step another agent is near it, so no set can be
+/// dropped, and the packed record does not fit. Then no agent is near a POI, and all sets can be dropped.
 #[test]
-fn everything_or_nothing_may_matter() {
-    let file = |poi: f64| {
+fn dense_and_empty_records_give_the_same_scores() {
+    let single_file = |poi: f64| {
         let text = format!(
             "[world]\nspeed = 1.5\nleaders = {}\npois = [[10.0, {poi:?}]]\nsteps = 24\ncoupling = 1\n\
              observation_radius = 0.14\n[policy]\nhidden = []",
@@ -196,132 +202,135 @@ fn everything_or_nothing_may_matter() {
         );
         vec![Teams::new(&config(&text), 500, false)]
     };
-    let (dense, empty) = (file(20.3), file(45.0));
+    let (dense, empty) = (single_file(20.3), single_file(45.0));
     let [for_dense, for_empty] = [&dense, &empty].map(|teams| expected(teams, 0));
     assert!(all_observed(&for_dense, 1) && all_observed(&for_empty, 0));
-    let (whole, table) = (dense[0].whole(), 501 * 4);
-    for (request, info) in support::adapters("everything_or_nothing_may_matter") {
+    let (whole, table) = (dense[0].unpacked_bytes(), 501 * 4);
+    for (request, info) in support::adapters("dense_and_empty_records_give_the_same_scores") {
         let mut backend = open(&request, Records::PackedFrom(0)).playing(Kernel::Generic);
-        let mut play = |all: &[Teams], expected: &[GroupScores]| {
-            assert!(scores(&mut backend, all, 0) == *expected, "{info}");
-            down(&mut backend)
+        let mut play = |batch: &[Teams], expected: &[GroupScores]| {
+            assert!(scores(&mut backend, batch, 0) == *expected, "{info}");
+            downloaded(&mut backend)
         };
         let first = play(&empty, &for_empty);
         assert!(first >= table && first < whole / 4, "{info}: {first} of {whole} bytes");
         let overflown = play(&dense, &for_dense);
         assert!(overflown > whole && overflown < whole + whole / 4, "{info}: {overflown} of {whole} bytes");
-        assert_eq!(play(&dense, &for_dense), whole + 8 + status(100), "{info}: known to be dense");
-        // It packs again once less matters.
-        let again = (0..60).map(|_| play(&empty, &for_empty)).find(|&bytes| bytes < whole / 4);
-        assert!(again.is_some(), "{info}: whole records for ever");
+        assert_eq!(play(&dense, &for_dense), whole + 8 + status(100), "{info}: a second dense batch is copied whole");
+        // Packing resumes when records become small again.
+        let packed_again = (0..60).map(|_| play(&empty, &for_empty)).find(|&bytes| bytes < whole / 4);
+        assert!(packed_again.is_some(), "{info}: records are never packed again");
     }
 }
 
-/// Whole records come home where one dispatch cannot pack them, and where that is not worth it.
+/// A record is copied whole if one dispatch cannot pack it, or if packing saves too little.
 #[test]
-fn whole_records_come_where_they_must() {
+fn very_long_episodes_and_small_batches_are_copied_whole() {
     let text = |steps: usize| {
         format!(
             "[world]\nleaders = [[10.0, 5.0], [20.0, 5.0]]\nfollowers = [[12.0, 2.0], [8.0, 2.0]]\n\
              pois = [[10.0, 15.0], [30.0, 40.0]]\nsteps = {steps}\ncoupling = 1\n[policy]\nhidden = []"
         )
     };
-    let of = |steps: usize| vec![Teams::new(&config(&text(steps)), 20, true)];
-    let (short, long, longest) = (of(100), of(3000), of(10_000));
+    let teams_with_steps = |steps: usize| vec![Teams::new(&config(&text(steps)), 20, true)];
+    let (short, long, longest) = (teams_with_steps(100), teams_with_steps(3000), teams_with_steps(10_000));
     let [for_short, for_long, for_longest] = [&short, &long, &longest].map(|teams| expected(teams, 0));
-    for (request, info) in support::adapters("whole_records_come_where_they_must") {
+    for (request, info) in support::adapters("very_long_episodes_and_small_batches_are_copied_whole") {
         let mut backend = open(&request, Records::PackedFrom(0)).playing(Kernel::Generic);
-        // Several dispatches.
+        // This episode takes several dispatches and is still packed.
         assert!(scores(&mut backend, &long, 0) == for_long, "{info}");
-        assert!(down(&mut backend) < long[0].whole(), "{info}: 3000 steps");
+        assert!(downloaded(&mut backend) < long[0].unpacked_bytes(), "{info}: 3000 steps");
         assert!(scores(&mut backend, &longest, 0) == for_longest, "{info}");
-        assert_eq!(down(&mut backend), longest[0].whole() + status(2), "{info}: 10 000 steps");
+        assert_eq!(downloaded(&mut backend), longest[0].unpacked_bytes() + status(2), "{info}: 10 000 steps");
         let mut small = open(&request, Records::PackedFrom(1 << 20)).playing(Kernel::Generic);
         assert!(scores(&mut small, &short, 0) == for_short, "{info}");
-        assert_eq!(down(&mut small), short[0].whole() + status(2), "{info}: not worth packing");
+        assert_eq!(downloaded(&mut small), short[0].unpacked_bytes() + status(2), "{info}: not worth packing");
     }
 }
 
-/// Bytes over the bus, up and down, of every generation of generally forward under Df, its populations held, by team:
-/// at 2^20 teams 100 MB are 95. More teams by `FLOTILLA_TEAMS`.
+/// Counts bytes over the bus per team, with populations on the device. The config is generally forward with Df. At 2^20
+/// teams, 100 MB are 95 bytes per team. `FLOTILLA_TEAMS` sets the number of teams.
 #[test]
-fn a_generation_moves_less_than_95_bytes_a_team() {
+fn a_generation_moves_less_than_95_bytes_per_team() {
     let mut config = support::layout("generally_forward");
     let teams = std::env::var("FLOTILLA_TEAMS").map_or(1 << 11, |teams| teams.parse().unwrap());
     (config.learning.trials, config.learning.population, config.learning.generations) = (1, teams, 60);
     config.learning.fitness = Fitness::Df;
-    for (request, info) in support::adapters("a_generation_moves_less_than_95_bytes_a_team") {
+    for (request, info) in support::adapters("a_generation_moves_less_than_95_bytes_per_team") {
         let mut backend = open(&request, Records::PackedFrom(0)).holding(ResidencyPolicy::Always);
         let mut trainer = Trainer::new([config.validate().unwrap()]);
         let mut before = backend.gpu().traffic();
         for generation in 0..=50 {
             let rows = trainer.advance(&mut backend).unwrap();
-            let (whole, played) = (backend.gpu().traffic(), backend.take_stages().traffic);
+            let (total, played) = (backend.gpu().traffic(), backend.take_stages().traffic);
             let held = (teams as u64 + 1) * 4 * 112 * 4;
-            let traffic = whole - std::mem::replace(&mut before, whole);
-            // The populations go up once.
+            let traffic = total - std::mem::replace(&mut before, total);
+            // The populations are uploaded once, in generation 0.
             let up = traffic.up - if generation == 0 { held } else { 0 };
-            let a_team = |bytes: u64| bytes as f64 / teams as f64;
+            let per_team = |bytes: u64| bytes as f64 / teams as f64;
             let mean_g = rows.first().map_or(0.0, |row| row.mean_g);
             println!(
-                "{info}: generation {generation}, mean G of the last {mean_g:.2}: {:.1} bytes a team up ({:.1} of it \
-                 rollouts), {:.1} down",
-                a_team(up),
-                a_team(played.up),
-                a_team(traffic.down)
+                "{info}: generation {generation}, mean G of the last {mean_g:.2}: {:.1} bytes per team up ({:.1} of it \
+                 for rollouts), {:.1} down",
+                per_team(up),
+                per_team(played.up),
+                per_team(traffic.down)
             );
             if [0, 50].contains(&generation) {
-                assert!(a_team(up + traffic.down) * f64::from(1 << 20) <= 1e8, "{info}: generation {generation}");
+                assert!(per_team(up + traffic.down) * f64::from(1 << 20) <= 1e8, "{info}: generation {generation}");
             }
         }
     }
 }
 
-/// Whether a POI is observed may hang on when somebody was near: such records come whole. Whose presence counts does not.
+/// With windows or an order, the time when an agent was near a POI can decide whether the POI is observed. Packing
+/// drops times, so such records are copied whole. The rule for observers does not depend on times.
 #[test]
-fn records_are_packed_only_where_time_does_not_matter() {
-    let of = |change: fn(&mut Config)| {
+fn records_are_not_packed_if_times_matter() {
+    let teams_with = |change: fn(&mut Config)| {
         let mut config = config(include_str!("../configs/generally_forward.toml"));
         config.world.steps = 60;
         change(&mut config);
         vec![Teams::new(&config, 200, true)]
     };
     let cases: [(_, _, fn(&mut Config)); 4] = [
-        ("by the default rule", true, |_| ()),
-        ("observed by followers", true, |config| {
+        ("default rules", true, |_| ()),
+        ("followers observe", true, |config| {
             (config.world.observers, config.world.coupling) = (Observers::Followers, Coupling::Same(2));
         }),
-        ("at some steps", false, |config| config.world.windows = vec![[20, 40]; 4]),
-        ("one after the other", false, |config| config.world.after = vec![vec![], vec![0], vec![0], vec![0]]),
+        ("windows", false, |config| config.world.windows = vec![[20, 40]; 4]),
+        ("POIs in order", false, |config| config.world.after = vec![vec![], vec![0], vec![0], vec![0]]),
     ];
-    for (request, info) in support::adapters("records_are_packed_only_where_time_does_not_matter") {
-        for (what, packed, change) in cases {
-            let all = of(change);
-            let expected = expected(&all, 0);
-            assert!(!all_observed(&expected, 0), "{what}: nothing is observed");
+    for (request, info) in support::adapters("records_are_not_packed_if_times_matter") {
+        for (name, packed, change) in cases {
+            let batch = teams_with(change);
+            let expected = expected(&batch, 0);
+            assert!(!all_observed(&expected, 0), "{name}: nothing is observed");
             let mut backend = open(&request, Records::PackedFrom(0)).playing(Kernel::Generic);
-            assert!(scores(&mut backend, &all, 0) == expected, "{info}, {what}");
-            let moved = down(&mut backend);
-            assert_eq!(moved < all[0].whole() / 2, packed, "{info}, {what}: {moved} bytes");
-            // Dt asks when its followers were led: nothing is packed, and sights come with the rest.
-            let expected = self::expected(&all, DT);
-            assert!(scores(&mut backend, &all, DT) == expected, "{info}, {what}, Dt");
-            let sights = (200 * 4 * all[0].world.sight_words()) as u64;
-            assert_eq!(down(&mut backend), all[0].whole() + sights + status(10), "{info}, {what}, Dt");
+            assert!(scores(&mut backend, &batch, 0) == expected, "{info}, {name}");
+            let bytes = downloaded(&mut backend);
+            assert_eq!(bytes < batch[0].unpacked_bytes() / 2, packed, "{info}, {name}: {bytes} bytes");
+            // Dt needs the time when each follower was led. Nothing is packed, and sights are copied too.
+            let expected = self::expected(&batch, DT);
+            assert!(scores(&mut backend, &batch, DT) == expected, "{info}, {name}, Dt");
+            let sights = (200 * 4 * batch[0].world.sight_words()) as u64;
+            assert_eq!(downloaded(&mut backend), batch[0].unpacked_bytes() + sights + status(10), "{info}, {name}, Dt");
         }
     }
 }
 
-/// Seconds that all threads have computed so far, whoever else did meanwhile (Linux counts in hundredths).
+/// Returns the processor time of all threads of this process in seconds. Linux counts in hundredths of a second.
 fn processor_seconds() -> f64 {
     let stat = std::fs::read_to_string("/proc/self/stat").expect("this is Linux");
-    // After the name, which may hold blanks, the times are the 12th and the 13th.
+    // The name may contain blanks. After it, the times are the 12th and 13th fields.
     let fields = stat.rsplit(')').next().unwrap_or_default().split_whitespace().skip(11).take(2);
     fields.map(|ticks| ticks.parse::<f64>().expect("a count") / 100.0).sum()
 }
 
-/// What compiling takes: the first two generations of two teams less twice the third, of everything that a GPU would compile, and of
-/// what a software renderer compiles by default. Drivers' caches have to be off (Mesa's by `MESA_SHADER_CACHE_DISABLE=true`).
+/// Prints the processor time of compiling: that of the first two generations minus twice that of the third.
+///
+/// *As on a GPU* forces all kernels that a GPU would compile; *by default* is what a software renderer compiles.
+/// Disable drivers' caches (Mesa: `MESA_SHADER_CACHE_DISABLE=true`).
 #[test]
 #[ignore = "prints a table"]
 fn compiling() {
@@ -347,20 +356,19 @@ fn compiling() {
     for (request, info) in support::adapters("compiling") {
         for (name, configs) in &cases {
             let backend = || GpuBackend::new(gpu::open(request.clone()).unwrap()).unwrap();
-            let gpu =
-                backend().playing(Kernel::Best).holding(ResidencyPolicy::Always).with_records(Records::PackedFrom(0));
-            for (what, mut backend) in [("by default", backend()), ("as on a GPU", gpu)] {
+            let gpu = backend().playing(Kernel::Best).holding(ResidencyPolicy::Always).bringing(Records::PackedFrom(0));
+            for (setup, mut backend) in [("by default", backend()), ("as on a GPU", gpu)] {
                 let mut trainer = Trainer::new(ValidConfig::all(configs).unwrap());
                 let mut seconds = || {
                     let start = processor_seconds();
                     trainer.advance(&mut backend).unwrap();
                     processor_seconds() - start
                 };
-                // Breeding is compiled while the second one waits for it.
+                // The second generation waits until the breeding kernels are compiled.
                 let (first, second, third) = (seconds(), seconds(), seconds());
                 let [generic, specialised] = backend.compiled();
                 println!(
-                    "{name}, {what}: {:.2} s, {generic} generic and {specialised} specialised kernels, {info}",
+                    "{name}, {setup}: {:.2} s, {generic} generic and {specialised} specialised kernels, {info}",
                     first + second - 2.0 * third
                 );
             }
@@ -368,8 +376,9 @@ fn compiling() {
     }
 }
 
-/// The CPU's part of a generation: its phases on a device that plays only the first steps of each episode. By default of
-/// 2^20 teams, more or fewer by `FLOTILLA_TEAMS`, with as many threads as `RAYON_NUM_THREADS` says.
+/// Prints the CPU's part of a generation, by phase. The device plays only the first steps of each episode.
+///
+/// `FLOTILLA_TEAMS` sets the number of teams (2^20 by default), and `RAYON_NUM_THREADS` the number of threads.
 #[test]
 #[ignore = "prints a table"]
 fn the_cpus_part_of_a_generation() {
@@ -378,11 +387,11 @@ fn the_cpus_part_of_a_generation() {
     }
     let mut config = support::layout("generally_forward");
     let teams = std::env::var("FLOTILLA_TEAMS").map_or(1 << 20, |teams| teams.parse().unwrap());
-    // A small generation is over too soon to be timed alone.
+    // One small generation is too short to be timed.
     let generations = (20_000 / teams).clamp(5, 400);
     (config.learning.trials, config.learning.population, config.learning.generations) = (1, teams, generations + 3);
     config.learning.fitness = Fitness::Df;
-    // A leader's population has to fit into one buffer, of 128 MiB on lavapipe. The CPU moves no weights.
+    // A leader's population has to fit into one buffer, which lavapipe limits to 128 MiB. The CPU moves no weights.
     config.policy.hidden = vec![];
     for (request, info) in support::adapters("the_cpus_part_of_a_generation") {
         let backend = open(&request, Records::PackedFrom(0)).holding(ResidencyPolicy::Always);
@@ -390,7 +399,7 @@ fn the_cpus_part_of_a_generation() {
         #[expect(unsafe_code, reason = "edited shaders are compiled without bounds checks")]
         let mut backend = unsafe { backend.edited(short) };
         let mut trainer = Trainer::new([config.validate().unwrap()]);
-        // Room for packed records is found by the first generations.
+        // The first generations reserve the memory for packed records.
         for _ in 0..3 {
             trainer.advance(&mut backend).unwrap();
         }
