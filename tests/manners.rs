@@ -1,4 +1,6 @@
-//! What makes the program at home on a machine: its version, configs to start from, standard input, shells and manuals.
+//! Tests commands and options that are not about training or scores.
+//!
+//! These are versions, starter configs, standard input, job arrays, shell completions, manual pages and JSON output.
 
 #![cfg(feature = "cli")]
 
@@ -16,30 +18,30 @@ use support::Place;
 #[path = "../build.rs"]
 mod build;
 
-fn told(flag: &str) -> String {
+fn output_of(flag: &str) -> String {
     let output = cargo_bin_cmd!("flotilla").arg(flag).output().unwrap();
     assert!(output.status.success());
     String::from_utf8(output.stdout).unwrap()
 }
 
 #[test]
-fn the_version_is_told_in_a_line_or_with_commit_and_target() {
+fn short_version_is_one_line_and_long_version_adds_commit_and_target() {
     let name = concat!("flotilla ", env!("CARGO_PKG_VERSION"));
-    assert_eq!(told("-V"), format!("{name}\n"));
-    let long = told("--version");
+    assert_eq!(output_of("-V"), format!("{name}\n"));
+    let long = output_of("--version");
     let lines: Vec<&str> = long.lines().collect();
     assert_eq!(lines[0], name, "{long}");
     assert!(lines[1].starts_with("commit  "), "{long}");
     let target = lines[2].strip_prefix("target  ").expect(&long);
     assert!(target.starts_with(std::env::consts::ARCH) && target.contains('-'), "{long}");
-    // A debug build is not told, so as not to be compiled anew at every commit.
+    // Debug builds record no commit, so that cargo does not rebuild them at every commit.
     let commit = build::state(Path::new(env!("CARGO_MANIFEST_DIR"))).0.filter(|_| !cfg!(debug_assertions));
     assert_eq!(flotilla::COMMIT, commit.as_deref());
     assert!(lines[1].ends_with(&commit.unwrap_or("not recorded".into())), "{long}");
 }
 
 #[test]
-fn the_commit_is_read_as_git_reads_it() {
+fn build_script_reads_the_same_commit_as_git() {
     let folder = tempfile::tempdir().unwrap();
     let git = |place: &Path, line: &str| {
         let output = Command::new("git")
@@ -58,42 +60,42 @@ fn the_commit_is_read_as_git_reads_it() {
         eprintln!("skipped: there is no git");
         return;
     }
-    // Every file named as a reason to look again must be there: cargo takes a missing one for one that changed.
+    // Cargo rebuilds if a file that the build script watches is missing, so all of them must exist.
     let read = |place: &Path| {
         let (commit, files) = build::commit(place);
         assert!(files.iter().all(|file| file.exists()), "{files:?}");
         (commit, files)
     };
-    let same = |place: &Path| {
+    let check_commit = |place: &Path| {
         let (commit, files) = read(place);
         assert_eq!(commit, git(place, "rev-parse HEAD"));
         files
     };
-    assert_eq!(read(&tree).0, None, "nothing is committed yet");
+    assert_eq!(read(&tree).0, None, "a repository without commits has none");
     git(&tree, "commit -q --allow-empty -m one");
-    let files = same(&tree);
+    let files = check_commit(&tree);
     assert!(files.iter().any(|file| file.ends_with("refs/heads/trunk")), "{files:?}");
     git(&tree, "pack-refs --all");
     assert!(!tree.join(".git/refs/heads/trunk").exists());
-    same(&tree);
+    check_commit(&tree);
     git(&tree, "commit -q --allow-empty -m two");
-    same(&tree);
+    check_commit(&tree);
     git(&tree, "worktree add -q ../side -b topic/side");
     let side = folder.path().join("side");
     git(&side, "commit -q --allow-empty -m three");
-    let files = same(&side);
+    let files = check_commit(&side);
     assert_ne!(read(&side).0, read(&tree).0);
     assert!(files.iter().any(|file| file.ends_with("refs/heads/topic/side")), "{files:?}");
     git(&tree, "checkout -q --detach HEAD~1");
-    same(&tree);
+    check_commit(&tree);
     let url = format!("clone -q --depth 1 file://{} ../shallow", tree.display());
     git(&tree, &url);
-    same(&folder.path().join("shallow"));
+    check_commit(&folder.path().join("shallow"));
 }
 
-/// A build of changed files is not a build of the commit.
+/// A build with uncommitted changes must not claim to be a build of the commit.
 #[test]
-fn a_changed_tree_is_recorded_as_such() {
+fn uncommitted_changes_are_recorded_as_dirty() {
     let folder = tempfile::tempdir().unwrap();
     let tree = folder.path();
     let git = |line: &str| {
@@ -111,7 +113,7 @@ fn a_changed_tree_is_recorded_as_such() {
     let hash = build::commit(tree).0.unwrap();
     let (state, files) = build::state(tree);
     assert_eq!(state.as_ref(), Some(&hash));
-    assert!(files.contains(&tree.join("src")), "cargo looks again when a source changes: {files:?}");
+    assert!(files.contains(&tree.join("src")), "the build script runs again if a source changes: {files:?}");
     fs::write(tree.join("notes"), "not tracked").unwrap();
     assert_eq!(build::state(tree).0.as_ref(), Some(&hash));
     fs::write(tree.join("src/lib.rs"), "// two\n").unwrap();
@@ -121,11 +123,11 @@ fn a_changed_tree_is_recorded_as_such() {
 }
 
 #[test]
-fn without_git_the_commit_is_what_the_archive_says_or_nothing() {
+fn without_git_the_commit_comes_from_the_archive() {
     let folder = tempfile::tempdir().unwrap();
     assert_eq!(build::commit(folder.path()), (None, vec![]));
     let hash = "0123456789abcdef0123456789abcdef01234567";
-    // As cargo package writes it.
+    // In the format of `cargo package`.
     let text = format!("{{\n  \"git\": {{\n    \"sha1\": \"{hash}\"\n  }},\n  \"path_in_vcs\": \"\"\n}}");
     fs::write(folder.path().join(".cargo_vcs_info.json"), text).unwrap();
     assert_eq!(build::commit(folder.path()).0.as_deref(), Some(hash));
@@ -140,76 +142,76 @@ fn without_git_the_commit_is_what_the_archive_says_or_nothing() {
     assert_eq!(build::commit(folder.path()).0, None);
     assert_eq!(build::state(folder.path()).0, None);
     fs::write(folder.path().join(".git/HEAD"), hash).unwrap();
-    assert_eq!(build::state(folder.path()).0, Some(format!("{hash}-unchecked")), "git cannot read this");
+    assert_eq!(build::state(folder.path()).0, Some(format!("{hash}-unchecked")), "git cannot read this directory");
 }
 
-/// Standard output and standard error of a command that must succeed, with something on standard input.
-fn fed(place: &Place, line: &str, input: &str) -> (String, String) {
+/// Runs a command that must succeed, with text on standard input. Returns its standard output and standard error.
+fn good_with_input(place: &Place, line: &str, input: &str) -> (String, String) {
     let output = place.command().args(line.split_whitespace()).write_stdin(input).output().unwrap();
-    let told = String::from_utf8(output.stderr).unwrap();
-    assert_eq!(output.status.code(), Some(0), "{line}: {told}");
-    (String::from_utf8(output.stdout).unwrap(), told)
+    let stderr = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(0), "{line}: {stderr}");
+    (String::from_utf8(output.stdout).unwrap(), stderr)
 }
 
 const LAYOUTS: [&str; 3] = ["generally_forward", "strictly_forward", "chaotic"];
 
 #[test]
-fn a_config_to_start_from_says_every_key_and_is_its_layouts() {
+fn init_prints_every_key_with_its_layouts_values() {
     let place = Place::new(&[]);
     for layout in LAYOUTS {
-        let (text, told) = place.good(&format!("init {}", layout.replace('_', "-")));
-        assert_eq!(told, "");
+        let (text, stderr) = place.good(&format!("init {}", layout.replace('_', "-")));
+        assert_eq!(stderr, "");
         assert!(text.lines().all(|line| line.chars().count() <= 120), "{text}");
-        let from =
+        let layout_text =
             fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("configs/{layout}.toml"))).unwrap();
-        assert_eq!(text.lines().next(), from.lines().next(), "what it is, to begin with");
-        let checked = |text: &str| fed(&place, "check -", text).0;
-        assert_eq!(checked(&text), checked(&from));
-        // Each key once, below all that there is to know of it.
-        let mut told = String::new();
-        let mut said = std::collections::BTreeMap::new();
+        assert_eq!(text.lines().next(), layout_text.lines().next(), "the title line");
+        let check_output = |text: &str| good_with_input(&place, "check -", text).0;
+        assert_eq!(check_output(&text), check_output(&layout_text));
+        // Each key appears once, below a comment with its meaning, unit, kind, range and default.
+        let mut comment = String::new();
+        let mut comments = std::collections::BTreeMap::new();
         let mut section = "";
         for line in text.lines() {
             match (line.strip_prefix("# "), line.split_once(" = ")) {
-                (Some(comment), _) => told += &format!("{comment} "),
+                (Some(comment), _) => comment += &format!("{comment} "),
                 (_, Some((leaf, _))) => {
-                    let before = said.insert(format!("{section}.{leaf}"), std::mem::take(&mut told));
+                    let before = comments.insert(format!("{section}.{leaf}"), std::mem::take(&mut comment));
                     assert_eq!(before, None, "{line}");
                 }
-                _ if line.starts_with('[') => (section, told) = (line.trim_matches(['[', ']']), String::new()),
+                _ if line.starts_with('[') => (section, comment) = (line.trim_matches(['[', ']']), String::new()),
                 _ => {}
             }
         }
         let keys = config::keys();
-        assert_eq!(said.len(), keys.len());
+        assert_eq!(comments.len(), keys.len());
         for key in keys {
             let default = key.default.map_or("has to be given".into(), |default| format!("default {default}"));
             for part in [key.meaning, key.unit, &key.kind, &key.range, &default] {
-                assert!(said[key.name].contains(part), "{part} of {}: {}", key.name, said[key.name]);
+                assert!(comments[key.name].contains(part), "{part} of {}: {}", key.name, comments[key.name]);
             }
         }
     }
     assert_eq!(place.good("init"), place.good("init generally-forward"));
     assert_eq!(place.good("init"), place.good("init generally_forward"));
     assert_eq!(place.run("init spiral").status.code(), Some(2));
-    assert_eq!(place.run("init --force").status.code(), Some(2), "there is no file to write over");
+    assert_eq!(place.run("init --force").status.code(), Some(2), "--force needs --out");
 }
 
 #[test]
-fn a_config_to_start_from_trains_and_writes_over_nothing() {
+fn init_writes_a_config_that_trains_and_overwrites_nothing() {
     let place = Place::new(&[]);
     assert_eq!(place.good("init -o my.toml").0, "my.toml\n");
-    let there = place.read("my.toml");
-    assert_eq!(there, place.good("init").0);
+    let written = place.read("my.toml");
+    assert_eq!(written, place.good("init").0);
     place.good("train my.toml --backend cpu --generations 1 --trials 1 -q -o run");
-    let again = place.run("init chaotic --out my.toml");
-    let told = String::from_utf8(again.stderr).unwrap();
+    let refused = place.run("init chaotic --out my.toml");
+    let stderr = String::from_utf8(refused.stderr).unwrap();
     assert_eq!(
-        (again.status.code(), told.contains("the file exists; choose another --out, or overwrite it with --force")),
+        (refused.status.code(), stderr.contains("the file exists; choose another --out, or overwrite it with --force")),
         (Some(1), true),
-        "{told}"
+        "{stderr}"
     );
-    assert_eq!(place.read("my.toml"), there);
+    assert_eq!(place.read("my.toml"), written);
     place.good("init chaotic --out my.toml --force");
     assert_eq!(place.read("my.toml"), place.good("init chaotic").0);
 }
@@ -231,95 +233,102 @@ trials = 1
 fn every_command_that_reads_a_config_reads_standard_input() {
     let place = Place::new(&[]);
     let read = |name: &str| fs::read(place.path(name)).unwrap();
-    let (_, told) = fed(&place, "train - --backend cpu --seed 3", SMALL);
-    assert!(told.contains("into runs/config\n"), "{told}");
-    // What is kept is a config like any other: training from it repeats the run.
+    let (_, stderr) = good_with_input(&place, "train - --backend cpu --seed 3", SMALL);
+    assert!(stderr.contains("into runs/config\n"), "{stderr}");
+    // The saved config can be used like any other: training from it repeats the run.
     assert!(Config::load(&place.path("runs/config/config.toml")).is_ok());
     place.good("train runs/config/config.toml --backend cpu -q -o again");
     assert_eq!(read("again/policies.safetensors"), read("runs/config/policies.safetensors"));
-    let (done, _) = fed(&place, "train - --backend cpu --seed 3 --resume", SMALL);
+    let (done, _) = good_with_input(&place, "train - --backend cpu --seed 3 --resume", SMALL);
     assert!(done.contains("runs/config"), "{done}");
-    // The latest is the one of the highest number, whatever is gone.
+    // A new run gets the largest number plus one, even if smaller numbers are unused. `--resume` takes the largest.
     fs::create_dir(place.path("runs/config-4")).unwrap();
-    let (_, told) = fed(&place, "train - --backend cpu", SMALL);
-    assert!(told.contains("into runs/config-5\n"), "{told}");
-    let (done, _) = fed(&place, "train - --backend cpu --resume", SMALL);
+    let (_, stderr) = good_with_input(&place, "train - --backend cpu", SMALL);
+    assert!(stderr.contains("into runs/config-5\n"), "{stderr}");
+    let (done, _) = good_with_input(&place, "train - --backend cpu --resume", SMALL);
     assert!(done.contains("runs/config-5"), "{done}");
     let policies = "--policies again/policies.safetensors";
     let small = place.path("small.toml");
     fs::write(&small, SMALL).unwrap();
     for line in ["check FILE", "check FILE --json", &format!("rollout FILE --backend cpu {policies} --json")] {
-        let [from_file, from_input] = ["small.toml", "-"].map(|name| fed(&place, &line.replace("FILE", name), SMALL).0);
+        let [from_file, from_input] =
+            ["small.toml", "-"].map(|name| good_with_input(&place, &line.replace("FILE", name), SMALL).0);
         assert_eq!(from_file, from_input, "{line}");
     }
-    fed(&place, "bench - --backend cpu --teams 2 --rollout-only --json", SMALL);
+    good_with_input(&place, "bench - --backend cpu --teams 2 --rollout-only --json", SMALL);
     let wrong = SMALL.replace("steps = 4", "steps = 0");
     for line in ["check -", "train -", &format!("rollout - {policies}"), "verify -", "bench -", "sweep -"] {
         let grid = if line == "sweep -" { "[grid]\n'learning.seed' = [1]\n" } else { "" };
         let input = wrong.clone() + grid;
         let output = place.command().args(line.split_whitespace()).write_stdin(input).output().unwrap();
-        let told = String::from_utf8(output.stderr).unwrap();
-        assert!(told.contains("standard input:7: world.steps: found 0, allowed 1 to 10000"), "{line}: {told}");
+        let stderr = String::from_utf8(output.stderr).unwrap();
+        assert!(stderr.contains("standard input:7: world.steps: found 0, allowed 1 to 10000"), "{line}: {stderr}");
         assert_eq!(output.status.code(), Some(1));
     }
 }
 
 #[test]
-fn a_sweep_from_standard_input_is_gone_on_with_from_its_folder() {
+fn a_sweep_from_standard_input_resumes_from_its_directory() {
     let place = Place::new(&[]);
     let sweep = SMALL.to_string() + "[grid]\n'learning.seed' = [1, 2]\n";
-    let (told, _) = fed(&place, "sweep - --backend cpu -q --shard 1/2", &sweep);
-    assert!(told.contains("flotilla sweep runs/sweep/sweep.toml --out runs/sweep --backend cpu --collect"), "{told}");
+    let (stdout, _) = good_with_input(&place, "sweep - --backend cpu -q --shard 1/2", &sweep);
+    assert!(
+        stdout.contains("flotilla sweep runs/sweep/sweep.toml --out runs/sweep --backend cpu --collect"),
+        "{stdout}"
+    );
     place.good("sweep runs/sweep/sweep.toml --out runs/sweep --backend cpu -q --shard 2/2");
-    let (all, _) = fed(&place, "sweep - --collect", &sweep);
-    assert!(all.starts_with("2 of 2 points are done."), "{all}");
-    let (script, _) = fed(&place, "sweep - --slurm", &sweep);
+    let (collected, _) = good_with_input(&place, "sweep - --collect", &sweep);
+    assert!(collected.starts_with("2 of 2 points are done."), "{collected}");
+    let (script, _) = good_with_input(&place, "sweep - --slurm", &sweep);
     assert!(script.contains("/runs/sweep/sweep.toml"), "{script}");
 }
 
 #[test]
-fn a_job_array_says_if_its_size_fits_badly() {
+fn a_job_array_of_unsuitable_size_prints_a_note() {
     let place = Place::new(&[]);
     let sweep = SMALL.to_string() + "[grid]\n'learning.seed' = [1, 2]\n";
-    let (_, one) = fed(&place, "sweep - --slurm", &sweep);
-    assert!(one.contains("note: the job array has one task, which trains all points"), "{one}");
-    let (_, many) = fed(&place, "sweep - --slurm --shards 5", &sweep);
-    assert!(many.contains("note: 3 of the 5 tasks get nothing to train, because the sweep has 2 points"), "{many}");
-    let (_, two) = fed(&place, "sweep - --slurm --shards 2", &sweep);
-    assert!(!two.contains("note:"), "{two}");
+    let (_, one_task) = good_with_input(&place, "sweep - --slurm", &sweep);
+    assert!(one_task.contains("note: the job array has one task, which trains all points"), "{one_task}");
+    let (_, many_tasks) = good_with_input(&place, "sweep - --slurm --shards 5", &sweep);
+    assert!(
+        many_tasks.contains("note: 3 of the 5 tasks get nothing to train, because the sweep has 2 points"),
+        "{many_tasks}"
+    );
+    let (_, two_tasks) = good_with_input(&place, "sweep - --slurm --shards 2", &sweep);
+    assert!(!two_tasks.contains("note:"), "{two_tasks}");
 }
 
 #[test]
-fn mistakes_with_places_are_told_with_the_right_place() {
+fn errors_about_wrong_places_name_the_right_place() {
     let place = Place::new(&[]);
-    let refusal = |line: &str, input: &str| {
+    let error_of = |line: &str, input: &str| {
         let output = place.command().args(line.split_whitespace()).write_stdin(input).output().unwrap();
         assert_ne!(output.status.code(), Some(0), "{line}");
         String::from_utf8(output.stderr).unwrap()
     };
-    // An axis of the grid in no section.
-    let told = refusal("sweep -", &format!("groups = [2, 4]\n{SMALL}[grid]\n'learning.seed' = [1]\n"));
-    assert!(told.contains("groups: this key belongs in the section [grid]: groups = [2, 4]"), "{told}");
-    // A run is named without the folder that `train` chose for it.
-    fed(&place, "train - --backend cpu -q -o runs/first", SMALL);
-    let told = refusal("replay first", "");
-    assert!(told.contains("; did you mean runs/first?"), "{told}");
-    // A picture in a folder that is not there.
-    let told = refusal("plot runs/first -o pictures/curves.svg", "");
-    assert!(told.contains("the folder pictures does not exist; make it first"), "{told}");
+    // A grid axis outside of the section [grid].
+    let stderr = error_of("sweep -", &format!("groups = [2, 4]\n{SMALL}[grid]\n'learning.seed' = [1]\n"));
+    assert!(stderr.contains("groups: this key belongs in the section [grid]: groups = [2, 4]"), "{stderr}");
+    // A run named without its parent directory.
+    good_with_input(&place, "train - --backend cpu -q -o runs/first", SMALL);
+    let stderr = error_of("replay first", "");
+    assert!(stderr.contains("; did you mean runs/first?"), "{stderr}");
+    // A picture in a directory that does not exist.
+    let stderr = error_of("plot runs/first -o pictures/curves.svg", "");
+    assert!(stderr.contains("the folder pictures does not exist; make it first"), "{stderr}");
 }
 
 #[test]
-fn pois_out_of_reach_for_one_reason_share_a_warning() {
+fn pois_unreachable_for_one_reason_share_a_warning() {
     let place = Place::new(&[]);
     let far = SMALL.replace("pois = [[10, 9]]", "pois = [[50, 9], [50, 9], [10, 50]]");
-    let (_, told) = fed(&place, "check -", &far);
-    assert_eq!(told.matches("cannot be reached by").count(), 2, "{told}");
-    assert!(told.contains("; the same holds for POI 1\n"), "{told}");
+    let (_, stderr) = good_with_input(&place, "check -", &far);
+    assert_eq!(stderr.matches("cannot be reached by").count(), 2, "{stderr}");
+    assert!(stderr.contains("; the same holds for POI 1\n"), "{stderr}");
 }
 
 #[test]
-fn shells_complete_commands_and_flags() {
+fn completions_cover_commands_flags_and_values() {
     let place = Place::new(&[]);
     for shell in ["bash", "elvish", "fish", "powershell", "zsh"] {
         let (script, _) = place.good(&format!("completions {shell}"));
@@ -328,7 +337,7 @@ fn shells_complete_commands_and_flags() {
         }
     }
     assert_eq!(place.run("completions tcsh").status.code(), Some(2));
-    // As a shell would use it.
+    // Call the completion function as bash would.
     fs::write(place.path("flotilla.bash"), place.good("completions bash").0).unwrap();
     let complete = |line: &str| {
         let words: Vec<&str> = line.split(' ').collect();
@@ -358,7 +367,7 @@ fn every_command_has_a_manual_page() {
         let name = format!("flotilla-{}", command.get_name());
         let page = page(&format!("{name}.1"));
         assert!(page.contains(&format!(".TH {name} 1 ")), "{page}");
-        // Hyphens are written so that they can be copied.
+        // Hyphens are escaped, so that flags can be copied from the rendered page.
         for flag in command.get_arguments().filter_map(|flag| flag.get_long()) {
             assert!(page.contains(&format!("\\-\\-{}", flag.replace('-', "\\-"))), "{flag} of {name}");
         }
@@ -368,28 +377,28 @@ fn every_command_has_a_manual_page() {
     assert_eq!(fs::read_dir(place.path("pages")).unwrap().count(), commands + 1);
 }
 
-/// Every command that writes a file takes it by `-o`, and every one that shows progress can be made quiet by `-q`.
+/// Every command with `--out` also has `-o`, and every command with `--quiet` also has `-q`.
 #[test]
-fn the_same_letters_mean_the_same_everywhere() {
-    let mut found = [0; 2];
+fn short_flags_o_and_q_mean_the_same_in_every_command() {
+    let mut counts = [0; 2];
     for command in flotilla::cli::command().get_subcommands() {
         for flag in command.get_arguments() {
             for (place, (long, short)) in [("out", 'o'), ("quiet", 'q')].into_iter().enumerate() {
                 assert_eq!(flag.get_long() == Some(long), flag.get_short() == Some(short), "{}", command.get_name());
-                found[place] += usize::from(flag.get_long() == Some(long));
+                counts[place] += usize::from(flag.get_long() == Some(long));
             }
         }
     }
-    assert!(found[0] >= 7 && found[1] >= 6, "{found:?}");
+    assert!(counts[0] >= 7 && counts[1] >= 6, "{counts:?}");
 }
 
 #[test]
-fn pictures_and_replays_are_told_as_json() {
+fn plot_and_replay_report_as_json() {
     let place = Place::new(&[]);
-    fed(&place, "train - --backend cpu -q -o run", SMALL);
+    good_with_input(&place, "train - --backend cpu -q -o run", SMALL);
     let json = |line: &str| -> serde_json::Value {
-        let (text, told) = place.good(line);
-        assert_eq!(told, "", "{line}");
+        let (text, stderr) = place.good(line);
+        assert_eq!(stderr, "", "{line}");
         serde_json::from_str(&text).unwrap()
     };
     let object = json("plot run --json -o curves.svg");
@@ -407,7 +416,7 @@ fn pictures_and_replays_are_told_as_json() {
 }
 
 #[test]
-fn what_to_cite_names_this_version() {
+fn citation_file_names_this_version() {
     let text = fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("CITATION.cff")).unwrap();
     assert!(text.contains(&format!("\nversion: {}\n", env!("CARGO_PKG_VERSION"))), "{text}");
     assert!(text.contains("title: Structural Credit Assignment for Multiagent Leader-Based Learning"), "{text}");
