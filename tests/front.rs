@@ -1,4 +1,4 @@
-//! The library's functions give the program's results, and refuse wrong input without a panic.
+//! Tests that the library's functions give the program's results, and that invalid input returns an error.
 
 #![cfg(feature = "cli")]
 
@@ -33,9 +33,9 @@ mod train;
 
 #[test]
 fn the_examples_run() {
-    train::main().expect("it trains");
-    play::main().expect("it plays");
-    step::main().expect("it steps");
+    train::main().expect("the train example runs");
+    play::main().expect("the play example runs");
+    step::main().expect("the step example runs");
 }
 
 /// A random world that trains quickly.
@@ -45,109 +45,110 @@ fn config(seed: u64) -> Config {
     config
 }
 
-/// The program's result for a config in a folder.
-fn recorded(config: &Config, folder: &Path) -> String {
-    recorded_from(config, folder, None)
+/// Trains a config as the program does, in this directory. Returns the digest.
+fn run_digest(config: &Config, folder: &Path) -> String {
+    run_digest_from(config, folder, None)
 }
 
-fn recorded_from(config: &Config, folder: &Path, init: Option<Init>) -> String {
+fn run_digest_from(config: &Config, folder: &Path, init: Option<Init>) -> String {
     let runs = vec![(config.clone(), folder.to_path_buf(), init)];
-    let (mut session, _) = Session::open_from(runs, Start::Fresh, &Disk::default()).expect("the folder is free");
-    let none = std::sync::atomic::AtomicBool::default();
+    let (mut session, _) = Session::open_from(runs, Start::Fresh, &Disk::default()).expect("the directory is empty");
+    let unset = std::sync::atomic::AtomicBool::default();
     let ended = session.train(
         &mut front::cpu(),
         &mut Options {
             command: "",
-            stop: &none,
-            save: &none,
+            stop: &unset,
+            save: &unset,
             instead: &mut |_| None,
             setback: &mut |_| (),
             watch: &mut |_| (),
         },
     );
-    assert_eq!(ended.expect("it trains"), Ended::Done);
-    session.results(0).expect("it is done").digest.clone()
+    assert_eq!(ended.expect("training succeeds"), Ended::Done);
+    session.results(0).expect("the run is finished").digest.clone()
 }
 
 #[test]
-fn champions_are_given_without_changing_the_training() {
-    let mut config = Config::parse(include_str!("../configs/chaotic.toml"), "chaotic.toml").expect("it is valid");
+fn requesting_champions_does_not_change_training() {
+    let mut config = Config::parse(include_str!("../configs/chaotic.toml"), "chaotic.toml").expect("a valid config");
     (config.learning.generations, config.learning.trials) = (6, 3);
-    let mut told = Vec::new();
+    let mut champions = Vec::new();
     let watch = |generation: front::Generation<'_>| {
-        told.push(generation.champions.expect("they were asked for").to_vec());
+        champions.push(generation.champions.expect("champions were requested").to_vec());
         Continue(())
     };
-    let trained = front::train_with_champions(&config, &mut Cpu::default(), watch).expect("it trains");
+    let trained = front::train_with_champions(&config, &mut Cpu::default(), watch).expect("training succeeds");
     assert_eq!(trained, flotilla::train(&config, &mut Cpu::default(), |_| Continue(())).expect("it trains"));
     let (population, parameters) = (config.learning.population, config.parameters());
     let populations = trained.policies.iter().flat_map(|trial| trial.chunks(population * parameters));
     let best: Vec<f32> = populations.flat_map(|policies| policies[..parameters].to_vec()).collect();
-    assert_eq!(told.len(), 7);
-    assert_eq!(told[6], best);
-    // Otherwise, the champions of the generation before would pass, too.
-    assert_ne!(told[5], best);
+    assert_eq!(champions.len(), 7);
+    assert_eq!(champions[6], best);
+    // Without this, champions of the previous generation would pass, too.
+    assert_ne!(champions[5], best);
 }
 
 #[test]
-fn training_comes_to_what_a_run_comes_to() {
+fn train_gives_the_results_of_a_recorded_run() {
     let folder = tempfile::tempdir().expect("a folder for runs");
     for seed in 0..6 {
         let (config, path) = (config(seed), folder.path().join(seed.to_string()));
-        let mut told = Vec::new();
+        let mut scores = Vec::new();
         let trained = flotilla::train(&config, &mut Cpu::default(), |generation| {
             assert_eq!((generation.last, generation.rows.len()), (6, 3));
-            told.extend(generation.rows.iter().map(|row| (generation.generation, row.trial, row.champion_g)));
+            scores.extend(generation.rows.iter().map(|row| (generation.generation, row.trial, row.champion_g)));
             Continue(())
         });
         let trained = trained.unwrap_or_else(|error| panic!("seed {seed}: {error}"));
         let expected = (0..7).flat_map(|generation| (0..3).map(move |trial| (generation, trial)));
         let expected =
             expected.map(|(generation, trial)| (generation, trial, trained.champion_g[trial * 7 + generation]));
-        assert_eq!(told, expected.collect::<Vec<_>>(), "seed {seed}");
-        assert_eq!(trained.digest(), recorded(&config, &path), "seed {seed}");
-        assert_eq!(Trained::read(&path, Verification::Required).expect("the run is whole"), trained, "seed {seed}");
+        assert_eq!(scores, expected.collect::<Vec<_>>(), "seed {seed}");
+        assert_eq!(trained.digest(), run_digest(&config, &path), "seed {seed}");
+        assert_eq!(Trained::read(&path, Verification::Required).expect("the run is complete"), trained, "seed {seed}");
     }
     assert!(matches!(Trained::read(folder.path(), Verification::Required), Err(Failure::Run(_))));
 
-    // A row that is missing, and two that changed places.
+    // A missing row, an additional row, and two swapped rows.
     let (run, path) = (folder.path().join("0"), folder.path().join("0/metrics.csv"));
     let rows = fs::read_to_string(&path).expect("the run has metrics");
     let mut lines: Vec<&str> = rows.lines().collect();
-    let read = |lines: &[&str]| {
-        fs::write(&path, lines.join("\n") + "\n").expect("the folder can be written");
-        Trained::read(&run, Verification::Skipped).expect_err("rows are not as they were").to_string()
+    let read_error = |lines: &[&str]| {
+        fs::write(&path, lines.join("\n") + "\n").expect("the file is writable");
+        Trained::read(&run, Verification::Skipped).expect_err("the rows are invalid").to_string()
     };
-    let short = read(&lines[..lines.len() - 1]);
+    let short = read_error(&lines[..lines.len() - 1]);
     assert!(short.contains("metrics.csv has 20 rows of 21"), "{short}");
     let late = lines[lines.len() - 1].replacen("2,6,", "2,7,", 1);
-    let late = read(&[&lines[..], &[&late]].concat());
+    let late = read_error(&[&lines[..], &[&late]].concat());
     assert!(late.contains("line 23 is trial 2, generation 7, which the run's config.toml does not have"), "{late}");
-    let more = read(&[&lines[..], &lines[lines.len() - 1..]].concat());
-    assert!(more.contains("it must have one row per trial and generation, in order"), "{more}");
+    let more = read_error(&[&lines[..], &lines[lines.len() - 1..]].concat());
+    assert!(more.contains("its rows are not one a trial and generation, in their order"), "{more}");
     lines.swap(1, 4);
-    let mixed = read(&lines);
-    assert!(mixed.contains("it must have one row per trial and generation, in order"), "{mixed}");
-    // Policies of another run: fewer of each leader, and of another network.
+    let swapped = read_error(&lines);
+    assert!(swapped.contains("its rows are not one a trial and generation, in their order"), "{swapped}");
+    // Policies of other runs: with a larger population, and of another network.
     lines.swap(1, 4);
-    fs::write(&path, lines.join("\n") + "\n").expect("the folder can be written");
+    fs::write(&path, lines.join("\n") + "\n").expect("the file is writable");
     assert!(Trained::read(&run, Verification::Required).is_ok());
     let config = config(0);
-    for (change, told) in [
+    for (change, message) in [
         ((|config| config.learning.population += 1) as fn(&mut Config), "policies of each leader, not"),
         (|config| config.policy.hidden = vec![9, 9], "but the config needs F32"),
     ] {
-        let mut other = config.clone();
-        change(&mut other);
-        let trained = flotilla::train(&other, &mut Cpu::default(), |_| Continue(())).expect("it trains");
-        policies::write(&Disk::default(), &run.join("policies.safetensors"), &other, &trained.policies).unwrap();
-        let error = Trained::read(&run, Verification::Required).expect_err("they are of another run").to_string();
-        assert!(error.contains("policies.safetensors: ") && error.contains(told), "{error}");
+        let mut changed = config.clone();
+        change(&mut changed);
+        let trained = flotilla::train(&changed, &mut Cpu::default(), |_| Continue(())).expect("training succeeds");
+        policies::write(&Disk::default(), &run.join("policies.safetensors"), &changed, &trained.policies).unwrap();
+        let error =
+            Trained::read(&run, Verification::Required).expect_err("the policies belong to another run").to_string();
+        assert!(error.contains("policies.safetensors: ") && error.contains(message), "{error}");
     }
 }
 
 #[test]
-fn a_training_that_is_stopped_is_one_of_fewer_generations() {
+fn stopped_training_equals_training_with_fewer_generations() {
     for (seed, after) in [(3, 0), (4, 2), (5, 4), (6, 5), (7, 6)] {
         let config = config(seed);
         let mut calls = 0;
@@ -160,7 +161,7 @@ fn a_training_that_is_stopped_is_one_of_fewer_generations() {
         let whole = flotilla::train(&stopped.config, &mut Cpu::default(), |_| Continue(()));
         assert_eq!(whole.unwrap_or_else(|error| panic!("seed {seed}: {error}")), stopped, "after {after}");
     }
-    // Nor does a stage that begins where it ends make it longer.
+    // The same with stages. A stage that would start after the end is dropped.
     let mut config = config(3);
     let stage = |from| Stage { from, set: [("world.steps".to_string(), toml::Value::from(60))].into() };
     config.stages = vec![stage(2), stage(5)];
@@ -169,45 +170,48 @@ fn a_training_that_is_stopped_is_one_of_fewer_generations() {
             if generation.generation == after { Break(()) } else { Continue(()) }
         });
         let stopped = stopped.unwrap_or_else(|error| panic!("{error}"));
-        let begun = [2, 5].into_iter().filter(|from| *from <= 6.min(after + 2)).count();
-        assert_eq!((stopped.config.learning.generations, stopped.config.stages.len()), (6.min(after + 2), begun));
+        let started_stages = [2, 5].into_iter().filter(|from| *from <= 6.min(after + 2)).count();
+        assert_eq!(
+            (stopped.config.learning.generations, stopped.config.stages.len()),
+            (6.min(after + 2), started_stages)
+        );
         let whole = flotilla::train(&stopped.config, &mut Cpu::default(), |_| Continue(()));
         assert_eq!(whole.unwrap_or_else(|error| panic!("{error}")), stopped, "stages, after {after}");
     }
 }
 
 #[test]
-fn a_training_starts_from_given_policies() {
+fn training_starts_from_given_policies() {
     let config = config(5);
     let learned = flotilla::train(&config, &mut Cpu::default(), |_| Continue(())).unwrap();
     let policies = config.learning.population;
-    let from = |policies: usize, first: &[Vec<f32>]| {
+    let train_from = |policies: usize, first: &[Vec<f32>]| {
         flotilla::front::train_from(&config, &mut Cpu::default(), policies, first, |_| Continue(()))
     };
-    let warm = from(policies, &learned.policies).unwrap();
+    let warm = train_from(policies, &learned.policies).unwrap();
     let trials = learned.policies.iter().map(|weights| Policies { policies, weights: weights.clone() }).collect();
     let folder = tempfile::tempdir().unwrap();
     let init = Init { digest: "of no file".into(), trials };
-    assert_eq!(warm.digest(), recorded_from(&config, folder.path(), Some(init)));
+    assert_eq!(warm.digest(), run_digest_from(&config, folder.path(), Some(init)));
     assert_ne!(warm.digest(), learned.digest());
     let columns = config.learning.generations + 1;
-    assert_eq!(from(policies, &learned.policies[..1]).unwrap().best_g[..columns], warm.best_g[..columns]);
+    assert_eq!(train_from(policies, &learned.policies[..1]).unwrap().best_g[..columns], warm.best_g[..columns]);
     for wrong in [0, policies - 1, policies + 1, usize::MAX, usize::MAX / config.parameters()] {
-        assert!(matches!(from(wrong, &learned.policies), Err(Failure::Weights { teams, .. }) if teams == wrong));
+        assert!(matches!(train_from(wrong, &learned.policies), Err(Failure::Weights { teams, .. }) if teams == wrong));
     }
-    assert!(matches!(from(0, &[vec![]]), Err(Failure::Weights { found: 0, .. })));
+    assert!(matches!(train_from(0, &[vec![]]), Err(Failure::Weights { found: 0, .. })));
     let [two, four] = [learned.policies[..2].to_vec(), [&learned.policies[..], &learned.policies[..1]].concat()];
-    for (found, given) in [(2, two), (4, four)] {
-        let error = from(policies, &given).expect_err("three trials are trained").to_string();
-        assert!(error.starts_with(&format!("policies of {found} trials, where 3 are trained; ")), "{error}");
+    for (count, trials) in [(2, two), (4, four)] {
+        let error = train_from(policies, &trials).expect_err("the number of trials differs").to_string();
+        assert!(error.starts_with(&format!("policies of {count} trials, where 3 are trained; ")), "{error}");
     }
     let mut wrong = learned.policies.clone();
     wrong[1][3] = f32::NAN;
-    assert!(matches!(from(policies, &wrong), Err(Failure::Weight { leader: 0, team: 0, parameter: 3, .. })));
+    assert!(matches!(train_from(policies, &wrong), Err(Failure::Weight { leader: 0, team: 0, parameter: 3, .. })));
 }
 
 #[test]
-fn given_policies_are_played_and_traced_team_by_team() {
+fn play_and_trace_treat_each_team_separately() {
     let mut backend = Cpu::default();
     for seed in 0..12 {
         let (config, teams) = (sample::world(seed), 1 + seed as usize * 3);
@@ -215,37 +219,38 @@ fn given_policies_are_played_and_traced_team_by_team() {
         let (leaders, parameters) = (world.leaders(), world.parameters());
         let starts = Starts::Drawn { episodes: 5, seed, jitter: 0.4, poi_jitter: 0.0 };
         let weights = sample::weights(&world, teams, seed);
-        let played = flotilla::play(&config, &mut backend, teams, &weights, &starts).expect("they fit");
+        let played = flotilla::play(&config, &mut backend, teams, &weights, &starts).expect("valid weights");
         let sizes = [&played.d, &played.df, &played.dpp].map(Vec::len);
         assert_eq!((played.observed.len(), played.g.len(), sizes), (teams, teams, [teams * leaders; 3]));
 
-        // A team by itself comes to what it comes to among others; so does a policy that leaders share.
+        // A team gets the same scores alone as among others. One shared policy equals a copy for each leader.
         let team = teams - 1;
         let own = |leader: usize| &weights[(leader * teams + team) * parameters..][..parameters];
-        let alone: Vec<f32> = (0..leaders).flat_map(own).copied().collect();
-        let by_itself = flotilla::play(&config, &mut backend, 1, &alone, &starts).expect("they fit");
+        let alone_weights: Vec<f32> = (0..leaders).flat_map(own).copied().collect();
+        let alone_scores = flotilla::play(&config, &mut backend, 1, &alone_weights, &starts).expect("valid weights");
         assert_eq!(
-            (by_itself.g[0], &by_itself.dpp[..]),
+            (alone_scores.g[0], &alone_scores.dpp[..]),
             (played.g[team], &played.dpp[team * leaders..]),
             "seed {seed}"
         );
-        let shared = flotilla::play(&config, &mut backend, 1, own(0), &starts).expect("they fit");
-        let written = flotilla::play(&config, &mut backend, 1, &own(0).repeat(leaders), &starts).expect("they fit");
-        assert_eq!(shared, written, "seed {seed}");
+        let shared = flotilla::play(&config, &mut backend, 1, own(0), &starts).expect("valid weights");
+        let repeated =
+            flotilla::play(&config, &mut backend, 1, &own(0).repeat(leaders), &starts).expect("valid weights");
+        assert_eq!(shared, repeated, "seed {seed}");
 
-        let traced = flotilla::trace(&config, &mut backend, teams, &weights, &starts, 3).expect("they fit");
-        let from = starts.of(3, &world);
+        let traced = flotilla::trace(&config, &mut backend, teams, &weights, &starts, 3).expect("valid weights");
+        let episode_starts = starts.of(3, &world);
         let order: Vec<u32> = (0..teams as u32).flat_map(|team| vec![team; leaders]).collect();
         let group = Group {
             world: &world,
-            starts: &from,
+            starts: &episode_starts,
             weights: weights[..].into(),
             policies: teams,
             sharing: Sharing::PerLeader,
             teams: &order,
             fitnesses: &[],
         };
-        let trace = backend.trace(&group).expect("it fits");
+        let trace = backend.trace(&group).expect("a valid group");
         let (agents, steps) = (world.agents(), world.steps());
         for (step, team, agent) in
             [(0, 0, 0), (steps, team, agents - 1), (steps / 2, team, agents / 2), (1, team, leaders - 1)]
@@ -269,58 +274,59 @@ fn given_policies_are_played_and_traced_team_by_team() {
 }
 
 #[test]
-fn what_is_wrong_is_told() {
+fn invalid_input_returns_an_error() {
     let config = sample::world(1);
     let (leaders, parameters) = (config.learners(), config.parameters());
     let mut backend = Cpu::default();
-    let good = vec![0.5; leaders * 2 * parameters];
+    let valid = vec![0.5; leaders * 2 * parameters];
     let mut play = |config: &Config, teams, weights: &[f32], starts| {
         let traced = flotilla::trace(config, &mut backend, teams, weights, &starts, 0).map(drop);
         let played = flotilla::play(config, &mut backend, teams, weights, &starts).map(drop);
         assert_eq!(played.as_ref().map_err(ToString::to_string), traced.as_ref().map_err(ToString::to_string));
         played
     };
-    play(&config, 2, &good, Starts::Own).expect("it is good");
+    play(&config, 2, &valid, Starts::Own).expect("valid input");
     assert!(matches!(play(&config, 0, &[], Starts::Own), Err(Failure::Teams(0))));
-    assert!(matches!(play(&config, usize::MAX, &good, Starts::Own), Err(Failure::Teams(_))));
-    assert!(matches!(play(&config, 2, &good[1..], Starts::Own), Err(Failure::Weights { teams: 2, .. })));
-    let more = [&good[..], &[0.5]].concat();
+    assert!(matches!(play(&config, usize::MAX, &valid, Starts::Own), Err(Failure::Teams(_))));
+    assert!(matches!(play(&config, 2, &valid[1..], Starts::Own), Err(Failure::Weights { teams: 2, .. })));
+    let more = [&valid[..], &[0.5]].concat();
     assert!(matches!(play(&config, 2, &more, Starts::Own), Err(Failure::Weights { teams: 2, .. })));
     assert!(matches!(play(&config, 5, &[], Starts::Own), Err(Failure::Weights { found: 0, .. })));
-    for (bad, fine) in [(f32::NAN, false), (f32::INFINITY, false), (2e6, false), (1e-20, true), (-0.0, true)] {
-        let mut weights = good.clone();
-        weights[(leaders * 2 - 1) * parameters + 3] = bad;
+    for (value, is_valid) in [(f32::NAN, false), (f32::INFINITY, false), (2e6, false), (1e-20, true), (-0.0, true)] {
+        let mut weights = valid.clone();
+        weights[(leaders * 2 - 1) * parameters + 3] = value;
         match play(&config, 2, &weights, Starts::Own) {
-            Ok(()) => assert!(fine, "{bad}"),
+            Ok(()) => assert!(is_valid, "{value}"),
             Err(Failure::Weight { leader, team, parameter, .. }) => {
-                assert!(!fine && (leader, team, parameter) == (leaders - 1, 1, 3), "{bad}");
+                assert!(!is_valid && (leader, team, parameter) == (leaders - 1, 1, 3), "{value}");
             }
-            Err(error) => panic!("{bad}: {error}"),
+            Err(error) => panic!("{value}: {error}"),
         }
     }
     for (episodes, jitter) in [(0, 0.1), (u32::MAX, 0.1), (1, f64::NAN), (1, f64::INFINITY), (1, -0.1)] {
         let drawn = Starts::Drawn { episodes, seed: 1, jitter, poi_jitter: 0.0 };
-        assert!(matches!(play(&config, 2, &good, drawn), Err(Failure::Starts { .. })), "{episodes}, {jitter}");
+        assert!(matches!(play(&config, 2, &valid, drawn), Err(Failure::Starts { .. })), "{episodes}, {jitter}");
         let moved = Starts::Drawn { episodes, seed: 1, jitter: 0.1, poi_jitter: jitter };
-        assert!(matches!(play(&config, 2, &good, moved), Err(Failure::Starts { .. })), "{episodes}, POIs by {jitter}");
+        assert!(matches!(play(&config, 2, &valid, moved), Err(Failure::Starts { .. })), "{episodes}, POIs by {jitter}");
     }
 
     let drawn = Starts::Drawn { episodes: 2, seed: 1, jitter: 0.1, poi_jitter: 0.0 };
-    let trace = |episode| flotilla::trace(&config, &mut Cpu::default(), 2, &good, &drawn, episode);
-    trace(1).expect("it is the last");
+    let trace = |episode| flotilla::trace(&config, &mut Cpu::default(), 2, &valid, &drawn, episode);
+    trace(1).expect("the last episode exists");
     assert!(matches!(trace(2), Err(Failure::NoEpisode { episode: 2, episodes: 2 })));
 
-    // All steps of a million large teams are more than any machine has.
+    // The steps of a million large teams need more memory than any machine has.
     let followers = "[1, 1], ".repeat(MAX_AGENTS - 1);
     let text = format!(
-        "[world]\nleaders = [[2, 2]]\nfollowers = [{followers}]\npois = [[9, 9]]\nsteps = {MAX_STEPS}\n[policy]\nhidden = []"
+        "[world]\nleaders = [[2, 2]]\nfollowers = [{followers}]\npois = [[9, 9]]\n\
+         steps = {MAX_STEPS}\n[policy]\nhidden = []"
     );
-    let large = Config::parse(&text, "large.toml").expect("all is within bounds");
+    let large = Config::parse(&text, "large.toml").expect("a valid config");
     let weights = vec![0.5; large.parameters() * MAX_POPULATION];
     let traced = flotilla::trace(&large, &mut Cpu::default(), MAX_POPULATION, &weights, &Starts::Own, 0);
     assert!(matches!(traced, Err(Failure::Memory { what: "all steps of all teams", .. })));
 
-    // Configs built by hand are checked like files.
+    // Configs that were built in code are validated like files.
     let broken: [fn(&mut Config); 6] = [
         |config| config.policy.hidden = vec![3; 9],
         |config| config.world.leaders.clear(),
@@ -329,42 +335,42 @@ fn what_is_wrong_is_told() {
         |config| config.learning.population = 0,
         |config| config.learning.seed = u64::MAX,
     ];
-    for (index, break_it) in broken.into_iter().enumerate() {
+    for (index, make_invalid) in broken.into_iter().enumerate() {
         let mut config = config.clone();
-        break_it(&mut config);
+        make_invalid(&mut config);
         let refused = |error| matches!(error, Failure::Config(_));
-        assert!(refused(play(&config, 2, &good, Starts::Own).expect_err("it is broken")), "{index}");
+        assert!(refused(play(&config, 2, &good, Starts::Own).expect_err("the config is invalid")), "{index}");
         let trained = flotilla::train(&config, &mut Cpu::default(), |_| Continue(()));
-        assert!(refused(trained.expect_err("it is broken")), "{index}");
+        assert!(refused(trained.expect_err("the config is invalid")), "{index}");
         assert!(flotilla::stepper(&config, 1, false).is_err_and(refused), "{index}");
     }
     assert!(matches!(flotilla::stepper(&config, 0, true), Err(Failure::Step(StepError::Teams(0)))));
-    // Sights are kept where they are asked for.
-    let mut led = support::layout("generally_forward");
+    // Sights are recorded only if the fitness needs them.
+    let mut config = support::layout("generally_forward");
     for (fitness, kept) in [(Fitness::Df, false), (Fitness::Dt, true)] {
-        led.learning.fitness = fitness;
-        let stepper = flotilla::stepper(&led, 2, true).expect("two teams are few");
+        config.learning.fitness = fitness;
+        let stepper = flotilla::stepper(&config, 2, true).expect("valid options");
         assert_eq!(stepper.fitness(Fitness::Dt, &mut [0.0; 8]).is_ok(), kept, "{fitness}");
     }
 }
 
 #[test]
-fn a_processor_is_found() {
-    let ((backend, machine), passed_over) = flotilla::open(&Processor::Cpu).expect("it is always there");
-    assert!(backend.describe().starts_with("cpu") && machine.backend == "cpu" && passed_over.is_none());
-    let error = flotilla::open(&Processor::Adapter("no such adapter".into())).err().expect("there is none");
+fn open_finds_the_cpu_and_rejects_unknown_adapters() {
+    let ((backend, machine), skipped) = flotilla::open(&Processor::Cpu).expect("the CPU is always available");
+    assert!(backend.describe().starts_with("cpu") && machine.backend == "cpu" && skipped.is_none());
+    let error = flotilla::open(&Processor::Adapter("no such adapter".into())).err().expect("there is no such adapter");
     assert!(error.to_string().contains("no such adapter"), "{error}");
 }
 
-/// The command line names the flag that helps.
+/// Only the command line knows flags and commands, so it adds the advice that names them.
 #[test]
-fn errors_of_the_library_speak_of_no_flags() {
-    fn walk(folder: &Path, found: &mut Vec<String>) {
-        for entry in fs::read_dir(folder).expect("a folder of sources") {
-            let path = entry.expect("its entries").path();
+fn library_errors_mention_no_flags() {
+    fn walk(folder: &Path, errors: &mut Vec<String>) {
+        for entry in fs::read_dir(folder).expect("a readable directory") {
+            let path = entry.expect("a readable entry").path();
             if path.is_dir() {
                 if !path.ends_with("src/cli") {
-                    walk(&path, found);
+                    walk(&path, errors);
                 }
                 continue;
             }
@@ -373,12 +379,12 @@ fn errors_of_the_library_speak_of_no_flags() {
                 let error = error.split(")]").next().unwrap_or_default();
                 let flag = error.split("--").skip(1).any(|rest| rest.starts_with(|c: char| c.is_ascii_lowercase()));
                 if flag || error.contains("`flotilla") {
-                    found.push(format!("{}: {error}", path.display()));
+                    errors.push(format!("{}: {error}", path.display()));
                 }
             }
         }
     }
-    let mut found = Vec::new();
-    walk(&Path::new(env!("CARGO_MANIFEST_DIR")).join("src"), &mut found);
-    assert_eq!(found, Vec::<String>::new());
+    let mut errors = Vec::new();
+    walk(&Path::new(env!("CARGO_MANIFEST_DIR")).join("src"), &mut errors);
+    assert_eq!(errors, Vec::<String>::new());
 }
