@@ -1,6 +1,6 @@
-//! Whatever stands in a file, its reader neither panics nor hangs nor takes much memory.
+//! Tests that no file makes its reader panic, hang or use much memory.
 //!
-//! `FLOTILLA_FUZZ` is how many mutated inputs each reader gets (20 000 if left out).
+//! Each reader gets mutations of valid files. `FLOTILLA_FUZZ` sets how many; the default is 20 000.
 
 #![cfg(feature = "cli")]
 
@@ -38,16 +38,16 @@ generations = 4
 trials = 2
 ";
 
-/// Most bytes the whole process may have had in memory at once.
-const MOST_MEMORY: u64 = 256 << 20;
-/// Longest that one input may take on a busy machine; most take microseconds.
-const LONGEST: Duration = Duration::from_secs(5);
+/// Maximum memory of the whole process at any time.
+const MAX_MEMORY: u64 = 256 << 20;
+/// Time limit for one input on a busy machine. Most take microseconds.
+const MAX_TIME: Duration = Duration::from_secs(5);
 
 fn config() -> Config {
     Config::parse(CONFIG, "config.toml").unwrap()
 }
 
-/// The files of a real run: config, run.json, metrics, policies, its last checkpoint and the one that it ended with.
+/// The files of a real run: run.json, metrics, policies, and its last two checkpoints.
 struct Files {
     run: Vec<u8>,
     metrics: Vec<u8>,
@@ -73,7 +73,7 @@ fn files() -> Files {
     session.train(&mut (Box::new(Cpu::default()), Machine::default()), &mut options).unwrap();
     let read = |name: &str| fs::read(path.join(name)).unwrap();
     let checkpoints = path.join("checkpoints");
-    let [before, end] = checkpoint::list(&checkpoints).unwrap()[..] else { panic!("two are kept") };
+    let [before, end] = checkpoint::list(&checkpoints).unwrap()[..] else { panic!("two checkpoints are kept") };
     Files {
         run: read(RUN),
         metrics: read(METRICS),
@@ -82,7 +82,7 @@ fn files() -> Files {
     }
 }
 
-/// Pieces that mean something to one of the formats.
+/// Pieces that have a meaning in one of the formats.
 const PIECES: &[&str] = &[
     "0",
     "-1",
@@ -133,7 +133,7 @@ const PIECES: &[&str] = &[
     "trial,generation",
 ];
 
-/// Another version of an input, a few edits away from it or from another.
+/// Returns a mutated copy of one of the seeds.
 fn mutate(random: &mut ChaCha8Rng, seeds: &[&[u8]]) -> Vec<u8> {
     let mut bytes = seeds[random.random_range(0..seeds.len())].to_vec();
     for _ in 0..random.random_range(1..6) {
@@ -160,7 +160,7 @@ fn mutate(random: &mut ChaCha8Rng, seeds: &[&[u8]]) -> Vec<u8> {
                 bytes.splice(at..end, piece.bytes());
             }
             _ => {
-                // A number where a number was.
+                // Replace a number by another.
                 if let Some(digit) = bytes[at..].iter().position(u8::is_ascii_digit) {
                     let start = at + digit;
                     let count = bytes[start..].iter().take_while(|byte| byte.is_ascii_digit()).count();
@@ -170,20 +170,20 @@ fn mutate(random: &mut ChaCha8Rng, seeds: &[&[u8]]) -> Vec<u8> {
             }
         }
     }
-    // Where a header says how long it is, mostly keep that right, or its text is never looked at.
+    // With a wrong header length, readers would reject most files before they read the header.
     if random.random_range(0..4) > 0 {
         reseal(&mut bytes);
     }
     bytes
 }
 
-/// Makes the header's length and the checksum fit what stands there, so that a reader looks further.
+/// Corrects the header's length and the checksum, so that a reader checks the rest of the file.
 fn reseal(bytes: &mut [u8]) {
     const KEY: &[u8] = b"\"sha256\":\"";
     if bytes.get(8) != Some(&b'{') {
         return;
     }
-    // The header ends with the brace, and spaces, before the first byte that is no text.
+    // The header ends with the last brace, and spaces, in the text at the start.
     let text = bytes[8..].iter().take_while(|&&byte| (b' '..0x7f).contains(&byte)).count();
     if let Some(brace) = bytes[8..8 + text].iter().rposition(|&byte| byte == b'}') {
         let spaces = bytes[8 + brace + 1..].iter().take_while(|&&byte| byte == b' ').count();
@@ -199,29 +199,32 @@ fn reseal(bytes: &mut [u8]) {
     }
 }
 
-/// Reads mutated inputs; `read` says whether it took the input. Gives how many it took.
+/// Reads mutated inputs. `read` returns whether it accepted an input.
 fn fuzz(name: &str, seeds: &[&[u8]], mut read: impl FnMut(&[u8]) -> bool) {
     let count: u64 = std::env::var("FLOTILLA_FUZZ").map_or(20_000, |text| text.parse().expect("a number of inputs"));
     for seed in seeds {
-        assert!(read(seed), "{name}: the unchanged input is good");
+        assert!(read(seed), "{name}: the unchanged input is rejected");
     }
     let mut random = ChaCha8Rng::seed_from_u64(7);
-    let (mut taken, mut slowest) = (0, Duration::ZERO);
+    let (mut accepted, mut slowest) = (0, Duration::ZERO);
     for index in 0..count {
         let input = mutate(&mut random, seeds);
         let start = Instant::now();
-        taken += u64::from(read(&input));
+        accepted += u64::from(read(&input));
         let time = start.elapsed();
-        assert!(time < LONGEST, "{name}: input {index} took {time:?}");
+        assert!(time < MAX_TIME, "{name}: input {index} took {time:?}");
         slowest = slowest.max(time);
     }
-    // Else the inputs are too far off to test more than the first check.
-    assert!(taken > 0 && taken < count, "{name}: {taken} of {count} taken");
-    println!("{name}: {count} inputs, {taken} taken, slowest {slowest:?}, peak memory {} MB", peak_memory() >> 20);
-    assert!(peak_memory() < MOST_MEMORY);
+    // If every input fails, mutations may never pass the first check.
+    assert!(accepted > 0 && accepted < count, "{name}: {accepted} of {count} accepted");
+    println!(
+        "{name}: {count} inputs, {accepted} accepted, slowest {slowest:?}, peak memory {} MB",
+        peak_memory() >> 20
+    );
+    assert!(peak_memory() < MAX_MEMORY);
 }
 
-/// The most bytes this process had in memory, where the system tells.
+/// Returns the process's peak memory in bytes, or 0 if the system does not report it.
 fn peak_memory() -> u64 {
     let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
     let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
@@ -229,7 +232,7 @@ fn peak_memory() -> u64 {
 }
 
 #[test]
-fn configs() {
+fn mutated_configs() {
     let resolved = config().to_toml();
     fuzz("config", &[CONFIG.as_bytes(), resolved.as_bytes()], |bytes| {
         std::str::from_utf8(bytes).is_ok_and(|text| Config::parse(text, "config.toml").is_ok())
@@ -237,12 +240,12 @@ fn configs() {
 }
 
 #[test]
-fn runs() {
+fn mutated_run_files() {
     fuzz("run.json", &[&files().run], |bytes| std::str::from_utf8(bytes).is_ok_and(|text| Run::parse(text).is_ok()));
 }
 
 #[test]
-fn metrics() {
+fn mutated_metrics() {
     fuzz("metrics", &[&files().metrics], |bytes| {
         let Ok(mut rows) = Rows::new(bytes) else { return false };
         rows.all(|row| {
@@ -256,9 +259,9 @@ fn metrics() {
 }
 
 #[test]
-fn policies_files() {
+fn mutated_policies() {
     let (config, files) = (config(), files());
-    // Another program's has no checksum, and is looked at more closely.
+    // Files of other programs have no checksum, so more of their content is checked.
     let weights = vec![0.5f32; 2 * 5 * config.parameters()];
     let view = safetensors::tensor::TensorView::new(
         safetensors::Dtype::F32,
@@ -277,7 +280,7 @@ fn policies_files() {
 }
 
 #[test]
-fn checkpoints() {
+fn mutated_checkpoints() {
     let (config, files) = (config(), files());
     let mut backend = Cpu::default();
     let mut longer = config.clone();
@@ -287,12 +290,12 @@ fn checkpoints() {
         let Ok(read) = Checkpoint::read(Cursor::new(bytes), &longer) else { return false };
         let mut trainer = Trainer::new([longer.validate().unwrap()]);
         if read.snapshot.weights.is_empty() {
-            // They are the policies', and those are read with as much care.
+            // Finished runs keep their weights in the policies file, whose reader checks them.
             assert_eq!(read.snapshot.generation, read.snapshot.last + 1);
             assert!(!trainer.restore(0, read.snapshot));
             return true;
         }
-        // Whatever is taken can be trained on.
+        // Training can resume from every accepted checkpoint.
         assert!(trainer.restore(0, read.snapshot));
         let rows = trainer.finish(&mut backend).unwrap();
         assert!(rows.iter().all(|row| (0.0..=1.0).contains(&row.mean_g)));
@@ -300,20 +303,20 @@ fn checkpoints() {
     });
 }
 
-/// Headers as long as they may be, made to cost as much memory and time as they can.
+/// Headers of the maximum size, made to use as much memory and time as possible.
 #[test]
-fn headers_made_to_cost() {
+fn costly_headers_fail_quickly() {
     let config = config();
-    let most = MAX_HEADER_BYTES as usize;
+    let max = MAX_HEADER_BYTES as usize;
     let repeat = |open: &str, piece: &str, close: &str| {
-        let count = (most - open.len() - close.len()) / piece.len();
+        let count = (max - open.len() - close.len()) / piece.len();
         format!("{open}{}{close}", piece.repeat(count))
     };
     let numbered = |open: &str, piece: &dyn Fn(usize) -> String, close: &str| {
         let mut text = open.to_string();
         for index in 0.. {
             let piece = piece(index);
-            if text.len() + piece.len() + close.len() > most {
+            if text.len() + piece.len() + close.len() > max {
                 break;
             }
             text += &piece;
@@ -342,20 +345,20 @@ fn headers_made_to_cost() {
         let start = Instant::now();
         assert!(policies::from_source(Cursor::new(&bytes), &config, None).is_err());
         assert!(Checkpoint::read(Cursor::new(&bytes), &config).is_err());
-        assert!(start.elapsed() < LONGEST, "{}", &header[..40]);
+        assert!(start.elapsed() < MAX_TIME, "{}", &header[..40]);
     }
-    // A header that says it is larger than memory.
+    // Headers whose stated size is larger than allowed.
     for length in [MAX_HEADER_BYTES + 1, u64::MAX, 1 << 40] {
         let bytes = [&length.to_le_bytes()[..], b"{}"].concat();
-        let told = policies::from_source(Cursor::new(&bytes), &config, None).unwrap_err();
-        assert!(told.contains("it is not a safetensors file"), "{told}");
+        let error = policies::from_source(Cursor::new(&bytes), &config, None).unwrap_err();
+        assert!(error.contains("it is not a safetensors file"), "{error}");
     }
-    assert!(peak_memory() < MOST_MEMORY, "{} MB", peak_memory() >> 20);
+    assert!(peak_memory() < MAX_MEMORY, "{} MB", peak_memory() >> 20);
 }
 
-/// Text without an end.
+/// Lines without an end.
 #[test]
-fn lines_made_to_cost() {
+fn endless_lines_fail() {
     let endless = "1".repeat(64 << 20);
     assert!(Rows::new(endless.as_bytes()).is_err());
     let long = format!("{}\n{endless}", flotilla::record::metrics::HEADER);

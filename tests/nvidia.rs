@@ -1,13 +1,14 @@
-//! What NVIDIA's compiler makes of every shader, by proxy: naga's Metal text, with a header that makes CUDA of it, through
-//! `nvcc` for chips that are not there. Vulkan's driver has the same compiler behind another door, so registers and
-//! spills are near to what it will take, and no promise.
+//! Tests what NVIDIA's compiler makes of every specialised kernel, without an NVIDIA GPU.
 //!
-//! Without `nvcc` all is skipped in plain sight, or fails where `FLOTILLA_REQUIRE_NVCC=1` says that it is needed; the folder
-//! of CUDA's headers is `FLOTILLA_CUDA_INCLUDE` where the compiler does not find it by itself. `.ci/ports nvidia` brings both.
+//! naga writes a kernel as Metal source, and a header turns that into CUDA for `nvcc`. Vulkan's driver contains the
+//! same compiler with another front end. So registers and spills are estimates of what the driver will use.
 //!
-//! With `FLOTILLA_EVIDENCE=FOLDER` what was read is noted there, as a row of `docs/develop/evidence.md`.
+//! Without `nvcc` the tests are skipped with a message, or fail if `FLOTILLA_REQUIRE_NVCC=1`. `FLOTILLA_CUDA_INCLUDE`
+//! names the directory of CUDA's headers if the compiler does not find it. `.ci/ports nvidia` installs both.
 //!
-//! `cargo test --test nvidia -- table --ignored --nocapture` makes the table of `benches/static-figures.md`.
+//! With `FLOTILLA_EVIDENCE=DIRECTORY` the findings are written there, as a row of `docs/develop/evidence.md`.
+//!
+//! `cargo test --test nvidia -- table --ignored --nocapture` prints the table of `benches/static-figures.md`.
 
 #![cfg(feature = "gpu")]
 
@@ -24,14 +25,14 @@ use naga::back::msl;
 use naga::proc::{BoundsCheckPolicies, BoundsCheckPolicy};
 use naga::valid::{Capabilities, ValidationFlags, Validator};
 
-/// Turing, Ampere, Hopper.
+/// Turing, Ampere and Hopper.
 const CHIPS: [&str; 3] = ["sm_75", "sm_86", "sm_90"];
 
-/// Bytes of local memory that a thread takes at most. Not for arrays: `ptxas` gives a few bytes of a thread away where that
-/// lets one more workgroup run beside it.
+/// Maximum bytes of local memory per thread. A few bytes are no sign of arrays in memory: `ptxas` spills them if that
+/// lets another workgroup run on the same processor.
 const STACK: u64 = 24;
 
-/// Metal's library functions, for CUDA.
+/// Defines Metal's types and functions in CUDA.
 const HEADER: &str = "
 #define INLINE __host__ __device__ __forceinline__ constexpr
 namespace metal {
@@ -77,26 +78,26 @@ template <class T, class U> __device__ inline T as_type(U from) {
 using metal::uint;
 ";
 
-/// Whether `nvcc` can be asked.
-fn nvcc(test: &str) -> bool {
-    let found = Command::new("nvcc").arg("--version").output().is_ok_and(|output| output.status.success());
-    if !found {
+/// Whether `nvcc` runs. If not, prints that the test is skipped.
+fn has_nvcc(test: &str) -> bool {
+    let runs = Command::new("nvcc").arg("--version").output().is_ok_and(|output| output.status.success());
+    if !runs {
         let message = format!("{test}: skipped: there is no nvcc in the PATH");
         assert!(std::env::var("FLOTILLA_REQUIRE_NVCC").as_deref() != Ok("1"), "{message}, but it is required");
         writeln!(std::io::stderr(), "\n{message}").expect("standard error takes a line");
     }
-    found
+    runs
 }
 
-/// The last line of what a compiler says its version is.
+/// Returns the compiler's version.
 fn version() -> String {
-    let output = Command::new("nvcc").arg("--version").output().expect("it was there");
+    let output = Command::new("nvcc").arg("--version").output().expect("nvcc runs");
     let text = String::from_utf8_lossy(&output.stdout).into_owned();
     let line = text.lines().find_map(|line| Some(line.split_once("release ")?.1.to_string()));
     format!("nvcc {}", line.unwrap_or_default())
 }
 
-/// The Metal text of a shader under a pass. What Metal does about products and sums is the caller's.
+/// Returns a shader as Metal source after a pass. Whether products and sums are fused is left to the compiler's flags.
 fn metal(wgsl: &str, pass: Pass) -> String {
     let (module, _) = exact::parse(wgsl).unwrap_or_else(|error| panic!("{error}"));
     let module = match pass {
@@ -119,13 +120,13 @@ fn metal(wgsl: &str, pass: Pass) -> String {
         emit_int_div_checks: false,
         ..Default::default()
     };
-    msl::write_string(&module, &info, &options, &Default::default()).expect("it has Metal text").0
+    msl::write_string(&module, &info, &options, &Default::default()).expect("naga writes Metal").0
 }
 
-/// CUDA of a kernel's Metal text.
+/// Translates a kernel from Metal source to CUDA.
 fn cuda(metal: &str) -> String {
-    let from = metal.find("struct _mslBufferSizes").expect("what comes before is Metal's headers");
-    let (functions, kernel) = metal[from..].split_once("[[max_total_threads_per_threadgroup(").expect("a kernel");
+    let start = metal.find("struct _mslBufferSizes").expect("a struct after Metal's headers");
+    let (functions, kernel) = metal[start..].split_once("[[max_total_threads_per_threadgroup(").expect("a kernel");
     let mut text = format!("{HEADER}namespace shader {{\n");
     let is_function = |line: &str| {
         let name = line.split_once('(').and_then(|(head, _)| head.split_once(' '));
@@ -138,7 +139,7 @@ fn cuda(metal: &str) -> String {
         if let Some(constant) = line.strip_prefix("constant ") {
             writeln!(text, "static constexpr {constant}").expect("memory");
         } else if line.starts_with("typedef") && line.ends_with("[1];") {
-            // An array of the run time's length.
+            // An array whose length is known only at run time.
             writeln!(text, "{}[1 << 20];", line.trim_end_matches("[1];")).expect("memory");
         } else if is_function(line) {
             writeln!(text, "static __device__ __forceinline__ {line}").expect("memory");
@@ -149,7 +150,7 @@ fn cuda(metal: &str) -> String {
     let (threads, kernel) = kernel.split_once(")]] kernel void ").expect("its threads");
     let (name, kernel) = kernel.split_once("(\n").expect("its parameters");
     let (parameters, body) = kernel.split_once("\n) {\n").expect("its body");
-    let (mut taken, mut declared) = (Vec::new(), String::new());
+    let (mut arguments, mut declared) = (Vec::new(), String::new());
     for parameter in parameters.split('\n').map(|line| line.trim_start_matches(", ").trim()) {
         let (parameter, attribute) = parameter.split_once(" [[").unwrap_or((parameter, ""));
         let (kind, name) = parameter.rsplit_once(' ').expect("a type and a name");
@@ -165,19 +166,19 @@ fn cuda(metal: &str) -> String {
             _ if kind.contains("_mslBufferSizes") => format!("const _mslBufferSizes {name}{{}};"),
             _ => {
                 let kind = kind.trim_end_matches('&');
-                taken.push(format!("{kind}* __restrict__ {name}_at"));
+                arguments.push(format!("{kind}* __restrict__ {name}_at"));
                 format!("{kind}& {name} = *{name}_at;")
             }
         };
         writeln!(declared, "    {line}").expect("memory");
     }
-    let taken = taken.join(", ");
+    let arguments = arguments.join(", ");
     write!(
         text,
-        "extern \"C\" __global__ void __launch_bounds__({threads}) {name}({taken}) {{\n{declared}{body}\n}}\n"
+        "extern \"C\" __global__ void __launch_bounds__({threads}) {name}({arguments}) {{\n{declared}{body}\n}}\n"
     )
     .expect("memory");
-    // Where things lie is the compiler's to find out, and a literal without its letter would be a double.
+    // CUDA infers address spaces, so their names are removed. Without a suffix `f`, a literal would be a double.
     let mut lines = String::new();
     for line in text.lines() {
         let line = ["device ", "threadgroup ", "thread "].iter().fold(line.to_string(), |line, space| {
@@ -194,7 +195,7 @@ fn cuda(metal: &str) -> String {
     lines
 }
 
-/// Writes `f` behind every literal with a point.
+/// Appends `f` to every literal with a decimal point.
 fn with_float_literals(line: &str) -> String {
     let mut out = String::new();
     let mut rest = line;
@@ -220,33 +221,35 @@ fn with_float_literals(line: &str) -> String {
 /// The result of compiling a kernel.
 struct Compiled {
     registers: u64,
-    /// Bytes: of local memory, and what spills write and read of it.
+    /// Bytes of local memory.
     stack: u64,
+    /// Bytes that spills write and read.
     spilled: u64,
     assembly: String,
 }
 
-/// Compiles a shader for a chip, with products fused into sums where the compiler likes to or nowhere; told that one
-/// workgroup at a time is enough, or nothing of that.
-fn compile(wgsl: &str, pass: Pass, chip: &str, fuse: bool, alone: bool) -> Compiled {
+/// Compiles a shader for a chip. `fuse` lets the compiler fuse products into sums. `single_workgroup` tells it that one
+/// workgroup at a time is enough.
+fn compile(wgsl: &str, pass: Pass, chip: &str, fuse: bool, single_workgroup: bool) -> Compiled {
     let folder = tempfile::tempdir().expect("a folder for the kernel");
     let (source, binary) = (folder.path().join("kernel.cu"), folder.path().join("kernel.cubin"));
     let text = cuda(&metal(wgsl, pass));
     let (before, bounds) = text.split_once("__launch_bounds__(").expect("a kernel has bounds");
-    let text = if alone { format!("{before}__launch_bounds__({}", bounds.replacen(')', ", 1)", 1)) } else { text };
-    std::fs::write(&source, text).expect("the folder takes a file");
+    let text =
+        if single_workgroup { format!("{before}__launch_bounds__({}", bounds.replacen(')', ", 1)", 1)) } else { text };
+    std::fs::write(&source, text).expect("the directory is writable");
     let mut nvcc = Command::new("nvcc");
     nvcc.args(["-cubin", "-std=c++17", "-ftz=true", "--expt-relaxed-constexpr", "-w", "-Xptxas", "-v", "-arch", chip])
         .arg(format!("-fmad={fuse}"))
         .args(std::env::var("FLOTILLA_CUDA_INCLUDE").map(|folder| format!("-I{folder}")))
         .args([source.as_path(), Path::new("-o"), &binary]);
     let output = nvcc.output().expect("nvcc runs");
-    let said = [output.stderr, output.stdout].map(|text| String::from_utf8_lossy(&text).into_owned()).concat();
-    assert!(output.status.success(), "nvcc takes no text of this shader: {said}");
-    let number = |before: &str| {
-        let text = said.split_once(before).unwrap_or_else(|| panic!("no '{before}' in: {said}")).0;
+    let output_text = [output.stderr, output.stdout].map(|text| String::from_utf8_lossy(&text).into_owned()).concat();
+    assert!(output.status.success(), "nvcc does not compile this shader: {output_text}");
+    let number = |label: &str| {
+        let text = output_text.split_once(label).unwrap_or_else(|| panic!("no '{label}' in: {output_text}")).0;
         let digits = text.rsplit(|letter: char| !letter.is_ascii_digit()).find(|digits| !digits.is_empty());
-        digits.expect("a number stands before it").parse::<u64>().expect("a number")
+        digits.expect("a number before the label").parse::<u64>().expect("a number")
     };
     let assembly = Command::new("nvdisasm").arg(&binary).output().expect("nvdisasm comes with nvcc");
     Compiled {
@@ -264,7 +267,7 @@ fn count(assembly: &str, instruction: &str) -> usize {
         .count()
 }
 
-/// The specialised kernels of the paper's layouts, by the threads of the largest workgroup.
+/// Returns the specialised kernels of the paper's layouts, for workgroups of up to 256 and 1024 threads.
 fn episodes() -> Vec<(String, String)> {
     let shaders = support::papers_worlds().into_iter().flat_map(|(name, world)| {
         [256, 1024].map(|threads| (format!("{name}, {threads}"), shader_of(&world, Kernel::Specialised, threads)))
@@ -273,50 +276,51 @@ fn episodes() -> Vec<(String, String)> {
 }
 
 #[test]
-fn guards_hold_and_little_spills_on_nvidia() {
-    if !nvcc("guards_hold_and_little_spills_on_nvidia") {
+fn guards_prevent_fusing_and_registers_rarely_spill() {
+    if !has_nvcc("guards_prevent_fusing_and_registers_rarely_spill") {
         return;
     }
     let mut findings = Vec::new();
     for pass in [Pass::NoContraction, Pass::Guarded] {
         for chip in CHIPS {
-            let (mut most, mut shaders) = (0, 0);
+            let (mut max_registers, mut shaders) = (0, 0);
             for (name, text) in episodes() {
-                // Vulkan's decoration of every sum and product is one option of nvcc's, so only the guard is tried here.
+                // Vulkan's no-contraction decoration is a flag of nvcc, so only the guarded pass is tested with fusing.
                 let kernel = compile(&text, pass, chip, pass == Pass::Guarded, false);
-                let what = format!("{chip} under the {pass} pass, {name}");
-                assert!(count(&kernel.assembly, "FMUL") > 50, "{what}: this is no assembly: {}", kernel.assembly);
-                assert!(pass != Pass::Guarded || count(&kernel.assembly, "FFMA") == 0, "{what}: fused");
-                assert!(kernel.stack <= STACK, "{what}: {} bytes of local memory", kernel.stack);
-                let alone = compile(&text, pass, chip, pass == Pass::Guarded, true);
-                assert_eq!(alone.stack, 0, "{what}: local memory that no other workgroup asks for");
-                (most, shaders) = (most.max(kernel.registers), shaders + 1);
+                let case = format!("{chip} under the {pass} pass, {name}");
+                assert!(count(&kernel.assembly, "FMUL") > 50, "{case}: this is not assembly: {}", kernel.assembly);
+                assert!(pass != Pass::Guarded || count(&kernel.assembly, "FFMA") == 0, "{case}: fused");
+                assert!(kernel.stack <= STACK, "{case}: {} bytes of local memory", kernel.stack);
+                let single_workgroup = compile(&text, pass, chip, pass == Pass::Guarded, true);
+                assert_eq!(single_workgroup.stack, 0, "{case}: local memory, although one workgroup has all registers");
+                (max_registers, shaders) = (max_registers.max(kernel.registers), shaders + 1);
             }
-            println!("{chip}: {shaders} shaders, {pass} pass, at most {most} registers");
-            // Under the other pass it is nvcc that was told not to fuse, which says nothing of the pass.
-            let found = if pass == Pass::Guarded { "none fused though nvcc may, " } else { "" };
-            findings.push(format!("{chip}, {pass} pass: {shaders} shaders, {found}at most {most} registers"));
+            println!("{chip}: {shaders} shaders, {pass} pass, at most {max_registers} registers");
+            // Under the no-contraction pass nvcc must not fuse, so its result says nothing about the pass.
+            let fused_note = if pass == Pass::Guarded { "none fused though nvcc may, " } else { "" };
+            findings
+                .push(format!("{chip}, {pass} pass: {shaders} shaders, {fused_note}at most {max_registers} registers"));
         }
     }
     note(findings);
 }
 
-/// The canary: without a pass the compiler fuses, and it shows.
+/// A canary: without a pass, the compiler fuses, and the test above can detect it.
 #[test]
-fn without_a_pass_nvidias_compiler_fuses() {
-    if !nvcc("without_a_pass_nvidias_compiler_fuses") {
+fn without_a_pass_the_compiler_fuses() {
+    if !has_nvcc("without_a_pass_the_compiler_fuses") {
         return;
     }
     let (name, text) = episodes().swap_remove(0);
-    let found = count(&compile(&text, Pass::Plain, CHIPS[2], true, false).assembly, "FFMA");
-    assert!(found > 50, "{name}: only {found} instructions are fused");
+    let fused = count(&compile(&text, Pass::Plain, CHIPS[2], true, false).assembly, "FFMA");
+    assert!(fused > 50, "{name}: only {fused} fused instructions");
 }
 
-/// Prints the table by chip of `benches/static-figures.md`.
+/// Prints the table by chip for `benches/static-figures.md`.
 #[test]
 #[ignore = "prints a table"]
 fn table() {
-    if !nvcc("table") {
+    if !has_nvcc("table") {
         return;
     }
     println!("{}\n", version());
@@ -333,14 +337,14 @@ fn table() {
     }
 }
 
-/// Notes what was read where `FLOTILLA_EVIDENCE` says.
+/// Writes the findings if `FLOTILLA_EVIDENCE` is set.
 #[cfg(feature = "record")]
 fn note(findings: Vec<String>) {
     use flotilla::record::evidence::{MachineReport, Tier};
     let Some(folder) = std::env::var_os("FLOTILLA_EVIDENCE") else { return };
     let note = format!("NVIDIA's {}, of naga's Metal text made CUDA, for chips that were not there", version());
-    let sighting = MachineReport { note: Some(note), findings, ..MachineReport::new(Tier::MachineCodeRead) };
-    std::fs::write(Path::new(&folder).join("nvidia.json"), sighting.to_json()).expect("the folder takes a file");
+    let report = MachineReport { note: Some(note), findings, ..MachineReport::new(Tier::MachineCodeRead) };
+    std::fs::write(Path::new(&folder).join("nvidia.json"), report.to_json()).expect("the directory is writable");
 }
 
 #[cfg(not(feature = "record"))]
