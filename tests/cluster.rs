@@ -1,5 +1,6 @@
-//! The binary where many people share machines: under a batch system, on file systems without locks, with broken clocks,
-//! and with names and files that others chose.
+//! Tests the program on shared machines.
+//!
+//! This covers batch systems, file systems without locks, broken clocks, and unusual names and files.
 #![cfg(feature = "cli")]
 #![cfg(target_os = "linux")]
 
@@ -19,8 +20,8 @@ use flotilla::record::hex;
 use sha2::{Digest, Sha256};
 use support::{Place, TINY, tiny};
 
-/// Takes minutes, with many short generations.
-fn long() -> String {
+/// A config with many short generations, which takes minutes.
+fn long_config() -> String {
     tiny(200000, "generations = 0")
 }
 
@@ -29,22 +30,22 @@ fn place() -> Place {
     Place::new(&[("small.toml", &small), ("grid.toml", &format!("{small}[grid]\n\"world.coupling\" = [1, 2]\n"))])
 }
 
-/// Builds a library that replaces functions of the C library, to be named in `LD_PRELOAD`.
+/// Builds a library for `LD_PRELOAD` that replaces functions of the C library.
 fn preload(place: &Place, source: &str) {
     place.write("preload.c", source);
     let mut compiler = Command::new("cc");
     compiler.args(["-shared", "-fPIC", "-o", "preload.so", "preload.c"]).current_dir(place.root());
-    let output = compiler.output().expect("a C compiler, which the linker of Rust needs too");
+    let output = compiler.output().expect("a C compiler");
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
 }
 
-fn told(output: &Output) -> String {
+fn stderr(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
-/// Starts a long run in the folder named by a shell word, sends signals once it trains, and returns how it ended.
-fn stopped(place: &Place, out: &OsStr, signals: &[&str]) -> Output {
-    place.write("long.toml", long());
+/// Starts a long run in `out`, sends it signals once it trains, and returns its output.
+fn signalled_run(place: &Place, out: &OsStr, signals: &[&str]) -> Output {
+    place.write("long.toml", long_config());
     let mut child = support::flotilla();
     let mut flag = OsStr::new("--out=").to_owned();
     flag.push(out);
@@ -62,61 +63,61 @@ fn stopped(place: &Place, out: &OsStr, signals: &[&str]) -> Output {
 }
 
 #[test]
-fn sigterm_saves_however_often_it_arrives() {
+fn repeated_sigterm_saves_and_exits_with_75() {
     let place = place();
-    let output = stopped(&place, OsStr::new("run"), &["-TERM"; 5]);
-    assert_eq!(output.status.code(), Some(75), "{} {:?}", told(&output), output.status.signal());
-    assert!(told(&output).contains("with everything saved"), "{}", told(&output));
+    let output = signalled_run(&place, OsStr::new("run"), &["-TERM"; 5]);
+    assert_eq!(output.status.code(), Some(75), "{} {:?}", stderr(&output), output.status.signal());
+    assert!(stderr(&output).contains("with everything saved"), "{}", stderr(&output));
     assert!(place.read("run/run.json").contains("\"stopped\""));
 }
 
 #[test]
-fn a_resume_command_works_whatever_the_name_of_the_folder() {
+fn the_printed_resume_command_works_with_unusual_names() {
     for out in [&b"-y"[..], b"--force", b"a b'c", b"\xff$HOME"] {
         let place = place();
         let out = OsStr::from_bytes(out);
-        let output = stopped(&place, out, &["-TERM"]);
-        let text = told(&output);
+        let output = signalled_run(&place, out, &["-TERM"]);
+        let text = stderr(&output);
         assert_eq!(output.status.code(), Some(75), "{text}");
         let command = text.lines().last().unwrap().trim();
-        // It reaches the run, which refuses to become shorter.
+        // The command finds the run, which cannot become shorter.
         place.write("script", format!("{command} --quiet --generations 1"));
         let output = place.shell("bash script");
-        let (code, text) = (output.status.code(), told(&output));
+        let (code, text) = (output.status.code(), stderr(&output));
         assert!(code == Some(1) && text.contains("is a run of"), "{command}: {text}");
     }
 }
 
 #[test]
-fn a_config_whose_name_is_dots_gets_a_folder_of_its_own() {
+fn a_config_named_dots_gets_its_own_directory() {
     let place = place();
     fs::copy(place.path("small.toml"), place.path("...toml")).unwrap();
-    let before = place.names();
+    let existing = place.names();
     place.good("train ...toml --quiet");
     place.good("train ...toml --force --quiet");
     assert!(place.path("runs/config/run.json").exists());
     fs::copy(place.path("grid.toml"), place.path("...toml")).unwrap();
     place.good("sweep ...toml --quiet");
     assert!(place.path("runs/sweep/points/0000/run.json").exists());
-    let added: Vec<_> = place.names().into_iter().filter(|name| !before.contains(name)).collect();
+    let added: Vec<_> = place.names().into_iter().filter(|name| !existing.contains(name)).collect();
     assert!(added.iter().all(|name| name.starts_with("runs")), "{added:?}");
 }
 
 #[test]
-fn a_flag_that_does_not_fit_a_stage_is_named() {
+fn errors_in_a_stage_name_the_flag_that_caused_them() {
     let stage = "[[stages]]\nfrom = 3\nset = { \"world.coupling\" = 3 }\n";
     let place = Place::new(&[("staged.toml", &format!("{TINY}{stage}"))]);
     place.good("check staged.toml");
     let text = place.refused(2, "check staged.toml --seed 7 --set world.observers=\"leaders\"");
     assert!(text.contains("--set") && text.contains("stages[0]") && !text.contains("--seed"), "{text}");
-    // What is wrong in the file stays the file's.
+    // Errors in the file do not mention flags.
     place.write("wrong.toml", format!("{TINY}{}", stage.replace("= 3 }", "= 300 }")));
     let text = place.refused(1, "check wrong.toml --seed 7");
     assert!(text.contains("wrong.toml:") && !text.contains("--seed"), "{text}");
 }
 
 #[test]
-fn a_clock_beyond_the_year_9999_stops_nothing() {
+fn a_clock_beyond_the_year_9999_is_tolerated() {
     let place = place();
     preload(
         &place,
@@ -131,12 +132,12 @@ fn a_clock_beyond_the_year_9999_stops_nothing() {
     );
     let output =
         place.shell("LD_PRELOAD=$PWD/preload.so exec flotilla train small.toml --out run --backend cpu --quiet");
-    assert_eq!(output.status.code(), Some(0), "{}", told(&output));
+    assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
     assert!(place.read("run/run.json").contains("9999-12-31T23:59:59Z"));
 }
 
 #[test]
-fn bench_refuses_a_clock_that_stands_still() {
+fn bench_rejects_a_clock_that_does_not_advance() {
     let place = place();
     preload(
         &place,
@@ -151,12 +152,12 @@ fn bench_refuses_a_clock_that_stands_still() {
     // The limit counts processor time, so that a busy machine does not matter.
     let script = "ulimit -t 60; LD_PRELOAD=$PWD/preload.so exec flotilla bench --backend cpu --threads 1 --teams 2";
     let output = place.shell(script);
-    let text = told(&output);
+    let text = stderr(&output);
     assert!(output.status.code() == Some(1) && text.contains("clock does not advance"), "{:?} {text}", output.status);
 }
 
 #[test]
-fn a_file_system_without_locks_is_a_warning() {
+fn a_file_system_without_locks_causes_a_warning() {
     let place = place();
     preload(
         &place,
@@ -166,14 +167,14 @@ fn a_file_system_without_locks_is_a_warning() {
     for command in ["train small.toml --out run", "sweep grid.toml --out sweep", "train small.toml --out run --resume"]
     {
         let output = place.shell(&format!("LD_PRELOAD=$PWD/preload.so exec flotilla {command} --backend cpu --quiet"));
-        let text = told(&output);
+        let text = stderr(&output);
         assert_eq!(output.status.code(), Some(0), "{command}: {text}");
         assert_eq!(text.matches("this file system has no locks").count(), 1, "{command}: {text}");
     }
 }
 
 #[test]
-fn names_in_tables_are_neither_columns_nor_formulas() {
+fn names_are_escaped_in_tables() {
     let place = place();
     place.good("train small.toml --out run --quiet");
     place.shell("cp -r run '=1+1'; cp -r run 'a|b'; cp -r run -- -0.5");
@@ -195,7 +196,7 @@ fn names_that_differ_print_differently() {
         let outputs = ["plot", "replay", "train"].map(|command| {
             let output = support::flotilla().arg(command).arg(name).current_dir(place.root()).output().unwrap();
             assert_eq!(output.status.code(), Some(1));
-            told(&output)
+            stderr(&output)
         });
         outputs.concat()
     });
@@ -203,14 +204,14 @@ fn names_that_differ_print_differently() {
     assert_eq!(texts[0].replace(r"\xff", r"\xfe"), texts[1]);
 }
 
-/// Replaces a part of a file by one of the same length.
+/// Overwrites a part of a file with as many bytes.
 fn replace(bytes: &mut [u8], from: &[u8], to: &[u8]) {
     let start = bytes.windows(from.len()).position(|part| part == from).unwrap();
     bytes[start..start + to.len()].copy_from_slice(to);
 }
 
 #[test]
-fn an_impossible_training_time_does_not_stop_a_run() {
+fn a_run_resumes_from_an_impossible_training_time() {
     let place = place();
     place.good("train small.toml --out run --quiet");
     place.good("train small.toml --out whole --generations 8 --quiet");
@@ -218,9 +219,9 @@ fn an_impossible_training_time_does_not_stop_a_run() {
     let checkpoints = place.path("run/checkpoints");
     for generation in checkpoint::list(&checkpoints).unwrap() {
         let path = checkpoint::path(&checkpoints, generation);
-        let found = checkpoint::read(&path, &place.path("run/policies.safetensors"), &config).unwrap();
-        let mut forged = found.unwrap();
-        // As many characters as the forged time has.
+        let original = checkpoint::read(&path, &place.path("run/policies.safetensors"), &config).unwrap();
+        let mut forged = original.unwrap();
+        // As many characters as the time that replaces it.
         forged.seconds = 12345.0;
         forged.write(&Disk::default(), &path, &config).unwrap();
         let mut bytes = fs::read(&path).unwrap();
@@ -243,7 +244,7 @@ fn an_impossible_training_time_does_not_stop_a_run() {
 }
 
 #[test]
-fn a_missing_file_comes_with_a_remedy() {
+fn errors_about_missing_files_suggest_a_remedy() {
     let place = place();
     for (command, remedy) in [
         ("train missing.toml", "check the path, or write a config with `flotilla init`"),
@@ -256,10 +257,9 @@ fn a_missing_file_comes_with_a_remedy() {
     }
 }
 
-/// Texts of a megabyte, the most that a config may have, which took half a minute or more when the time grew with the
-/// square of their length.
+/// Texts of a megabyte, the maximum for a config. These took half a minute or more when reading took quadratic time.
 #[test]
-fn the_longest_config_is_read_in_seconds() {
+fn the_longest_configs_are_rejected_within_seconds() {
     const LENGTH: usize = 1 << 20;
     let repeated = |start: &str, part: &str, end: &str| {
         format!("{start}{}{end}", part.repeat((LENGTH - start.len() - end.len()) / part.len()))
@@ -290,7 +290,7 @@ fn the_longest_config_is_read_in_seconds() {
         let place = Place::new(&[("x.toml", &text)]);
         // The limit counts processor time, so that a busy machine does not matter.
         let output = place.shell("ulimit -t 20; exec flotilla check x.toml");
-        let lines = told(&output).lines().count();
+        let lines = stderr(&output).lines().count();
         assert_eq!(output.status.code(), Some(1), "{name}: {:?}", output.status);
         assert!(lines <= 52, "{name}: {lines} lines");
     }

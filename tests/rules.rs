@@ -1,5 +1,6 @@
-//! Whose presence counts, when and in what order POIs are observed, and who leads whom step by step: from the command
-//! line to tables, pictures and pages.
+//! Tests the rules of tasks, from the command line to tables, pictures and pages.
+//!
+//! Rules say which agents observe, when and in which order POIs can be observed, and who counts as leading a follower.
 
 #![cfg(feature = "cli")]
 
@@ -17,7 +18,7 @@ use flotilla::sweep::Sweep;
 use serde_json::Value;
 use tempfile::TempDir;
 
-/// Two leaders with two followers each, who alone observe; the second POI comes after the first.
+/// Two leaders with two followers each. Only followers observe. The second POI counts only after the first.
 const RELAY: &str = "
 [world]
 map = [30.0, 20.0]
@@ -43,8 +44,8 @@ fn succeed(arguments: &[&str]) -> String {
     String::from_utf8(output.stdout).unwrap()
 }
 
-/// A folder with the config and a run of it.
-fn trained(config: &str) -> (TempDir, PathBuf) {
+/// Trains a config. Returns the directory and the run in it.
+fn train(config: &str) -> (TempDir, PathBuf) {
     let folder = TempDir::new().unwrap();
     let (path, run) = (folder.path().join("relay.toml"), folder.path().join("run"));
     fs::write(&path, config).unwrap();
@@ -57,7 +58,7 @@ fn text(path: &Path) -> &str {
 }
 
 #[test]
-fn every_new_key_can_be_an_axis() {
+fn every_rule_key_can_be_a_grid_axis() {
     let plain = RELAY.replace("windows = [[3, 12], [2, 20]]\nafter = [[], [0]]\n", "").replace("led_within = 4\n", "");
     let grid = "[grid]\n\"world.observers\" = ['all', 'followers']\n\"world.windows\" = [[], [[1, 9], [4, 20]]]\n\
                 \"world.after\" = [[], [[1], []]]\n\"learning.fitness\" = ['D', 'Dt']\n\
@@ -78,16 +79,16 @@ fn fitness(word: &str) -> Override {
 }
 
 #[test]
-fn what_is_recorded_for_dt_is_foretold() {
+fn check_predicts_the_memory_for_dt() {
     let folder = TempDir::new().unwrap();
     let path = folder.path().join("relay.toml");
     fs::write(&path, RELAY).unwrap();
     let cost = |fitness: &str| -> Value {
-        let told = succeed(&["check", text(&path), "--fitness", fitness, "--json"]);
-        serde_json::from_str::<Value>(&told).unwrap()["cost"].clone()
+        let stdout = succeed(&["check", text(&path), "--fitness", fitness, "--json"]);
+        serde_json::from_str::<Value>(&stdout).unwrap()["cost"].clone()
     };
     let (df, dt) = (cost("Df"), cost("Dt"));
-    // Sets of two POIs and counts of four followers; then a word for each follower and step.
+    // Sets of two POIs, and counts of four followers. Dt adds one word per follower and step.
     assert_eq!(
         (&df["record_bytes"], &dt["record_bytes"]),
         (&(4 * (20 * 2 + 4 * 2)).into(), &(4 * (48 + 20 * 4)).into())
@@ -97,13 +98,13 @@ fn what_is_recorded_for_dt_is_foretold() {
     }
 }
 
-/// `rollout --scores` and the library tell the same Dt; without followers it is D.
+/// Only followers observe, so D is 0 and Dt is not.
 #[test]
-fn a_rollout_tells_dt() {
-    let (_folder, run) = trained(RELAY);
+fn rollout_and_library_report_the_same_dt() {
+    let (_folder, run) = train(RELAY);
     let (config, policies, scores) =
         (run.join("config.toml"), run.join("policies.safetensors"), run.join("scores.csv"));
-    let told = |flags: &[&str]| -> Vec<Vec<f32>> {
+    let score_rows = |flags: &[&str]| -> Vec<Vec<f32>> {
         let (config, policies, scores) = (text(&config), text(&policies), text(&scores));
         let line = ["rollout", config, "--policies", policies, "--scores", scores, "--backend", "cpu", "--quiet"];
         succeed(&[&line, flags].concat());
@@ -111,28 +112,28 @@ fn a_rollout_tells_dt() {
         assert!(file.starts_with("team,leader,g,d,df,dpp,dt"), "{file}");
         file.lines().skip(1).map(|line| line.split(',').map(|word| word.parse().unwrap()).collect()).collect()
     };
-    let found = told(&[]);
+    let rows = score_rows(&[]);
     let bytes = fs::read(&policies).unwrap();
     let file = safetensors::SafeTensors::deserialize(&bytes).unwrap();
     let weights: Vec<f32> = bytemuck::pod_collect_to_vec(file.tensor("weights.0").unwrap().data());
     let config = Config::load(&config).unwrap();
     let played = |config: &Config| flotilla::play(config, &mut Cpu::default(), 20, &weights, &Starts::Own).unwrap();
     let by_dt = played(&config);
-    let column = |index: usize| found.iter().map(|row| row[index]).collect::<Vec<f32>>();
+    let column = |index: usize| rows.iter().map(|row| row[index]).collect::<Vec<f32>>();
     assert_eq!((column(3), column(4), column(6)), (by_dt.d.clone(), by_dt.df.clone(), by_dt.dt.clone()));
-    assert!(by_dt.observed.iter().any(|&observed| observed > 0.0), "nothing is observed: {found:?}");
-    assert!(by_dt.dt.iter().any(|&dt| dt > 0.0) && by_dt.d.iter().all(|&d| d == 0.0), "{found:?}");
-    // Where it is not the config's fitness, nobody pays for it.
+    assert!(by_dt.observed.iter().any(|&observed| observed > 0.0), "nothing is observed: {rows:?}");
+    assert!(by_dt.dt.iter().any(|&dt| dt > 0.0) && by_dt.d.iter().all(|&d| d == 0.0), "{rows:?}");
+    // Dt is computed only if it is the config's fitness.
     let by_df = played(&config.with(&[fitness("Df")]).unwrap());
     assert_eq!((by_df.df, by_df.dt), (by_dt.df, vec![]));
-    let several = told(&["--episodes", "3", "--start-jitter", "0.5"]);
+    let several = score_rows(&["--episodes", "3", "--start-jitter", "0.5"]);
     assert_eq!((several.len(), several[0].len()), (40, 12));
 }
 
-/// The page of a run by Dt says whom each follower is led by at every step, when POIs can be observed and by whom.
+/// The page of a run with Dt shows which leader each follower follows at every step, and the rules for POIs.
 #[test]
-fn replays_show_the_rule_and_who_leads() {
-    let (_folder, run) = trained(RELAY);
+fn replays_show_rules_and_who_leads_whom() {
+    let (_folder, run) = train(RELAY);
     succeed(&["replay", text(&run), "--backend", "cpu"]);
     let page = fs::read_to_string(run.join("replay.html")).unwrap();
     let start = page.find("id=\"data\">").unwrap() + "id=\"data\">".len();
@@ -149,7 +150,7 @@ fn replays_show_the_rule_and_who_leads() {
     };
     let positions: Vec<f32> = words("positions").into_iter().map(f32::from_bits).collect();
     let at = |step: usize, agent: usize| [positions[(step * 6 + agent) * 2], positions[(step * 6 + agent) * 2 + 1]];
-    // Before the move of a step, from 1.
+    // Whether a follower sees a leader at a step, counted from 1, before the step's move.
     let sees = |step: usize, follower: usize, leader: usize| {
         let ([x, y], [u, v]) = (at(step - 1, 2 + follower), at(step - 1, leader));
         (u - x) * (u - x) + (v - y) * (v - y) <= 25.0
@@ -184,13 +185,13 @@ fn replays_show_the_rule_and_who_leads() {
         (&layout, "\"POI that cannot be observed now\""),
         (&layout, "Only followers observe. POIs can be observed: 0: "),
     ] {
-        assert!(picture.contains(label), "{label} is not in {picture}");
+        assert!(picture.contains(label), "{label} is missing from {picture}");
     }
 }
 
-/// Runs of versions without these keys can go on: where they are at their defaults, a config's digest is as it was.
+/// Runs of versions without these keys can be resumed only if keys with default values do not change the digest.
 #[test]
-fn keys_at_their_defaults_leave_a_configs_digest_as_it_was() {
+fn default_values_do_not_change_a_configs_digest() {
     let config = Config::parse(include_str!("../configs/generally_forward.toml"), "config").unwrap();
     assert_eq!(config_digest(&config), "09b7c71c3753ec9f8bdb1a046ac1ca8c8e8e06f180d62f5bff86efc9ba40df48");
     let mut digests = vec![config_digest(&config)];
@@ -215,5 +216,5 @@ fn keys_at_their_defaults_leave_a_configs_digest_as_it_was() {
     }
     digests.sort();
     digests.dedup();
-    assert_eq!(digests.len(), 14, "each key has a say");
+    assert_eq!(digests.len(), 14, "each key changes the digest");
 }

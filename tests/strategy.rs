@@ -1,4 +1,4 @@
-//! Evolution strategies follow their equations, which this file states again in float64, on every instruction set.
+//! Tests evolution strategies against their papers' equations, written here in float64, on every instruction set.
 
 mod support;
 
@@ -22,19 +22,19 @@ fn key(generation: usize) -> Key {
     Key::new(7, 1, Purpose::Weights).at(generation, 2, 3)
 }
 
-/// Random numbers that are roughly normal.
-fn numbers(count: usize, generation: usize) -> Vec<f32> {
+/// Returns random numbers from a roughly normal distribution.
+fn random_numbers(count: usize, generation: usize) -> Vec<f32> {
     let mut numbers = vec![0.0; count];
     evolve::random_policy(Level::baseline(), key(generation), &mut numbers);
     numbers
 }
 
 #[track_caller]
-fn near(what: &str, found: f64, expected: f64, tolerance: f64) {
-    assert!((found - expected).abs() <= tolerance, "{what}: {found}, expected {expected}");
+fn assert_near(what: &str, actual: f64, expected: f64, tolerance: f64) {
+    assert!((actual - expected).abs() <= tolerance, "{what}: {actual}, expected {expected}");
 }
 
-/// The utility of a rank, from 0, as the papers have it.
+/// The utility of a rank, counted from 0, by the papers' formulas.
 fn utility(method: Method, rank: usize, policies: usize) -> f64 {
     let count = policies as f64;
     match method {
@@ -47,39 +47,39 @@ fn utility(method: Method, rank: usize, policies: usize) -> f64 {
 }
 
 #[test]
-fn utilities_are_those_of_the_papers_and_ties_share_theirs() {
+fn utilities_equal_the_papers_and_ties_share_the_mean() {
     for method in [Method::OpenAiEs, Method::Snes] {
         for policies in [2, 3, 4, 7, 50, 5000] {
             let strategy = strategy(method, policies, 112);
             let rising: Vec<f32> = (0..policies).map(|policy| policy as f32 - 1.5).collect();
-            let found = strategy.utilities(&rising);
-            for (policy, &found) in found.iter().enumerate() {
+            let actual = strategy.utilities(&rising);
+            for (policy, &actual) in actual.iter().enumerate() {
                 let expected = utility(method, policies - 1 - policy, policies);
-                near(&format!("{method}, {policy} of {policies}"), found, expected, 1e-6);
+                assert_near(&format!("{method}, {policy} of {policies}"), actual, expected, 1e-6);
             }
-            near("the sum", found.iter().sum(), 0.0, 1e-12);
-            // No score differs, so no direction is better.
+            assert_near("the sum", actual.iter().sum(), 0.0, 1e-12);
+            // With equal scores, no direction is better than another.
             assert!(strategy.utilities(&vec![0.25; policies]).iter().all(|utility| utility.abs() < 1e-15));
         }
-        // Ranks 0, 1 and 2 are tied at 3, rank 3 has 1, and ranks 4 and 5 are tied at two zeros.
-        let found = strategy(method, 6, 112).utilities(&[0.0, 3.0, 1.0, 3.0, -0.0, 3.0]);
+        // Sorted: three scores of 3 share ranks 0 to 2, 1 has rank 3, and two zeros share ranks 4 and 5.
+        let actual = strategy(method, 6, 112).utilities(&[0.0, 3.0, 1.0, 3.0, -0.0, 3.0]);
         let mean = |ranks: std::ops::Range<usize>| {
             let count = ranks.len() as f64;
             ranks.map(|rank| utility(method, rank, 6)).sum::<f64>() / count
         };
-        for (found, expected) in
-            found.iter().zip([mean(4..6), mean(0..3), mean(3..4), mean(0..3), mean(4..6), mean(0..3)])
+        for (actual, expected) in
+            actual.iter().zip([mean(4..6), mean(0..3), mean(3..4), mean(0..3), mean(4..6), mean(0..3)])
         {
-            near(&method.to_string(), *found, expected, 1e-6);
+            assert_near(&method.to_string(), *actual, expected, 1e-6);
         }
     }
 }
 
-/// Weight by weight: Box and Muller's formula in f64, from the draws that the counters give.
+/// Computes each weight by the Box-Muller formula in f64 from the draws of its counters.
 #[test]
-fn samples_follow_from_their_own_counters() {
+fn samples_equal_box_muller_of_their_counters() {
     let parameters = 150;
-    let (mean, mut sigmas) = (numbers(parameters, 0), numbers(parameters, 1));
+    let (mean, mut sigmas) = (random_numbers(parameters, 0), random_numbers(parameters, 1));
     sigmas.iter_mut().for_each(|sigma| *sigma = sigma.abs() + 0.01);
     let key = Key::new(8, 3, Purpose::Search);
     for (method, policies) in [(Method::OpenAiEs, 9), (Method::OpenAiEs, 8), (Method::Snes, 9)] {
@@ -94,41 +94,42 @@ fn samples_follow_from_their_own_counters() {
             };
             let key = key.at(5, 1, number);
             for (index, &weight) in child.iter().enumerate() {
-                // One draw makes four deviates, 16 weights apart: a cosine and a sine of each pair of words.
+                // One draw gives four deviates, 16 weights apart: a cosine and a sine for each pair of words.
                 let words = key.draw((index / 64 * 16 + index % 16) as u32);
-                let which = index / 16 % 4;
-                let [a, b] = [words[which / 2 * 2], words[which / 2 * 2 + 1]];
+                let part = index / 16 % 4;
+                let [a, b] = [words[part / 2 * 2], words[part / 2 * 2 + 1]];
                 let unit = (f64::from(a >> 8) + 1.0) / (1u32 << 24) as f64;
                 let angle = (f64::from(b >> 8) / (1u32 << 23) as f64 - 1.0) * std::f64::consts::PI;
-                let deviate = (-2.0 * unit.ln()).sqrt() * if which % 2 == 0 { angle.cos() } else { angle.sin() };
+                let deviate = (-2.0 * unit.ln()).sqrt() * if part % 2 == 0 { angle.cos() } else { angle.sin() };
                 let expected = f64::from(mean[index]) + sign * f64::from(sigmas[index]) * deviate;
-                near(&format!("{method}, slot {slot}, weight {index}"), f64::from(weight), expected, 1e-5);
+                assert_near(&format!("{method}, slot {slot}, weight {index}"), f64::from(weight), expected, 1e-5);
             }
         }
     }
 }
 
-/// A population with scores: `[policies + 2][parameters]`.
+/// Returns a population, `[policies + 2][parameters]`, and its scores. The last two rows are the mean and the standard
+/// deviations.
 fn population(policies: usize, parameters: usize) -> (Vec<f32>, Vec<f32>) {
-    let mut population = numbers((policies + 2) * parameters, 2);
+    let mut population = random_numbers((policies + 2) * parameters, 2);
     let sigmas = (policies + 1) * parameters;
     population[sigmas..].iter_mut().for_each(|sigma| *sigma = sigma.abs() / 2.0 + 0.1);
-    // Few distinct scores, as tasks have them.
-    let scores = numbers(policies, 3).into_iter().map(|score| (score * 4.0).round() / 4.0).collect();
+    // Few distinct scores, as in real tasks.
+    let scores = random_numbers(policies, 3).into_iter().map(|score| (score * 4.0).round() / 4.0).collect();
     (population, scores)
 }
 
 #[test]
-fn an_update_is_its_equation() {
-    // More policies than are added up at a time, too.
+fn updates_equal_the_papers_equations() {
+    // The largest case has more policies than one block of the sum.
     for (policies, parameters) in [(8, 112), (37, 70), (2600, 5)] {
         let (before, scores) = population(policies, parameters);
         for method in [Method::OpenAiEs, Method::Snes] {
             let strategy = strategy(method, policies, parameters);
             let mut after = before.clone();
             strategy.update(Level::new(), 1, &scores, &mut after);
-            let whole = policies * parameters;
-            assert_eq!(after[..whole], before[..whole], "policies stay");
+            let weights = policies * parameters;
+            assert_eq!(after[..weights], before[..weights], "policies are unchanged");
             let mut ranked: Vec<f32> = scores.clone();
             ranked.sort_by(|a, b| b.partial_cmp(a).unwrap());
             let utility = |policy: usize| {
@@ -139,31 +140,41 @@ fn an_update_is_its_equation() {
             };
             let utilities: Vec<f64> = (0..policies).map(utility).collect();
             for index in 0..parameters {
-                let [mean, sigma] = [0, 1].map(|slot| f64::from(before[whole + slot * parameters + index]));
+                let [mean, sigma] = [0, 1].map(|slot| f64::from(before[weights + slot * parameters + index]));
                 let deviate = |policy: usize| (f64::from(before[policy * parameters + index]) - mean) / sigma;
                 let sum = |each: &dyn Fn(f64) -> f64| -> f64 {
                     (0..policies).map(|policy| utilities[policy] * each(deviate(policy))).sum()
                 };
                 let dimensions = parameters as f64;
                 let rate = (3.0 + dimensions.ln()) / (5.0 * dimensions.sqrt());
-                let (moved, adapted) = match method {
+                let (expected_mean, expected_sigma) = match method {
                     // Salimans et al. (2017), Algorithm 1.
                     Method::OpenAiEs => (mean + 0.7 / (policies as f64 * sigma) * sum(&|s| s), sigma),
-                    // Wierstra et al. (2014), Algorithm 6; a change is at most by a factor of e.
+                    // Wierstra et al. (2014), Algorithm 6. A step changes sigma by at most a factor of e.
                     _ => {
                         let change = rate / 2.0 * sum(&|s| s * s - 1.0);
                         (mean + sigma * sum(&|s| s), sigma * change.clamp(-1.0, 1.0).exp())
                     }
                 };
-                let found = [0, 1].map(|slot| f64::from(after[whole + slot * parameters + index]));
-                near(&format!("{method}, {policies}, mean {index}"), found[0], moved, 2e-6 * (1.0 + moved.abs()));
-                near(&format!("{method}, {policies}, sigma {index}"), found[1], adapted, 2e-6 * (1.0 + adapted));
+                let actual = [0, 1].map(|slot| f64::from(after[weights + slot * parameters + index]));
+                assert_near(
+                    &format!("{method}, {policies}, mean {index}"),
+                    actual[0],
+                    expected_mean,
+                    2e-6 * (1.0 + expected_mean.abs()),
+                );
+                assert_near(
+                    &format!("{method}, {policies}, sigma {index}"),
+                    actual[1],
+                    expected_sigma,
+                    2e-6 * (1.0 + expected_sigma),
+                );
             }
         }
     }
 }
 
-/// Generation 0 is random whatever the method: the search starts from its best policy, and the first of those that tie.
+/// Generation 0 is random for every method. The search starts from its best policy, or the first of equally good ones.
 #[test]
 fn a_search_starts_at_the_best_random_policy() {
     let (before, mut scores) = population(10, 6);
@@ -178,9 +189,9 @@ fn a_search_starts_at_the_best_random_policy() {
     }
 }
 
-/// A population of few policies that repeat finds the optimum of a sphere: signs and sizes of steps are right.
+/// Repeated updates must find the optimum of a sphere, which checks the signs and sizes of steps.
 #[test]
-fn a_sphere_is_solved() {
+fn searches_find_the_optimum_of_a_sphere() {
     let (policies, parameters) = (60, 10);
     for method in [Method::OpenAiEs, Method::Snes] {
         let strategy = strategy(method, policies, parameters);
@@ -208,13 +219,13 @@ fn bits(numbers: &[f32]) -> Vec<u32> {
     numbers.iter().map(|number| number.to_bits()).collect()
 }
 
-/// The same bits on every instruction set, from any slot on, and on any number of threads.
+/// Results must not depend on the instruction set, the first slot sampled, or the number of threads.
 #[test]
-fn a_search_depends_on_no_instruction_set() {
+fn searches_give_the_same_bits_on_any_instruction_set_and_threads() {
     for method in [Method::OpenAiEs, Method::Snes] {
         for (policies, parameters) in [(2, 1), (5, 15), (9, 112), (64, 65), (2500, 3)] {
             let (before, scores) = population(policies, parameters);
-            let all = |level: Level, first: usize| {
+            let bits_from = |level: Level, first: usize| {
                 let learning = learning(method, policies, 0.4, 1.3);
                 let strategy = Strategy::of(level, &learning, parameters).unwrap();
                 let mut population = before.clone();
@@ -227,24 +238,24 @@ fn a_search_depends_on_no_instruction_set() {
                 population.extend(&search);
                 bits(&population[first * parameters..])
             };
-            let expected = all(Level::baseline(), 0);
+            let expected = bits_from(Level::baseline(), 0);
             for level in Cpu::levels() {
-                assert_eq!(all(level, 0), expected, "{method}, {policies}, {parameters}, {}", level_name(level));
+                assert_eq!(bits_from(level, 0), expected, "{method}, {policies}, {parameters}, {}", level_name(level));
             }
             let first = policies / 4 * 2;
-            assert_eq!(all(Level::new(), first), expected[first * parameters..], "{method} from {first} on");
+            assert_eq!(bits_from(Level::new(), first), expected[first * parameters..], "{method} from {first} on");
             #[cfg(feature = "parallel")]
             for count in [1, 2, 8] {
                 let pool = rayon::ThreadPoolBuilder::new().num_threads(count).build().unwrap();
-                assert_eq!(pool.install(|| all(Level::new(), 0)), expected, "{method}, {count} threads");
+                assert_eq!(pool.install(|| bits_from(Level::new(), 0)), expected, "{method}, {count} threads");
             }
         }
     }
 }
 
-/// Whatever the scores, weights are such as the kernels can take, and standard deviations stay positive.
+/// For any scores, weights must be valid for the kernels, and standard deviations must stay positive.
 #[test]
-fn a_search_stays_in_bounds() {
+fn weights_and_sigmas_stay_in_bounds() {
     let (policies, parameters) = (20, 40);
     for method in [Method::OpenAiEs, Method::Snes] {
         for (sigma, step) in [(1e-6, 100.0), (100.0, 100.0), (100.0, 1e-6)] {
@@ -257,7 +268,7 @@ fn a_search_stays_in_bounds() {
                 let samples = Samples { key, generation, population: 0, policies, first: 0, mean, sigmas };
                 let mut children = vec![0.0; policies * parameters];
                 strategy.sample(Level::new(), samples, &mut children, &mut vec![]);
-                // What grows is better, then what shrinks.
+                // Larger weights score better in the first 100 generations, and smaller ones afterwards.
                 let size = |policy: &[f32]| policy.iter().map(|weight| weight.abs() / MAX_WEIGHT).sum::<f32>();
                 let sign = if generation < 100 { 1.0 } else { -1.0 };
                 let scores: Vec<f32> = children.chunks(parameters).map(|policy| sign * size(policy)).collect();
@@ -271,13 +282,13 @@ fn a_search_stays_in_bounds() {
     }
 }
 
-/// The logarithms of the utilities are of numbers up to half of the largest population.
+/// Utilities use logarithms of numbers up to half of the largest population, and must stay accurate there.
 #[test]
-fn the_largest_population_has_utilities() {
+fn utilities_are_accurate_for_the_largest_population() {
     let scores: Vec<f32> = (0..MAX_POPULATION).map(|policy| -(policy as f32)).collect();
-    let found = strategy(Method::Snes, MAX_POPULATION, 112).utilities(&scores);
+    let actual = strategy(Method::Snes, MAX_POPULATION, 112).utilities(&scores);
     let count = MAX_POPULATION as f64;
     for rank in [0, 1, 1000, MAX_POPULATION / 2 - 1, MAX_POPULATION / 2, MAX_POPULATION - 1] {
-        near("utility", found[rank] * count, utility(Method::Snes, rank, MAX_POPULATION) * count, 2e-5);
+        assert_near("utility", actual[rank] * count, utility(Method::Snes, rank, MAX_POPULATION) * count, 2e-5);
     }
 }
