@@ -1,5 +1,6 @@
-//! What a run takes in memory is what `flotilla check` foretold, and a run that would take more than there is does not
-//! start.
+//! Tests that a run uses as much memory as `flotilla check` predicts.
+//!
+//! A run that needs more memory than is available must not start.
 
 #![cfg(feature = "cli")]
 
@@ -21,8 +22,8 @@ use flotilla::trainer::Trainer;
 
 const GENERALLY_FORWARD: &str = include_str!("../configs/generally_forward.toml");
 
-/// A run of generally forward with other sizes and checkpoints.
-fn text(population: usize, trials: usize, generations: usize, checkpoint: &str) -> String {
+/// Returns the config of generally forward with other sizes and checkpoint settings.
+fn config_text(population: usize, trials: usize, generations: usize, checkpoint: &str) -> String {
     let change = |line: &str| match line.split(" = ").next() {
         Some("population") => format!("population = {population}"),
         Some("trials") => format!("trials = {trials}"),
@@ -33,12 +34,12 @@ fn text(population: usize, trials: usize, generations: usize, checkpoint: &str) 
     format!("{}\n\n[checkpoint]\n{checkpoint}\n", lines.join("\n"))
 }
 
-/// The most memory that a process had resident while it ran, None where the system does not tell.
+/// Returns the peak resident memory of a process in bytes, or `None` if the system does not report it.
 fn peak(command: &mut Command) -> Option<u64> {
     let mut child = command.stdout(Stdio::null()).spawn().unwrap();
     let mut peak = None;
     loop {
-        // The system keeps the peak; it is gone with the process, so it is asked for to the end.
+        // The system records the peak only while the process exists, so it is read until the end.
         let status = fs::read_to_string(format!("/proc/{}/status", child.id())).unwrap_or_default();
         let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
         let kib = line.and_then(|line| line.split_whitespace().next()?.parse::<u64>().ok());
@@ -51,108 +52,112 @@ fn peak(command: &mut Command) -> Option<u64> {
     }
 }
 
-fn foretold(config: &std::path::Path) -> u64 {
+fn predicted(config: &std::path::Path) -> u64 {
     let output = support::flotilla().arg("check").arg(config).arg("--json").output().unwrap();
     let json: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
     json["cost"]["host_bytes"].as_u64().unwrap()
 }
 
 #[test]
-fn a_run_takes_what_was_foretold() {
+fn runs_use_the_predicted_memory() {
     for (population, trials, checkpoint) in [
         (1 << 15, 1, "generations = 0\nseconds = 0.0"),
-        // Small enough for a copy, and too large.
+        // A run that is small enough for a copy of its checkpoint, and one that is too large.
         (1 << 15, 1, "generations = 1"),
         (1 << 15, 2, "generations = 1"),
     ] {
         let folder = tempfile::tempdir().unwrap();
         let config = folder.path().join("config.toml");
-        fs::write(&config, text(population, trials, 2, checkpoint)).unwrap();
+        fs::write(&config, config_text(population, trials, 2, checkpoint)).unwrap();
         let mut train = support::flotilla();
         train.arg("train").arg(&config).args(["--backend", "cpu", "--quiet", "--out"]).arg(folder.path().join("run"));
         let Some(peak) = peak(&mut train) else {
-            println!("skipped: this system does not tell what a process takes");
+            println!("skipped: this system does not report the memory of a process");
             return;
         };
-        let foretold = foretold(&config);
-        let share = peak as f64 / foretold as f64;
-        println!("{trials} trials of {population} policies: foretold {foretold} bytes, took {peak}: {share:.3}");
+        let predicted = predicted(&config);
+        let share = peak as f64 / predicted as f64;
+        println!("{trials} trials of {population} policies: predicted {predicted} bytes, used {peak}: {share:.3}");
         assert!(
             (0.9..=1.1).contains(&share),
-            "{trials} × {population}, {checkpoint}: {foretold} foretold, {peak} taken"
+            "{trials} × {population}, {checkpoint}: {predicted} predicted, {peak} used"
         );
     }
 }
 
 #[test]
-fn a_run_that_does_not_fit_does_not_start() {
+fn a_run_without_enough_memory_does_not_start() {
     let folder = tempfile::tempdir().unwrap();
     let (path, out) = (folder.path().join("config.toml"), folder.path().join("run"));
-    let text = text(1 << 20, 140, 1, "generations = 0\nseconds = 0.0");
+    let text = config_text(1 << 20, 140, 1, "generations = 0\nseconds = 0.0");
     let config = Config::parse(&text, "config").unwrap();
     let needed = Peaks::of([&config], 1).host;
     if memory::available().is_none_or(|available| available >= needed) {
-        println!("skipped: this system does not tell what is free, or has {needed} bytes");
+        println!("skipped: this system does not report free memory, or has {needed} bytes");
         return;
     }
-    let trained = flotilla::train(&config, &mut Cpu::default(), |_| panic!("it has started"));
+    let trained = flotilla::train(&config, &mut Cpu::default(), |_| panic!("training has started"));
     assert!(matches!(trained, Err(Failure::TooLittle(_))));
     fs::write(&path, text).unwrap();
     let mut train = support::flotilla();
     let output = train.arg("train").arg(&path).args(["--backend", "cpu", "--out"]).arg(&out).output().unwrap();
     assert_eq!(output.status.code(), Some(1));
-    let told = String::from_utf8(output.stderr).unwrap();
+    let stderr = String::from_utf8(output.stderr).unwrap();
     for part in ["GiB of memory at its peak", "is available", "smaller population", "fewer trials"] {
-        assert!(told.contains(part), "{told}");
+        assert!(stderr.contains(part), "{stderr}");
     }
-    assert!(!told.contains("checkpoints"), "there are none to leave out: {told}");
-    assert!(!out.exists(), "nothing is written");
+    assert!(
+        !stderr.contains("checkpoints"),
+        "a run without checkpoints cannot save memory by leaving them out: {stderr}"
+    );
+    assert!(!out.exists(), "the output directory exists");
 }
 
-/// For configs that train together, memory that is used in turn counts once, and the rest adds up.
+/// Configs that train together share the memory that they use in turns. The rest adds up.
 #[test]
-fn plans_add_up() {
-    let config = |population| Config::parse(&text(population, 2, 1, "generations = 1"), "config").unwrap();
+fn peaks_of_configs_that_train_together_add_up() {
+    let config = |population| Config::parse(&config_text(population, 2, 1, "generations = 1"), "config").unwrap();
     let [small, large] = [config(1000), config(9000)];
-    let [one, other, both] = [vec![&small], vec![&large], vec![&small, &large]].map(|configs| Peaks::of(configs, 3));
+    let [small_only, large_only, both] =
+        [vec![&small], vec![&large], vec![&small, &large]].map(|configs| Peaks::of(configs, 3));
     let growing = |plan: Peaks| plan.host - memory::PROGRAM;
-    assert_eq!(both.checkpoint, one.checkpoint + other.checkpoint);
-    assert!(growing(both) > growing(other) && growing(both) <= growing(one) + growing(other));
-    assert!(both.adapter > other.adapter && both.gpu_host > both.host - both.checkpoint);
+    assert_eq!(both.checkpoint, small_only.checkpoint + large_only.checkpoint);
+    assert!(growing(both) > growing(large_only) && growing(both) <= growing(small_only) + growing(large_only));
+    assert!(both.adapter > large_only.adapter && both.gpu_host > both.host - both.checkpoint);
     assert!(memory::copies_checkpoint([&small, &large]));
     assert!(!memory::copies_checkpoint(&[config(40_000)]));
 }
 
-/// With stages, the one that takes most memory counts, wherever it is in the order.
+/// The stage that needs the most memory counts, wherever it is in the order.
 #[test]
-fn stages_take_what_the_largest_takes() {
-    let plain = text(1000, 2, 9, "generations = 1");
+fn the_largest_stage_determines_the_peak() {
+    let plain = config_text(1000, 2, 9, "generations = 1");
     let config = |stages: &str| Config::parse(&[&plain, stages].concat(), "config").unwrap();
     let stage = |from: usize, set: &str| format!("[[stages]]\nfrom = {from}\nset = {{ {set} }}\n");
     let (large, small) = ("learning.episodes_per_team = 5, world.steps = 90", "world.steps = 5");
-    let all = Peaks::of([&config(&stage(0, large))], 3);
-    assert!(all.host > Peaks::of([&config("")], 3).host);
+    let expected = Peaks::of([&config(&stage(0, large))], 3);
+    assert!(expected.host > Peaks::of([&config("")], 3).host);
     for stages in [stage(4, large), stage(2, large) + &stage(4, small), stage(2, small) + &stage(4, large)] {
-        assert_eq!(Peaks::of([&config(&stages)], 3), all, "{stages}");
+        assert_eq!(Peaks::of([&config(&stages)], 3), expected, "{stages}");
     }
 }
 
-/// Records that are large enough to be packed on a GPU take room twice: there may be as much again of what is packed.
+/// Records that are large enough to be packed on a GPU count twice, because packed records may be as large.
 #[test]
-fn packed_records_are_counted() {
+fn packed_records_and_populations_are_counted() {
     let adapter = |population| {
-        let config = Config::parse(&text(population, 2, 1, "generations = 0"), "config").unwrap();
+        let config = Config::parse(&config_text(population, 2, 1, "generations = 0"), "config").unwrap();
         Peaks::of([&config], 1).adapter
     };
-    // Weights and record of a team: 4 leaders of 112 weights; 25 steps of 4 POIs, and 8 followers who see 4 leaders.
+    // Per team, weights and record: 4 leaders of 112 weights; 25 steps of 4 POIs, and 8 followers with 4 leaders each.
     let (weights, record) = (4 * 112 * 4, (25 * 4 + 8 * 4) * 4);
     assert_eq!(adapter(100), 2 * 101 * (weights + record));
-    // By then populations are held, too: a buffer a leader and one more, and the parents.
-    let held = 5 * 112 * 4 + 4 * 4;
-    assert_eq!(adapter(2000), 2 * 2001 * (weights + 2 * record + held));
+    // Populations of this size stay on the device, which takes five more sets of weights per team, and the parents.
+    let population = 5 * 112 * 4 + 4 * 4;
+    assert_eq!(adapter(2000), 2 * 2001 * (weights + 2 * record + population));
 }
 
-/// Episodes of large teams take several dispatches on a GPU. The agents' states between them are counted, too.
+/// Episodes of large teams take several dispatches on a GPU. The agents' states between them must count, too.
 #[test]
 fn states_between_dispatches_are_counted() {
     let text = |agents: usize| {
@@ -160,15 +165,15 @@ fn states_between_dispatches_are_counted() {
         format!("[world]\nleaders = [[1, 1]]\nfollowers = [{followers}]\npois = [[9, 9]]\n[learning]\ntrials = 1\n")
     };
     let config = Config::parse(&text(1024), "config").unwrap();
-    // Weights, record and states of a team: 112 weights; 25 steps of 32 words, and 1023 followers who see one leader.
+    // Per team, weights, record and states: 112 weights; 25 steps of 32 words, and 1023 followers with one leader.
     let (weights, record, states) = (112 * 4, (25 * 32 + 1023) * 4, 1024 * 20);
     assert_eq!(Peaks::of([&config], 1).adapter, 2 * 51 * (weights + record + states) / 2);
 }
 
-/// Writing from the populations and writing from a copy of them give the same file.
+/// A checkpoint written from the populations must equal one written from a copy of them.
 #[test]
-fn checkpoints_need_no_copy() {
-    let config = Config::parse(&text(60, 2, 9, "generations = 1"), "config").unwrap();
+fn checkpoints_from_a_copy_and_a_view_are_equal() {
+    let config = Config::parse(&config_text(60, 2, 9, "generations = 1"), "config").unwrap();
     let mut trainer = Trainer::new([config.validate().unwrap()]);
     for _ in 0..3 {
         trainer.advance(&mut Cpu::default()).unwrap();
@@ -199,13 +204,13 @@ fn checkpoints_need_no_copy() {
         fs::read(checkpoint::path(&path, 3)).unwrap()
     });
     assert!(files[0].len() as u64 > config.policy_bytes() && files[0] == files[1]);
-    let read = checkpoint::read(&checkpoint::path(&folder.path().join("view"), 3), Path::new("none"), &config);
-    let read = read.unwrap().expect("it has its weights");
-    assert_eq!(read.snapshot, trainer.snapshot(0).unwrap());
-    let mut other = Trainer::new([config.validate().unwrap()]);
-    assert!(other.restore(0, read.snapshot));
+    let loaded = checkpoint::read(&checkpoint::path(&folder.path().join("view"), 3), Path::new("none"), &config);
+    let loaded = loaded.unwrap().expect("a checkpoint with weights");
+    assert_eq!(loaded.snapshot, trainer.snapshot(0).unwrap());
+    let mut resumed = Trainer::new([config.validate().unwrap()]);
+    assert!(resumed.restore(0, loaded.snapshot));
     let rows = |trainer: &mut Trainer| trainer.advance(&mut Cpu::default()).unwrap();
-    assert_eq!(rows(&mut other), rows(&mut trainer));
-    assert_eq!(other.policies(0), trainer.policies(0));
-    assert_eq!(other.policies(0), other.ends(&[0]).remove(0).0);
+    assert_eq!(rows(&mut resumed), rows(&mut trainer));
+    assert_eq!(resumed.policies(0), trainer.policies(0));
+    assert_eq!(resumed.policies(0), resumed.ends(&[0]).remove(0).0);
 }
