@@ -1,4 +1,4 @@
-//! `--json`: whatever a command does, its standard output is JSON, and a failure is one object.
+//! Tests `--json`: standard output is always JSON, and a failure is one object.
 
 #![cfg(feature = "cli")]
 
@@ -7,13 +7,13 @@ mod support;
 use serde_json::Value;
 use support::{Place, SMALL};
 
-/// Names that are legal in a file system, and need escapes in JSON, in a shell or in a terminal.
-const NAMES: [&str; 5] = ["a\"b", "back\\slash", "it's", "Zürich – 東京", "{\"code\": 1}"];
-/// Names that no command takes.
-const REFUSED: [&str; 4] = ["line\nbreak", "red\u{1b}[31m", "left\u{202e}right", "c1\u{9b}"];
+/// Names that file systems allow, but that need escapes in JSON, in a shell or in a terminal.
+const ODD_NAMES: [&str; 5] = ["a\"b", "back\\slash", "it's", "Zürich – 東京", "{\"code\": 1}"];
+/// Names that every command rejects.
+const INVALID_NAMES: [&str; 4] = ["line\nbreak", "red\u{1b}[31m", "left\u{202e}right", "c1\u{9b}"];
 
 /// Runs a command with `--json`. Returns its exit code and the objects on standard output, line by line.
-fn told(place: &Place, words: &[&str]) -> (i32, Vec<Value>) {
+fn run_json(place: &Place, words: &[&str]) -> (i32, Vec<Value>) {
     let output = place.run(&[words, &["--json"]].concat());
     let text = String::from_utf8(output.stdout).expect("JSON is UTF-8");
     assert!(text.ends_with('\n'), "{words:?} printed {text:?}");
@@ -21,16 +21,17 @@ fn told(place: &Place, words: &[&str]) -> (i32, Vec<Value>) {
     (output.status.code().unwrap(), text.lines().map(parse).collect())
 }
 
-fn good(place: &Place, words: &[&str]) -> Value {
-    let (code, objects) = told(place, words);
+/// Runs a command that must succeed, and returns its object.
+fn result(place: &Place, words: &[&str]) -> Value {
+    let (code, objects) = run_json(place, words);
     assert_eq!((code, objects.len()), (0, 1), "{words:?}: {objects:?}");
     assert!(objects[0].get("code").is_none(), "{words:?}: {objects:?}");
     objects.into_iter().next().unwrap()
 }
 
-/// Runs a command that must fail as it does without `--json`, and returns its code and message.
-fn failed(place: &Place, words: &[&str]) -> (String, String) {
-    let (code, objects) = told(place, words);
+/// Runs a command that must fail with the same exit code with and without `--json`. Returns its error code and message.
+fn failure(place: &Place, words: &[&str]) -> (String, String) {
+    let (code, objects) = run_json(place, words);
     assert_eq!(place.run(words).status.code(), Some(code), "{words:?}");
     let [object] = &objects[..] else { panic!("{words:?}: {objects:?}") };
     let names: Vec<_> = object.as_object().unwrap().keys().map(String::as_str).collect();
@@ -42,12 +43,12 @@ fn failed(place: &Place, words: &[&str]) -> (String, String) {
 }
 
 #[test]
-fn results_in_hostile_names_are_json() {
+fn names_that_need_escapes_give_valid_json() {
     let place = Place::new(&[]).on_cpu();
-    for name in NAMES {
+    for name in ODD_NAMES {
         let config = format!("{name}.toml");
         place.write(&config, SMALL);
-        let trained = good(&place, &["train", &config, "--out", name]);
+        let trained = result(&place, &["train", &config, "--out", name]);
         assert_eq!((&trained["folder"], &trained["config"]), (&name.into(), &name.into()));
         for field in ["backend", "description", "adapter", "driver", "threads"] {
             assert!(trained.get(field).is_some(), "{field}");
@@ -57,38 +58,40 @@ fn results_in_hostile_names_are_json() {
         let plotted = place.command().args(["plot", name, "--out", &picture, "--json"]).output().unwrap();
         let plotted: Value = serde_json::from_slice(&plotted.stdout).unwrap();
         assert_eq!(plotted["out"], *picture);
-        let replayed = good(&place, &["replay", name]);
+        let replayed = result(&place, &["replay", name]);
         assert!(replayed["out"].as_str().unwrap().starts_with(name), "{replayed}");
-        assert_eq!(good(&place, &["rollout", name])["backend"], "cpu");
+        assert_eq!(result(&place, &["rollout", name])["backend"], "cpu");
     }
     let place = Place::new(&[("x.toml", SMALL)]);
-    let other = &["--set", "learning.seed=1", "--backend", "cpu"][..];
-    for (name, flags) in [(NAMES[0], &other[2..]), (NAMES[1], other)] {
-        good(&place, &[&["train", "x.toml", "--out", name], flags].concat());
+    let other_seed = &["--set", "learning.seed=1", "--backend", "cpu"][..];
+    for (name, flags) in [(ODD_NAMES[0], &other_seed[2..]), (ODD_NAMES[1], other_seed)] {
+        result(&place, &[&["train", "x.toml", "--out", name], flags].concat());
     }
-    let compared = good(&place, &["compare", NAMES[0], NAMES[1]]);
+    let compared = result(&place, &["compare", ODD_NAMES[0], ODD_NAMES[1]]);
     let folders = compared["comparisons"][0]["arms"].as_array().unwrap().iter().map(|arm| &arm["folders"][0]);
-    assert_eq!(folders.collect::<Vec<_>>(), NAMES[..2].iter().collect::<Vec<_>>());
+    assert_eq!(folders.collect::<Vec<_>>(), ODD_NAMES[..2].iter().collect::<Vec<_>>());
 }
 
 #[test]
-fn commands_that_train_nothing_print_json() {
+fn other_commands_print_json() {
     let sweep = SMALL.replace("coupling = 2\n", "") + "[grid]\n\"world.coupling\" = [1, 2]\n";
     let place = Place::new(&[("x.toml", SMALL), ("s.toml", &sweep)]);
     let cpu = ["--backend", "cpu"];
-    assert!(good(&place, &["check", "x.toml"])["cost"].is_object());
-    assert!(good(&place, &["devices"])["cpu"].is_string());
+    assert!(result(&place, &["check", "x.toml"])["cost"].is_object());
+    assert!(result(&place, &["devices"])["cpu"].is_string());
     let flags = ["--generations", "1", "--population", "8", "--paradigm", "all-leaders"];
-    let flags = good(&place, &[&["baseline", "x.toml", "--seeds", "2"], &flags[..], &cpu].concat());
-    assert_eq!(flags["teams"], 16);
+    let with_flags = result(&place, &[&["baseline", "x.toml", "--seeds", "2"], &flags[..], &cpu].concat());
+    assert_eq!(with_flags["teams"], 16);
     let baseline = ["baseline", "x.toml", "--seeds", "2", "--set", "learning.generations=1"];
-    let baseline = good(&place, &[&baseline[..], &cpu].concat());
-    // A generation after the random one: two generations of 8 random teams.
+    let baseline = result(&place, &[&baseline[..], &cpu].concat());
+    // Two generations of 8 random teams: generation 0, and generation 1 as in training.
     assert_eq!((&baseline["backend"], &baseline["teams"]), (&"cpu".into(), &16.into()));
-    let swept = good(&place, &[&["sweep", "s.toml", "--out", NAMES[0]][..], &cpu].concat());
+    let swept = result(&place, &[&["sweep", "s.toml", "--out", ODD_NAMES[0]][..], &cpu].concat());
     assert_eq!(swept["points"].as_array().unwrap().len(), 2);
-    let (code, lines) =
-        told(&place, &[&["bench", "x.toml", "--rollout-only", "--teams", "4,8", "--agents", "6"][..], &cpu].concat());
+    let (code, lines) = run_json(
+        &place,
+        &[&["bench", "x.toml", "--rollout-only", "--teams", "4,8", "--agents", "6"][..], &cpu].concat(),
+    );
     assert_eq!((code, lines.len()), (0, 2));
     assert!(lines.iter().all(|line| line["backend"] == "cpu" && line["description"].is_string()));
     let report = ["verify", "x.toml", "--set", "world.steps=2", "--teams", "2", "--report", "r.json"];
@@ -99,12 +102,12 @@ fn commands_that_train_nothing_print_json() {
 }
 
 #[test]
-fn failures_are_one_object() {
+fn failures_print_one_object() {
     let place =
         Place::new(&[("x.toml", SMALL), ("text", "no folder"), ("bad.toml", "\"\u{202e}\\\"\" = 1\n[world]\n")]);
     let cpu = ["--backend", "cpu"];
-    good(&place, &[&["train", "x.toml", "--out", "run"][..], &cpu].concat());
-    let on_cpu = |words: &[&str]| failed(&place, &[words, &cpu].concat()).0;
+    result(&place, &[&["train", "x.toml", "--out", "run"][..], &cpu].concat());
+    let on_cpu = |words: &[&str]| failure(&place, &[words, &cpu].concat()).0;
     assert_eq!(on_cpu(&["train", "none.toml"]), "config_unreadable");
     assert_eq!(on_cpu(&["train", "bad.toml"]), "config_invalid");
     assert_eq!(on_cpu(&["train", "x.toml", "--set", "world.steps=0"]), "usage");
@@ -124,20 +127,20 @@ fn failures_are_one_object() {
     assert_eq!(on_cpu(&["sweep", "x.toml", "--collect"]), "config_invalid");
     assert_eq!(on_cpu(&["bench", "x.toml", "--teams", "0"]), "usage");
     assert_eq!(on_cpu(&["baseline", "none.toml"]), "config_unreadable");
-    assert_eq!(failed(&place, &["compare", "run"]).0, "usage");
-    assert_eq!(failed(&place, &["plot", "text", "--out", "a.svg"]).0, "no_run");
-    assert_eq!(failed(&place, &["plot", "run", "--out", "a.doc"]).0, "usage");
-    assert_eq!(failed(&place, &["check", "none.toml"]).0, "config_unreadable");
-    assert_eq!(failed(&place, &["verify", "--set", "world.steps=3"]).0, "usage");
-    assert_eq!(failed(&place, &["no-such-command"]).0, "usage");
+    assert_eq!(failure(&place, &["compare", "run"]).0, "usage");
+    assert_eq!(failure(&place, &["plot", "text", "--out", "a.svg"]).0, "no_run");
+    assert_eq!(failure(&place, &["plot", "run", "--out", "a.doc"]).0, "usage");
+    assert_eq!(failure(&place, &["check", "none.toml"]).0, "config_unreadable");
+    assert_eq!(failure(&place, &["verify", "--set", "world.steps=3"]).0, "usage");
+    assert_eq!(failure(&place, &["no-such-command"]).0, "usage");
     place.write("run/config.toml", SMALL.replace("steps = 9", "steps = 8"));
-    assert_eq!(failed(&place, &["plot", "run", "--out", "a.svg"]).0, "damaged");
-    for name in REFUSED {
-        let (code, message) = failed(&place, &["check", name]);
+    assert_eq!(failure(&place, &["plot", "run", "--out", "a.svg"]).0, "damaged");
+    for name in INVALID_NAMES {
+        let (code, message) = failure(&place, &["check", name]);
         assert!(code == "usage" && !message.contains(name), "{message}");
     }
-    for name in NAMES {
-        let (code, message) = failed(&place, &["check", name]);
+    for name in ODD_NAMES {
+        let (code, message) = failure(&place, &["check", name]);
         assert!(code == "config_unreadable" && message.contains(name), "{message}");
     }
 }
@@ -150,7 +153,7 @@ fn every_command_with_json_fails_in_json() {
         if command.get_arguments().any(|arg| arg.get_long() == Some("json")) {
             let name = command.get_name();
             for word in ["--no-such-flag", "--a\"b", "--\\", "--\u{2028}", "--red\u{1b}[31m", "--left\u{202e}right\n"] {
-                assert_eq!(failed(&place, &[name, word]).0, "usage", "{name} {word:?}");
+                assert_eq!(failure(&place, &[name, word]).0, "usage", "{name} {word:?}");
             }
             count += 1;
         }
@@ -159,13 +162,13 @@ fn every_command_with_json_fails_in_json() {
 }
 
 #[test]
-fn points_that_are_missing_are_part_of_the_results() {
+fn collect_reports_missing_points() {
     let sweep = SMALL.replace("coupling = 2\n", "") + "[grid]\n\"world.coupling\" = [1, 2]\n";
     let place = Place::new(&[("s.toml", &sweep)]);
     let cpu = ["--backend", "cpu"];
-    let (code, shard) = told(&place, &[&["sweep", "s.toml", "--out", "s", "--shard", "1/2"][..], &cpu].concat());
+    let (code, shard) = run_json(&place, &[&["sweep", "s.toml", "--out", "s", "--shard", "1/2"][..], &cpu].concat());
     assert_eq!((code, shard.len()), (0, 1));
-    let (code, collected) = told(&place, &[&["sweep", "s.toml", "--out", "s", "--collect"][..], &cpu].concat());
+    let (code, collected) = run_json(&place, &[&["sweep", "s.toml", "--out", "s", "--collect"][..], &cpu].concat());
     assert_eq!((code, collected.len()), (1, 1));
     let points = collected[0]["points"].as_array().unwrap();
     assert_eq!(points.iter().filter(|point| point["missing"].is_string()).count(), 1);
