@@ -1,6 +1,6 @@
-//! Pictures, pixel by pixel, beside kept references. `FLOTILLA_WRITE=1` writes the references anew.
+//! Compares pictures with saved references, pixel by pixel. `FLOTILLA_WRITE=1` writes the references again.
 //!
-//! `tests/pictures.py` compares SVG, as another program draws it, with PNG.
+//! `tests/pictures.py` compares SVG files, drawn by another program, with PNG files.
 
 #![cfg(feature = "cli")]
 
@@ -12,14 +12,14 @@ use std::path::Path;
 
 use support::{Place, tiny};
 
-/// Pictures of a small run: the file's name, and the command that draws it.
+/// Pictures of a small run: the name of the reference, and the command that draws it.
 const PICTURES: [(&str, &str); 4] = [
     ("layout", "check small.toml"),
     ("curves", "plot run"),
     ("comparison", "plot run other"),
     ("still", "replay run --quiet"),
 ];
-/// References are smaller than pictures by this factor, and grey.
+/// References are smaller than the pictures by this factor, and grey.
 const SHRINK: usize = 4;
 
 /// The pixels of a picture, row by row.
@@ -30,7 +30,7 @@ struct Pixels {
 }
 
 impl Pixels {
-    fn of_png(bytes: &[u8]) -> Pixels {
+    fn from_png(bytes: &[u8]) -> Pixels {
         let mut reader = png::Decoder::new(Cursor::new(bytes)).read_info().unwrap();
         let mut content = vec![0; reader.output_buffer_size().unwrap()];
         let frame = reader.next_frame(&mut content).unwrap();
@@ -42,7 +42,8 @@ impl Pixels {
         Pixels { width: frame.width as usize, height: frame.height as usize, colors }
     }
 
-    fn small(&self) -> Pixels {
+    /// Returns a grey picture, smaller by [`SHRINK`].
+    fn shrunk(&self) -> Pixels {
         let (width, height) = (self.width / SHRINK, self.height / SHRINK);
         let grey = |at: usize| {
             let (x, y) = (at % width * SHRINK, at / width * SHRINK);
@@ -53,10 +54,10 @@ impl Pixels {
         Pixels { width, height, colors: (0..width * height).map(grey).collect() }
     }
 
-    /// The share of pixels of which a colour differs by more than `most`.
-    fn differing(&self, other: &Pixels, most: u8) -> f64 {
+    /// Returns the share of pixels in which a colour differs by more than `tolerance`.
+    fn differing(&self, other: &Pixels, tolerance: u8) -> f64 {
         assert_eq!((self.width, self.height), (other.width, other.height));
-        let differs = |(a, b): (&[u8; 3], &[u8; 3])| (0..3).any(|color| a[color].abs_diff(b[color]) > most);
+        let differs = |(a, b): (&[u8; 3], &[u8; 3])| (0..3).any(|color| a[color].abs_diff(b[color]) > tolerance);
         let count = self.colors.iter().zip(&other.colors).filter(|&pair| differs(pair)).count();
         count as f64 / self.colors.len() as f64
     }
@@ -82,19 +83,19 @@ fn draw(place: &Place, command: &str, file: &str) -> Vec<u8> {
 }
 
 #[test]
-fn pictures_look_like_their_references() {
+fn pictures_equal_their_references() {
     let place = place();
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/pictures");
     for (name, command) in PICTURES {
-        let drawn = Pixels::of_png(&draw(&place, command, "x.png")).small();
+        let drawn = Pixels::from_png(&draw(&place, command, "x.png")).shrunk();
         let path = folder.join(format!("{name}.png"));
         if std::env::var("FLOTILLA_WRITE").is_ok_and(|write| write == "1") {
             drawn.write(&path);
         }
-        let kept = Pixels::of_png(&fs::read(&path).unwrap());
+        let reference = Pixels::from_png(&fs::read(&path).unwrap());
         let size = |pixels: &Pixels| (pixels.width, pixels.height);
-        assert_eq!(size(&drawn), size(&kept), "{name}");
-        let differing = drawn.differing(&kept, 8);
+        assert_eq!(size(&drawn), size(&reference), "{name}");
+        let differing = drawn.differing(&reference, 8);
         assert!(differing == 0.0, "{name}: {differing} of the pixels differ from {}", path.display());
     }
 }

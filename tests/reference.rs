@@ -1,4 +1,4 @@
-//! `docs/reference/config.md` says what the table of keys says. `FLOTILLA_WRITE=1` writes the page anew.
+//! Tests that `docs/reference/config.md` agrees with the table of keys. `FLOTILLA_WRITE=1` writes the page again.
 
 use std::fmt::Write;
 
@@ -33,7 +33,7 @@ Any number of stages, in order of `from`. Each starts from the file's own keys a
 | `set` |  | table of keys | any of the keys above but `policy.*`, `checkpoint.*`, `learning.paradigm`, `sharing`, `population`, `elites`, `parents`, `method`, `search_sigma`, `generations`, `trials` and `seed`; as many leaders learn | `{}` | the keys that differ from the file, `{ \"world.coupling\" = 1 }` | 2.1 |
 ";
 
-/// A cell of a Markdown table.
+/// Returns text as a cell of a Markdown table.
 fn cell(text: &str) -> String {
     text.replace('|', "\\|")
 }
@@ -59,18 +59,18 @@ fn section(key: &Definition) -> &str {
 }
 
 #[test]
-fn the_page_says_what_the_table_of_keys_says() {
+fn the_page_agrees_with_the_table_of_keys() {
     let page = page();
     if std::env::var("FLOTILLA_WRITE").as_deref() == Ok("1") {
         std::fs::write(PAGE, &page).unwrap();
     }
-    let there = std::fs::read_to_string(PAGE).unwrap();
-    let differs = there.lines().zip(page.lines()).find(|(there, page)| there != page);
-    assert!(there == page, "{PAGE} is out of date ({differs:?}); FLOTILLA_WRITE=1 cargo test --test reference");
+    let written = std::fs::read_to_string(PAGE).unwrap();
+    let difference = written.lines().zip(page.lines()).find(|(written, page)| written != page);
+    assert!(written == page, "{PAGE} is out of date ({difference:?}); FLOTILLA_WRITE=1 cargo test --test reference");
 }
 
 #[test]
-fn every_key_is_told_of_once_and_in_the_order_of_a_config() {
+fn keys_are_in_the_order_of_a_config_with_correct_defaults() {
     let keys = config::keys();
     let smallest = "[world]\nleaders = [[1, 2], [3, 4], [5, 6]]\npois = [[3, 4]]\n";
     let config = Config::parse(smallest, "smallest").unwrap();
@@ -85,7 +85,7 @@ fn every_key_is_told_of_once_and_in_the_order_of_a_config() {
     assert_eq!(names, keys.iter().map(|key| key.name).collect::<Vec<_>>());
     for key in &keys {
         assert!(!key.meaning.is_empty() && !key.meaning.ends_with('.') && !key.range.is_empty(), "{key:?}");
-        // A default written out is the default.
+        // Setting a key to its documented default must change nothing.
         if let Some(default) = &key.default {
             let set = Override { key: key.name.into(), text: default.clone(), name: key.name.into() };
             assert_eq!(config.with(&[set]).as_ref(), Ok(&config), "{}", key.name);
@@ -94,12 +94,12 @@ fn every_key_is_told_of_once_and_in_the_order_of_a_config() {
     assert_eq!(config.world.coupling, Coupling::Same(3));
 }
 
-/// The ranges are those that a config is held to: their ends are taken, and what is beyond is refused.
+/// The ends of each documented range must be valid, and values beyond them invalid.
 #[test]
-fn ranges_are_those_that_configs_are_held_to() {
-    // Keys left out give way to the one that is set.
+fn documented_ranges_equal_those_of_validation() {
+    // Only the tested key is set.
     let smallest = "[world]\nleaders = [[1, 2]]\npois = [[3, 4]]\n";
-    let holds = |key: &Definition, text: String| {
+    let is_valid = |key: &Definition, text: String| {
         let set = Override { key: key.name.into(), text, name: key.name.into() };
         Config::read(smallest, "smallest", &[], &[set]).is_ok()
     };
@@ -111,12 +111,12 @@ fn ranges_are_those_that_configs_are_held_to() {
         };
         checked += 1;
         let zero = key.range.starts_with("0 ") || (low < 0.0 && 0.0 < high);
-        assert_eq!(holds(key, "0".into()), zero, "{key:?}");
-        assert_eq!(holds(key, "inf".into()), key.range.contains("inf"), "{key:?}");
+        assert_eq!(is_valid(key, "0".into()), zero, "{key:?}");
+        assert_eq!(is_valid(key, "inf".into()), key.range.contains("inf"), "{key:?}");
         if key.kind == "number" {
-            assert!(holds(key, format!("{low:e}")) && holds(key, format!("{high:e}")), "{key:?}");
-            assert!(!holds(key, format!("{:e}", low - low.abs() * 1e-6 - 1e-12)), "{key:?}");
-            assert!(!holds(key, format!("{:e}", high * (1.0 + 1e-6))), "{key:?}");
+            assert!(is_valid(key, format!("{low:e}")) && is_valid(key, format!("{high:e}")), "{key:?}");
+            assert!(!is_valid(key, format!("{:e}", low - low.abs() * 1e-6 - 1e-12)), "{key:?}");
+            assert!(!is_valid(key, format!("{:e}", high * (1.0 + 1e-6))), "{key:?}");
         }
     }
     assert!(checked >= 20, "{checked}");

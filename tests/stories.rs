@@ -1,9 +1,11 @@
-//! The paper's claims (Sections 1, 5 and 6, Figures 4 to 6) over 200 trials: the tables of docs/results/claims.md,
-//! docs/results/claims-measured.md and docs/results/claims/measured.csv are what comes out, whether the claims hold or not.
+//! Tests the results of the paper's claims (Sections 1, 5 and 6, Figures 4 to 6) over 200 trials.
 //!
-//! docs/results/claims/trials.csv has every trial's result at generation 100. The first trials are trained again, and
-//! the means on the page are those of the file. `FLOTILLA_LONG=1 cargo test --release --test stories` trains all of it;
-//! with `FLOTILLA_WRITE_CLAIMS=1` it writes file, tables and figures anew.
+//! The tables of docs/results/claims.md and docs/results/claims-measured.md, and the files docs/results/claims/*.csv,
+//! must have these results, whether the claims hold or not. trials.csv has every trial's result at generation 100.
+//!
+//! By default the first three trials are trained again, and the means on the page are compared with trials.csv.
+//! `FLOTILLA_LONG=1 cargo test --release --test stories` trains everything. With `FLOTILLA_WRITE_CLAIMS=1` as well, it
+//! writes the files, tables and figures again.
 
 #![cfg(feature = "cli")]
 
@@ -24,7 +26,7 @@ const SEED: u32 = 777;
 const LAST: usize = 100;
 
 /// Trains the paper's experiments.
-fn trained(trials: usize) -> Vec<Experiment> {
+fn train_experiments(trials: usize) -> Vec<Experiment> {
     let set = |key: &str, value: u32| Override::new(key, value, key);
     let mut arms = paper::arms(&[set("learning.trials", trials as u32), set("learning.seed", SEED)]).unwrap();
     let learning = &arms[0].config.learning;
@@ -32,8 +34,8 @@ fn trained(trials: usize) -> Vec<Experiment> {
     let (configs, places) = paper::trained(&arms);
     let mut trainer = Trainer::new(ValidConfig::all(&configs).unwrap());
     for row in trainer.finish(&mut Cpu::default()).unwrap() {
-        let of = (0..arms.len()).filter(|&arm| places[arm] == row.experiment);
-        of.for_each(|arm| arms[arm].add(&Row { experiment: arm, ..row }));
+        let shared = (0..arms.len()).filter(|&arm| places[arm] == row.experiment);
+        shared.for_each(|arm| arms[arm].add(&Row { experiment: arm, ..row }));
     }
     arms
 }
@@ -42,8 +44,9 @@ fn root(path: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join(path)
 }
 
-/// One row per arm: its name, and for each trial a digit, the POIs that the champion and the best team observe.
-fn listed(arms: &[Experiment]) -> String {
+/// Returns one row per experiment: its name, then one digit per trial for the POIs that the champion observed, and one
+/// digit per trial for those of the best team.
+fn trials_csv(arms: &[Experiment]) -> String {
     let mut text = String::from("arm,champion_pois,best_pois\n");
     for arm in arms {
         let digits = |g: &[Vec<f64>]| -> String {
@@ -55,13 +58,13 @@ fn listed(arms: &[Experiment]) -> String {
 }
 
 #[test]
-fn the_file_of_trials_is_what_comes_out() {
+fn trials_csv_agrees_with_training_and_the_page() {
     let text = fs::read_to_string(root("docs/results/claims/trials.csv")).unwrap();
     let page = fs::read_to_string(root("docs/results/claims.md")).unwrap();
-    let arms = trained(3);
+    let arms = train_experiments(3);
     let mut table = csv::Reader::from_reader(text.as_bytes());
     let mut rows = table.records().map(Result::unwrap);
-    for line in listed(&arms).lines().skip(1) {
+    for line in trials_csv(&arms).lines().skip(1) {
         let row = rows.next().unwrap();
         let (name, results) = line.rsplit_once("\",").unwrap();
         assert_eq!(&row[0], name.trim_matches('"'));
@@ -77,17 +80,17 @@ fn the_file_of_trials_is_what_comes_out() {
         let cell = format!("{:.2} [{:.2}, {:.2}] ({best:.2})", mean.value, mean.low, mean.high);
         let name = format!("| {}, {} ", arm.layout.name, arm.paradigm);
         let line = page.lines().find(|line| line.starts_with(&name)).unwrap();
-        // Agents that choose among behaviours are not in this table.
+        // Experiments with behaviours are not in this table.
         assert!(arm.selects || line.contains(&cell), "{}: {cell}", arm.name());
     }
 }
 
 #[test]
-fn the_pages_tell_what_comes_out() {
+fn pages_agree_with_the_full_study() {
     if !std::env::var("FLOTILLA_LONG").is_ok_and(|long| long == "1") {
         return;
     }
-    let arms = trained(TRIALS);
+    let arms = train_experiments(TRIALS);
     let mut baselines = Baselines::new(paper::grounds(&arms));
     while !baselines.is_done() {
         baselines.advance(&mut Cpu::default()).unwrap();
@@ -97,7 +100,7 @@ fn the_pages_tell_what_comes_out() {
     let claims = claims::claims(results);
     let (baseline, heading) = (tables::without_learning(results), tables::heading(&arms[0].config.learning, &claims));
     let [meaning, pois, race] = baseline.split("\n\n").collect::<Vec<_>>()[..] else { panic!("{baseline}") };
-    for (name, text) in [("trials.csv", listed(&arms)), ("measured.csv", comma_separated(&tables::full(&claims)))] {
+    for (name, text) in [("trials.csv", trials_csv(&arms)), ("measured.csv", comma_separated(&tables::full(&claims)))] {
         let path = root("docs/results/claims").join(name);
         match std::env::var_os("FLOTILLA_WRITE_CLAIMS") {
             Some(_) => fs::write(path, text).unwrap(),
@@ -113,8 +116,8 @@ fn the_pages_tell_what_comes_out() {
             None => assert_eq!(fs::read_to_string(path).unwrap(), svg, "figure {number}"),
         }
     }
-    holds("docs/results/claims.md", &format!("{meaning}\n\n{heading}\n\n{pois}\n"));
-    holds("docs/results/claims-measured.md", &format!("{race}\n{}", tables::verdicts(&claims)));
+    check_or_write_page("docs/results/claims.md", &format!("{meaning}\n\n{heading}\n\n{pois}\n"));
+    check_or_write_page("docs/results/claims-measured.md", &format!("{race}\n{}", tables::verdicts(&claims)));
 }
 
 /// Returns a Markdown table as comma-separated values.
@@ -127,20 +130,20 @@ fn comma_separated(table: &str) -> String {
     String::from_utf8(rows.into_inner().unwrap()).unwrap()
 }
 
-/// Fails unless a page has this between its marks, or puts it there if that is asked for.
-fn holds(page: &str, text: &str) {
+/// Fails unless the page has this text between its marks. With `FLOTILLA_WRITE_CLAIMS`, writes it there instead.
+fn check_or_write_page(page: &str, text: &str) {
     const MARKS: [&str; 2] = ["<!-- what comes out: cargo test --test stories -->\n", "<!-- so far -->\n"];
     let path = root(page);
-    let whole = fs::read_to_string(&path).unwrap();
-    let (before, rest) = whole.split_once(MARKS[0]).unwrap_or_else(|| panic!("{page} has no {:?}", MARKS[0]));
-    let (there, after) = rest.split_once(MARKS[1]).unwrap_or_else(|| panic!("{page} has no {:?}", MARKS[1]));
-    let here = format!("\n{text}\n");
+    let text_of_page = fs::read_to_string(&path).unwrap();
+    let (before, rest) = text_of_page.split_once(MARKS[0]).unwrap_or_else(|| panic!("{page} has no {:?}", MARKS[0]));
+    let (expected, after) = rest.split_once(MARKS[1]).unwrap_or_else(|| panic!("{page} has no {:?}", MARKS[1]));
+    let actual = format!("\n{text}\n");
     if std::env::var_os("FLOTILLA_WRITE_CLAIMS").is_some() {
-        fs::write(&path, [before, MARKS[0], &here, MARKS[1], after].concat()).unwrap();
-    } else if there != here {
-        let differs = there.lines().zip(here.lines()).find(|(there, here)| there != here);
+        fs::write(&path, [before, MARKS[0], &actual, MARKS[1], after].concat()).unwrap();
+    } else if expected != actual {
+        let difference = expected.lines().zip(actual.lines()).find(|(expected, actual)| expected != actual);
         panic!(
-            "{page} does not tell what comes out; there, and here: {differs:#?}\n(see the head of tests/stories.rs)"
+            "{page} differs from the results; on the page and now: {difference:#?}\n(see the head of tests/stories.rs)"
         );
     }
 }

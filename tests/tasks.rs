@@ -1,7 +1,9 @@
-//! The tasks in `configs/tasks/`, and scripted teams that solve some of them.
+//! Tests the tasks in `configs/tasks/`, with scripted teams that solve some of them.
 //!
-//! A scripted team is a table beside the config, `leader,until,x,y,speed`. Before step `until`, the leader drives to a
-//! place with at most this speed, and waits there. Rows of a leader are in order.
+//! A scripted team is a table next to the config, with the columns `leader,until,x,y,speed`. Before step `until`, the
+//! leader drives to a place with at most this speed, and waits there. A leader's rows are in order.
+//!
+//! `FLOTILLA_TRACE=1` prints positions every five steps. `FLOTILLA_TASKS=DIR` tests the tasks in another directory.
 
 #![cfg(feature = "cli")]
 
@@ -13,7 +15,7 @@ use assert_cmd::cargo::cargo_bin_cmd;
 use flotilla::Config;
 use tempfile::TempDir;
 
-fn files(ending: &str) -> Vec<PathBuf> {
+fn task_files(ending: &str) -> Vec<PathBuf> {
     let folder = std::env::var_os("FLOTILLA_TASKS").map(PathBuf::from);
     let folder = folder.unwrap_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("configs/tasks"));
     let paths = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
@@ -30,7 +32,7 @@ struct Leg {
     speed: f32,
 }
 
-/// Drives one team by a script, and returns the step at which each POI was observed.
+/// Plays one team by a script, and returns the step at which each POI was first observed.
 fn play(config: &Config, script: &[Leg]) -> Vec<Option<u32>> {
     let mut stepper = flotilla::stepper(config, 1, false).unwrap();
     let leaders = config.learners();
@@ -41,18 +43,21 @@ fn play(config: &Config, script: &[Leg]) -> Vec<Option<u32>> {
         let states = stepper.states();
         for (leader, action) in actions.chunks_exact_mut(2).enumerate() {
             let Some(leg) = script.iter().find(|leg| leg.leader == leader && step < leg.until) else { continue };
-            let at = |of: &[f32]| [of[2 * leader], of[2 * leader + 1]];
-            let ([x, y], [ahead, up]) = (at(states.positions), at(states.headings));
+            let vector = |vectors: &[f32]| [vectors[2 * leader], vectors[2 * leader + 1]];
+            let ([x, y], [ahead, up]) = (vector(states.positions), vector(states.headings));
             let (dx, dy) = (leg.place[0] - x, leg.place[1] - y);
             let distance = dx.hypot(dy);
             let turn = (ahead * dy - up * dx).atan2(ahead * dx + up * dy);
             action[0] = turn / PI;
-            // Slow down near the place, and where it is not ahead.
+            // Slow down near the place, and if it is not ahead.
             let speed = leg.speed.min(2.0 * distance) * turn.cos().max(0.0);
             action[1] = 2.0 * speed / config.motion.max_speed as f32 - 1.0;
         }
         stepper.step(&actions).unwrap();
-        for (first, _) in observed.iter_mut().zip(stepper.observed()).filter(|(first, seen)| first.is_none() && **seen)
+        for (first, _) in observed
+            .iter_mut()
+            .zip(stepper.observed())
+            .filter(|(first, observed_now)| first.is_none() && **observed_now)
         {
             *first = Some(step + 1);
         }
@@ -67,7 +72,7 @@ fn play(config: &Config, script: &[Leg]) -> Vec<Option<u32>> {
 
 #[test]
 fn scripted_teams_observe_every_poi() {
-    let scripts = files("csv");
+    let scripts = task_files("csv");
     for path in &scripts {
         let config = Config::load(&path.with_extension("toml")).unwrap();
         let mut table = csv::Reader::from_path(path).unwrap();
@@ -88,16 +93,16 @@ fn scripted_teams_observe_every_poi() {
             "{}: {observed:?}",
             path.display()
         );
-        // Without its script, the team observes nothing that way.
+        // A team that does not move observes nothing, so the script matters.
         assert!(play(&config, &[]).iter().all(Option::is_none), "{}", path.display());
     }
     assert!(!scripts.is_empty());
 }
 
-/// The page's table between these marks is what the command above it prints.
+/// Between these marks, the page has what the test below prints.
 const MARKS: [&str; 2] = ["<!-- what comes out: cargo test --test tasks -->\n", "<!-- so far -->\n"];
 
-/// Runs `flotilla tasks` without large populations, and returns its exit code and what it prints.
+/// Runs `flotilla tasks` without large populations. Returns its exit code, standard output and standard error.
 fn run(folder: &Path, line: &str) -> (Option<i32>, String, String) {
     let line = format!("tasks {line} --population 0 --backend cpu --quiet");
     let output = cargo_bin_cmd!("flotilla").args(line.split_whitespace()).current_dir(folder).output().unwrap();
@@ -105,16 +110,16 @@ fn run(folder: &Path, line: &str) -> (Option<i32>, String, String) {
     (output.status.code(), text(output.stdout), text(output.stderr))
 }
 
-/// Where results change on purpose, `FLOTILLA_WRITE_TASKS=1 cargo test --test tasks` writes the table anew.
+/// If results change on purpose, `FLOTILLA_WRITE_TASKS=1 cargo test --test tasks` writes the page's table again.
 #[test]
-fn no_baseline_and_no_small_population_solves_a_task() {
+fn baselines_and_small_populations_do_not_solve_tasks() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/results/tasks.md");
     let page = fs::read_to_string(&path).unwrap();
-    let tasks = files("toml");
+    let tasks = task_files("toml");
     assert!(tasks.len() >= 8, "{tasks:?}");
     for task in &tasks {
         let name = task.file_stem().unwrap().to_str().unwrap();
-        assert!(page.contains(&format!("(tasks/{name}.svg)")), "{name} has no picture");
+        assert!(page.contains(&format!("(tasks/{name}.svg)")), "{name} has no picture on the page");
         assert!(path.with_file_name("tasks").join(name).with_extension("svg").is_file(), "{name}");
     }
     let list: Vec<String> = tasks.iter().map(|task| task.display().to_string()).collect();
@@ -123,27 +128,27 @@ fn no_baseline_and_no_small_population_solves_a_task() {
     println!("{table}");
     assert_eq!(code, Some(0), "{error}");
     let (before, rest) = page.split_once(MARKS[0]).unwrap();
-    let (there, after) = rest.split_once(MARKS[1]).unwrap();
-    let here = format!("\n{table}");
+    let (expected, after) = rest.split_once(MARKS[1]).unwrap();
+    let actual = format!("\n{table}");
     match std::env::var_os("FLOTILLA_WRITE_TASKS") {
-        Some(_) => fs::write(&path, [before, MARKS[0], &here, MARKS[1], after].concat()).unwrap(),
-        None => assert_eq!(there, here, "docs/results/tasks.md"),
+        Some(_) => fs::write(&path, [before, MARKS[0], &actual, MARKS[1], after].concat()).unwrap(),
+        None => assert_eq!(expected, actual, "docs/results/tasks.md"),
     }
 }
 
 #[test]
-fn a_task_resumes_and_one_that_a_constant_speed_solves_is_refused() {
+fn tasks_resume_and_those_that_a_constant_speed_solves_fail() {
     let folder = TempDir::new().unwrap();
     let run = |line: &str| run(folder.path(), &format!("{line} --trials 2"));
     let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("configs");
     let file = |name: &str| configs.join(name).display().to_string();
-    let (task, easy) = (file("tasks/return.toml"), file("strictly_forward.toml"));
+    let (task, solved) = (file("tasks/return.toml"), file("strictly_forward.toml"));
     let (code, table, error) = run(&format!("{task} --out a"));
     assert_eq!(code, Some(0), "{error}");
-    // The same command resumes, and does not write over the runs by itself.
+    // Without `--resume`, the same command does not overwrite the runs.
     assert_eq!(run(&format!("{task} --out a --resume")).1, table);
     assert_eq!(run(&format!("{task} --out a")).0, Some(1));
-    let (code, _, error) = run(&format!("{easy} --out b"));
+    let (code, _, error) = run(&format!("{solved} --out b"));
     assert!(code == Some(1) && error.contains("G of the best constant speed is 1.00"), "{error}");
     let (code, _, error) = run(&format!("{task} {task} --out c"));
     assert!(code == Some(2) && error.contains("two configs"), "{error}");
