@@ -204,7 +204,7 @@ fn names_that_differ_print_differently() {
     assert_eq!(texts[0].replace(r"\xff", r"\xfe"), texts[1]);
 }
 
-/// Overwrites a part of a file with as many bytes.
+/// Overwrites a part of a file with the same number of bytes.
 fn replace(bytes: &mut [u8], from: &[u8], to: &[u8]) {
     let start = bytes.windows(from.len()).position(|part| part == from).unwrap();
     bytes[start..start + to.len()].copy_from_slice(to);
@@ -221,7 +221,7 @@ fn a_run_resumes_from_an_impossible_training_time() {
         let path = checkpoint::path(&checkpoints, generation);
         let original = checkpoint::read(&path, &place.path("run/policies.safetensors"), &config).unwrap();
         let mut forged = original.unwrap();
-        // As many characters as the time that replaces it.
+        // Has as many characters as its replacement below.
         forged.seconds = 12345.0;
         forged.write(&Disk::default(), &path, &config).unwrap();
         let mut bytes = fs::read(&path).unwrap();

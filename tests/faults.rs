@@ -1,8 +1,8 @@
 //! Tests that no failed file-system call, and no kill at one, loses results.
 //!
 //! `cc` compiles `faults/shim.c` to a library that makes one call of the program fail, or kills the program there.
-//! Afterwards `--resume` must produce the files of an undisturbed run. Otherwise it must fail with a message that names
-//! a command that does.
+//! Afterwards `--resume` must produce the files of an undisturbed run, or fail with a message that names a command that
+//! does.
 //!
 //! By default a few hundred faults are injected. `FLOTILLA_LONG=1` injects more than 5000, in about 15 minutes of one
 //! processor: every call of the small scenarios fails in each way, and evenly spread calls of the large ones.

@@ -79,7 +79,7 @@ fn requesting_champions_does_not_change_training() {
         Continue(())
     };
     let trained = front::train_with_champions(&config, &mut Cpu::default(), watch).expect("training succeeds");
-    assert_eq!(trained, flotilla::train(&config, &mut Cpu::default(), |_| Continue(())).expect("it trains"));
+    assert_eq!(trained, flotilla::train(&config, &mut Cpu::default(), |_| Continue(())).expect("training succeeds"));
     let (population, parameters) = (config.learning.population, config.parameters());
     let populations = trained.policies.iter().flat_map(|trial| trial.chunks(population * parameters));
     let best: Vec<f32> = populations.flat_map(|policies| policies[..parameters].to_vec()).collect();

@@ -147,9 +147,9 @@ fn cuda(metal: &str) -> String {
             writeln!(text, "{line}").expect("memory");
         }
     }
-    let (threads, kernel) = kernel.split_once(")]] kernel void ").expect("its threads");
-    let (name, kernel) = kernel.split_once("(\n").expect("its parameters");
-    let (parameters, body) = kernel.split_once("\n) {\n").expect("its body");
+    let (threads, kernel) = kernel.split_once(")]] kernel void ").expect("the number of threads");
+    let (name, kernel) = kernel.split_once("(\n").expect("a parameter list");
+    let (parameters, body) = kernel.split_once("\n) {\n").expect("a function body");
     let (mut arguments, mut declared) = (Vec::new(), String::new());
     for parameter in parameters.split('\n').map(|line| line.trim_start_matches(", ").trim()) {
         let (parameter, attribute) = parameter.split_once(" [[").unwrap_or((parameter, ""));

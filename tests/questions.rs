@@ -76,7 +76,7 @@ fn a_short_form_of_the_study_writes_its_page_and_files() {
     let (code, _, stderr) = run_paper(folder, &format!("{short} --quiet --resume --seed 4"));
     assert!(code == Some(1) && stderr.contains("holds another sweep"), "{stderr}");
 
-    // A part that cannot be trained is reported before any part is trained.
+    // An error in one part is reported before any part is trained.
     succeed(folder, "--questions=d --trials 2 --generations 2 --out mixed --quiet");
     let (code, _, stderr) = run_paper(folder, "--questions=b,d --trials 2 --generations 2 --out mixed --quiet");
     assert!(
@@ -84,7 +84,7 @@ fn a_short_form_of_the_study_writes_its_page_and_files() {
         "{stderr}"
     );
 
-    // Curricula of 60 generations fit their stages.
+    // Curricula have stages, so they need more generations.
     let json = succeed(folder, "--questions=e --trials 2 --generations 60 --out e --quiet --json");
     let json: serde_json::Value = serde_json::from_str(&json).unwrap();
     assert_eq!(json["questions"][0]["comparisons"].as_array().unwrap().len(), 6);

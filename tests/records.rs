@@ -50,8 +50,8 @@ impl Teams {
     }
 }
 
-/// Returns the fitnesses that a group is scored by. Those that a packed record suffices for take turns, starting from
-/// `first`. [`DT`] selects Dt, which needs the whole record.
+/// Returns the fitnesses that a group is scored by. Groups take turns with those that a packed record suffices for,
+/// starting from `first`. [`DT`] selects Dt, which needs the whole record.
 fn fitnesses_of(group: usize, first: usize) -> &'static [Fitness] {
     let (packed, dt) = KINDS.split_at(5);
     if first == DT { dt[0] } else { packed[(group + first) % packed.len()] }

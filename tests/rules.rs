@@ -130,7 +130,7 @@ fn rollout_and_library_report_the_same_dt() {
     assert_eq!((several.len(), several[0].len()), (40, 12));
 }
 
-/// The page of a run with Dt shows which leader each follower follows at every step, and the rules for POIs.
+/// The page of a run with Dt shows which leader led each follower at every step, and the rules for POIs.
 #[test]
 fn replays_show_rules_and_who_leads_whom() {
     let (_folder, run) = train(RELAY);

@@ -218,6 +218,7 @@ fn the_public_interface_is_as_listed() {
     assert!(
         listed == public_items,
         "the public interface has changed: {added:?} was added, {removed:?} was removed. \
-         If programs that are built on it still build, or this is a new minor version: FLOTILLA_WRITE=1 cargo test --test structure"
+         If programs that use it still build, or this is a new minor version: \
+         FLOTILLA_WRITE=1 cargo test --test structure"
     );
 }

@@ -42,7 +42,7 @@ fn with_faults(gpu: &Gpu, faults: &Arc<impl Faults + 'static>) -> Gpu {
     }
 }
 
-/// Opens the device anew, because a lost device stays lost.
+/// Opens a new device, because a lost one stays lost.
 fn open_gpu(request: &Request) -> Gpu {
     gpu::open(Request { pass: Some(Pass::NoContraction), ..request.clone() }).unwrap()
 }
@@ -100,7 +100,7 @@ impl Faults for Dropping {
     }
 }
 
-/// Metal after a time-out and DX12 after a removed device do this: they signal the fence, but did not run the commands.
+/// Metal after a time-out and DX12 after a removed device signal the fence without running the commands.
 #[test]
 fn a_dropped_submission_counts_as_a_lost_device() {
     let (rows, policies) = expected();
