@@ -339,7 +339,7 @@ fn invalid_input_returns_an_error() {
         let mut config = config.clone();
         make_invalid(&mut config);
         let refused = |error| matches!(error, Failure::Config(_));
-        assert!(refused(play(&config, 2, &good, Starts::Own).expect_err("the config is invalid")), "{index}");
+        assert!(refused(play(&config, 2, &valid, Starts::Own).expect_err("the config is invalid")), "{index}");
         let trained = flotilla::train(&config, &mut Cpu::default(), |_| Continue(()));
         assert!(refused(trained.expect_err("the config is invalid")), "{index}");
         assert!(flotilla::stepper(&config, 1, false).is_err_and(refused), "{index}");

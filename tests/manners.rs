@@ -168,26 +168,26 @@ fn init_prints_every_key_with_its_layouts_values() {
         let check_output = |text: &str| good_with_input(&place, "check -", text).0;
         assert_eq!(check_output(&text), check_output(&layout_text));
         // Each key appears once, below a comment with its meaning, unit, kind, range and default.
-        let mut comment = String::new();
-        let mut comments = std::collections::BTreeMap::new();
+        let mut description = String::new();
+        let mut descriptions = std::collections::BTreeMap::new();
         let mut section = "";
         for line in text.lines() {
             match (line.strip_prefix("# "), line.split_once(" = ")) {
-                (Some(comment), _) => comment += &format!("{comment} "),
+                (Some(comment), _) => description += &format!("{comment} "),
                 (_, Some((leaf, _))) => {
-                    let before = comments.insert(format!("{section}.{leaf}"), std::mem::take(&mut comment));
+                    let before = descriptions.insert(format!("{section}.{leaf}"), std::mem::take(&mut description));
                     assert_eq!(before, None, "{line}");
                 }
-                _ if line.starts_with('[') => (section, comment) = (line.trim_matches(['[', ']']), String::new()),
+                _ if line.starts_with('[') => (section, description) = (line.trim_matches(['[', ']']), String::new()),
                 _ => {}
             }
         }
         let keys = config::keys();
-        assert_eq!(comments.len(), keys.len());
+        assert_eq!(descriptions.len(), keys.len());
         for key in keys {
             let default = key.default.map_or("has to be given".into(), |default| format!("default {default}"));
             for part in [key.meaning, key.unit, &key.kind, &key.range, &default] {
-                assert!(comments[key.name].contains(part), "{part} of {}: {}", key.name, comments[key.name]);
+                assert!(descriptions[key.name].contains(part), "{part} of {}: {}", key.name, descriptions[key.name]);
             }
         }
     }
