@@ -124,10 +124,10 @@ fn train_gives_the_results_of_a_recorded_run() {
     let late = read_error(&[&lines[..], &[&late]].concat());
     assert!(late.contains("line 23 is trial 2, generation 7, which the run's config.toml does not have"), "{late}");
     let more = read_error(&[&lines[..], &lines[lines.len() - 1..]].concat());
-    assert!(more.contains("its rows are not one a trial and generation, in their order"), "{more}");
+    assert!(more.contains("it must have one row per trial and generation, in order"), "{more}");
     lines.swap(1, 4);
     let swapped = read_error(&lines);
-    assert!(swapped.contains("its rows are not one a trial and generation, in their order"), "{swapped}");
+    assert!(swapped.contains("it must have one row per trial and generation, in order"), "{swapped}");
     // Policies of other runs: with a larger population, and of another network.
     lines.swap(1, 4);
     fs::write(&path, lines.join("\n") + "\n").expect("the file is writable");

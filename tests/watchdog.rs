@@ -283,7 +283,7 @@ fn check_stall() {
     let (rows, policies) = expected();
     for (request, info) in support::adapters("a_stalled_device_is_reported_and_counts_as_lost") {
         let faults = Arc::new(Stalled(AtomicUsize::new(0)));
-        let patience = Patience { wait: Duration::from_millis(20), waits: 3 };
+        let patience = WaitLimit { wait: Duration::from_millis(20), waits: 3 };
         let result = train(backend(with_faults(&open_gpu(&request), &faults).waiting(patience), MODES[0]));
         assert_eq!((result.0, result.1, result.2), (rows.clone(), policies.clone(), 1), "{info}");
         assert_eq!(faults.0.load(SeqCst), 3);
@@ -380,7 +380,7 @@ fn the_faster_packing_is_kept_and_results_do_not_change() {
         {
             let case = format!("{info}, {faster} teams per workgroup, {records:?}");
             let device = GpuBackend::new(with_faults(&gpu, &Arc::new(FasterWith(faster)))).unwrap();
-            let mut device = device.playing(Kernel::Specialised).bringing(records).packing(None);
+            let mut device = device.playing(Kernel::Specialised).with_records(records).packing(None);
             // These teams are too few to compare speeds.
             assert_eq!(device.trace(&few).unwrap(), trace, "{case}");
             assert_eq!(device.packed(), None, "{case}");
