@@ -228,10 +228,10 @@ pub fn bootstrap(samples: &[&[f64]]) -> Option<Estimate> {
     };
     let mean = |sample: &[f64]| moments(sample).map_or(f64::NAN, |(mean, _)| mean);
     let value = total(&mut |sample, sign| sign * mean(sample));
-    let moment = |power: i32| {
+    let moment = |power: usize| {
         total(&mut |sample, sign| {
             let (mean, count) = (mean(sample), sample.len() as f64);
-            sample.iter().map(|value| (sign * (value - mean) / count).powi(power)).sum()
+            sample.iter().map(|value| power_of(sign * (value - mean) / count, power)).sum()
         })
     };
     let spread = moment(2);
@@ -290,10 +290,15 @@ pub fn rank_sum(one: &[f64], other: &[f64]) -> Option<Tested> {
         two_sided(&sums_of(&ranks, size), sum)
     } else {
         let middle = (all + 1) as f64;
-        let squares: f64 = ranks.iter().map(|&rank| (rank as f64 - middle).powi(2)).sum();
+        let squares: f64 = ranks.iter().map(|&rank| power_of(rank as f64 - middle, 2)).sum();
         normal(sum as f64 - count as f64 * middle, pairings * squares / (all * (all - 1)) as f64)
     };
     Some(Tested { a, p })
+}
+
+/// Returns a power by multiplication. The precision of `powi` is not specified, so it could differ between systems.
+fn power_of(base: f64, exponent: usize) -> f64 {
+    (0..exponent).fold(1.0, |power, _| power * base)
 }
 
 /// Returns Wilcoxon's signed-rank test of the differences of pairs. None without differences.
@@ -315,7 +320,7 @@ pub fn signed_rank(differences: &[f64]) -> Option<Tested> {
     let p = if some.len() <= EXACT {
         two_sided(&sums_of_any(&ranks), sum)
     } else {
-        let [all, squares] = [1, 2].map(|power| ranks.iter().map(|&rank| (rank as f64).powi(power)).sum::<f64>());
+        let [all, squares] = [1, 2].map(|power| ranks.iter().map(|&rank| power_of(rank as f64, power)).sum::<f64>());
         normal(sum as f64 - all / 2.0, squares / 4.0)
     };
     let count = (!differences.is_empty()).then_some(differences.len() as f64)?;

@@ -88,6 +88,7 @@ fn trials_csv_agrees_with_training_and_the_page() {
 #[test]
 fn pages_agree_with_the_full_study() {
     if !std::env::var("FLOTILLA_LONG").is_ok_and(|long| long == "1") {
+        let _ = writeln!(std::io::stderr(), "skipped: it trains for minutes; FLOTILLA_LONG=1 runs it");
         return;
     }
     let arms = train_experiments(TRIALS);

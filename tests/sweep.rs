@@ -448,7 +448,7 @@ fn points_trained_in_one_batch_equal_points_trained_alone() {
         let experiments = configs.len();
         let mut trainer = Trainer::new(ValidConfig::all(&configs).unwrap());
         let rows = trainer.finish(&mut Cpu::default()).unwrap();
-        (0..arms)
+        (0..experiments)
             .map(|experiment| {
                 let rows = rows.iter().filter(|row| row.experiment == experiment);
                 let rows: Vec<_> = rows.map(|r| (r.trial, r.generation, r.best_g, r.mean_g, r.champion_g)).collect();

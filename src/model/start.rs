@@ -81,6 +81,9 @@ impl Heading {
 
 /// Returns the index of the nearest place. Ties go to the first.
 pub fn nearest(from: &[f64; 2], places: &[[f64; 2]]) -> usize {
-    let distance2 = |at: &[f64; 2]| (at[0] - from[0]).powi(2) + (at[1] - from[1]).powi(2);
+    let distance2 = |at: &[f64; 2]| {
+        let [dx, dy] = [at[0] - from[0], at[1] - from[1]];
+        dx * dx + dy * dy
+    };
     (0..places.len()).min_by(|&a, &b| distance2(&places[a]).total_cmp(&distance2(&places[b]))).unwrap_or(0)
 }

@@ -406,7 +406,7 @@ impl Comparison {
 pub fn estimate(Estimate { value, low, high }: Estimate, digits: usize, signed: bool) -> String {
     // Adding 0.0 turns -0.0 into 0.0, which prints no sign.
     let [value, low, high] = [value, low, high].map(|x| {
-        let tens = 10f64.powi(digits as i32);
+        let tens = (0..digits).fold(1.0, |power, _| power * 10.0);
         (x * tens).round() / tens + 0.0
     });
     let value = if signed { format!("{value:+.digits$}") } else { format!("{value:.digits$}") };

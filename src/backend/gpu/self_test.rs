@@ -498,7 +498,7 @@ mod tests {
     #[test]
     fn no_value_comes_near_the_denormals() {
         assert!(
-            values().iter().all(|&value| value == 0.0 && value.is_sign_positive() || value.abs() >= 2f32.powi(-25))
+            values().iter().all(|&value| value == 0.0 && value.is_sign_positive() || value.abs() >= 1.0 / 33_554_432.0)
         );
     }
 }
