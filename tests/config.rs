@@ -1,4 +1,6 @@
-//! Configs: defaults, round trips, and that no text makes the reader panic.
+//! Tests that configs have the documented defaults, survive a round trip, and are refused with precise messages.
+//!
+//! Property tests generate valid configs and mangled text. No text may make the parser panic.
 
 use std::path::Path;
 
@@ -31,7 +33,7 @@ fn every_key_but_leaders_and_pois_has_its_default() {
             leaders: vec![[1.0, 2.0]],
             followers: vec![],
             pois: vec![[3.0, 4.0]],
-            coupling: Coupling::Same(1), // 3 where there are as many agents
+            coupling: Coupling::Same(1), // 3 with three or more agents
             observation_radius: 5.0,
             observers: Observers::All,
             windows: vec![],
@@ -88,7 +90,7 @@ fn every_key_but_leaders_and_pois_has_its_default() {
 }
 
 #[test]
-fn the_papers_layouts_are_what_the_paper_shows() {
+fn layout_configs_match_the_paper() {
     for (name, groups, offsets, coupling, steps) in [
         (LAYOUTS[0], vec![10.0, 20.0, 30.0, 40.0], vec![[2.0, -3.0], [-2.0, -3.0]], 3, 25),
         (LAYOUTS[1], vec![10.0, 40.0], vec![[2.0, -3.0], [-2.0, -3.0]], 3, 25),
@@ -119,14 +121,14 @@ fn an_unlimited_range_is_written_as_inf_and_read_back() {
 }
 
 #[test]
-fn defaults_give_way_to_what_was_written() {
+fn defaults_are_clamped_to_explicit_values() {
     let text = format!("{SMALLEST}[motion]\nmin_speed = 1\n[follow]\nattraction_radius = 0.5\n");
     let config = Config::parse(&text, "test.toml").unwrap();
     assert_eq!((config.world.speed, config.follow.repulsion_radius), (1.0, 0.5));
 }
 
 #[test]
-fn minus_zero_is_zero() {
+fn minus_zero_is_read_as_zero() {
     let config = Config::parse(&format!("{SMALLEST}speed = -0.0\nheading = -0.0"), "test.toml").unwrap();
     assert!(config.world.speed.is_sign_positive() && config.world.headings()[0].is_sign_positive());
 }
@@ -149,18 +151,18 @@ fn a_wrong_value_is_the_only_problem_reported() {
 }
 
 #[test]
-fn overrides_are_checked_with_the_file_and_named_as_the_user_knows_them() {
+fn overrides_are_validated_with_the_file_and_named_by_their_source() {
     let text = format!("{SMALLEST}coupling = 2");
-    let more = Override::new("world.followers", vec![vec![5.0, 5.0]], "grid \"world.followers\"");
-    assert!(Config::parse(&text, "test.toml").is_err());
-    let config = Config::read(&text, "test.toml", &[], std::slice::from_ref(&more)).unwrap();
+    let follower = Override::new("world.followers", vec![vec![5.0, 5.0]], "grid \"world.followers\"");
+    assert!(Config::parse(&text, "test.toml").is_err(), "one agent cannot satisfy a coupling of 2");
+    let config = Config::read(&text, "test.toml", &[], std::slice::from_ref(&follower)).unwrap();
     assert_eq!(config.world.coupling, Coupling::Same(2));
     let error = Config::read(
         &text,
         "test.toml",
         &[],
         &[
-            more,
+            follower,
             Override::new("learning.population", 1, "--population"),
             Override::new("world.pois", vec![vec![5.0, 51.0]], "grid \"world.pois\""),
             Override::new("world.dtt", 1, "grid \"world.dtt\""),
@@ -173,32 +175,32 @@ fn overrides_are_checked_with_the_file_and_named_as_the_user_knows_them() {
          --population: found 1, allowed 2 to 1048576\n\
          grid \"world.dtt\": unknown key, did you mean `world.dt`?"
     );
-    let again = config.with(&[Override::new("learning.fitness", "D++", "--fitness")]).unwrap();
-    assert_eq!(again.learning.fitness, Fitness::Dpp);
+    let changed = config.with(&[Override::new("learning.fitness", "D++", "--fitness")]).unwrap();
+    assert_eq!(changed.learning.fitness, Fitness::Dpp);
 }
 
 #[test]
-fn foreign_sections_are_passed_over_only_when_named() {
+fn unknown_sections_are_ignored_only_when_listed() {
     let text = format!("{SMALLEST}[grid]\n\"world.coupling\" = [1, 2]\n");
     assert_eq!(problems(&text)[0].key, "grid");
     assert_eq!(Config::read(&text, "test.toml", &["grid"], &[]), Config::parse(SMALLEST, "test.toml"));
 }
 
 #[test]
-fn a_quoted_dotted_key_is_not_the_key_it_looks_like() {
+fn a_quoted_dotted_key_is_not_a_nested_key() {
     let found = problems(&format!("\"world.dt\" = 0.1\n{SMALLEST}"));
     assert_eq!((found.len(), found[0].line, found[0].key.as_str()), (1, Some(1), "world.dt"));
 }
 
 #[test]
-fn long_lists_of_problems_are_cut() {
+fn long_lists_of_problems_are_truncated() {
     let text = format!("[world]\npois = [[1, 1]]\nleaders = [{}]", "[-1, -1],".repeat(1000));
     let message = Config::parse(&text, "test.toml").unwrap_err().to_string();
     assert_eq!(message.lines().count(), 52);
     assert!(message.starts_with("2000 problems in test.toml\n") && message.ends_with("… and 1950 more"), "{message}");
 }
 
-/// 0, or a size from `low` to `high` of any magnitude between.
+/// Generates a size from `low` to `high`, uniform in its logarithm.
 fn size(low: f64, high: f64) -> impl Strategy<Value = f64> {
     (0.0..=1.0f64).prop_map(move |t| (low * (high / low).powf(t)).clamp(low, high))
 }
@@ -207,21 +209,24 @@ fn size_or_zero(low: f64, high: f64) -> impl Strategy<Value = f64> {
     prop_oneof![1 => Just(0.0), 4 => size(low, high)]
 }
 
-fn word<T: flotilla::config::Choice + std::fmt::Debug>() -> impl Strategy<Value = T> {
+/// Generates any value of a key that has a fixed list of values.
+fn choice<T: flotilla::config::Choice + std::fmt::Debug>() -> impl Strategy<Value = T> {
     (0..T::ALL.len()).prop_map(|index| T::ALL[index].1)
 }
 
+/// Generates valid `[world]` and `[motion]` sections.
 fn worlds() -> impl Strategy<Value = (WorldConfig, Motion)> {
     let speeds = (size_or_zero(1e-6, 1e3), 0.0..=1.0, 0.0..=1.0).prop_map(|(max, a, b): (f64, f64, f64)| {
-        let tidy = |speed: f64| if speed < 1e-6 { 0.0 } else { speed };
-        let min = tidy(max * a);
-        (min, tidy(min + (max - min) * b).clamp(min, max), max)
+        // Positive speeds below 1e-6 are not valid.
+        let valid = |speed: f64| if speed < 1e-6 { 0.0 } else { speed };
+        let min = valid(max * a);
+        (min, valid(min + (max - min) * b).clamp(min, max), max)
     });
     (size(1.0, 1e4), size(1.0, 1e4), 1..20usize, 0..20usize, 1..9usize, speeds).prop_flat_map(
         |(x, y, leaders, followers, pois, (min_speed, speed, max_speed))| {
             let places =
                 move |count| vec((size_or_zero(1e-6, x), size_or_zero(1e-6, y)).prop_map(|(x, y)| [x, y]), count);
-            let coupling = word().prop_flat_map(move |observers| {
+            let coupling = choice().prop_flat_map(move |observers| {
                 let (observers, most) = match observers {
                     Observers::All => (observers, leaders + followers),
                     Observers::Followers if followers > 0 => (observers, leaders.min(followers)),
@@ -274,6 +279,7 @@ fn worlds() -> impl Strategy<Value = (WorldConfig, Motion)> {
     )
 }
 
+/// Generates valid configs without stages.
 fn configs() -> impl Strategy<Value = Config> {
     let gain = || size_or_zero(1e-3, 1e3);
     let follow = (size(0.01, 1e4), 0.0..=1.0, gain(), gain(), gain()).prop_map(
@@ -286,22 +292,18 @@ fn configs() -> impl Strategy<Value = Config> {
         },
     );
     let range = || prop_oneof![Just(0.0), Just(f64::INFINITY), size(0.01, 1e4)];
-    let sense = (range(), range(), word(), size(1e-3, 1e3)).prop_map(|(poi_range, agent_range, density, gain)| Sense {
-        poi_range,
-        agent_range,
-        density,
-        gain,
-    });
-    let policy = (vec(1..=MAX_HIDDEN_UNITS, 0..=MAX_HIDDEN_LAYERS), word())
+    let sense = (range(), range(), choice(), size(1e-3, 1e3))
+        .prop_map(|(poi_range, agent_range, density, gain)| Sense { poi_range, agent_range, density, gain });
+    let policy = (vec(1..=MAX_HIDDEN_UNITS, 0..=MAX_HIDDEN_LAYERS), choice())
         .prop_map(|(hidden, actions)| Policy { hidden, actions });
     let elites = prop_oneof![(0.0..=1.0f64).prop_map(Ok), size(1e-3, 100.0).prop_map(Err)];
-    let teams = (2..=5000usize, 1..=MAX_PARTNERS, 0..=MAX_HALL_OF_FAME, word());
-    let sizes = (teams, 0..=MAX_GENERATIONS, 1..=9usize, (elites, word()), 1..=MAX_EPISODES);
-    let mutation = (word(), size_or_zero(1e-6, 1.0), size_or_zero(1e-6, 100.0));
-    let mutation = (mutation, 0..=MAX_STEPS, word());
-    let search = (word(), size(1e-6, 100.0), size(1e-6, 100.0));
+    let teams = (2..=5000usize, 1..=MAX_PARTNERS, 0..=MAX_HALL_OF_FAME, choice());
+    let sizes = (teams, 0..=MAX_GENERATIONS, 1..=9usize, (elites, choice()), 1..=MAX_EPISODES);
+    let mutation = (choice(), size_or_zero(1e-6, 1.0), size_or_zero(1e-6, 100.0));
+    let mutation = (mutation, 0..=MAX_STEPS, choice());
+    let search = (choice(), size(1e-6, 100.0), size(1e-6, 100.0));
     let jitters = (size_or_zero(1e-6, 1e4), size_or_zero(1e-6, 1e4));
-    let learning = ((word(), word()), word(), sizes, (mutation, search), jitters, 0..=i64::MAX as u64).prop_map(
+    let learning = ((choice(), choice()), choice(), sizes, (mutation, search), jitters, 0..=i64::MAX as u64).prop_map(
         |(
             (paradigm, sharing),
             fitness,
@@ -317,7 +319,7 @@ fn configs() -> impl Strategy<Value = Config> {
                 fitness,
                 population,
                 partners: if sharing == Sharing::Shared { 1 } else { partners },
-                // Leaders with partners and a tournament are needed for a hall of fame.
+                // A hall of fame requires leaders with partners and the tournament method.
                 hall_of_fame: if sharing == Sharing::Shared || method != Method::Tournament { 0 } else { hall_of_fame },
                 leniency,
                 generations,
@@ -361,7 +363,7 @@ fn configs() -> impl Strategy<Value = Config> {
     )
 }
 
-/// A piece of text that means something to TOML or to a config.
+/// Generates a piece of text: mostly one that has a meaning in TOML or in a config.
 fn token() -> impl Strategy<Value = String> {
     let known = "[ ] [[ ]] = , . # \" ''' { } inf -inf nan -0.0 1e999 -1 0 3 0x7f \
                  99999999999999999999 1e-40 true 1979-05-27 [world] [learning] [grid] \
@@ -374,12 +376,12 @@ proptest! {
     #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn what_is_written_reads_back_the_same(config in configs()) {
+    fn a_config_survives_a_round_trip_through_toml(config in configs()) {
         let text = config.to_toml();
         prop_assert_eq!(Config::parse(&text, "test.toml"), Ok(config), "{}", text);
     }
 
-    /// Ranges and relations keep the exact arithmetic well inside f32: no constant is infinite, NaN or denormal.
+    /// Checks that no constant is infinite, NaN or denormal. The exact arithmetic depends on it.
     #[test]
     fn a_valid_config_makes_normal_constants(config in configs()) {
         let world = flotilla::world::World::new(&config);
@@ -416,9 +418,9 @@ proptest! {
         }
     }
 
-    /// One key of a valid config set to anything: taken, or refused with what was found.
+    /// Sets one key of a valid config to an arbitrary value. An error has to name the value found.
     #[test]
-    fn one_changed_value_is_taken_or_refused(
+    fn one_changed_value_is_accepted_or_refused(
         config in configs(),
         key in any::<prop::sample::Index>(),
         value in token(),
@@ -458,9 +460,9 @@ fn counts_at_their_limits_are_valid() {
     }
 }
 
-/// Errors in observers, windows and order name the line and the place in the list.
+/// Errors in observers, windows and order name the line and the index in the list.
 #[test]
-fn rules_that_cannot_be_are_refused_where_they_stand() {
+fn impossible_rules_are_refused_with_their_line_and_index() {
     let world = |rest: &str| {
         format!("[world]\nleaders = [[1, 2], [2, 2]]\nfollowers = [[1, 1]]\npois = [[3, 4], [5, 6], [7, 8]]\n{rest}")
     };
@@ -481,7 +483,7 @@ fn rules_that_cannot_be_are_refused_where_they_stand() {
             "after = [[1], [2], [0]]",
             "5: world.after[0]: found POI 0 after POI 1 after POI 2 after POI 0, which can never begin",
         ),
-        // Who waits for a cycle is not reported for it.
+        // POI 0 depends on the cycle but is not in it, so it is not reported.
         ("after = [[1], [2], [1]]", "5: world.after[1]: found POI 1 after POI 2 after POI 1, which can never begin"),
         ("windows = [[1, 2]]", "5: world.windows: found a list of 1, allowed a list of 3 pairs [first, last], or none"),
         ("windows = [[1, 2], [0, 3], [1, 9]]", "5: world.windows[1][0]: found 0, allowed 1 to 25 (world.steps)"),
@@ -512,23 +514,23 @@ fn rules_that_cannot_be_are_refused_where_they_stand() {
         let error = Config::parse(&world(rest), "rules.toml").expect_err(rest).to_string();
         assert!(error.starts_with(&format!("rules.toml:{expected}")) && !error.contains('\n'), "{rest}: {error}");
     }
-    let alone = "[world]\nleaders = [[1, 2]]\npois = [[3, 4]]\nobservers = 'followers'";
-    let error = Config::parse(alone, "rules.toml").unwrap_err().to_string();
+    let without_followers = "[world]\nleaders = [[1, 2]]\npois = [[3, 4]]\nobservers = 'followers'";
+    let error = Config::parse(without_followers, "rules.toml").unwrap_err().to_string();
     assert_eq!(
         error,
         "rules.toml:4: world.observers: found \"followers\", but there are no followers, so nobody would observe"
     );
-    // By the flag, the error names the flag or the key that no longer fits.
+    // The same conflict, caused by a flag.
     let flag = Override::new("learning.paradigm", "all-leaders", "--paradigm");
     let text = world("observers = 'followers'");
     assert!(Config::read(&text, "rules.toml", &[], &[flag]).is_err());
     assert_eq!(Config::parse(&text, "rules.toml").unwrap().world.coupling, Coupling::Same(1));
 }
 
-/// One heading is everybody's. Of one per leader, each follower takes that of the nearest leader, the first if two are
-/// equally near. One per agent is taken as it is.
+/// A single heading applies to all agents. With one heading per leader, each follower gets that of the nearest leader,
+/// and of the first one on a tie. With one heading per agent, each agent gets its own.
 #[test]
-fn followers_face_as_their_leader() {
+fn followers_start_with_the_heading_of_the_nearest_leader() {
     let text = |heading: &str| {
         format!(
             "[world]\nleaders = [[10, 10], [20, 10]]\nfollowers = [[21, 10], [9, 10], [15, 10]]\npois = [[1, 1]]\n\
@@ -544,14 +546,14 @@ fn followers_face_as_their_leader() {
     assert_eq!(x, [1.0, -1.0, -1.0, 1.0, 1.0]);
 }
 
-/// Returns what is noted of a config's `[world]`, by default of one leader, one follower and one POI.
+/// Returns the notes about a config with one leader, one follower and one POI, and `world` appended.
 fn notes(world: &str) -> Vec<String> {
     let text = format!("[world]\nleaders = [[9, 9]]\nfollowers = [[8, 8]]\npois = [[5, 5]]\n{world}");
     Config::read_noted(&Document::parse(&text), "x.toml", &[], &[]).unwrap_or_else(|error| panic!("{error}")).1
 }
 
 #[test]
-fn a_default_that_does_not_fit_is_noted() {
+fn an_out_of_range_default_causes_a_note() {
     assert_eq!(
         notes(""),
         ["world.coupling is not set: 2 is used, because the default, 3, is not in the range allowed here, 1 to 2 \
@@ -562,7 +564,7 @@ fn a_default_that_does_not_fit_is_noted() {
     assert!(found[0].contains("1 is used") && found[0].contains("the number of leaders"), "{found:?}");
     let found = notes("coupling = 1\n[motion]\nmin_speed = 1.5");
     assert!(found.len() == 1 && found[0].starts_with("world.speed is not set: 1.5 is used"), "{found:?}");
-    // What is written out says itself.
+    // A written config has all values, so reading it back causes no notes.
     let config = Config::parse("[world]\nleaders = [[9, 9]]\npois = [[5, 5]]", "x.toml").unwrap();
     assert_eq!(
         Config::read_noted(&Document::parse(&config.to_toml()), "x.toml", &[], &[]).unwrap().1,
@@ -570,7 +572,7 @@ fn a_default_that_does_not_fit_is_noted() {
     );
 }
 
-/// Where an agent gets that heads along the x axis at 1 unit a second.
+/// Returns the distance that an agent travels along the x axis at a speed of 1 unit per second.
 fn travelled(map: f64, dt: f64, from: f64, steps: usize) -> f64 {
     let text = format!(
         "[world]\nmap = [{map}, {map}]\nleaders = [[{from}, 5]]\npois = [[5, 5]]\ncoupling = 1\nsteps = {steps}\ndt = {dt}\n\
@@ -581,22 +583,22 @@ fn travelled(map: f64, dt: f64, from: f64, steps: usize) -> f64 {
     f64::from(stepper.states().positions[0]) - from
 }
 
-/// Positions are f32 on a grid. Steps that are long enough for that are walked in full, shorter ones are noted.
+/// Positions are f32 on a grid, so very short steps lose distance to rounding. A note warns of such steps.
 #[test]
-fn steps_too_short_for_the_map_are_noted() {
+fn steps_too_short_for_the_map_cause_a_note() {
     let noted = |map: f64, dt: f64, speed: f64| {
         let found = notes(&format!("coupling = 1\nmap = [{map}, 9]\ndt = {dt}\n[motion]\nmax_speed = {speed}"));
         assert!(found.iter().all(|note| note.starts_with("motion.max_speed times world.dt is ")), "{found:?}");
         !found.is_empty()
     };
-    // The paper's, and one step for which there are just as many positions as asked for, in f32 and on the grid.
+    // The paper's step, then the shortest steps without a note: limited once by f32's spacing and once by the grid's.
     assert!(!noted(50.0, 0.2, 3.0));
     assert!(!noted(1000.0, 256.0 / 16384.0, 1.0) && noted(1000.0, 255.9 / 16384.0, 1.0));
     assert!(!noted(20.0, 1.0 / 1024.0, 1.0) && noted(20.0, 0.99 / 1024.0, 1.0));
     assert!(noted(10_000.0, 1e-4, 3.0) && noted(1000.0, 1e-3, 1.0) && !noted(1000.0, 1e-3, 0.0));
     let error =
         |map: f64, dt: f64, from: f64, steps: usize| travelled(map, dt, from, steps) / (dt * steps as f64) - 1.0;
-    assert!(error(1000.0, 0.001, 600.0, 10_000) < -0.02, "what the note is for");
+    assert!(error(1000.0, 0.001, 600.0, 10_000) < -0.02, "steps that cause a note should lose distance");
     assert_eq!(travelled(10_000.0, 1e-4, 9000.0, 1000), 0.0);
     for (map, dt, from) in
         [(1000.0, 0.0157, 600.0), (1000.0, 0.01567, 900.0), (20.0, 0.000_98, 3.0), (60.0, 0.000_98, 40.0)]
