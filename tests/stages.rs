@@ -1,4 +1,6 @@
-//! Curricula and warm starts: what is wrong with them by line, and that a run goes on through either to the same results.
+//! Tests curricula (`[[stages]]`) and warm starts (`--init`).
+//!
+//! Errors in stages name their line. A resumed run has to end in the same results, byte for byte, as one without a stop.
 
 #![cfg(feature = "cli")]
 
@@ -40,33 +42,33 @@ fn staged() -> Config {
     config(&[SMALL, STAGES].concat())
 }
 
-/// Every error of a text, a line each.
-fn wrong(text: &str) -> Vec<String> {
+/// Returns the error message for an invalid config, line by line.
+fn error_lines(text: &str) -> Vec<String> {
     Config::parse(text, "test.toml").expect_err(text).to_string().lines().map(String::from).collect()
 }
 
 #[test]
-fn stages_start_from_the_file() {
+fn each_stage_changes_the_config_of_the_file() {
     let config = staged();
     assert_eq!(Config::parse(&config.to_toml(), "again").unwrap(), config, "{}", config.to_toml());
-    let all = config.staged();
-    let froms: Vec<usize> = all.iter().map(|(from, _)| *from).collect();
+    let stages = config.staged();
+    let froms: Vec<usize> = stages.iter().map(|(from, _)| *from).collect();
     assert_eq!(froms, [0, 2, 4]);
-    let own = Config { stages: vec![], ..config.clone() };
-    assert_eq!(all[0].1, own);
-    // Not from the stage before.
-    assert_eq!((all[1].1.world.steps, all[2].1.world.steps), (14, 9));
-    assert_eq!((all[1].1.world.pois.len(), all[2].1.world.pois.len(), config.pois()), (2, 3, None));
+    let without_stages = Config { stages: vec![], ..config.clone() };
+    assert_eq!(stages[0].1, without_stages);
+    // Changes of one stage do not carry over to the next.
+    assert_eq!((stages[1].1.world.steps, stages[2].1.world.steps), (14, 9));
+    assert_eq!((stages[1].1.world.pois.len(), stages[2].1.world.pois.len(), config.pois()), (2, 3, None));
     assert_eq!((0..7).map(|generation| config.stage_of(generation)).collect::<Vec<_>>(), [0, 0, 1, 1, 2, 2, 2]);
     let shares: Vec<usize> = config.shares().iter().map(|share| share.learning.generations + 1).collect();
     assert_eq!(shares, [2, 2, 3]);
-    let at_once = self::config(&format!("{SMALL}[[stages]]\nfrom = 0\nset = {{ world.coupling = 1 }}\n"));
-    assert_eq!((at_once.staged().len(), at_once.stage_of(6)), (1, 0));
-    assert_eq!(at_once.at(0).world.coupling, flotilla::config::Coupling::Same(1));
+    let immediate = self::config(&format!("{SMALL}[[stages]]\nfrom = 0\nset = {{ world.coupling = 1 }}\n"));
+    assert_eq!((immediate.staged().len(), immediate.stage_of(6)), (1, 0));
+    assert_eq!(immediate.at(0).world.coupling, flotilla::config::Coupling::Same(1));
 }
 
 #[test]
-fn what_is_wrong_with_a_stage_is_told_by_its_line() {
+fn errors_in_stages_name_their_line() {
     let lines = SMALL.lines().count();
     let stage = |from: &str, set: &str| format!("[[stages]]\nfrom = {from}\nset = {{ {set} }}\n");
     let cases = [
@@ -103,19 +105,20 @@ fn what_is_wrong_with_a_stage_is_told_by_its_line() {
         ("[[stages]]\nfrom = 1\nset = 3\n".into(), 3, "stages[0].set: allowed a table"),
     ];
     for (text, line, message) in cases {
-        let found = wrong(&[SMALL, &text].concat());
+        let found = error_lines(&[SMALL, &text].concat());
         let expected = format!("test.toml:{}: {message}", lines + line);
         assert!(found.len() == 1 && found[0].starts_with(&expected), "{text}: {found:?} is not {expected}");
     }
-    assert!(wrong(&["stages = 3\n", SMALL].concat())[0].starts_with("test.toml:1: stages: allowed a list"));
-    // In all-leaders, everyone is a learner.
-    let all = SMALL.replace("population", "paradigm = 'all-leaders'\npopulation");
-    let text = format!("{all}{}", stage("1", "'world.followers' = [[1, 2]]"));
-    assert!(wrong(&text)[0].contains("world.followers: 3 leaders learn in this stage, 5 in all others"), "{text}");
+    assert!(error_lines(&["stages = 3\n", SMALL].concat())[0].starts_with("test.toml:1: stages: allowed a list"));
+    // In the all-leaders paradigm, followers learn too, so a stage cannot change their number.
+    let all_leaders = SMALL.replace("population", "paradigm = 'all-leaders'\npopulation");
+    let text = format!("{all_leaders}{}", stage("1", "'world.followers' = [[1, 2]]"));
+    let error = &error_lines(&text)[0];
+    assert!(error.contains("world.followers: 3 leaders learn in this stage, 5 in all others"), "{text}");
 }
 
-/// Trains until it may stop before a generation, or to the end.
-fn go_on(session: &mut Session, stops: impl Fn(usize) -> bool) -> Result<Ended, RunError> {
+/// Trains until `stops` returns true for the next generation, or to the end.
+fn train_until(session: &mut Session, stops: impl Fn(usize) -> bool) -> Result<Ended, RunError> {
     let (stop, save) = (AtomicBool::new(stops(0)), AtomicBool::new(false));
     let mut options = Options {
         command: "",
@@ -128,7 +131,7 @@ fn go_on(session: &mut Session, stops: impl Fn(usize) -> bool) -> Result<Ended, 
     session.train(&mut (Box::new(Cpu::default()), Machine::default()), &mut options)
 }
 
-/// Trains until a generation has been played, or to the end.
+/// Opens a run and trains it until generation `until` is next, or to the end. Returns the results of a finished run.
 fn train(
     config: &Config,
     path: &Path,
@@ -138,80 +141,81 @@ fn train(
 ) -> Result<Option<Results>, RunError> {
     let (mut session, _) =
         Session::open_from(vec![(config.clone(), path.to_path_buf(), init)], start, &Disk::default())?;
-    let ended = go_on(&mut session, |next| next >= until)?;
+    let ended = train_until(&mut session, |next| next >= until)?;
     Ok((ended == Ended::Done).then(|| session.results(0).cloned().unwrap()))
 }
 
-/// Trains until a generation has been played and makes the next one the last; then to that end, if so asked. Gives the last.
+/// Trains up to generation `until` and makes it the last (`Session::end`). Plays it too if `finish` is set. Returns the
+/// last generation.
 fn train_shorter(config: &Config, path: &Path, init: Option<Init>, until: usize, finish: bool) -> usize {
     let runs = vec![(config.clone(), path.to_path_buf(), init)];
     let (mut session, _) = Session::open_from(runs, Start::Fresh, &Disk::default()).unwrap();
-    assert!(go_on(&mut session, |next| next == until).unwrap() == Ended::Stopped);
+    assert!(train_until(&mut session, |next| next == until).unwrap() == Ended::Stopped);
     let last = session.end().unwrap();
     if finish {
-        assert!(go_on(&mut session, |_| false).unwrap() == Ended::Done);
+        assert!(train_until(&mut session, |_| false).unwrap() == Ended::Done);
     }
     last
 }
 
-/// Every file of a folder but its lock, with its bytes.
-fn everything(path: &Path) -> Vec<(PathBuf, Vec<u8>)> {
-    let mut all = Vec::new();
+/// Reads all files below a folder, except locks.
+fn read_files(path: &Path) -> Vec<(PathBuf, Vec<u8>)> {
+    let mut files = Vec::new();
     for entry in fs::read_dir(path).unwrap() {
         let path = entry.unwrap().path();
         match path.is_dir() {
-            true => all.extend(everything(&path)),
+            true => files.extend(read_files(&path)),
             false if path.extension().is_some_and(|extension| extension == "lock") => {}
-            false => all.push((path.clone(), fs::read(&path).unwrap())),
+            false => files.push((path.clone(), fs::read(&path).unwrap())),
         }
     }
-    all.sort();
-    all
+    files.sort();
+    files
 }
 
-/// The metrics, the seconds left out.
+/// Reads the metrics without the column of seconds, which differs between runs.
 fn rows(path: &Path) -> Vec<Vec<String>> {
     let text = fs::read_to_string(path.join(METRICS)).unwrap();
     let fields = |line: &str| line.split(',').enumerate().filter(|&(at, _)| at != 5).map(|(_, f)| f.into()).collect();
     text.lines().map(fields).collect()
 }
 
-fn bytes(path: &Path) -> Vec<u8> {
+fn policy_bytes(path: &Path) -> Vec<u8> {
     fs::read(path.join(POLICIES)).unwrap()
 }
 
 #[test]
-fn a_run_goes_on_through_its_stages() {
+fn a_staged_run_resumes_to_the_same_results() {
     let place = tempfile::tempdir().unwrap();
     let (config, whole) = (staged(), place.path().join("whole"));
     let expected = train(&config, &whole, None, Start::Fresh, 99).unwrap().unwrap();
-    let told = rows(&whole);
-    assert_eq!(told[0], ["trial", "generation", "best_g", "mean_g", "champion_g", "stage"]);
-    for row in &told[1..] {
+    let metrics = rows(&whole);
+    assert_eq!(metrics[0], ["trial", "generation", "best_g", "mean_g", "champion_g", "stage"]);
+    for row in &metrics[1..] {
         assert_eq!(row[5], config.stage_of(row[1].parse().unwrap()).to_string());
     }
-    // Up to where the first stage ends it is, champions too, a run without stages.
+    // Before generation 2, where a stage begins, the metrics equal those of a run without stages.
     let plain = place.path().join("plain");
     train(&Config { stages: vec![], ..config.clone() }, &plain, None, Start::Fresh, 99).unwrap();
     let without: Vec<_> = rows(&plain).iter().map(|row| row.to_vec()).collect();
-    assert!((1..7).all(|row| told[row][..5] == without[row][..5]) && told[7][..5] != without[7][..5]);
+    assert!((1..7).all(|row| metrics[row][..5] == without[row][..5]) && metrics[7][..5] != without[7][..5]);
     for until in 1..=7 {
         let path = place.path().join(format!("stopped-{until}"));
         let stopped = train(&config, &path, None, Start::Fresh, until).unwrap();
         assert_eq!(stopped, None, "{until}");
         assert_eq!(train(&config, &path, None, Start::Resume, 99).unwrap().as_ref(), Some(&expected), "{until}");
-        assert_eq!((rows(&path), bytes(&path)), (told.clone(), bytes(&whole)), "{until}");
+        assert_eq!((rows(&path), policy_bytes(&path)), (metrics.clone(), policy_bytes(&whole)), "{until}");
     }
-    // Other stages are another run.
+    // A run cannot be resumed with other stages.
     let mut other = config.clone();
     other.stages[1].from = 5;
     let error = train(&other, &whole, None, Start::Resume, 99).unwrap_err().to_string();
     assert!(error.contains("stages[1]: { from = 4") && error.contains("{ from = 5"), "{error}");
 }
 
-/// A killed run of policies with several partners, whose number stages change, goes on to the same bits.
+/// Stages change the number of partners.
 #[test]
-fn a_run_with_several_partners_goes_on() {
+fn a_run_with_several_partners_resumes_to_the_same_results() {
     let place = tempfile::tempdir().unwrap();
     let text = SMALL.replace("population = 8", "population = 8\npartners = 3\nleniency = 'max'");
     let stages = "[[stages]]\nfrom = 3\nset = { learning.partners = 1 }\n\
@@ -223,9 +227,9 @@ fn a_run_with_several_partners_goes_on() {
         let path = place.path().join(format!("stopped-{until}"));
         assert_eq!(train(&config, &path, None, Start::Fresh, until).unwrap(), None, "{until}");
         assert_eq!(train(&config, &path, None, Start::Resume, 99).unwrap().as_ref(), Some(&expected), "{until}");
-        assert_eq!((rows(&path), bytes(&path)), (rows(&whole), bytes(&whole)), "{until}");
+        assert_eq!((rows(&path), policy_bytes(&path)), (rows(&whole), policy_bytes(&whole)), "{until}");
     }
-    // Of each generation, the best of all teams and the champions are played again.
+    // The best team and the champions of each generation can be replayed.
     for which in [Which::Best, Which::Champion] {
         let again =
             replay(&whole, 1, &[0, 2, 3, 5, 6], which, Verification::Required, &mut Cpu::default(), &mut |_| true);
@@ -240,9 +244,9 @@ fn a_run_with_several_partners_goes_on() {
     assert!(team(2).is_ok() && team(3).is_err());
 }
 
-/// A run with past champions resumes to the same bits, also beyond the end of a shorter run.
+/// A finished run can also be extended to the same results as a longer run.
 #[test]
-fn past_champions_go_on() {
+fn a_run_with_a_hall_of_fame_resumes_to_the_same_results() {
     const FAR: &str = "pois = [[10, 12], [20, 13]]\ncoupling = 1\nsteps = 20";
     let place = tempfile::tempdir().unwrap();
     let small = SMALL.replace("pois = [[10, 9], [20, 9]]\ncoupling = 2\nsteps = 9", FAR);
@@ -258,12 +262,12 @@ fn past_champions_go_on() {
     without.learning.hall_of_fame = 0;
     let without_path = place.path().join("without");
     train(&without, &without_path, None, Start::Fresh, 99).unwrap();
-    assert!(bytes(&without_path) != bytes(&whole), "past champions changed nothing");
+    assert!(policy_bytes(&without_path) != policy_bytes(&whole), "the hall of fame changed nothing");
     for until in 1..=7 {
         let path = place.path().join("stopped");
         assert_eq!(train(&config, &path, None, Start::Force, until).unwrap(), None, "{until}");
         assert_eq!(train(&config, &path, None, Start::Resume, 99).unwrap().as_ref(), Some(&expected), "{until}");
-        assert_eq!((rows(&path), bytes(&path)), (rows(&whole), bytes(&whole)), "{until}");
+        assert_eq!((rows(&path), policy_bytes(&path)), (rows(&whole), policy_bytes(&whole)), "{until}");
     }
     for generations in [0, 1, 3, 5] {
         let extended = place.path().join("extended");
@@ -272,9 +276,13 @@ fn past_champions_go_on() {
         train(&short, &extended, None, Start::Force, 99).unwrap();
         let (mut session, _) =
             Session::open(vec![(plain.clone(), extended.clone())], Start::Resume, &Disk::default()).unwrap();
-        assert_eq!(session.generations(), [generations + 1], "it does not begin again");
-        assert!(go_on(&mut session, |_| false).unwrap() == Ended::Done);
-        assert_eq!((rows(&extended), bytes(&extended)), (rows(&longer), bytes(&longer)), "from {generations} on");
+        assert_eq!(session.generations(), [generations + 1], "the finished generations are trained again");
+        assert!(train_until(&mut session, |_| false).unwrap() == Ended::Done);
+        assert_eq!(
+            (rows(&extended), policy_bytes(&extended)),
+            (rows(&longer), policy_bytes(&longer)),
+            "from {generations} on"
+        );
     }
     for which in [Which::Best, Which::Champion] {
         let again = replay(&whole, 1, &[0, 2, 3, 6], which, Verification::Required, &mut Cpu::default(), &mut |_| true);
@@ -282,27 +290,27 @@ fn past_champions_go_on() {
     }
 }
 
-/// An evolution strategy resumes from its mean and standard deviations to the same bits, also beyond the end of a shorter
-/// run, and through stages that change its step.
+/// Checkpoints include the mean and the standard deviations of the search. A stage changes its step size. A finished
+/// run can also be extended to the same results as a longer run.
 #[test]
-fn evolution_strategies_go_on() {
+fn evolution_strategies_resume_to_the_same_results() {
     const FAR: &str = "pois = [[10, 12], [20, 13]]\ncoupling = 1\nsteps = 20";
     let place = tempfile::tempdir().unwrap();
     let stage = "[[stages]]\nfrom = 3\nset = { learning.search_step = 2.0, world.coupling = 2 }\n";
     for method in ["openai-es", "snes"] {
         let method = format!("population = 9\nmethod = '{method}'\nfitness = 'G'");
-        // Far enough for policies to differ in what they reach.
+        // The POIs are far enough away that policies differ in how many they reach.
         let small = SMALL.replace("pois = [[10, 9], [20, 9]]\ncoupling = 2\nsteps = 9", FAR);
         let config = config(&[&small.replace("population = 8", &method), stage].concat());
         let whole = place.path().join("whole");
         let expected = train(&config, &whole, None, Start::Force, 99).unwrap().unwrap();
         let varied = rows(&whole)[1..].iter().filter(|row| row[2] != row[3]).count();
-        assert!(varied > 10, "{method}: all teams tied in all but {varied} rows, so that the mean stayed");
+        assert!(varied > 10, "{method}: teams differ in only {varied} rows, so the search hardly moves");
         for until in 1..=7 {
             let path = place.path().join("stopped");
             assert_eq!(train(&config, &path, None, Start::Force, until).unwrap(), None, "{until}");
             assert_eq!(train(&config, &path, None, Start::Resume, 99).unwrap().as_ref(), Some(&expected), "{until}");
-            assert_eq!((rows(&path), bytes(&path)), (rows(&whole), bytes(&whole)), "{until}");
+            assert_eq!((rows(&path), policy_bytes(&path)), (rows(&whole), policy_bytes(&whole)), "{until}");
         }
         let plain = Config { stages: vec![], ..config.clone() };
         let longer = place.path().join("longer");
@@ -314,32 +322,36 @@ fn evolution_strategies_go_on() {
             assert!(train(&short, &extended, None, Start::Force, 99).unwrap().is_some());
             let (mut session, _) =
                 Session::open(vec![(plain.clone(), extended.clone())], Start::Resume, &Disk::default()).unwrap();
-            assert_eq!(session.generations(), [generations + 1], "it does not begin again");
-            assert!(go_on(&mut session, |_| false).unwrap() == Ended::Done);
+            assert_eq!(session.generations(), [generations + 1], "the finished generations are trained again");
+            assert!(train_until(&mut session, |_| false).unwrap() == Ended::Done);
             assert_eq!(session.results(0), Some(&expected), "from {generations} on");
-            assert_eq!((rows(&extended), bytes(&extended)), (rows(&longer), bytes(&longer)), "from {generations} on");
+            assert_eq!(
+                (rows(&extended), policy_bytes(&extended)),
+                (rows(&longer), policy_bytes(&longer)),
+                "from {generations} on"
+            );
         }
         for which in [Which::Best, Which::Champion] {
             let again =
                 replay(&whole, 1, &[0, 2, 3, 6], which, Verification::Required, &mut Cpu::default(), &mut |_| true);
             assert_eq!(again.unwrap_or_else(|error| panic!("{which:?}: {error}")).len(), 4);
         }
-        // What the search starts from is the best of the given policies.
+        // A search that starts from given policies resumes, too.
         let init = || Some(read_init(&whole.join(POLICIES), &config).unwrap());
         let [warm, again] = ["warm", "again"].map(|name| place.path().join(name));
         train(&config, &warm, init(), Start::Force, 99).unwrap();
         train(&config, &again, init(), Start::Force, 2).unwrap();
         train(&config, &again, init(), Start::Resume, 99).unwrap();
-        assert_eq!((rows(&again), bytes(&again)), (rows(&warm), bytes(&warm)));
-        assert!(bytes(&warm) != bytes(&whole));
+        assert_eq!((rows(&again), policy_bytes(&again)), (rows(&warm), policy_bytes(&warm)));
+        assert!(policy_bytes(&warm) != policy_bytes(&whole));
         fs::remove_dir_all(place.path()).unwrap();
         fs::create_dir(place.path()).unwrap();
     }
 }
 
-/// The populations after the last generation are bred as its stage says.
+/// Policies after the last generation are bred with the settings of its stage.
 #[test]
-fn a_finished_run_is_extended_from_the_stage_that_it_ended_in() {
+fn a_finished_run_is_extended_with_the_settings_of_its_last_stage() {
     let place = tempfile::tempdir().unwrap();
     let stage = "[[stages]]\nfrom = 3\nset = { learning.mutation = 'additive', learning.mutation_probability = 0.9 }\n";
     let config = config(&[SMALL, stage].concat());
@@ -350,12 +362,16 @@ fn a_finished_run_is_extended_from_the_stage_that_it_ended_in() {
         short.learning.generations = generations;
         assert!(train(&short, &extended, None, Start::Force, 99).unwrap().is_some());
         assert_eq!(train(&config, &extended, None, Start::Resume, 99).unwrap(), expected, "from {generations} on");
-        assert_eq!((rows(&extended), bytes(&extended)), (rows(&whole), bytes(&whole)), "from {generations} on");
+        assert_eq!(
+            (rows(&extended), policy_bytes(&extended)),
+            (rows(&whole), policy_bytes(&whole)),
+            "from {generations} on"
+        );
     }
 }
 
 #[test]
-fn a_run_goes_on_from_the_policies_that_it_started_from() {
+fn a_warm_started_run_resumes_to_the_same_results() {
     let place = tempfile::tempdir().unwrap();
     let (config, first) = (config(SMALL), place.path().join("first"));
     train(&config, &first, None, Start::Fresh, 99).unwrap();
@@ -364,7 +380,7 @@ fn a_run_goes_on_from_the_policies_that_it_started_from() {
     longer.learning.generations += 2;
     let init = || Some(read_init(&file, &config).unwrap());
     let digest = init().unwrap().digest;
-    // As generation 0, in the file's order.
+    // The policies of the file are generation 0, in the same order.
     let learned = policies::read_all(&file, &config).unwrap();
     let whole = place.path().join("whole");
     let expected = train(&config, &whole, init(), Start::Fresh, 99).unwrap().unwrap();
@@ -378,14 +394,14 @@ fn a_run_goes_on_from_the_policies_that_it_started_from() {
         }
     }
     assert!(!trainer.start_from(0, 0, policies, &learned[0][1..]));
-    let begun = trainer.advance(&mut Cpu::default()).and_then(|_| trainer.advance(&mut Cpu::default())).unwrap();
-    for (told, row) in rows(&whole)[1..].iter().zip(&begun) {
-        assert_eq!(told[2..4], [row.best_g.to_string(), row.mean_g.to_string()], "trial {}", row.trial);
+    let trained = trainer.advance(&mut Cpu::default()).and_then(|_| trainer.advance(&mut Cpu::default())).unwrap();
+    for (metrics, row) in rows(&whole)[1..].iter().zip(&trained) {
+        assert_eq!(metrics[2..4], [row.best_g.to_string(), row.mean_g.to_string()], "trial {}", row.trial);
     }
-    // Each trial from its own.
+    // Each trial starts from the policies of the same trial.
     let given: Vec<Vec<f32>> = init().unwrap().trials.into_iter().map(|trial| trial.weights).collect();
     assert!(given == learned && learned[0] != learned[1]);
-    // Of more policies the first, of fewer all, before those that are drawn as ever.
+    // With more policies than the population needs, the first are used. With fewer, random policies fill the rest.
     let drawn = Trainer::new([config.validate().unwrap()]).weights(0, 0).unwrap().to_vec();
     for given in [3, 20] {
         let mut trainer = Trainer::new([config.validate().unwrap()]);
@@ -401,28 +417,29 @@ fn a_run_goes_on_from_the_policies_that_it_started_from() {
     for until in 0..=7 {
         let path = place.path().join(format!("stopped-{until}"));
         train(&config, &path, init(), Start::Fresh, until).unwrap();
-        // With the file or without it.
-        let again = if until % 2 == 0 { init() } else { None };
-        assert_eq!(train(&config, &path, again, Start::Resume, 99).unwrap().as_ref(), Some(&expected), "{until}");
-        assert_eq!((rows(&path), bytes(&path)), (rows(&whole), bytes(&whole)), "{until}");
+        // The file may be given again, but need not be.
+        let given = if until % 2 == 0 { init() } else { None };
+        assert_eq!(train(&config, &path, given, Start::Resume, 99).unwrap().as_ref(), Some(&expected), "{until}");
+        assert_eq!((rows(&path), policy_bytes(&path)), (rows(&whole), policy_bytes(&whole)), "{until}");
     }
-    // Not from another file, nor where there is nothing yet to go on from, nor a run that started otherwise.
+    // A run cannot be resumed with another file, or with a file if it did not start from one.
     let other = read_init(&whole.join(POLICIES), &config).unwrap();
     for config in [&config, &longer] {
-        let before = [&whole, &first].map(|path| everything(path));
+        let before = [&whole, &first].map(|path| read_files(path));
         let error = train(config, &whole, Some(other.clone()), Start::Resume, 99).unwrap_err().to_string();
         assert!(error.contains("started from a file of policies with SHA-256") && !error.contains('\n'), "{error}");
         let error = train(config, &first, init(), Start::Resume, 99).unwrap_err().to_string();
         assert!(error.contains("did not start from a file"), "{error}");
-        assert!(before == [&whole, &first].map(|path| everything(path)), "what was refused was changed");
+        assert!(before == [&whole, &first].map(|path| read_files(path)), "a refused command changed files");
     }
+    // Without a checkpoint, the file has to be given again.
     let bare = place.path().join("bare");
     let (folder, _) = Folder::open(&bare, Start::Fresh, &config, StartFrom::Unspecified, Disk::default()).unwrap();
     folder.write_run(&Run { init: Some(digest), ..Run::new(&config) }).unwrap();
     drop(folder);
     let error = train(&config, &bare, None, Start::Resume, 99).unwrap_err().to_string();
     assert!(error.contains("has no checkpoint yet"), "{error}");
-    // Nor one that was killed before it did anything.
+    // The same holds for a run that was killed before its first generation.
     let early = place.path().join("early");
     let runs = vec![(config.clone(), early.clone(), init())];
     drop(Session::open_from(runs, Start::Fresh, &Disk::default()).unwrap());
@@ -432,14 +449,14 @@ fn a_run_goes_on_from_the_policies_that_it_started_from() {
     assert_eq!(train(&config, &bare, init(), Start::Resume, 99).unwrap().as_ref(), Some(&expected));
 }
 
-/// A run that was made to end early is a run of so many generations: it is gone on with, extended and replayed as one.
+/// Resuming, extending and replaying give the same results as for a run with this number of generations.
 #[test]
-fn a_run_that_ended_early_is_whole() {
+fn a_run_that_was_ended_early_equals_a_shorter_run() {
     let place = tempfile::tempdir().unwrap();
     let first = place.path().join("first");
     train(&config(SMALL), &first, None, Start::Fresh, 99).unwrap();
     let init = Some(read_init(&first.join(POLICIES), &config(SMALL)).unwrap());
-    // No stage comes, one does, or there are none; from given policies, or not.
+    // The early end is before all stages, between two stages, or there are no stages; with and without given policies.
     let late = "[[stages]]\nfrom = 6\nset = { 'world.coupling' = 3 }\n";
     let cases = [(late, None), (late, init.clone()), (STAGES, init.clone()), ("", init)];
     for (number, (stages, init)) in cases.into_iter().enumerate() {
@@ -459,14 +476,14 @@ fn a_run_that_ended_early_is_whole() {
         let mut backend = Cpu::default();
         let replayed = replay(&done, 0, &[1, 3], Which::Best, Verification::Required, &mut backend, &mut |_| true);
         assert_eq!(replayed.unwrap_or_else(|error| panic!("{number}: {error}")).len(), 2);
-        // Killed before it could finish.
+        // Killed between the request to end early and the last generation.
         train_shorter(&config, &killed, init.clone(), 3, false);
         let (session, notes) =
             Session::open(vec![(shorter.clone(), killed.clone())], Start::Resume, &Disk::default()).unwrap();
         assert!(notes.iter().all(|(_, note)| !note.is_damage()), "{number}: {notes:?}");
         drop(session);
         assert_eq!(train(&shorter, &killed, None, Start::Resume, 99).unwrap(), expected, "{number}");
-        // It is extended as any other.
+        // Both can be extended.
         let mut longer = shorter.clone();
         longer.learning.generations = 5;
         let expected =
@@ -476,7 +493,7 @@ fn a_run_that_ended_early_is_whole() {
             assert_eq!(extended.map(|results| results.digest), expected.as_ref().map(|results| results.digest.clone()));
         }
     }
-    // Without what it started from there is nothing to replay.
+    // Without its checkpoints, a warm-started run cannot be replayed.
     let done = place.path().join("3-done");
     fs::remove_dir_all(done.join("checkpoints")).unwrap();
     let error = replay(&done, 0, &[2], Which::Best, Verification::Required, &mut Cpu::default(), &mut |_| true);
@@ -484,20 +501,20 @@ fn a_run_that_ended_early_is_whole() {
     assert!(error.contains("started from given policies"), "{error}");
 }
 
-/// `verify` plays the world of the first stage, also where that begins at once.
+/// The first stage begins at generation 0, so it replaces the world of the file.
 #[test]
-fn a_stage_from_the_start_on_is_verified() {
+fn verify_plays_the_world_of_the_first_stage() {
     let config = config(&format!("{SMALL}[[stages]]\nfrom = 0\nset = {{ 'world.steps' = 17 }}\n"));
     let worlds = vec![("at once".to_string(), config.clone())];
     let plan = verify::Plan { worlds, teams: 3, seed: 0, generations: 1 };
     let found = verify::compare(&plan, &mut Cpu::default(), &mut Cpu::default(), |_| {}).unwrap();
     let agents = (config.world.leaders.len() + config.world.followers.len()) as u64;
     assert!(found.mismatch.is_none() && config.world.steps != 17);
-    // Traced, recorded, and six kinds of scores.
+    // Each team plays 8 times: traced, recorded, and once for each of six kinds of scores.
     assert_eq!(found.agent_steps, 8 * 3 * agents * 17);
 }
 
-/// A folder with two configs and a run of the first.
+/// Creates a folder with three configs: without sharing, with a shared policy, and with more leaders that share one.
 fn place() -> (TempDir, PathBuf) {
     let place = tempfile::tempdir().unwrap();
     fs::write(place.path().join("small.toml"), SMALL).unwrap();
@@ -509,6 +526,7 @@ fn place() -> (TempDir, PathBuf) {
     (place, path)
 }
 
+/// Runs a command on the CPU. Returns its exit code, standard output and standard error.
 fn run(folder: &Path, line: &str) -> (Option<i32>, String, String) {
     let line = if line.starts_with("plot") { line.to_string() } else { format!("{line} --backend cpu") };
     let output = cargo_bin_cmd!("flotilla").args(line.split_whitespace()).current_dir(folder).output().unwrap();
@@ -520,55 +538,54 @@ fn run(folder: &Path, line: &str) -> (Option<i32>, String, String) {
 fn a_shared_policy_fits_any_number_of_leaders() {
     let (_place, folder) = place();
     let good = |line: &str| {
-        let (code, out, told) = run(&folder, line);
-        assert_eq!(code, Some(0), "{line}: {told}");
-        out
+        let (code, stdout, stderr) = run(&folder, line);
+        assert_eq!(code, Some(0), "{line}: {stderr}");
+        stdout
     };
     good("train shared.toml --out run");
     let bytes = fs::read(folder.join("run").join(POLICIES)).unwrap();
     let tensors = safetensors::SafeTensors::deserialize(&bytes).unwrap();
     assert_eq!(tensors.tensor("weights.1").unwrap().shape(), [1, 8, 57]);
-    // By its own config, by one without sharing, and by one of more leaders.
+    // The file fits its own config, one without sharing, and one with more leaders.
     let own = good("rollout shared.toml --policies run/policies.safetensors --scores own.csv");
     assert_eq!(good("rollout small.toml --policies run/policies.safetensors --scores other.csv"), own);
     assert_eq!(fs::read(folder.join("own.csv")).unwrap(), fs::read(folder.join("other.csv")).unwrap());
     good("rollout more.toml --policies run/policies.safetensors --scores more.csv");
     assert_eq!(fs::read_to_string(folder.join("more.csv")).unwrap().lines().count(), 1 + 8 * 3);
-    // A smaller file is joined by random policies; it fits more leaders where these share.
+    // Training can start from it with a larger population and more leaders that share a policy.
     good("train more.toml --out warm --init run/policies.safetensors");
     good("replay warm --generation 1 --out replay.html");
-    let (code, _, told) = run(&folder, "train small.toml --out cold --init run/policies.safetensors");
+    let (code, _, stderr) = run(&folder, "train small.toml --out cold --init run/policies.safetensors");
     let reason = "weights.0 is F32 [1, 8, 57], but the config needs F32 [2, 1 to 1048576, 57]";
-    assert!(code == Some(1) && told.contains(reason) && told.lines().count() == 1, "{told}");
-    let (code, _, told) = run(&folder, "train small.toml --out cold --init small.toml");
-    assert!(code == Some(1) && told.starts_with("error: small.toml: ") && told.lines().count() == 1, "{told}");
-    let (code, _, told) = run(&folder, "train small.toml --out cold --init missing.safetensors");
-    assert!(code == Some(1) && told.contains("missing.safetensors: cannot be read"), "{told}");
+    assert!(code == Some(1) && stderr.contains(reason) && stderr.lines().count() == 1, "{stderr}");
+    let (code, _, stderr) = run(&folder, "train small.toml --out cold --init small.toml");
+    assert!(code == Some(1) && stderr.starts_with("error: small.toml: ") && stderr.lines().count() == 1, "{stderr}");
+    let (code, _, stderr) = run(&folder, "train small.toml --out cold --init missing.safetensors");
+    assert!(code == Some(1) && stderr.contains("missing.safetensors: cannot be read"), "{stderr}");
     assert!(!folder.join("cold").exists());
     assert_eq!(Config::load(&folder.join("run/config.toml")).unwrap().learning.sharing, Sharing::Shared);
 }
 
 #[test]
-fn stages_are_seen_by_every_command() {
+fn every_command_supports_stages() {
     let (_place, folder) = place();
     fs::write(folder.join("staged.toml"), [SMALL, STAGES].concat()).unwrap();
     let good = |line: &str| {
-        let (code, out, told) = run(&folder, line);
-        assert_eq!(code, Some(0), "{line}: {told}");
-        out
+        let (code, stdout, stderr) = run(&folder, line);
+        assert_eq!(code, Some(0), "{line}: {stderr}");
+        stdout
     };
     good("train staged.toml --out run");
-    // Each generation is played again as it was.
+    // Generations of all stages can be replayed.
     for generation in [1, 2, 3, 4, 6] {
         good(&format!("replay run --generation {generation} --out replay.html"));
     }
-    let (code, _, told) = run(&folder, "replay run --generation 6 --compare 1");
-    assert!(code == Some(2) && told.contains("different stages"), "{told}");
+    let (code, _, stderr) = run(&folder, "replay run --generation 6 --compare 1");
+    assert!(code == Some(2) && stderr.contains("different stages"), "{stderr}");
     good("plot run --out curves.svg");
     let curves = fs::read_to_string(folder.join("curves.svg")).unwrap();
-    let told = "Stage 1 begins at generation 2. Stage 2 begins at generation 4.";
-    assert!(curves.contains(told), "{curves}");
-    // Of a run that stopped before its last stage, those that it came to; of several runs, what is all of theirs.
+    assert!(curves.contains("Stage 1 begins at generation 2. Stage 2 begins at generation 4."), "{curves}");
+    // A plot of several runs shows only stages that all have. A plot of a stopped run shows only the stages it reached.
     let rows = fs::read_to_string(folder.join("run/metrics.csv")).unwrap();
     let short: String = rows.split_inclusive('\n').take(1 + 3 * 3).collect();
     good("train small.toml --out plain");
@@ -581,17 +598,17 @@ fn stages_are_seen_by_every_command() {
     fs::write(folder.join("run/metrics.csv"), rows).unwrap();
     good("rollout staged.toml --policies run/policies.safetensors");
     assert!(good("rollout staged.toml --policies run/policies.safetensors --stage 2").contains("of 3"));
-    let (code, _, told) = run(&folder, "rollout staged.toml --policies run/policies.safetensors --stage 3");
-    assert!(code == Some(2) && told.contains("the config has 3 stages, 0 to 2"), "{told}");
-    // 2 generations of 9 steps, 2 of twice 14, 3 of 9, each of 27 teams.
+    let (code, _, stderr) = run(&folder, "rollout staged.toml --policies run/policies.safetensors --stage 3");
+    assert!(code == Some(2) && stderr.contains("the config has 3 stages, 0 to 2"), "{stderr}");
+    // 27 teams play 9 steps in 2 generations, two episodes of 14 steps in 2 generations, and 9 steps in 3.
     let output = cargo_bin_cmd!("flotilla").args(["check", "staged.toml"]).current_dir(&folder).output().unwrap();
     let text = String::from_utf8(output.stdout).unwrap();
     let steps = text.lines().find_map(|line| line.strip_prefix("#   team-steps")).map(str::trim);
     assert_eq!(steps, Some(format!("{}", 27 * (2 * 9 + 2 * 2 * 14 + 3 * 9)).as_str()), "{text}");
-    // A run that a flag ends before a stage has none of it, and goes on as such.
-    let (code, _, told) = run(&folder, "train staged.toml --generations 3 --out short --quiet");
-    assert_eq!(code, Some(0), "{told}");
-    assert!(told.contains("note: the stage from generation 4 on is left out"), "{told}");
+    // If --generations ends the run before a stage, the run's config omits the stage. Both configs can resume the run.
+    let (code, _, stderr) = run(&folder, "train staged.toml --generations 3 --out short --quiet");
+    assert_eq!(code, Some(0), "{stderr}");
+    assert!(stderr.contains("note: the stage from generation 4 on is left out"), "{stderr}");
     assert!(!fs::read_to_string(folder.join("short/config.toml")).unwrap().contains("from = 4"));
     good("train staged.toml --generations 3 --out short --resume");
     good("train short/config.toml --out short --resume");
