@@ -1,4 +1,4 @@
-//! The binary on good and bad input: exit codes, what it prints and where.
+//! Tests the command line: exit codes, messages, and the streams that they are printed to.
 
 #![cfg(feature = "cli")]
 
@@ -10,7 +10,7 @@ use std::process::Output;
 
 use tempfile::TempDir;
 
-/// Two leaders, four followers, two POIs; each test below changes one line.
+/// A valid config with two leaders, four followers and two POIs. Tests replace lines of it by their number.
 const GOOD: &str = "\
 [world]
 map = [50, 40]
@@ -41,7 +41,7 @@ fn flotilla(args: &[&str]) -> Output {
     support::flotilla().args(args).output().unwrap()
 }
 
-fn written(text: impl AsRef<[u8]>) -> (TempDir, PathBuf) {
+fn write_config(text: impl AsRef<[u8]>) -> (TempDir, PathBuf) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("x.toml");
     fs::write(&path, text).unwrap();
@@ -49,18 +49,18 @@ fn written(text: impl AsRef<[u8]>) -> (TempDir, PathBuf) {
 }
 
 fn check(text: impl AsRef<[u8]>, flags: &[&str]) -> Output {
-    let (_folder, path) = written(text);
+    let (_folder, path) = write_config(text);
     flotilla(&[&["check", path.to_str().unwrap()], flags].concat())
 }
 
-/// Standard error of a failed run, without the folder's name.
-fn refusal(output: Output) -> String {
+/// Returns the error message of a command that failed with exit code 1, without the folder's name.
+fn failure_message(output: Output) -> String {
     assert_eq!(output.status.code(), Some(1), "{}", String::from_utf8_lossy(&output.stderr));
-    told(output)
+    error_message(output)
 }
 
-/// Standard error, without the folder's name; nothing may be on standard output.
-fn told(output: Output) -> String {
+/// Returns the error message of a command, without the folder's name. Checks that standard output is empty.
+fn error_message(output: Output) -> String {
     let error = String::from_utf8(output.stderr).unwrap();
     assert!(output.stdout.is_empty(), "{}", String::from_utf8_lossy(&output.stdout));
     let error = error.strip_prefix("error: ").expect(&error).trim_end();
@@ -68,13 +68,13 @@ fn told(output: Output) -> String {
     error.lines().map(name).collect::<Vec<_>>().join("\n")
 }
 
-/// A line of [`GOOD`], by number, replaced.
+/// Returns [`GOOD`] with one line replaced, numbered from 1.
 fn with_line(number: usize, line: &str) -> String {
     GOOD.lines().enumerate().map(|(at, old)| if at + 1 == number { line } else { old }).collect::<Vec<_>>().join("\n")
 }
 
 #[test]
-fn a_good_config_is_printed_as_resolved_and_prints_itself_again() {
+fn check_prints_the_resolved_config_and_accepts_it_again() {
     let output = check(GOOD, &[]);
     assert_eq!(output.status.code(), Some(0));
     assert!(output.stderr.is_empty());
@@ -97,14 +97,14 @@ fn a_good_config_is_printed_as_resolved_and_prints_itself_again() {
 }
 
 #[test]
-fn a_heading_in_degrees_is_noted() {
-    let told = |text: &str| String::from_utf8(check(text, &[]).stderr).unwrap();
+fn a_heading_in_degrees_causes_a_note() {
+    let stderr = |text: &str| String::from_utf8(check(text, &[]).stderr).unwrap();
     let note =
         "world.heading has 90, which is more than a full turn: headings are in radians, and 90 degrees would be 1.5708";
     let text = GOOD.replacen("heading = 1.5\n", "heading = 90\n", 1);
-    assert!(told(&text).contains(note), "{}", told(&text));
+    assert!(stderr(&text).contains(note), "{}", stderr(&text));
     let text = GOOD.replacen("heading = 1.5\n", "heading = 1.5708\n", 1);
-    assert!(!told(&text).contains("full turn"), "{}", told(&text));
+    assert!(!stderr(&text).contains("full turn"), "{}", stderr(&text));
 }
 
 #[test]
@@ -119,25 +119,25 @@ fn json_is_one_object_with_config_and_cost() {
 }
 
 #[test]
-fn the_most_expensive_run_is_still_counted() {
+fn the_cost_of_the_largest_run_does_not_overflow() {
     let text = GOOD.replace("steps = 25", "steps = 10000").replace("population = 50", "population = 1048576")
         + "trials = 100\ngenerations = 1000000\nepisodes_per_team = 1000\n";
     let output = check(text, &["--json"]);
     let text = String::from_utf8(output.stdout).unwrap();
-    // 100 × 1 000 001 × 1 048 577 × 1000 × 10 000, beyond 64 bits
+    // 100 × 1 000 001 × 1 048 577 × 1000 × 10 000 does not fit in 64 bits.
     assert!(text.contains("\"team_steps\":1048578048577000000000"), "{text}");
 }
 
 #[test]
-fn the_papers_configs_are_good() {
+fn the_papers_configs_are_valid() {
     for name in ["generally_forward", "strictly_forward", "chaotic"] {
         assert_eq!(flotilla(&["check", &format!("configs/{name}.toml")]).status.code(), Some(0), "{name}");
     }
 }
 
-/// Each wrong line is answered by its place, its key, what was found and what is allowed.
+/// Each message has the line, the key, the value found and the allowed values.
 #[test]
-fn every_wrong_value_is_named_with_line_and_range() {
+fn wrong_values_are_reported_with_line_and_range() {
     let many = |count: usize| format!("[{}]", vec!["[1, 1]"; count].join(", "));
     let agents = "found 1028 agents with the leaders, allowed 1 to 1024";
     let leaders = format!("leaders = {}", many(1025));
@@ -293,31 +293,31 @@ fn every_wrong_value_is_named_with_line_and_range() {
         (21, "hidden = 10", "policy.hidden: found 10, allowed a list of 0 to 3 numbers, each 1 to 64"),
     ] {
         let expected = format!("x.toml:{line}: {expected}");
-        let found = refusal(check(with_line(line, text), &[]));
+        let found = failure_message(check(with_line(line, text), &[]));
         assert_eq!(found.lines().next(), Some(expected.as_str()), "{text}");
     }
     let crowd =
         GOOD.replace("[[12, 2], [8, 2], [22, 2], [18, 2]]", &many(1023)).replace("[[10, 5], [20, 5]]", &many(5));
-    assert_eq!(refusal(check(crowd, &[])), format!("x.toml:4: world.followers: {agents}"));
+    assert_eq!(failure_message(check(crowd, &[])), format!("x.toml:4: world.followers: {agents}"));
     let single = GOOD.replace("[[10, 5], [20, 5]]", "[[10, 5]]") + "hall_of_fame = 3\n";
     let expected = "x.toml:24: learning.hall_of_fame: found 3 with a single leader, allowed 0: it has no partners";
-    assert_eq!(refusal(check(single, &[])), expected);
+    assert_eq!(failure_message(check(single, &[])), expected);
 }
 
 #[test]
-fn policies_beyond_memory_are_refused_with_the_limit() {
+fn policies_above_the_memory_limit_are_refused() {
     let text = GOOD.replace("population = 50", "population = 1048576\ntrials = 4096");
     assert_eq!(
-        refusal(check(text, &[])),
+        failure_message(check(text, &[])),
         "x.toml:23: learning.population: found 1048576, whose policies of all trials take 3584 GiB, allowed 256 GiB"
     );
 }
 
 #[test]
-fn several_problems_are_told_together_by_line() {
+fn several_problems_are_reported_together_in_line_order() {
     let text = GOOD.replace("coupling = 3", "coupling = 9").replace("max_speed", "max_sped").replace("[10]", "[65]");
     assert_eq!(
-        refusal(check(format!("{text}trials = 0\nfoo = 1\n"), &["--population", "1"])),
+        failure_message(check(format!("{text}trials = 0\nfoo = 1\n"), &["--population", "1"])),
         "x.toml
 x.toml:6: world.coupling: found 9, allowed 1 to 6 (the number of agents)
 x.toml:13: motion.max_sped: unknown key, did you mean `motion.max_speed`?
@@ -330,54 +330,56 @@ x.toml:25: learning.foo: unknown key; [learning] has elites, episodes_per_team, 
 }
 
 #[test]
-fn missing_positions_and_sections_of_another_kind_are_named() {
+fn missing_positions_and_non_table_sections_are_named() {
     let leaders = "world.leaders: missing, allowed a list of 1 to 1024 positions [x, y]";
     let pois = "world.pois: missing, allowed a list of 1 to 256 positions [x, y]";
-    assert_eq!(refusal(check("", &[])), format!("x.toml\nx.toml:1: {leaders}\nx.toml:1: {pois}"));
-    let found = refusal(check("# no positions\n\n[world]\nsteps = 3\n", &[]));
+    assert_eq!(failure_message(check("", &[])), format!("x.toml\nx.toml:1: {leaders}\nx.toml:1: {pois}"));
+    let found = failure_message(check("# no positions\n\n[world]\nsteps = 3\n", &[]));
     assert_eq!(found, format!("x.toml\nx.toml:3: {leaders}\nx.toml:3: {pois}"));
-    let found =
-        refusal(check(format!("learning = 3\nseed = 1\n{GOOD}").replace("[learning]\npopulation = 50\n", ""), &[]));
+    let found = failure_message(check(
+        format!("learning = 3\nseed = 1\n{GOOD}").replace("[learning]\npopulation = 50\n", ""),
+        &[],
+    ));
     let expected = "x.toml\nx.toml:1: learning: found 3, allowed a section [learning]\n\
                     x.toml:2: seed: unknown key, did you mean `learning.seed`?";
     assert_eq!(found, expected);
 }
 
 #[test]
-fn broken_toml_is_told_with_its_line() {
-    for (line, text, told, at) in [
+fn toml_syntax_errors_name_their_line() {
+    for (line, text, reported_line, part) in [
         (8, "dt =", 8, ""),
         (8, "dt = 0.2 0.3", 8, "0.2 0.3"),
         (8, "steps = 3", 8, "steps"),
         (13, "max speed = 3", 13, ""),
         (2, "map = [50, 40", 3, "comma"),
     ] {
-        let found = refusal(check(with_line(line, text), &[]));
-        let place = format!("x.toml:{told}: ");
-        assert!(found.starts_with(&place) && found.len() > place.len() && found.contains(at), "{text}: {found}");
+        let found = failure_message(check(with_line(line, text), &[]));
+        let start = format!("x.toml:{reported_line}: ");
+        assert!(found.starts_with(&start) && found.len() > start.len() && found.contains(part), "{text}: {found}");
         assert_eq!(found.lines().count(), 1, "{text}: {found}");
     }
-    let twice = refusal(check(with_line(8, "dt =").replace("max_speed = 3", "max_speed ="), &[]));
-    assert_eq!(twice.lines().filter(|line| line.starts_with("x.toml:")).count(), 2, "{twice}");
+    let two_errors = failure_message(check(with_line(8, "dt =").replace("max_speed = 3", "max_speed ="), &[]));
+    assert_eq!(two_errors.lines().filter(|line| line.starts_with("x.toml:")).count(), 2, "{two_errors}");
 }
 
 #[test]
-fn what_is_no_config_file_is_refused() {
+fn unreadable_config_files_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name).to_str().unwrap().to_string();
-    let refused = |path: &str, reason: &str| {
-        let found = refusal(flotilla(&["check", path]));
+    let assert_refused = |path: &str, reason: &str| {
+        let found = failure_message(flotilla(&["check", path]));
         assert!(found.contains(reason) && found.contains("x.toml"), "{found}");
     };
-    refused(&path("x.toml"), "cannot be read: ");
+    assert_refused(&path("x.toml"), "cannot be read: ");
     fs::create_dir(path("dir-x.toml")).unwrap();
-    refused(&path("dir-x.toml"), "it is a directory; name a config file in it");
+    assert_refused(&path("dir-x.toml"), "it is a directory; name a config file in it");
     fs::write(path("latin-x.toml"), b"[world]\n# caf\xe9\n").unwrap();
-    refused(&path("latin-x.toml"), "line 2 is not UTF-8 text");
-    // 100 MB of nothing: refused by its size, before most of it is read.
+    assert_refused(&path("latin-x.toml"), "line 2 is not UTF-8 text");
+    // 100 MB of zeros, refused before most of it is read.
     let big = path("big-x.toml");
     fs::File::create(Path::new(&big)).unwrap().set_len(100_000_000).unwrap();
-    refused(&big, "larger than 1048576 bytes");
+    assert_refused(&big, "larger than 1048576 bytes");
 }
 
 #[test]
@@ -391,12 +393,13 @@ fn overrides_out_of_range_name_the_flag() {
         (["--seed", "-1"], &format!("--seed: found -1, {whole}")),
     ] {
         let output = check(GOOD, &flags);
-        assert_eq!(output.status.code(), Some(2), "wrong usage, though only the config's ranges tell");
-        assert_eq!(told(output), expected);
+        assert_eq!(output.status.code(), Some(2), "an out-of-range flag is wrong usage");
+        assert_eq!(error_message(output), expected);
     }
-    let wrong = check(GOOD, &["--trials", "five"]);
-    assert!(told(wrong).starts_with("invalid value 'five' for '--trials <N>': allowed a number\n"));
-    // A number below 0 is a value of any flag, and no flag itself.
+    let not_a_number = check(GOOD, &["--trials", "five"]);
+    let message = error_message(not_a_number);
+    assert!(message.starts_with("invalid value 'five' for '--trials <N>': allowed a number\n"), "{message}");
+    // A negative number is parsed as the value of a flag, not as another flag.
     for (line, flag) in [
         ("replay x --trial -1", "--trial <best|worst|N>"),
         ("replay x --step -2", "--step <N>"),
@@ -404,15 +407,15 @@ fn overrides_out_of_range_name_the_flag() {
     ] {
         let output = flotilla(&line.split(' ').collect::<Vec<_>>());
         assert_eq!(output.status.code(), Some(2), "{line}");
-        let told = told(output);
-        assert!(told.contains(&format!("for '{flag}': allowed")) && !told.contains("tip:"), "{line}: {told}");
+        let message = error_message(output);
+        assert!(message.contains(&format!("for '{flag}': allowed")) && !message.contains("tip:"), "{line}: {message}");
     }
-    // A flag mends what the file has wrong.
+    // A flag replaces an invalid value of the file.
     assert_eq!(check(with_line(23, "trials = 0"), &["--trials", "3"]).status.code(), Some(0));
 }
 
 #[test]
-fn wrong_usage_is_exit_code_2() {
+fn wrong_usage_exits_with_code_2() {
     for args in [
         &["check"][..],
         &["chekc", "configs/chaotic.toml"],
@@ -428,7 +431,7 @@ fn wrong_usage_is_exit_code_2() {
         assert_eq!(output.status.code(), Some(2), "{args:?}");
         assert!(output.stdout.is_empty() && !output.stderr.is_empty(), "{args:?}");
     }
-    // Numbers are refused in one way, wherever they are given.
+    // All commands report wrong numbers in the same form.
     for (line, allowed) in [
         ("verify --worlds 0", "a whole number from 1 to 100000"),
         ("verify --seed -1", "a whole number from 0 to 4294967295"),
@@ -442,18 +445,18 @@ fn wrong_usage_is_exit_code_2() {
         ("train x.toml --trials far", "a number"),
     ] {
         let output = flotilla(&line.split(' ').collect::<Vec<_>>());
-        let told = told(output);
-        assert!(told.contains(&format!(": allowed {allowed}\n")), "{line}: {told}");
+        let message = error_message(output);
+        assert!(message.contains(&format!(": allowed {allowed}\n")), "{line}: {message}");
     }
-    // What is advised can be typed.
-    let told = refusal(flotilla(&["plot", "no run; here"]));
-    assert!(told.ends_with("`flotilla train CONFIG --out 'no run; here'` makes a run there"), "{told}");
+    // Suggested commands are quoted, so that they can be pasted into a shell.
+    let message = failure_message(flotilla(&["plot", "no run; here"]));
+    assert!(message.ends_with("`flotilla train CONFIG --out 'no run; here'` makes a run there"), "{message}");
     assert_eq!(flotilla(&["--help"]).status.code(), Some(0));
     assert_eq!(flotilla(&["--version"]).status.code(), Some(0));
 }
 
 #[test]
-fn a_reader_that_leaves_early_is_no_failure() {
+fn a_closed_standard_output_is_not_an_error() {
     let (reader, writer) = std::io::pipe().unwrap();
     drop(reader);
     let mut child = support::flotilla();
@@ -462,8 +465,8 @@ fn a_reader_that_leaves_early_is_no_failure() {
     assert_eq!((output.status.code(), String::from_utf8_lossy(&output.stderr).as_ref()), (Some(0), ""));
 }
 
-/// The JSON objects that `bench` prints of rollouts at these numbers, one a line.
-fn benched(flags: &[&str]) -> Vec<serde_json::Value> {
+/// Returns the JSON objects that `bench --json` prints, one per line.
+fn bench_json(flags: &[&str]) -> Vec<serde_json::Value> {
     let output = flotilla(&[&["bench", "--backend", "cpu", "--json"], flags].concat());
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let text = String::from_utf8(output.stdout).unwrap();
@@ -471,23 +474,23 @@ fn benched(flags: &[&str]) -> Vec<serde_json::Value> {
 }
 
 #[test]
-fn bench_keeps_to_its_contract() {
-    let objects = benched(&["--teams", "20"]);
-    let [object] = &objects[..] else { panic!("one combination, {} objects", objects.len()) };
+fn bench_json_has_plausible_values() {
+    let objects = bench_json(&["--teams", "20"]);
+    let [object] = &objects[..] else { panic!("one combination gives {} objects", objects.len()) };
     assert_eq!(object["backend"], "cpu");
     assert!(object["adapter"].is_null());
     assert_eq!([&object["teams"], &object["agents"], &object["steps"]], [20, 12, 25]);
     for rate in ["team_steps_per_s", "generations_per_s", "generation_team_steps_per_s", "ceiling_operations_per_s"] {
         assert!(object[rate].as_f64().is_some_and(|rate| rate > 0.0), "{rate} of {object}");
     }
-    // Neither fused nor skipped: what must be done takes time, and no more of the machine than there is.
+    // A wrong count of operations, or skipped work, would leave these ranges.
     assert!(object["operations_per_team_step"].as_f64().is_some_and(|count| (4e3..8e3).contains(&count)), "{object}");
     assert!(object["ceiling_share"].as_f64().is_some_and(|share| share > 0.0 && share <= 1.0), "{object}");
 }
 
 #[test]
 fn bench_measures_every_combination() {
-    let objects = benched(&["--teams", "2,3", "--steps", "1,2", "--agents", "3,7", "--rollout-only"]);
+    let objects = bench_json(&["--teams", "2,3", "--steps", "1,2", "--agents", "3,7", "--rollout-only"]);
     let found: Vec<_> =
         objects.iter().map(|o| ["agents", "steps", "teams"].map(|key| o[key].as_u64().unwrap())).collect();
     let expected: Vec<_> = [3, 7]
@@ -496,41 +499,42 @@ fn bench_measures_every_combination() {
         .collect();
     assert_eq!(found, expected);
     for object in &objects {
-        assert_eq!(object["pois"], 4, "as many as the config has: {object}");
-        assert!(object.get("generations_per_s").is_none(), "left out: {object}");
+        assert_eq!(object["pois"], 4, "the config has 4 POIs: {object}");
+        assert!(object.get("generations_per_s").is_none(), "only rollouts are measured: {object}");
     }
 }
 
 #[test]
-fn bench_tells_where_a_generation_goes() {
-    let [object] = &benched(&["--teams", "50", "--profile"])[..] else { panic!("one combination") };
+fn bench_profile_reports_the_parts_of_a_generation() {
+    let [object] = &bench_json(&["--teams", "50", "--profile"])[..] else { panic!("one combination") };
     let profile = object["profile"].as_object().unwrap();
-    let ms = |stage: &str| profile[stage].as_f64().filter(|&ms| ms > 0.0).unwrap_or_else(|| panic!("{stage}"));
+    let ms = |part: &str| profile[part].as_f64().filter(|&ms| ms > 0.0).unwrap_or_else(|| panic!("{part}: {object}"));
     let [rollout, rest @ ..] =
         ["rollout_and_scores_ms", "teams_and_starts_ms", "fitness_and_champions_ms", "selection_and_mutation_ms"]
             .map(ms);
-    assert_eq!(profile.len(), 1 + rest.len(), "the CPU has no other stages: {object}");
-    assert!(rollout > rest.into_iter().fold(0.0, f64::max), "what takes longest: {object}");
+    assert_eq!(profile.len(), 1 + rest.len(), "the CPU has no other parts: {object}");
+    assert!(rollout > rest.into_iter().fold(0.0, f64::max), "the rollout takes longest: {object}");
 }
 
-/// With stages, `bench` plays the first one. A generation is one episode, as a rollout is.
+/// With stages, `bench` plays the first one. A generation plays one episode per team, as a rollout does, although the
+/// stage sets 8.
 #[test]
 fn bench_plays_the_first_stage() {
     let text = format!(
         "{}[[stages]]\nfrom = 0\nset = {{ 'learning.episodes_per_team' = 8, 'learning.start_jitter' = 1.0, 'world.windows' = [[20, 25], [1, 25]] }}\n",
         include_str!("../configs/strictly_forward.toml").replace("[world]", "[world]\nwindows = [[1, 25], [1, 25]]")
     );
-    let (_folder, path) = written(text);
+    let (_folder, path) = write_config(text);
     let path = path.to_str().unwrap();
-    let objects = benched(&[path, "--teams", "50", "--steps", "30"]);
+    let objects = bench_json(&[path, "--teams", "50", "--steps", "30"]);
     assert!(objects[0]["generation_share"].as_f64().is_some_and(|share| share > 0.3), "{objects:?}");
     let short = flotilla(&["bench", "--backend", "cpu", path, "--steps", "10", "--teams", "50"]);
     assert!(!String::from_utf8_lossy(&short.stderr).contains("panicked"), "{short:?}");
 }
 
-/// Fewer trials than an interval takes are told before any training.
+/// Intervals require two trials. Fewer are refused before any training.
 #[test]
-fn questions_take_two_trials() {
+fn questions_require_two_trials() {
     let output = flotilla(&["paper", "--questions", "--trials", "1", "--out", "nowhere/questions"]);
     let error = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.code() == Some(2) && error.contains("--trials 1"), "{error}");
@@ -538,8 +542,8 @@ fn questions_take_two_trials() {
 }
 
 #[test]
-fn bench_refuses_what_it_cannot_lay_out() {
-    for (flags, named) in [
+fn bench_refuses_sizes_out_of_range() {
+    for (flags, part) in [
         (["--agents", "1024"], "341 leaders and 683 followers"),
         (["--agents", "0"], "from 1 to 1024"),
         (["--teams", "1"], "from 2 to "),
@@ -548,22 +552,25 @@ fn bench_refuses_what_it_cannot_lay_out() {
         let output = flotilla(&[&["bench", "--backend", "cpu"][..], &flags].concat());
         let error = String::from_utf8(output.stderr).unwrap();
         assert_eq!(output.status.code(), Some(2), "{error}");
-        assert!(error.contains(named), "{error}");
+        assert!(error.contains(part), "{error}");
         assert!(output.stdout.is_empty());
     }
 }
 
 #[test]
-fn a_flag_named_like_a_config_key_is_offered_as_set() {
-    let told = |arguments: &[&str]| String::from_utf8(flotilla(arguments).stderr).unwrap();
-    assert!(told(&["train", "x.toml", "--steps", "50"]).contains("'--set world.steps=VALUE'"));
-    assert!(told(&["check", "x.toml", "--start-jitter=2"]).contains("'--set learning.start_jitter=VALUE'"));
-    // Not by a command that has no --set, and not for a name that is no key.
-    assert!(!told(&["plot", "run", "--steps", "50"]).contains("--set"));
-    assert!(!told(&["train", "x.toml", "--colour", "red"]).contains("VALUE"));
-    let (_folder, path) = written(include_str!("../configs/chaotic.toml"));
-    let twice = told(&["check", path.to_str().unwrap(), "--set", "generations=3"]);
-    assert!(twice.contains("`learning.generations`") && twice.contains("`checkpoint.generations`"), "{twice}");
+fn an_unknown_flag_named_like_a_config_key_suggests_set() {
+    let stderr = |arguments: &[&str]| String::from_utf8(flotilla(arguments).stderr).unwrap();
+    assert!(stderr(&["train", "x.toml", "--steps", "50"]).contains("'--set world.steps=VALUE'"));
+    assert!(stderr(&["check", "x.toml", "--start-jitter=2"]).contains("'--set learning.start_jitter=VALUE'"));
+    // No suggestion if the command has no --set, or if the config has no such key.
+    assert!(!stderr(&["plot", "run", "--steps", "50"]).contains("--set"));
+    assert!(!stderr(&["train", "x.toml", "--colour", "red"]).contains("VALUE"));
+    let (_folder, path) = write_config(include_str!("../configs/chaotic.toml"));
+    let ambiguous = stderr(&["check", path.to_str().unwrap(), "--set", "generations=3"]);
+    assert!(
+        ambiguous.contains("`learning.generations`") && ambiguous.contains("`checkpoint.generations`"),
+        "{ambiguous}"
+    );
 }
 
 #[test]
@@ -578,15 +585,12 @@ fn help_lists_every_command_once_in_a_group() {
             None => group = line,
         }
     }
-    let all: Vec<_> =
-        flotilla::cli::command().get_subcommands().map(|command| command.get_name().to_string()).collect();
     let mut names: Vec<_> = found.iter().map(|(_, name)| name.to_string()).collect();
     names.sort();
-    assert_eq!(names, {
-        let mut all = all;
-        all.retain(|name| name != "help");
-        all.sort();
-        all
-    });
+    let mut commands: Vec<_> =
+        flotilla::cli::command().get_subcommands().map(|command| command.get_name().to_string()).collect();
+    commands.retain(|name| name != "help");
+    commands.sort();
+    assert_eq!(names, commands);
     assert!(found.contains(&("Train:", "sweep")) && found.contains(&("Look at results:", "replay")), "{found:?}");
 }

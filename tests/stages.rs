@@ -1,6 +1,6 @@
 //! Tests curricula (`[[stages]]`) and warm starts (`--init`).
 //!
-//! Errors in stages name their line. A resumed run has to end in the same results, byte for byte, as one without a stop.
+//! Errors in stages name their line. A resumed run must end in the same results as one without a stop, byte for byte.
 
 #![cfg(feature = "cli")]
 
