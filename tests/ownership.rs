@@ -1,4 +1,6 @@
-//! flotilla never replaces or deletes a file that it did not make, and never writes through a link in its folders.
+//! Tests that flotilla never replaces or deletes files that it did not make.
+//!
+//! It must not write through symbolic links in its own folders either, because these may lead to files of others.
 
 #![cfg(feature = "cli")]
 
@@ -36,48 +38,51 @@ fn place() -> Place {
     Place::new(&[("small.toml", SMALL), ("grid.toml", SWEEP)]).on_cpu()
 }
 
-/// A place with a run in `run`.
+/// Creates a folder with a run in `run`.
 fn with_run() -> Place {
     let place = place();
     place.good("train small.toml --out run --quiet");
     place
 }
 
-/// Everything below a folder: names, and what is in the files.
-fn all(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
-    let mut found = Vec::new();
+/// Reads all files below a folder.
+fn read_files(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
+    let mut files = Vec::new();
     for entry in fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()) {
         match entry.symlink_metadata().unwrap().is_dir() {
-            true => found.extend(all(&entry)),
-            false => found.push((entry.clone(), fs::read(&entry).unwrap_or_default())),
+            true => files.extend(read_files(&entry)),
+            false => files.push((entry.clone(), fs::read(&entry).unwrap_or_default())),
         }
     }
-    found.sort();
-    found
+    files.sort();
+    files
 }
 
 #[test]
-fn a_picture_that_flotilla_did_not_draw_is_not_drawn_over() {
+fn pictures_of_others_are_not_replaced() {
     let place = place();
     fs::create_dir(place.path("v")).unwrap();
     place.write("v/curves.svg", "precious");
     for flag in ["", "--force"] {
-        let told = place.refused(1, &format!("train small.toml --out v --quiet {flag}"));
-        assert!(told.contains("v/curves.svg was not made by flotilla") && told.contains("move it away"), "{told}");
+        let stderr = place.refused(1, &format!("train small.toml --out v --quiet {flag}"));
+        assert!(
+            stderr.contains("v/curves.svg was not made by flotilla") && stderr.contains("move it away"),
+            "{stderr}"
+        );
         assert_eq!((place.read("v/curves.svg"), place.path("v/run.json").exists()), ("precious".into(), false));
     }
-    // A run that is resumed is trained all the same, and told of.
-    let (_, told) = place.good("train small.toml --out v --quiet --resume");
-    assert!(told.contains("v/curves.svg: not drawn") && place.path("v/run.json").exists(), "{told}");
+    // With --resume the run is trained, and a note says that the picture was not drawn.
+    let (_, stderr) = place.good("train small.toml --out v --quiet --resume");
+    assert!(stderr.contains("v/curves.svg: not drawn") && place.path("v/run.json").exists(), "{stderr}");
     assert_eq!(place.read("v/curves.svg"), "precious");
     assert!(place.refused(1, "plot v").contains("v/curves.svg was not made by flotilla"));
     assert_eq!(place.read("v/curves.svg"), "precious");
     place.good("plot v --out v/curves.svg");
-    assert!(place.read("v/curves.svg").starts_with("<svg"), "it was named");
+    assert!(place.read("v/curves.svg").starts_with("<svg"), "a file named by --out is replaced");
 }
 
 #[test]
-fn a_picture_that_was_edited_is_kept() {
+fn an_edited_picture_is_kept() {
     let place = with_run();
     place.good("plot run");
     place.good("replay run --quiet");
@@ -86,10 +91,10 @@ fn a_picture_that_was_edited_is_kept() {
     place.write("run/curves.svg", &edited);
     assert!(place.refused(1, "plot run").contains("not made by flotilla"));
     place.refused(1, "train small.toml --out run --quiet --force");
-    let (_, told) = place.good("train small.toml --out run --quiet --resume --generations 8");
-    assert!(told.contains("curves.svg: not drawn"), "{told}");
+    let (_, stderr) = place.good("train small.toml --out run --quiet --resume --generations 8");
+    assert!(stderr.contains("curves.svg: not drawn"), "{stderr}");
     assert_eq!(place.read("run/curves.svg"), edited);
-    // A line of the list that a crash cut short takes none with it.
+    // A line of the list of files that a crash truncated must not invalidate the next line.
     let list = place.read(Path::new("run").join(LIST));
     place.write(Path::new("run").join(LIST), format!("{list}0123"));
     fs::remove_file(place.path("run/curves.svg")).unwrap();
@@ -98,43 +103,43 @@ fn a_picture_that_was_edited_is_kept() {
 }
 
 #[test]
-fn force_removes_what_the_run_made_and_nothing_else() {
+fn force_removes_only_files_of_the_run() {
     let place = place();
     fs::create_dir(place.path("v")).unwrap();
     place.write("v/replay.html", "precious");
     place.good("train small.toml --out v --quiet --force");
-    assert_eq!(place.read("v/replay.html"), "precious", "there was no run to write over");
+    assert_eq!(place.read("v/replay.html"), "precious", "there was no run to replace");
     place.good("train small.toml --out v --quiet --force");
     assert_eq!(place.read("v/replay.html"), "precious");
     assert!(place.refused(1, "replay v --quiet").contains("v/replay.html was not made by flotilla"));
     fs::remove_file(place.path("v/replay.html")).unwrap();
     place.good("replay v --quiet");
     place.good("train small.toml --out v --quiet --force");
-    assert!(!place.path("v/replay.html").exists(), "it showed the run that is gone");
+    assert!(!place.path("v/replay.html").exists(), "the replay showed the replaced run");
 }
 
 #[test]
-fn event_files_of_others_stay() {
+fn event_files_of_others_are_kept() {
     let place = with_run();
     let trial = place.path("run/tensorboard/trial-0");
     fs::create_dir_all(&trial).unwrap();
     let theirs = ["notes.flotilla", "events.out.tfevents.1.flotilla", "events.out.tfevents.x.flotilla"];
     theirs.iter().for_each(|name| fs::write(trial.join(name), "precious, and longer than a first record is").unwrap());
-    let stays = |count: usize| {
+    let assert_kept = |count: usize| {
         theirs.iter().for_each(|name| assert!(fs::read(trial.join(name)).unwrap().starts_with(b"precious"), "{name}"));
         assert_eq!(fs::read_dir(&trial).unwrap().count(), count);
     };
     place.good("train small.toml --out run --quiet --force --tensorboard");
-    stays(4);
+    assert_kept(4);
     place.good("train small.toml --out run --quiet --resume --generations 8 --tensorboard");
-    stays(4);
+    assert_kept(4);
     place.good("train small.toml --out run --quiet --force");
-    stays(3);
+    assert_kept(3);
 }
 
-/// The first message does not advise what the next one refuses.
+/// No message may suggest a flag with which the next attempt is refused, too.
 #[test]
-fn a_folder_of_someone_elses_is_refused_in_the_same_words_by_every_flag() {
+fn folders_with_files_of_others_are_refused_with_every_flag() {
     let place = place();
     for (name, text) in [
         ("metrics.csv", "loss,step\n1,2\n"),
@@ -147,27 +152,30 @@ fn a_folder_of_someone_elses_is_refused_in_the_same_words_by_every_flag() {
         let file = out.join(name);
         fs::create_dir_all(file.parent().unwrap()).unwrap();
         fs::write(&file, text).unwrap();
-        let before = all(&out);
+        let before = read_files(&out);
         for flags in [&[][..], &["--force"], &["--resume"]] {
             let words = [&["train", "small.toml", "--quiet", "--out", out.to_str().unwrap()], flags].concat();
-            let told = place.refused(1, &words);
-            assert!(told.contains(&format!("{name} was not made by flotilla")), "{name} {flags:?}: {told}");
-            assert!(told.contains("move it away, or choose another --out") && !told.contains("--force"), "{told}");
-            assert_eq!(all(&out), before, "{name} {flags:?}");
+            let stderr = place.refused(1, &words);
+            assert!(stderr.contains(&format!("{name} was not made by flotilla")), "{name} {flags:?}: {stderr}");
+            assert!(
+                stderr.contains("move it away, or choose another --out") && !stderr.contains("--force"),
+                "{stderr}"
+            );
+            assert_eq!(read_files(&out), before, "{name} {flags:?}");
         }
     }
-    // A config of one's own beside nothing else is one to start from, and another's is not replaced.
+    // A folder with nothing but a user's config can become a run of this config. No other config replaces it.
     fs::create_dir(place.path("own")).unwrap();
     let own = format!("# Mine.\n{SMALL}");
     place.write("own/config.toml", &own);
-    let told = place.refused(1, "train small.toml --out own --quiet --force --seed 3");
-    assert!(told.contains("own/config.toml was not made by flotilla"), "{told}");
+    let stderr = place.refused(1, "train small.toml --out own --quiet --force --seed 3");
+    assert!(stderr.contains("own/config.toml was not made by flotilla"), "{stderr}");
     place.good("train own/config.toml --out own --quiet");
     assert_eq!(place.read("own/config.toml"), own);
 }
 
 #[test]
-fn other_files_of_a_run_are_no_leftovers() {
+fn temporary_files_of_others_are_kept() {
     let place = with_run();
     for name in ["checkpoints/notes.tmp", "checkpoints/a.safetensors.tmp", "run.json.tmp", "metrics.csv.tmp"] {
         fs::write(place.path("run").join(name), "precious").unwrap();
@@ -181,17 +189,17 @@ fn other_files_of_a_run_are_no_leftovers() {
 }
 
 #[test]
-fn a_film_is_not_put_over_other_pictures() {
+fn an_animation_does_not_replace_pictures_of_others() {
     let place = with_run();
     place.write("p0003.png", "precious");
-    let told = place.refused(1, "replay run --quiet --width 100 --out p%04d.png");
-    assert!(told.contains("p0003.png was not made by flotilla"), "{told}");
+    let stderr = place.refused(1, "replay run --quiet --width 100 --out p%04d.png");
+    assert!(stderr.contains("p0003.png was not made by flotilla"), "{stderr}");
     assert_eq!(place.read("p0003.png"), "precious");
-    assert!(!place.path("p0000.png").exists(), "nothing of it was written");
+    assert!(!place.path("p0000.png").exists(), "no frame is written");
     place.good("replay run --quiet --width 100 --out q%04d.png");
-    // Over its own pictures, a film may be made again.
+    // An animation may replace its own frames.
     place.good("replay run --quiet --width 100 --out q%04d.png --trial 1");
-    // So may a comparison, whose name nobody chose.
+    // A comparison, which has a default name, may replace itself, but not a picture of others.
     place.good("train small.toml --out other --quiet --seed 3");
     place.good("plot run other");
     place.good("plot run other");
@@ -201,17 +209,17 @@ fn a_film_is_not_put_over_other_pictures() {
 }
 
 #[test]
-fn a_config_with_comments_is_kept_where_another_takes_its_place() {
+fn a_users_config_is_copied_before_another_replaces_it() {
     let place = place();
     fs::create_dir(place.path("own")).unwrap();
     let own = format!("# Mine.\n{SMALL}");
     place.write("own/config.toml", &own);
     place.good("train own/config.toml --out own --quiet");
-    let (_, told) = place.good("train own/config.toml --out own --quiet --resume --generations 15");
-    assert!(told.contains("kept as own/config.old.toml"), "{told}");
+    let (_, stderr) = place.good("train own/config.toml --out own --quiet --resume --generations 15");
+    assert!(stderr.contains("kept as own/config.old.toml"), "{stderr}");
     assert_eq!(place.read("own/config.old.toml"), own);
     assert!(place.read("own/config.toml").contains("generations = 15"));
-    // What flotilla wrote itself needs no copy.
+    // A config that flotilla wrote needs no copy.
     place.good("train own/config.toml --out own --quiet --resume --generations 16");
     assert!(!place.path("own/config.old-2.toml").exists());
     place.write("own/config.toml", format!("# Mine, too.\n{}", place.read("own/config.toml")));
@@ -220,7 +228,7 @@ fn a_config_with_comments_is_kept_where_another_takes_its_place() {
 }
 
 #[test]
-fn tables_and_pictures_of_others_in_a_sweep_are_left_alone() {
+fn files_of_others_in_sweeps_man_pages_and_papers_are_kept() {
     let place = place();
     place.good("sweep grid.toml --out sweep --quiet");
     place.good("sweep grid.toml --out sweep --quiet --collect");
@@ -228,8 +236,8 @@ fn tables_and_pictures_of_others_in_a_sweep_are_left_alone() {
         let before = fs::read(place.path("sweep").join(name)).unwrap();
         place.write(Path::new("sweep").join(name), "precious");
         for flag in ["--collect", "--force", "--resume"] {
-            let told = place.refused(1, &format!("sweep grid.toml --out sweep --quiet {flag}"));
-            assert!(told.contains(&format!("sweep/{name} was not made by flotilla")), "{told}");
+            let stderr = place.refused(1, &format!("sweep grid.toml --out sweep --quiet {flag}"));
+            assert!(stderr.contains(&format!("sweep/{name} was not made by flotilla")), "{stderr}");
             assert_eq!(place.read(Path::new("sweep").join(name)), "precious");
         }
         place.write(Path::new("sweep").join(name), before);
@@ -241,20 +249,20 @@ fn tables_and_pictures_of_others_in_a_sweep_are_left_alone() {
     fs::write(&page, "precious").unwrap();
     place.command().arg("man").assert().code(1);
     assert_eq!(fs::read_to_string(page).unwrap(), "precious");
-    // What another program calls a paper is none.
+    // A paper.toml of another program does not make the folder a paper.
     fs::create_dir(place.path("thesis")).unwrap();
     place.write("thesis/paper.toml", "title = 'mine'\n");
-    let told = place.refused(1, "paper --out thesis --force --trials 1 --generations 1 --quiet");
-    assert!(told.contains("thesis/paper.toml was not made by flotilla"), "{told}");
+    let stderr = place.refused(1, "paper --out thesis --force --trials 1 --generations 1 --quiet");
+    assert!(stderr.contains("thesis/paper.toml was not made by flotilla"), "{stderr}");
     assert_eq!(place.read("thesis/paper.toml"), "title = 'mine'\n");
 }
 
 #[test]
-fn only_the_owners_folders_are_written_in_unless_they_are_named() {
-    assert!(ownership::may_write(1000, 1000, false));
-    assert!(!ownership::may_write(1001, 1000, false));
-    assert!(!ownership::may_write(0, 1000, false) && !ownership::may_write(1000, 0, false));
-    assert!(ownership::may_write(1001, 1000, true));
+fn folders_of_other_users_are_entered_only_if_named() {
+    assert!(ownership::may_enter(1000, 1000, false));
+    assert!(!ownership::may_enter(1001, 1000, false));
+    assert!(!ownership::may_enter(0, 1000, false) && !ownership::may_enter(1000, 0, false));
+    assert!(ownership::may_enter(1001, 1000, true));
 }
 
 #[cfg(unix)]
@@ -264,7 +272,7 @@ mod links {
 
     use super::*;
 
-    /// A folder of somebody else's, which must not change.
+    /// Creates a folder of somebody else, to which links lead and which must not change.
     fn victim(place: &Place) -> PathBuf {
         let victim = place.path("victim");
         fs::create_dir_all(victim.join("docs")).unwrap();
@@ -274,19 +282,19 @@ mod links {
         victim
     }
 
-    /// Runs commands, whatever they come to, that must leave a folder as it was; gives what they said.
-    fn unchanged(place: &Place, folder: &Path, lines: &[&str]) -> String {
-        let before = all(folder);
-        let mut told = String::new();
+    /// Runs commands that must report a symbolic link and leave the folder unchanged. Returns their standard error.
+    fn assert_unchanged(place: &Place, folder: &Path, lines: &[&str]) -> String {
+        let before = read_files(folder);
+        let mut messages = String::new();
         for line in lines {
             let output = place.run(*line);
-            let text = String::from_utf8(output.stderr).unwrap();
-            assert!(!text.contains("panicked"), "{line}: {text}");
-            assert!(text.contains("is a symbolic link"), "{line}: {text}");
-            assert_eq!(all(folder), before, "{line}");
-            told += &text;
+            let stderr = String::from_utf8(output.stderr).unwrap();
+            assert!(!stderr.contains("panicked"), "{line}: {stderr}");
+            assert!(stderr.contains("is a symbolic link"), "{line}: {stderr}");
+            assert_eq!(read_files(folder), before, "{line}");
+            messages += &stderr;
         }
-        told
+        messages
     }
 
     #[test]
@@ -297,21 +305,21 @@ mod links {
             let path = place.path("run").join(name);
             let _ = fs::remove_file(&path);
             symlink(victim.join("file"), &path).unwrap();
-            let told = unchanged(&place, &victim, &[line]);
+            let stderr = assert_unchanged(&place, &victim, &[line]);
             assert!(
-                told.contains(&format!("run/{name} is a symbolic link")) && told.contains("remove the link"),
-                "{told}"
+                stderr.contains(&format!("run/{name} is a symbolic link")) && stderr.contains("remove the link"),
+                "{stderr}"
             );
             assert!(path.is_symlink());
             fs::remove_file(&path).unwrap();
         }
-        // Nor is a new file made, nor the list of what was made written elsewhere.
+        // A link to a missing file is not followed, nor one in place of the list of files that flotilla made.
         symlink(victim.join("new"), place.path("run/replay.html")).unwrap();
-        unchanged(&place, &victim, &["replay run --quiet"]);
+        assert_unchanged(&place, &victim, &["replay run --quiet"]);
         fs::remove_file(place.path("run/replay.html")).unwrap();
         fs::remove_file(place.path("run").join(LIST)).unwrap();
         symlink(victim.join("file"), place.path("run").join(LIST)).unwrap();
-        unchanged(&place, &victim, &["replay run --quiet"]);
+        assert_unchanged(&place, &victim, &["replay run --quiet"]);
     }
 
     #[test]
@@ -321,10 +329,10 @@ mod links {
         let [force, resume] =
             ["--force", "--resume --generations 9"].map(|flags| format!("train small.toml --out run --quiet {flags}"));
         let both = [&*force, &*resume];
-        // Folders: one of files that look like a run's, and an empty one.
+        // The checkpoints are a link to a folder with files that look like checkpoints.
         fs::rename(place.path("run/checkpoints"), place.path("kept")).unwrap();
         symlink(victim.join("docs"), place.path("run/checkpoints")).unwrap();
-        unchanged(&place, &victim, &both);
+        assert_unchanged(&place, &victim, &both);
         fs::remove_file(place.path("run/checkpoints")).unwrap();
         fs::rename(place.path("kept"), place.path("run/checkpoints")).unwrap();
         for name in [".lock", METRICS, POLICIES, RUN] {
@@ -332,23 +340,27 @@ mod links {
             let kept = fs::read(&path).unwrap();
             fs::remove_file(&path).unwrap();
             symlink(victim.join("new"), &path).unwrap();
-            unchanged(&place, &victim, &both[..usize::from(name != RUN) + 1]);
+            assert_unchanged(&place, &victim, &both[..usize::from(name != RUN) + 1]);
             fs::remove_file(&path).unwrap();
             fs::write(&path, kept).unwrap();
         }
-        // Even where it leads to what is a run's.
+        // A link is refused even if it leads to the run's own metrics.
         fs::rename(place.path("run").join(METRICS), victim.join(METRICS)).unwrap();
         symlink(victim.join(METRICS), place.path("run").join(METRICS)).unwrap();
-        unchanged(&place, &victim, &both);
+        assert_unchanged(&place, &victim, &both);
     }
 
     #[test]
-    fn a_new_run_is_not_locked_elsewhere() {
+    fn the_lock_of_a_new_run_is_not_created_through_a_link() {
         let place = place();
         let victim = victim(&place);
         fs::create_dir(place.path("v")).unwrap();
         symlink(victim.join("new"), place.path("v/.lock")).unwrap();
-        unchanged(&place, &victim, &["train small.toml --out v --quiet", "train small.toml --out v --quiet --resume"]);
+        assert_unchanged(
+            &place,
+            &victim,
+            &["train small.toml --out v --quiet", "train small.toml --out v --quiet --resume"],
+        );
     }
 
     #[test]
@@ -356,12 +368,12 @@ mod links {
         let place = with_run();
         let victim = victim(&place);
         symlink(&victim, place.path("run/tensorboard")).unwrap();
-        unchanged(&place, &victim, &["train small.toml --out run --quiet --force --tensorboard"]);
+        assert_unchanged(&place, &victim, &["train small.toml --out run --quiet --force --tensorboard"]);
         fs::remove_file(place.path("run/tensorboard")).unwrap();
         fs::create_dir(place.path("run/tensorboard")).unwrap();
         symlink(&victim, place.path("run/tensorboard/trial-0")).unwrap();
-        unchanged(&place, &victim, &["train small.toml --out run --quiet --force --tensorboard"]);
-        assert!(place.path("run/run.json").exists(), "the run is none the worse for it");
+        assert_unchanged(&place, &victim, &["train small.toml --out run --quiet --force --tensorboard"]);
+        assert!(place.path("run/run.json").exists(), "the run is kept");
     }
 
     #[test]
@@ -373,34 +385,34 @@ mod links {
             let path = place.path("sweep").join(name);
             fs::rename(&path, place.path("kept")).unwrap();
             symlink(victim.join("file"), &path).unwrap();
-            unchanged(&place, &victim, &["sweep grid.toml --out sweep --quiet --collect"]);
+            assert_unchanged(&place, &victim, &["sweep grid.toml --out sweep --quiet --collect"]);
             fs::remove_file(&path).unwrap();
             fs::rename(place.path("kept"), &path).unwrap();
         }
-        // Another run in the place of a point, or of all of them.
+        // A point is a link to another run, and then the folder of all points is a link.
         let runs = place.path("run");
         fs::rename(place.path("sweep/points/0000"), place.path("kept")).unwrap();
         symlink(&runs, place.path("sweep/points/0000")).unwrap();
-        unchanged(&place, &runs, &["sweep grid.toml --out sweep --quiet --force"]);
+        assert_unchanged(&place, &runs, &["sweep grid.toml --out sweep --quiet --force"]);
         fs::remove_file(place.path("sweep/points/0000")).unwrap();
         fs::rename(place.path("kept"), place.path("sweep/points/0000")).unwrap();
         fs::rename(place.path("sweep/points"), place.path("points")).unwrap();
         symlink(place.path("points"), place.path("sweep/points")).unwrap();
-        unchanged(&place, &place.path("points"), &["sweep grid.toml --out sweep --quiet --force"]);
+        assert_unchanged(&place, &place.path("points"), &["sweep grid.toml --out sweep --quiet --force"]);
 
         let paper = "paper --out paper --trials 1 --generations 1 --quiet";
         fs::create_dir(place.path("paper")).unwrap();
         symlink(&victim, place.path("paper/arms")).unwrap();
         place.write("paper/paper.toml", "seed = 0\ntrials = 1\ngenerations = 1\n");
-        unchanged(&place, &victim, &[&format!("{paper} --force"), &format!("{paper} --resume")]);
+        assert_unchanged(&place, &victim, &[&format!("{paper} --force"), &format!("{paper} --resume")]);
         fs::remove_file(place.path("paper/arms")).unwrap();
         symlink(victim.join("file"), place.path("paper/claims.md")).unwrap();
-        unchanged(&place, &victim, &[&format!("{paper} --force"), &format!("{paper} --resume")]);
+        assert_unchanged(&place, &victim, &[&format!("{paper} --force"), &format!("{paper} --resume")]);
     }
 
-    /// A file that a flag names is no exception: somebody else may have planted the link.
+    /// Somebody else may have created the link before the user names it.
     #[test]
-    fn named_files_in_our_folders_are_not_written_through_links() {
+    fn links_in_runs_and_sweeps_are_refused_even_if_a_flag_names_them() {
         let place = with_run();
         let victim = victim(&place);
         place.good("sweep grid.toml --out sweep --quiet");
@@ -415,14 +427,14 @@ mod links {
             let path = place.path(line.rsplit([' ', '=']).next().unwrap());
             for target in ["file", "new"] {
                 symlink(victim.join(target), &path).unwrap();
-                unchanged(&place, &victim, &[line]);
+                assert_unchanged(&place, &victim, &[line]);
                 assert!(path.is_symlink(), "{line}");
                 fs::remove_file(&path).unwrap();
             }
             place.good(line);
             assert!(path.is_file(), "{line}");
         }
-        // The same holds from within the folder, and for a folder on the way.
+        // The same holds inside the run, and if a folder in the path is a link.
         let inside = |line: &str| {
             let output = place.command().current_dir(place.path("run")).args(line.split(' ')).output().unwrap();
             String::from_utf8(output.stderr).unwrap()
@@ -431,8 +443,8 @@ mod links {
         symlink(victim.join("file"), place.path("run/x.svg")).unwrap();
         assert!(inside("plot . --out x.svg").contains("is a symbolic link"));
         symlink(&victim, place.path("run/pictures")).unwrap();
-        unchanged(&place, &victim, &["plot run --out run/pictures/x.svg"]);
-        // What is beside the run is the user's own.
+        assert_unchanged(&place, &victim, &["plot run --out run/pictures/x.svg"]);
+        // A link beside the run is the user's own and is followed.
         symlink(victim.join("file"), place.path("x.svg")).unwrap();
         place.good("plot run --out run/../x.svg");
         assert!(
@@ -452,22 +464,21 @@ mod links {
             let path = place.path("questions").join(name);
             fs::rename(&path, place.path("kept")).unwrap();
             symlink(victim.join("file"), &path).unwrap();
-            unchanged(&place, &victim, &both);
+            assert_unchanged(&place, &victim, &both);
             fs::remove_file(&path).unwrap();
             fs::rename(place.path("kept"), &path).unwrap();
         }
         let points = place.path("questions/places/points");
         fs::rename(&points, place.path("points")).unwrap();
         symlink(&victim, &points).unwrap();
-        unchanged(&place, &victim, &both);
+        assert_unchanged(&place, &victim, &both);
         fs::remove_file(&points).unwrap();
         fs::rename(place.path("points"), &points).unwrap();
         place.good(both[0]);
     }
 
-    /// The folder that the user names may be reached through links.
     #[test]
-    fn a_link_may_be_named() {
+    fn a_link_to_a_run_folder_can_be_named() {
         let place = place();
         fs::create_dir(place.path("disk")).unwrap();
         symlink(place.path("disk"), place.path("runs")).unwrap();
@@ -481,30 +492,30 @@ mod links {
     }
 
     #[test]
-    fn a_folder_of_another_user_is_written_in_only_if_it_is_named() {
+    fn a_run_of_another_user_is_changed_only_if_it_is_named() {
         let place = with_run();
         if chown(place.path("run"), Some(12345), None).is_err() {
-            writeln!(io::stderr(), "\nskipped: only root may give files away").unwrap();
+            writeln!(io::stderr(), "\nskipped: only root can change the owner of files").unwrap();
             return;
         }
         let _ = fs::remove_file(place.path("run/curves.svg"));
         for line in ["replay run --quiet", "plot run"] {
-            let told = place.refused(1, line);
-            assert!(told.contains("run belongs to another user") && told.contains("--out"), "{told}");
+            let stderr = place.refused(1, line);
+            assert!(stderr.contains("run belongs to another user") && stderr.contains("--out"), "{stderr}");
         }
         assert!(!place.path("run/replay.html").exists() && !place.path("run/curves.svg").exists());
         place.good("replay run --quiet --out run/replay.html");
         place.good("train small.toml --out run --quiet --resume --generations 8");
-        // The latest run of this name is another's, and nobody named it.
+        // Without --out, runs/small is chosen by default, so nobody named it.
         fs::create_dir(place.path("runs")).unwrap();
         fs::rename(place.path("run"), place.path("runs/small")).unwrap();
-        let told = place.refused(1, "train small.toml --quiet --resume --generations 9");
-        assert!(told.contains("runs/small belongs to another user"), "{told}");
+        let stderr = place.refused(1, "train small.toml --quiet --resume --generations 9");
+        assert!(stderr.contains("runs/small belongs to another user"), "{stderr}");
         place.good("train small.toml --quiet --resume --generations 9 --out runs/small");
     }
 }
 
-/// Trains to the end, unless the disk fails.
+/// Trains a run to the end. Returns the error message if the disk fails.
 fn train(config: &Config, path: &Path, start: Start, disk: Disk) -> Result<(), String> {
     let opened = Session::open(vec![(config.clone(), path.into())], start, &disk);
     let (mut session, _) = opened.map_err(|error| error.to_string())?;
@@ -530,10 +541,10 @@ fn digest(path: &Path) -> Option<String> {
     Run::read(&path.join(RUN)).unwrap().digest
 }
 
-/// Every operation of a replacement fails once, with all after it, as when the process is killed there: the next session
-/// takes the folder, by either flag, and comes to what a run from the start comes to.
+/// For each file operation of `--force`, this operation and all after it fail, as if the process were killed there. The
+/// next session, with either flag, has to end in the same results as a new run.
 #[test]
-fn an_interrupted_replacement_is_taken_up_by_force_and_by_resume() {
+fn an_interrupted_replacement_is_completed_by_force_and_by_resume() {
     let old = Config::parse(SMALL, "small.toml").unwrap();
     let mut new = old.clone();
     (new.learning.seed, new.learning.population, new.checkpoint.generations) = (5, 6, 2);
@@ -563,17 +574,17 @@ fn an_interrupted_replacement_is_taken_up_by_force_and_by_resume() {
             assert!(failed.is_err(), "operation {at}");
             let state = Run::read(&folder.path().join(RUN)).map(|run| run.state);
             replacing += usize::from(state.as_ref().is_ok_and(|state| *state == Status::Replacing));
-            let whole = state.is_ok_and(|state| state == Status::Done);
-            // Before the first step the old run is whole, and is not resumed as another.
-            let start = if whole && Config::load(&folder.path().join("config.toml")).unwrap() == old {
+            let complete = state.is_ok_and(|state| state == Status::Done);
+            // Before the first operation the old run is complete. It cannot be resumed with another config.
+            let start = if complete && Config::load(&folder.path().join("config.toml")).unwrap() == old {
                 Start::Force
             } else {
                 start
             };
-            let again = train(&new, folder.path(), start, Disk::default());
-            assert_eq!((again, digest(folder.path())), (Ok(()), expected.clone()), "operation {at}, {start:?}");
+            let result = train(&new, folder.path(), start, Disk::default());
+            assert_eq!((result, digest(folder.path())), (Ok(()), expected.clone()), "operation {at}, {start:?}");
             assert_eq!(fs::read(folder.path().join("notes.txt")).unwrap(), b"mine");
         }
     }
-    assert!(replacing > 20, "only {replacing} failures were inside the replacement");
+    assert!(replacing > 20, "only {replacing} failures were during the replacement");
 }
