@@ -1,4 +1,6 @@
-//! Populations that a GPU holds against populations on the host, bit for bit: bred, gathered, trained, saved and lost.
+//! Compares populations in GPU memory with populations in host memory, bit for bit: breeding, training and snapshots.
+//!
+//! A fake device fails at a chosen call, which tests that training survives the loss of the device.
 
 #![cfg(feature = "cli")]
 
@@ -28,7 +30,7 @@ fn learning() -> Learning {
     support::layout("generally_forward").learning
 }
 
-/// Weights `[leaders][slots][parameters]`, of all sizes that there may be.
+/// Returns random weights `[leaders][slots][parameters]`. Some are zero or have the largest or smallest magnitude.
 fn population([leaders, slots, parameters]: [usize; 3], seed: u64) -> Vec<f32> {
     let key = Key::new(seed, 0, Purpose::Weights);
     let mut weights = vec![0.0; leaders * slots * parameters];
@@ -50,15 +52,15 @@ fn bits(weights: &[f32]) -> &[u32] {
     bytemuck::cast_slice(weights)
 }
 
-/// Some parent for every slot; every fifth is kept as it is.
+/// Returns a parent for every slot. Every fifth slot is unchanged.
 fn parents([leaders, slots, _]: [usize; 3], generation: usize) -> Vec<u32> {
     let parent = |place: usize| ((place * 7 + generation * 3 + 1) % slots) as u32;
     (0..leaders * slots).map(|place| parent(place) | if place % 5 == 2 { UNCHANGED } else { 0 }).collect()
 }
 
 #[test]
-fn breeding_gives_the_same_bits() {
-    for (request, info) in support::adapters("breeding_gives_the_same_bits") {
+fn breeding_gives_the_same_bits_as_on_the_host() {
+    for (request, info) in support::adapters("breeding_gives_the_same_bits_as_on_the_host") {
         let mut backend = GpuBackend::new(gpu::open(request).unwrap()).unwrap().holding(ResidencyPolicy::Always);
         let mut mutated = 0;
         for sizes in [[1, 2, 1], [3, 5, 97], [4, 51, 112], [2, 301, 64], [2, 17, 1000], [1, 300, 65], [257, 2, 18]] {
@@ -66,7 +68,7 @@ fn breeding_gives_the_same_bits() {
                 let mutation = [Mutation::Scaled, Mutation::Additive][case % 2];
                 let mut learning = Learning { mutation_probability: probability, mutation, ..learning() };
                 let mut expected = population(sizes, case as u64);
-                let mut held = backend.hold(&expected, sizes).unwrap().expect("all are held");
+                let mut held = backend.hold(&expected, sizes).unwrap().expect("every population is held");
                 for generation in 0..5 {
                     learning.mutation = if generation % 2 == 0 { Mutation::Scaled } else { Mutation::Additive };
                     learning.mutation_sigma = [0.1, 3.0, 100.0, 1e-6, 0.0][generation];
@@ -90,8 +92,8 @@ fn breeding_gives_the_same_bits() {
     }
 }
 
-/// Experiments that differ in all that breeding and gathering depend on, and in length.
-fn arms() -> Vec<Config> {
+/// Returns experiments that differ in everything that breeding and gathering depend on, and in length.
+fn experiments() -> Vec<Config> {
     let mut first = support::layout("generally_forward");
     (first.learning.trials, first.learning.generations, first.learning.population) = (2, 5, 21);
     let mut second = support::layout("chaotic");
@@ -112,7 +114,7 @@ fn arms() -> Vec<Config> {
     (fifth.learning.trials, fifth.learning.generations, fifth.learning.population) = (2, 4, 30);
     (fifth.learning.elites, fifth.learning.parents) = (Elites::Percentage(20.0), Parents::Elites);
     fifth.sense.gain = 3.0;
-    // Every policy plays in three teams, and is worth the best of them.
+    // Every policy plays in three teams. Its fitness is the best of them.
     let mut sixth = support::layout("strictly_forward");
     (sixth.learning.trials, sixth.learning.generations, sixth.learning.population) = (2, 4, 14);
     (sixth.learning.partners, sixth.learning.leniency) = (3, Leniency::Max);
@@ -132,83 +134,83 @@ fn arms() -> Vec<Config> {
     vec![first, second, third, fourth, fifth, sixth, seventh, eighth, ninth]
 }
 
-/// The result of a trainer of [`arms`], and its snapshot before each generation.
+/// The metrics and the final policies of [`experiments`].
 #[derive(Debug, PartialEq)]
-struct Story {
+struct Outcome {
     rows: Vec<Row>,
     policies: Vec<Vec<Vec<f32>>>,
 }
 
 fn policies(trainer: &Trainer) -> Vec<Vec<Vec<f32>>> {
-    (0..arms().len()).map(|arm| trainer.policies(arm)).collect()
+    (0..experiments().len()).map(|experiment| trainer.policies(experiment)).collect()
 }
 
-/// For all arms.
+/// Takes a snapshot of every experiment.
 fn snapshots_of(trainer: &mut Trainer) -> Result<Vec<Snapshot>, SnapshotError> {
-    (0..arms().len()).map(|arm| trainer.snapshot(arm)).collect()
+    (0..experiments().len()).map(|experiment| trainer.snapshot(experiment)).collect()
 }
 
 fn restored(snapshots: &[Snapshot]) -> Trainer {
-    let mut trainer = Trainer::new(ValidConfig::all(&arms()).unwrap());
-    for (arm, snapshot) in snapshots.iter().enumerate() {
-        assert!(trainer.restore(arm, snapshot.clone()));
+    let mut trainer = Trainer::new(ValidConfig::all(&experiments()).unwrap());
+    for (experiment, snapshot) in snapshots.iter().enumerate() {
+        assert!(trainer.restore(experiment, snapshot.clone()));
     }
     trainer
 }
 
-fn train(trainer: &mut Trainer, backend: &mut dyn Backend) -> Story {
-    Story { rows: trainer.finish(backend).unwrap(), policies: policies(trainer) }
+fn train(trainer: &mut Trainer, backend: &mut dyn Backend) -> Outcome {
+    Outcome { rows: trainer.finish(backend).unwrap(), policies: policies(trainer) }
 }
 
-/// The CPU's result, and its snapshots before each generation.
-fn reference() -> (Story, Vec<Vec<Snapshot>>) {
+/// Trains on the CPU. Returns the outcome and the snapshots before each generation.
+fn reference() -> (Outcome, Vec<Vec<Snapshot>>) {
     let (mut trainer, mut rows, mut snapshots) =
-        (Trainer::new(ValidConfig::all(&arms()).unwrap()), Vec::new(), Vec::new());
+        (Trainer::new(ValidConfig::all(&experiments()).unwrap()), Vec::new(), Vec::new());
     while !trainer.is_done() {
         snapshots.push(snapshots_of(&mut trainer).unwrap());
         rows.extend(trainer.advance(&mut Cpu::default()).unwrap());
     }
-    (Story { rows, policies: policies(&trainer) }, snapshots)
+    (Outcome { rows, policies: policies(&trainer) }, snapshots)
 }
 
 #[test]
-fn training_comes_to_the_same_wherever_populations_are() {
+fn training_is_the_same_wherever_populations_are_stored() {
     let (expected, snapshots) = reference();
     assert!(expected.rows.iter().any(|row| row.best_g > 0.0), "nothing was observed");
-    for (request, info) in support::adapters("training_comes_to_the_same_wherever_populations_are") {
+    for (request, info) in support::adapters("training_is_the_same_wherever_populations_are_stored") {
         let gpu = gpu::open(request).unwrap();
         let open = |holding| GpuBackend::new(gpu.clone()).unwrap().holding(holding);
-        // The populations of some arms take more than this, of others less.
+        // Some populations are larger than this limit, others smaller.
         let some = ResidencyPolicy::From(4 * 30 * 112 * 4);
         for holding in [ResidencyPolicy::Always, ResidencyPolicy::Never, some] {
             assert_eq!(
-                train(&mut Trainer::new(ValidConfig::all(&arms()).unwrap()), &mut open(holding)),
+                train(&mut Trainer::new(ValidConfig::all(&experiments()).unwrap()), &mut open(holding)),
                 expected,
                 "{info}, {holding:?}"
             );
         }
-        // Batches of some teams each.
+        // A batch has only some of the teams.
         let mut small = open(ResidencyPolicy::Always).batched(1 << 14);
         assert_eq!(
-            train(&mut Trainer::new(ValidConfig::all(&arms()).unwrap()), &mut small),
+            train(&mut Trainer::new(ValidConfig::all(&experiments()).unwrap()), &mut small),
             expected,
             "{info}, small batches"
         );
-        // What is saved is the same, and goes on anywhere.
-        let (mut device, mut again) = (open(ResidencyPolicy::Always), open(ResidencyPolicy::Always));
-        let (mut trainer, mut rows) = (Trainer::new(ValidConfig::all(&arms()).unwrap()), Vec::new());
+        // Snapshots equal those of the CPU. Training resumes from them on any backend.
+        let (mut device, mut other_device) = (open(ResidencyPolicy::Always), open(ResidencyPolicy::Always));
+        let (mut trainer, mut rows) = (Trainer::new(ValidConfig::all(&experiments()).unwrap()), Vec::new());
         for (generation, snapshot) in snapshots.iter().enumerate() {
             assert_eq!(&snapshots_of(&mut trainer).unwrap(), snapshot, "{info}, before generation {generation}");
-            for other in [&mut Cpu::default() as &mut dyn Backend, &mut again] {
-                let rest = train(&mut restored(snapshot), other);
+            for backend in [&mut Cpu::default() as &mut dyn Backend, &mut other_device] {
+                let rest = train(&mut restored(snapshot), backend);
                 assert_eq!(rest.policies, expected.policies, "{info}, from generation {generation}");
                 assert!(expected.rows.ends_with(&rest.rows) || generation == 0, "{info}, from generation {generation}");
             }
             rows.extend(trainer.advance(&mut device).unwrap());
         }
         assert_eq!((&rows, policies(&trainer)), (&expected.rows, expected.policies.clone()), "{info}");
-        // A trainer that moves from one device to another takes its populations along.
-        let (mut trainer, mut rows) = (Trainer::new(ValidConfig::all(&arms()).unwrap()), Vec::new());
+        // When a trainer changes its backend, its populations move along.
+        let (mut trainer, mut rows) = (Trainer::new(ValidConfig::all(&experiments()).unwrap()), Vec::new());
         let mut backends: [Box<dyn Backend>; 3] = [
             Box::new(open(ResidencyPolicy::Always)),
             Box::new(open(ResidencyPolicy::Always)),
@@ -222,35 +224,36 @@ fn training_comes_to_the_same_wherever_populations_are() {
     }
 }
 
-/// Each arm of a trainer may stand at a generation of its own: what it comes to is the same.
+/// Their results are the same as if they all began together.
 #[test]
-fn arms_of_different_ages_train_side_by_side() {
+fn experiments_at_different_generations_train_together() {
     let (expected, snapshots) = reference();
     for first in 0..snapshots.len() {
         let from = [first, (first + 3) % snapshots.len(), snapshots.len() - 1 - first];
-        let mixed: Vec<Snapshot> = (0..3).map(|arm| snapshots[from[arm]][arm].clone()).collect();
-        // Also where a device holds them, and is lost on the way.
+        let mixed: Vec<Snapshot> = (0..3).map(|experiment| snapshots[from[experiment]][experiment].clone()).collect();
+        // Also with a device that holds the populations and is lost during the training.
         for nth in [None, Some(2), Some(5), Some(8)] {
             let mut trainer = restored(&mixed);
-            let mut device = nth.map_or_else(|| Device::failing_at(0, false), |nth| Device::failing_at(nth, true));
+            let mut device =
+                nth.map_or_else(|| FakeDevice::failing_at(0, false), |nth| FakeDevice::failing_at(nth, true));
             let mut rows = Vec::new();
             while !trainer.is_done() {
                 let advanced = trainer.advance(&mut device);
                 rows.extend(advanced.unwrap_or_else(|_| trainer.advance(&mut Cpu::default()).unwrap()));
             }
             assert_eq!(policies(&trainer), expected.policies, "from {from:?}, lost at {nth:?}");
-            for (arm, &from) in from.iter().enumerate() {
-                let of_arm =
-                    |rows: &[Row]| rows.iter().filter(|row| row.experiment == arm).copied().collect::<Vec<_>>();
-                let due =
-                    of_arm(&expected.rows).into_iter().filter(|row| row.generation + 1 >= from).collect::<Vec<_>>();
-                assert_eq!(of_arm(&rows), due, "arm {arm} from {from}, lost at {nth:?}");
+            for (experiment, &from) in from.iter().enumerate() {
+                let own_rows =
+                    |rows: &[Row]| rows.iter().filter(|row| row.experiment == experiment).copied().collect::<Vec<_>>();
+                let expected_rows =
+                    own_rows(&expected.rows).into_iter().filter(|row| row.generation + 1 >= from).collect::<Vec<_>>();
+                assert_eq!(own_rows(&rows), expected_rows, "experiment {experiment} from {from}, lost at {nth:?}");
             }
         }
     }
 }
 
-/// A short training of a task so easy that champions observe POIs, with stages.
+/// Returns a short training with stages. Its task is so easy that champions observe POIs.
 fn staged(stages: &str) -> Config {
     let mut config = support::layout("generally_forward");
     (config.learning.trials, config.learning.generations, config.learning.population) = (2, 7, 15);
@@ -258,15 +261,15 @@ fn staged(stages: &str) -> Config {
     Config::parse(&(config.to_toml() + stages), "staged.toml").unwrap()
 }
 
-/// Where a device holds populations the next generation's teams and starts are drawn while one plays: a stage that
-/// begins then counts, and so does an end that nobody knew of.
+/// If a device holds the populations, the teams and starts of the next generation are drawn while one plays. They have
+/// to respect a stage that begins there, and an early end.
 #[test]
-fn stages_and_ends_count_wherever_populations_are() {
+fn stages_and_early_ends_apply_wherever_populations_are_stored() {
     let config = staged(
         "[[stages]]\nfrom = 2\nset = { learning.start_jitter = 3.0, learning.episodes_per_team = 2 }\n\
          [[stages]]\nfrom = 5\nset = { world.coupling = 2, learning.poi_jitter = 2.0 }\n",
     );
-    let story = |backend: &mut dyn Backend, end: usize| {
+    let outcome = |backend: &mut dyn Backend, end: usize| {
         let (mut trainer, mut rows) = (Trainer::new([config.validate().unwrap()]), Vec::new());
         while !trainer.is_done() {
             rows.extend(trainer.advance(backend).unwrap());
@@ -276,24 +279,27 @@ fn stages_and_ends_count_wherever_populations_are() {
         }
         (rows, trainer.policies(0))
     };
-    let adapters = support::adapters("stages_and_ends_count_wherever_populations_are");
+    let adapters = support::adapters("stages_and_early_ends_apply_wherever_populations_are_stored");
     for end in 1..=8 {
-        let expected = story(&mut Cpu::default(), end);
-        assert_eq!(story(&mut Device::failing_at(0, false), end), expected, "ended at {end}");
+        let expected = outcome(&mut Cpu::default(), end);
+        assert_eq!(outcome(&mut FakeDevice::failing_at(0, false), end), expected, "ended at {end}");
         for (request, info) in &adapters {
             let mut gpu =
                 GpuBackend::new(gpu::open(request.clone()).unwrap()).unwrap().holding(ResidencyPolicy::Always);
-            assert_eq!(story(&mut gpu, end), expected, "{info}, ended at {end}");
+            assert_eq!(outcome(&mut gpu, end), expected, "{info}, ended at {end}");
         }
-        assert!(expected.0.iter().all(|row| row.champion_g > 0.0), "what champions start from does not show");
+        assert!(
+            expected.0.iter().all(|row| row.champion_g > 0.0),
+            "champions observe nothing, so their starts are not tested"
+        );
     }
 }
 
-/// Likewise where a trainer that has drawn ahead goes back, and ends before the stage that it drew for.
+/// The trainer draws the starts of a stage in advance. Then it is restored, and ends before this stage.
 #[test]
-fn what_was_drawn_for_a_stage_that_no_longer_comes_is_forgotten() {
+fn starts_drawn_in_advance_are_discarded_after_a_restore() {
     let config = staged("[[stages]]\nfrom = 3\nset = { learning.start_jitter = 3.0 }\n");
-    let story = |backend: &mut dyn Backend| {
+    let outcome = |backend: &mut dyn Backend| {
         let mut trainer = Trainer::new([config.validate().unwrap()]);
         while trainer.generation(0) < 2 {
             trainer.advance(backend).unwrap();
@@ -304,22 +310,26 @@ fn what_was_drawn_for_a_stage_that_no_longer_comes_is_forgotten() {
         assert_eq!(trainer.end(0), 2);
         (trainer.finish(backend).unwrap(), trainer.policies(0))
     };
-    let expected = story(&mut Cpu::default());
-    assert!(expected.0.iter().all(|row| row.champion_g > 0.0), "what champions start from does not show");
-    assert_eq!(story(&mut Device::failing_at(0, false)), expected);
+    let expected = outcome(&mut Cpu::default());
+    assert!(
+        expected.0.iter().all(|row| row.champion_g > 0.0),
+        "champions observe nothing, so their starts are not tested"
+    );
+    assert_eq!(outcome(&mut FakeDevice::failing_at(0, false)), expected);
 }
 
-/// An error that was made up for is told, once, by whoever asks.
+/// `take_setback` returns an error from which the trainer recovered, once.
 #[test]
-fn a_setback_is_told() {
+fn a_setback_is_reported_once() {
     for nth in 1.. {
-        let (mut trainer, mut device, mut told) =
-            (Trainer::new(ValidConfig::all(&arms()).unwrap()), Device::failing_at(nth, false), 0);
+        let (mut trainer, mut device, mut reported) =
+            (Trainer::new(ValidConfig::all(&experiments()).unwrap()), FakeDevice::failing_at(nth, false), 0);
         while !trainer.is_done() {
             trainer.advance(&mut device).unwrap();
-            told += usize::from(trainer.take_setback().is_some_and(|error| error.to_string().contains("pulled out")));
+            reported +=
+                usize::from(trainer.take_setback().is_some_and(|error| error.to_string().contains("pulled out")));
         }
-        assert_eq!(told, usize::from(device.failed()), "call {nth}");
+        assert_eq!(reported, usize::from(device.failed()), "call {nth}");
         if !device.failed() {
             assert!(nth > 20, "a run makes more calls than {nth}");
             break;
@@ -327,19 +337,19 @@ fn a_setback_is_told() {
     }
 }
 
-/// Leaders' populations over the size of a buffer stay on the host, unless that is ruled out.
+/// A population has to fit in a buffer. If it does not, `ResidencyPolicy::Always` is an error.
 #[test]
-fn what_does_not_fit_the_device_is_declined() {
-    for (request, info) in support::adapters("what_does_not_fit_the_device_is_declined") {
+fn populations_too_large_for_the_device_stay_on_the_host() {
+    for (request, info) in support::adapters("populations_too_large_for_the_device_stay_on_the_host") {
         let gpu = gpu::open(device::Request { default_limits: true, ..request }).unwrap();
-        // The least over WebGPU's 128 MiB; a backend that declines does not look at the weights.
+        // The smallest size above WebGPU's 128 MiB. The weights can be empty, because they are not read.
         let sizes = [1, (128 << 20) / 4 / 112 + 1, 112];
         let open = |holding| GpuBackend::new(gpu.clone()).unwrap().holding(holding);
         assert!(open(ResidencyPolicy::From(1)).hold(&[], sizes).unwrap().is_none(), "{info}");
         let error = open(ResidencyPolicy::Always).hold(&[], sizes).unwrap_err().to_string();
         assert!(error.contains("134217") && error.contains("breed on the host"), "{info}: {error}");
         assert!(open(ResidencyPolicy::Never).hold(&[], [1, 2, 1]).unwrap().is_none(), "{info}");
-        // Nothing is asked for.
+        // The default policy holds populations from `HELD_FROM` bytes on, except on software renderers.
         let weights = vec![0.0; HELD_FROM as usize / 4];
         let mut backend = GpuBackend::new(gpu.clone()).unwrap();
         let held = backend.hold(&weights, [2, weights.len() / 2, 1]).unwrap();
@@ -348,15 +358,15 @@ fn what_does_not_fit_the_device_is_declined() {
     }
 }
 
-/// A device that holds populations, in the host's memory, and fails at its nth call: for good, or that once.
-struct Device {
+/// A fake device that fails at its nth call, permanently or once. It holds populations in host memory.
+struct FakeDevice {
     cpu: Cpu,
     state: Arc<State>,
 }
 
 struct State {
     left: AtomicUsize,
-    for_good: bool,
+    permanent: bool,
     lost: AtomicBool,
 }
 
@@ -364,7 +374,7 @@ impl State {
     fn call(&self) -> Result<(), BackendError> {
         let left = self.left.fetch_update(SeqCst, SeqCst, |left| Some(left.saturating_sub(1))).unwrap();
         if left == 1 {
-            self.lost.store(self.for_good, SeqCst);
+            self.lost.store(self.permanent, SeqCst);
         }
         match left == 1 || self.lost.load(SeqCst) {
             true => Err(DeviceError::Lost { adapter: "test".into(), reason: "pulled out".into() }.into()),
@@ -373,32 +383,32 @@ impl State {
     }
 }
 
-impl Device {
-    /// One that fails at call `nth`, from 1 on.
-    fn failing_at(nth: usize, for_good: bool) -> Device {
-        let state = State { left: AtomicUsize::new(nth), for_good, lost: AtomicBool::new(false) };
-        Device { cpu: Cpu::default(), state: Arc::new(state) }
+impl FakeDevice {
+    /// Creates a device that fails at call `nth`, counted from 1. With 0 it never fails.
+    fn failing_at(nth: usize, permanent: bool) -> FakeDevice {
+        let state = State { left: AtomicUsize::new(nth), permanent, lost: AtomicBool::new(false) };
+        FakeDevice { cpu: Cpu::default(), state: Arc::new(state) }
     }
 
-    /// Whether it has failed.
+    /// Returns whether the device has failed.
     fn failed(&self) -> bool {
         self.state.left.load(SeqCst) == 0
     }
 }
 
-struct OnDevice {
+struct FakePopulation {
     state: Arc<State>,
     weights: Vec<f32>,
     sizes: [usize; 3],
 }
 
-impl std::fmt::Debug for OnDevice {
+impl std::fmt::Debug for FakePopulation {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("OnDevice").field("sizes", &self.sizes).finish_non_exhaustive()
+        f.debug_struct("FakePopulation").field("sizes", &self.sizes).finish_non_exhaustive()
     }
 }
 
-impl DevicePopulation for OnDevice {
+impl DevicePopulation for FakePopulation {
     fn breed(&mut self, breeding: &Breeding<'_>) -> Result<(), BackendError> {
         self.state.call()?;
         self.weights = breeding.on_host(self.sizes, &self.weights)?;
@@ -406,7 +416,7 @@ impl DevicePopulation for OnDevice {
     }
 
     fn fetch(&self, weights: &mut [f32]) -> Result<(), BackendError> {
-        // Half the weights have come when it fails.
+        // A failed copy leaves half of the weights.
         let half = weights.len() / 2;
         weights[..half].copy_from_slice(&self.weights[..half]);
         self.state.call()?;
@@ -415,15 +425,17 @@ impl DevicePopulation for OnDevice {
     }
 }
 
-impl Backend for Device {
+impl Backend for FakeDevice {
     fn play(&mut self, groups: &[Group<'_>]) -> Result<Vec<GroupScores>, BackendError> {
         self.state.call()?;
-        // Groups from the host come once populations were brought home.
+        // After an error, the trainer plays with weights that it fetched to the host.
         let weights = |group: &Group<'_>| match group.weights {
             Weights::OnHost(weights) => weights.to_vec(),
-            Weights::OnDevice(held) => {
-                (held as &dyn Any).downcast_ref::<OnDevice>().expect("held here").weights.clone()
-            }
+            Weights::OnDevice(held) => (held as &dyn Any)
+                .downcast_ref::<FakePopulation>()
+                .expect("a population of this device")
+                .weights
+                .clone(),
         };
         let weights: Vec<Vec<f32>> = groups.iter().map(weights).collect();
         let groups: Vec<Group<'_>> = groups
@@ -439,24 +451,24 @@ impl Backend for Device {
     }
 
     fn hold(&mut self, weights: &[f32], sizes: [usize; 3]) -> Result<Option<Box<dyn DevicePopulation>>, BackendError> {
-        Ok(Some(Box::new(OnDevice { state: self.state.clone(), weights: weights.to_vec(), sizes })))
+        Ok(Some(Box::new(FakePopulation { state: self.state.clone(), weights: weights.to_vec(), sizes })))
     }
 
     fn describe(&self) -> String {
-        "a device about to be lost".into()
+        "a fake device".into()
     }
 }
 
-/// Whatever call a device is lost at, the rest is played on the CPU to the same rows and policies; each row comes once.
-/// Where it fails but once, it does so itself.
+/// The device fails at each call in turn. If it fails permanently, the CPU continues. If it fails once, the trainer
+/// recovers by itself. Rows and policies are the same, and no row is repeated.
 #[test]
-fn populations_lost_with_their_device_are_made_again() {
+fn populations_of_a_lost_device_are_recomputed() {
     let (expected, _) = reference();
-    for (for_good, saves_every) in [(true, 1), (true, 3), (true, 100), (false, 3), (false, 100)] {
+    for (permanent, saves_every) in [(true, 1), (true, 3), (true, 100), (false, 3), (false, 100)] {
         for nth in 1.. {
-            let case = format!("fails at call {nth}, for good: {for_good}, saved every {saves_every} generations");
-            let (mut trainer, mut rows) = (Trainer::new(ValidConfig::all(&arms()).unwrap()), Vec::new());
-            let mut device = Device::failing_at(nth, for_good);
+            let case = format!("fails at call {nth}, permanently: {permanent}, saved every {saves_every} generations");
+            let (mut trainer, mut rows) = (Trainer::new(ValidConfig::all(&experiments()).unwrap()), Vec::new());
+            let mut device = FakeDevice::failing_at(nth, permanent);
             while !trainer.is_done() {
                 if trainer.generation(2) % saves_every == 0 {
                     match snapshots_of(&mut trainer) {
@@ -467,7 +479,7 @@ fn populations_lost_with_their_device_are_made_again() {
                 let advanced = match trainer.advance(&mut device) {
                     Ok(advanced) => advanced,
                     Err(error) => {
-                        assert!(device.failed() && for_good, "{case}: {error}");
+                        assert!(device.failed() && permanent, "{case}: {error}");
                         trainer.advance(&mut Cpu::default()).unwrap()
                     }
                 };
@@ -483,13 +495,14 @@ fn populations_lost_with_their_device_are_made_again() {
     }
 }
 
-/// A run whose device is lost goes on with the CPU, or says that the last checkpoint is all there is and goes on from it.
+/// If the device is lost, the run continues on the CPU, provided that `instead` returns it. Otherwise it stops with an
+/// error, and can be resumed from the last checkpoint.
 #[test]
-fn a_run_survives_the_loss_of_the_device_that_holds_its_populations() {
-    let mut config = arms().remove(0);
+fn a_run_survives_the_loss_of_its_device() {
+    let mut config = experiments().remove(0);
     config.checkpoint = flotilla::config::CheckpointConfig { generations: 2, seconds: 0.0 };
     let folder = tempfile::tempdir().unwrap();
-    let run = |name: &str, start: Start, device: Option<Device>, change: bool| {
+    let run = |name: &str, start: Start, device: Option<FakeDevice>, fall_back: bool| {
         let path = folder.path().join(name);
         let (mut session, _) = Session::open(vec![(config.clone(), path.clone())], start, &Disk::default()).unwrap();
         let (stop, save) = (AtomicBool::new(false), AtomicBool::new(false));
@@ -498,7 +511,7 @@ fn a_run_survives_the_loss_of_the_device_that_holds_its_populations() {
             command: "",
             stop: &stop,
             save: &save,
-            instead: &mut |_| change.then(cpu),
+            instead: &mut |_| fall_back.then(cpu),
             setback: &mut |_| {},
             watch: &mut |_| {},
         };
@@ -513,17 +526,18 @@ fn a_run_survives_the_loss_of_the_device_that_holds_its_populations() {
     };
     let (expected, rows) = run("cpu", Start::Fresh, None, false);
     let expected = expected.unwrap();
-    let mut gone = 0;
+    let mut lost_populations = 0;
     for nth in 1..20 {
-        let (ended, found) = run(&format!("change-{nth}"), Start::Fresh, Some(Device::failing_at(nth, true)), true);
+        let (ended, found) =
+            run(&format!("fall-back-{nth}"), Start::Fresh, Some(FakeDevice::failing_at(nth, true)), true);
         assert_eq!((ended.unwrap(), &found), (expected.clone(), &rows), "call {nth}");
         let name = format!("stop-{nth}");
-        let (ended, _) = run(&name, Start::Fresh, Some(Device::failing_at(nth, true)), false);
+        let (ended, _) = run(&name, Start::Fresh, Some(FakeDevice::failing_at(nth, true)), false);
         let error = flotilla::cli::Error::from(ended.unwrap_err()).to_string();
         assert!(error.contains("the device was lost") && error.contains("--resume"), "{error}");
-        gone += usize::from(error.contains("the populations were lost"));
+        lost_populations += usize::from(error.contains("the populations were lost"));
         let (ended, found) = run(&name, Start::Resume, None, false);
         assert_eq!((ended.unwrap(), &found), (expected.clone(), &rows), "call {nth}");
     }
-    assert!(gone > 0);
+    assert!(lost_populations > 0);
 }
