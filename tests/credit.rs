@@ -1,5 +1,6 @@
-//! Credit against its definition: the record is edited (agents taken out, copies added) and G counted anew, step by step
-//! as the rule has it.
+//! Compares credit with its definition: agents are removed from a record, or copies added, and G is counted again.
+//!
+//! Random records cover every rule, fitness and memory layout. Small records made by hand test one property each.
 
 use flotilla::config::{Fitness, LedBy, Observers};
 use flotilla::credit::{Credit, Episode, RecordRequest, Scores, Seen, Strided, owner_bits};
@@ -10,21 +11,23 @@ use rand::rngs::ChaCha8Rng;
 use rand::seq::SliceRandom;
 use rand::{RngExt, SeedableRng};
 
-/// One team's record, sets as lists of agents: `near[step][poi]`, and `seen[follower][leader]`.
+/// The record of one team, with sets as lists of agents.
 #[derive(Clone, Debug)]
 struct Record {
     leaders: usize,
     followers: usize,
     coupling: Vec<u32>,
+    /// The agents within the observation radius, `[steps][pois]`.
     near: Vec<Vec<Vec<usize>>>,
+    /// The number of steps at which a follower saw a leader, `[followers][leaders]`.
     seen: Vec<Vec<u32>>,
-    /// The leaders that each follower saw at each step, `[steps][followers]`.
+    /// The leaders that a follower saw at a step, `[steps][followers]`.
     sights: Vec<Vec<Vec<usize>>>,
     rule: Rule,
     led: Led,
 }
 
-/// By what rule POIs are observed, as a config has it.
+/// The rule by which POIs are observed, as in a config.
 #[derive(Clone, Debug)]
 struct Rule {
     observers: Observers,
@@ -32,7 +35,7 @@ struct Rule {
     after: Vec<Vec<usize>>,
 }
 
-/// The parts that a record made by hand leaves out.
+/// The fields that a record made by hand omits.
 const EMPTY: Record = Record {
     leaders: 0,
     followers: 0,
@@ -70,7 +73,7 @@ impl Record {
         }
     }
 
-    /// The record as a backend lays it out, among neighbours whose words are noise: sets, counts and sights.
+    /// Returns the sets, counts and sights in a backend's memory layout. The words of neighbouring teams are noise.
     fn words(&self, stride: usize, offset: usize, rng: &mut ChaCha8Rng) -> [Vec<u32>; 3] {
         let mut noise = |words: usize| -> Vec<u32> { (0..words * stride).map(|_| rng.random()).collect() };
         let set = |set: &[usize], word: usize| -> u32 {
@@ -93,21 +96,21 @@ impl Record {
         [sets, seen, sights]
     }
 
-    /// What a need leaves of the record: of each POI the sets that are large enough and that no other contains, and the
-    /// leader that each follower saw most.
-    fn packed(&self, need: RecordRequest<'_>) -> (Vec<u32>, Vec<u32>) {
+    /// Packs the record for a request. Keeps, per POI, the sets that are large enough and not contained in another set.
+    /// Keeps, per follower, the leader that it saw most.
+    fn packed(&self, request: RecordRequest<'_>) -> (Vec<u32>, Vec<u32>) {
         let (pois, words) = (self.coupling.len(), (self.leaders + self.followers).div_ceil(32));
         let contains = |a: &[usize], b: &[usize]| b.iter().all(|agent| a.contains(agent));
         let kept = |poi: usize| {
-            let all: Vec<&Vec<usize>> = self.near.iter().map(|sets| &sets[poi]).collect();
-            let least = need.least(self.coupling[poi]).unwrap() as usize;
-            let idle = |index: usize| {
+            let steps: Vec<&Vec<usize>> = self.near.iter().map(|sets| &sets[poi]).collect();
+            let least = request.least(self.coupling[poi]).unwrap() as usize;
+            let redundant = |index: usize| {
                 let larger = |(other, set): (usize, &&Vec<usize>)| {
-                    other != index && contains(set, all[index]) && (other < index || !contains(all[index], set))
+                    other != index && contains(set, steps[index]) && (other < index || !contains(steps[index], set))
                 };
-                all[index].len() < least || all.iter().enumerate().any(larger)
+                steps[index].len() < least || steps.iter().enumerate().any(larger)
             };
-            (0..all.len()).filter(|&index| !idle(index)).map(|index| all[index].clone()).collect::<Vec<_>>()
+            (0..steps.len()).filter(|&index| !redundant(index)).map(|index| steps[index].clone()).collect::<Vec<_>>()
         };
         let kept: Vec<Vec<Vec<usize>>> = (0..pois).map(kept).collect();
         let rows = kept.iter().map(Vec::len).max().unwrap();
@@ -118,38 +121,38 @@ impl Record {
             }
         }
         let bits = owner_bits(self.leaders as u32);
-        let a_word = (32 / bits) as usize;
-        let mut owners = vec![0; self.followers.div_ceil(a_word)];
+        let per_word = (32 / bits) as usize;
+        let mut owners = vec![0; self.followers.div_ceil(per_word)];
         for follower in 0..self.followers {
             let owner = self.owner(self.leaders + follower).map_or((1 << bits) - 1, |owner| owner as u32);
-            owners[follower / a_word] |= owner << (follower % a_word * bits as usize);
+            owners[follower / per_word] |= owner << (follower % per_word * bits as usize);
         }
-        (sets, if need.owners() { owners } else { vec![] })
+        (sets, if request.owners() { owners } else { vec![] })
     }
 
-    /// Observed POIs if each agent counted as many times as `weight` says of a step, from 0: step after step, what is
-    /// observed at one opens others from the next on.
+    /// Counts the observed POIs if each agent counts `weight(step, agent)` times, with steps from 0. A POI that is
+    /// observed at one step opens others from the next step on.
     fn observed(&self, weight: impl Fn(usize, usize) -> u32) -> u32 {
         let mut observed = vec![false; self.coupling.len()];
         for (step, sets) in self.near.iter().enumerate() {
             let before = observed.clone();
             for (poi, set) in sets.iter().enumerate() {
                 let Rule { observers, windows, after } = &self.rule;
-                let at_its_time = windows.is_empty() || (windows[poi][0]..=windows[poi][1]).contains(&(step + 1));
-                let in_its_turn = after.is_empty() || after[poi].iter().all(|&other| before[other]);
+                let in_window = windows.is_empty() || (windows[poi][0]..=windows[poi][1]).contains(&(step + 1));
+                let open = after.is_empty() || after[poi].iter().all(|&other| before[other]);
                 let counts = |&&agent: &&usize| match observers {
                     Observers::All => true,
                     Observers::Leaders => agent < self.leaders,
                     Observers::Followers => agent >= self.leaders,
                 };
-                let there: u32 = set.iter().filter(counts).map(|&agent| weight(step, agent)).sum();
-                observed[poi] |= at_its_time && in_its_turn && there >= self.coupling[poi];
+                let count: u32 = set.iter().filter(counts).map(|&agent| weight(step, agent)).sum();
+                observed[poi] |= in_window && open && count >= self.coupling[poi];
             }
         }
         observed.iter().filter(|&&observed| observed).count() as u32
     }
 
-    /// The leader a follower belongs to.
+    /// Returns the leader to whose group an agent belongs.
     fn owner(&self, agent: usize) -> Option<usize> {
         if agent < self.leaders {
             return Some(agent);
@@ -159,7 +162,7 @@ impl Record {
         (most > 0).then(|| seen.iter().position(|&steps| steps == most).unwrap())
     }
 
-    /// Whether a leader leads an agent at a step, from 0.
+    /// Returns whether a leader leads an agent at a step, with steps from 0.
     fn leads(&self, leader: usize, step: usize, agent: usize) -> bool {
         let Some(follower) = agent.checked_sub(self.leaders) else { return leader == agent };
         let first = if self.led.within == 0 { 0 } else { (step + 1).saturating_sub(self.led.within) };
@@ -175,6 +178,7 @@ impl Record {
         }
     }
 
+    /// Returns the scores by their definition.
     fn scores(&self) -> Scores {
         let share = |count: u32, of: u32| count as f32 / of as f32;
         let pois = self.coupling.len() as u32;
@@ -184,15 +188,14 @@ impl Record {
         let without_group = |leader| observed - self.observed(|_, agent| (owners[agent] != Some(leader)) as u32);
         let without_led = |leader| observed - self.observed(|step, agent| !self.leads(leader, step, agent) as u32);
         let gain = |leader, copies| self.observed(|_, agent| 1 + if agent == leader { copies } else { 0 }) - observed;
-        // a/b is bettered by c/d
-        let bettered =
-            |(a, b): (u32, u32), (c, d): (u32, u32)| u64::from(c) * u64::from(b) > u64::from(a) * u64::from(d);
+        // a/b < c/d, without rounding.
+        let less = |(a, b): (u32, u32), (c, d): (u32, u32)| u64::from(c) * u64::from(b) > u64::from(a) * u64::from(d);
         let stepping_stone = |leader| {
             let (d, most) = (without(leader), *self.coupling.iter().max().unwrap());
-            if !bettered((d, 1), (gain(leader, most), most)) {
+            if !less((d, 1), (gain(leader, most), most)) {
                 return share(d, pois);
             }
-            let copies = (1..).find(|&n| !bettered((gain(leader, n), n), (gain(leader, n + 1), n + 1))).unwrap();
+            let copies = (1..).find(|&n| !less((gain(leader, n), n), (gain(leader, n + 1), n + 1))).unwrap();
             share(gain(leader, copies), pois * copies)
         };
         Scores {
@@ -206,24 +209,24 @@ impl Record {
     }
 }
 
-/// A random record of at most `agents` agents, with sets whose sizes keep close to the coupling.
+/// Generates a random record of at most `agents` agents. Sets have sizes near the coupling: then single agents matter.
 fn random(rng: &mut ChaCha8Rng, agents: usize) -> Record {
     let agents = rng.random_range(1..=agents);
     let leaders = if rng.random_bool(0.2) { agents } else { rng.random_range(1..=agents) };
     let followers = agents - leaders;
     let (pois, steps) = (rng.random_range(1..=8), rng.random_range(1..=20));
-    let any = |rng: &mut ChaCha8Rng| match rng.random_range(0..6) {
+    let random_coupling = |rng: &mut ChaCha8Rng| match rng.random_range(0..6) {
         0 => 1,
         1 => agents,
         2 => agents + 1,
         3 => rng.random_range(1..=agents),
         _ => rng.random_range(1..=agents.min(6)),
     } as u32;
-    let same = any(rng);
+    let same = random_coupling(rng);
     let each = rng.random_bool(0.3);
-    let coupling: Vec<u32> = (0..pois).map(|_| if each { any(rng) } else { same }).collect();
+    let coupling: Vec<u32> = (0..pois).map(|_| if each { random_coupling(rng) } else { same }).collect();
     let mut near: Vec<Vec<Vec<usize>>> = Vec::new();
-    // Agents that come together make losses; a POI with a regular crowd has critical members.
+    // If the same agents return to a POI (`regular`), the loss of one of them changes G.
     let (empty, stay, regular) = (rng.random_range(0.0..1.0), rng.random_range(0.0..0.8), rng.random_bool(0.7));
     for step in 0..steps {
         let sets = (0..pois).map(|poi| {
@@ -255,7 +258,7 @@ fn random(rng: &mut ChaCha8Rng, agents: usize) -> Record {
         _ => (0..leaders).map(|_| rng.random_range(0..=most)).collect(),
     };
     let seen = (0..followers).map(|_| row(rng)).collect();
-    // Whom a follower sees, it mostly saw before.
+    // A follower mostly sees the leaders that it saw at the step before.
     let (change, many) = (rng.random_range(0.05..0.6), rng.random_range(0.1..0.7));
     let mut sights: Vec<Vec<Vec<usize>>> = Vec::new();
     for step in 0..steps {
@@ -271,8 +274,8 @@ fn random(rng: &mut ChaCha8Rng, agents: usize) -> Record {
     Record { leaders, followers, coupling, near, seen, sights, rule: PLAIN, led }
 }
 
-/// The same with another rule, of every kind.
-fn ruled(rng: &mut ChaCha8Rng, record: Record) -> Record {
+/// Returns the record with a random rule.
+fn with_random_rule(rng: &mut ChaCha8Rng, record: Record) -> Record {
     let (pois, steps) = (record.coupling.len(), record.near.len());
     let observers = match rng.random_range(0..4) {
         0 => Observers::Leaders,
@@ -297,6 +300,7 @@ fn ruled(rng: &mut ChaCha8Rng, record: Record) -> Record {
     Record { rule: Rule { observers, windows, after }, ..record }
 }
 
+/// Compares the scores of a record with their definition, for strided and packed words. Returns them.
 fn compare(record: &Record, credit: &mut Credit, rng: &mut ChaCha8Rng, stride: usize) -> Scores {
     let world = record.world();
     let offset = rng.random_range(0..stride);
@@ -306,9 +310,9 @@ fn compare(record: &Record, credit: &mut Credit, rng: &mut ChaCha8Rng, stride: u
     let episode = Episode { sets: strided(&sets), seen, sights };
     let expected = record.scores();
     assert_eq!(credit.all(&episode, &world), expected);
-    let without = Episode { sights: Strided::NONE, ..episode };
+    let without_sights = Episode { sights: Strided::NONE, ..episode };
     let dt = if record.followers == 0 { expected.dt.clone() } else { vec![] };
-    assert_eq!(credit.all(&without, &world), Scores { dt, ..expected.clone() });
+    assert_eq!(credit.all(&without_sights, &world), Scores { dt, ..expected.clone() });
     let mut g = vec![f32::NAN; record.leaders];
     assert_eq!(credit.score(&episode, &world, Fitness::G, &mut g), expected.observed);
     assert_eq!(g, vec![expected.g; record.leaders]);
@@ -318,44 +322,44 @@ fn compare(record: &Record, credit: &mut Credit, rng: &mut ChaCha8Rng, stride: u
     if world.rule.is_timed() {
         return expected;
     }
-    let needs: [&[Fitness]; 5] =
+    let requests: [&[Fitness]; 5] =
         [&[Fitness::D, Fitness::Df, Fitness::Dpp], &[Fitness::G], &[Fitness::D], &[Fitness::Df], &[Fitness::Dpp]];
-    for need in needs {
-        let (sets, owners) = record.packed(RecordRequest(need));
-        let whole = |words| Strided { words, stride: 1, offset: 0 };
-        let seen = Seen::Owners(whole(&owners));
-        let episode = Episode { sets: whole(&sets), seen, sights: Strided::NONE };
-        let &[fitness] = need else {
+    for request in requests {
+        let (sets, owners) = record.packed(RecordRequest(request));
+        let contiguous = |words| Strided { words, stride: 1, offset: 0 };
+        let seen = Seen::Owners(contiguous(&owners));
+        let episode = Episode { sets: contiguous(&sets), seen, sights: Strided::NONE };
+        let &[fitness] = request else {
             let found = Scores { dt: expected.dt.clone(), ..credit.all(&episode, &world) };
-            assert_eq!(found, expected, "packed");
+            assert_eq!(found, expected, "packed record");
             continue;
         };
         let mut scores = vec![f32::NAN; record.leaders];
-        assert_eq!(credit.score(&episode, &world, fitness, &mut scores), expected.observed, "{need:?}");
-        let of_g = vec![expected.g; record.leaders];
-        let wanted = match fitness {
-            Fitness::G => &of_g,
+        assert_eq!(credit.score(&episode, &world, fitness, &mut scores), expected.observed, "{request:?}");
+        let g = vec![expected.g; record.leaders];
+        let expected_scores = match fitness {
+            Fitness::G => &g,
             Fitness::D => &expected.d,
             Fitness::Df => &expected.df,
             Fitness::Dpp | Fitness::Dt => &expected.dpp,
         };
-        assert_eq!(&scores, wanted, "{need:?}");
+        assert_eq!(&scores, expected_scores, "{request:?}");
     }
     expected
 }
 
 #[test]
-fn every_fitness_is_its_definition() {
+fn every_fitness_equals_its_definition() {
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     let mut credit = Credit::default();
+    // Numbers of records whose scores differ, with the default rule and with a random rule.
     let mut differ = [0; 7];
-    // Of records by another rule: with scores that are not those by the default, and with D, Df, D++ and Dt that differ.
     let mut by_rule = [0; 5];
     for case in 0..6000 {
         let agents = [3, 12, 20, 32, 33, 70][case % 6];
         let record = random(&mut rng, agents);
-        let other = ruled(&mut rng, record.clone());
-        let found = compare(&other, &mut credit, &mut rng, [1, 8, 16][case % 3]);
+        let other_rule = with_random_rule(&mut rng, record.clone());
+        let found = compare(&other_rule, &mut credit, &mut rng, [1, 8, 16][case % 3]);
         let stride = [1, 8, 16][case % 3];
         let scores = compare(&record, &mut credit, &mut rng, stride);
         let any = |list: &[f32]| list.iter().any(|&score| score > 0.0);
@@ -369,57 +373,57 @@ fn every_fitness_is_its_definition() {
         differ[5] += (scores.dt != scores.d) as u32;
         differ[6] += (scores.dt != scores.df) as u32;
     }
-    // The records are of every kind: with critical leaders, with critical groups, with stepping stones, all, none.
+    // Critical leaders, critical groups, gains by copies, all POIs and no POI observed: each has to be frequent.
     assert!(differ.iter().all(|&cases| cases > 300), "{differ:?}");
     assert!(by_rule.iter().all(|&cases| cases > 300), "{by_rule:?}");
 }
 
 #[test]
-fn a_thousand_agents() {
+fn every_fitness_equals_its_definition_with_a_thousand_agents() {
     let mut rng = ChaCha8Rng::seed_from_u64(2);
     let mut credit = Credit::default();
     for case in 0..30 {
         let record = random(&mut rng, 1000);
-        let record = if case % 2 == 0 { record } else { ruled(&mut rng, record) };
+        let record = if case % 2 == 0 { record } else { with_random_rule(&mut rng, record) };
         compare(&record, &mut credit, &mut rng, [1, 8, 16][case % 3]);
     }
 }
 
-fn by_hand(record: &Record) -> Scores {
+/// Returns the scores of a record made by hand, after comparing them with their definition.
+fn scores_of(record: &Record) -> Scores {
     let mut record = record.clone();
-    // Where it is not said, nobody saw anybody.
+    // If a record omits the sights, no follower saw a leader.
     record.sights.resize(record.near.len(), vec![vec![]; record.followers]);
     compare(&record, &mut Credit::default(), &mut ChaCha8Rng::seed_from_u64(0), 8)
 }
 
-/// Equations 1 and 2 with C = 2: a pair at one step observes, the same two at different steps do not.
+/// Equations 1 and 2 with C = 2.
 #[test]
-fn a_pair_must_meet() {
+fn two_agents_observe_a_poi_only_at_the_same_step() {
     let near = vec![vec![vec![0, 1], vec![0]], vec![vec![], vec![1]]];
     let scores =
-        by_hand(&Record { leaders: 2, followers: 0, coupling: vec![2, 2], near, seen: vec![], rule: PLAIN, ..EMPTY });
+        scores_of(&Record { leaders: 2, followers: 0, coupling: vec![2, 2], near, seen: vec![], rule: PLAIN, ..EMPTY });
     assert_eq!((scores.observed, scores.g), (1, 0.5));
     assert_eq!((scores.d, scores.df), (vec![0.5, 0.5], vec![0.5, 0.5]));
 }
 
-/// Three near a POI of C = 2: nobody alone is missed, but a leader with its follower is.
+/// Three agents are near a POI with C = 2. No single agent is critical, but a leader with its follower is.
 #[test]
-fn a_spare_agent_hides_a_leader_but_not_its_group() {
+fn df_credits_a_leader_that_d_does_not() {
     let near = vec![vec![vec![0, 1, 2]]];
     let record =
         Record { leaders: 2, followers: 1, coupling: vec![2], near, seen: vec![vec![3, 1]], rule: PLAIN, ..EMPTY };
-    let scores = by_hand(&record);
+    let scores = scores_of(&record);
     assert_eq!(scores.d, [0.0, 0.0]);
     assert_eq!(scores.df, [1.0, 0.0]);
-    let tied = by_hand(&Record { seen: vec![vec![2, 2]], ..record });
+    let tied = scores_of(&Record { seen: vec![vec![2, 2]], ..record });
     assert_eq!(tied.df, [1.0, 0.0]);
 }
 
-/// A follower that saw no leader belongs to none, and is missed with none.
 #[test]
-fn an_unled_follower_is_nobodys() {
+fn a_follower_that_saw_no_leader_belongs_to_no_group() {
     let near = vec![vec![vec![1, 2]]];
-    let scores = by_hand(&Record {
+    let scores = scores_of(&Record {
         leaders: 1,
         followers: 2,
         coupling: vec![2],
@@ -431,29 +435,30 @@ fn an_unled_follower_is_nobodys() {
     assert_eq!((scores.g, scores.d, scores.df), (1.0, vec![0.0], vec![0.0]));
 }
 
-/// One observation by others, at another step, makes a leader dispensable.
 #[test]
-fn a_second_pair_at_another_step_is_enough() {
+fn a_leader_is_not_critical_if_others_observe_at_another_step() {
     let near = vec![vec![vec![0, 1]], vec![vec![2, 3]]];
     let scores =
-        by_hand(&Record { leaders: 4, followers: 0, coupling: vec![2], near, seen: vec![], rule: PLAIN, ..EMPTY });
+        scores_of(&Record { leaders: 4, followers: 0, coupling: vec![2], near, seen: vec![], rule: PLAIN, ..EMPTY });
     assert_eq!((scores.g, scores.d), (1.0, vec![0.0; 4]));
 }
 
-/// Two POIs of C = 3: one leader alone at the first needs two copies, at the second, in company, one.
+/// Two POIs with C = 3. Leader 0, alone at the first POI, needs two copies there. At the second POI one copy is enough,
+/// because two leaders are there.
 #[test]
-fn stepping_stones() {
+fn dpp_is_the_gain_per_copy() {
     let near = vec![vec![vec![0], vec![0, 1]]];
     let scores =
-        by_hand(&Record { leaders: 3, followers: 0, coupling: vec![3, 3], near, seen: vec![], rule: PLAIN, ..EMPTY });
-    // Leader 0: one copy completes 1 of 2 POIs (value 1/2), two copies both (2/2 over 2 = 1/2): not bettered.
-    // Leader 1: one copy completes the second POI. Leader 2 was near nothing.
+        scores_of(&Record { leaders: 3, followers: 0, coupling: vec![3, 3], near, seen: vec![], rule: PLAIN, ..EMPTY });
+    // Leader 0: one copy completes 1 of 2 POIs (value 1/2), two copies both (2/2 over 2 = 1/2), which is not larger.
+    // Leader 1: one copy completes the second POI. Leader 2 was near no POI.
     assert_eq!((scores.d, scores.dpp), (vec![0.0; 3], vec![0.5, 0.5, 0.0]));
 }
 
-/// The first value that the next does not better ends the search: 0 copies' worth at n = 1 and 2 is such a value.
+/// The search ends at the first number of copies whose value the next number does not exceed. If a POI needs three
+/// copies, one and two copies both have the value 0, so the search ends there.
 #[test]
-fn a_stepping_stone_two_copies_away_is_found_and_three_away_is_not() {
+fn dpp_finds_a_gain_by_two_copies_but_not_by_three() {
     let near = |set: &[usize]| vec![vec![set.to_vec()]];
     let alone = |coupling| Record {
         leaders: 1,
@@ -464,49 +469,47 @@ fn a_stepping_stone_two_copies_away_is_found_and_three_away_is_not() {
         rule: PLAIN,
         ..EMPTY
     };
-    assert_eq!(by_hand(&alone(2)).dpp, [1.0]);
-    assert_eq!(by_hand(&alone(3)).dpp, [0.5]);
-    assert_eq!(by_hand(&alone(4)).dpp, [0.0]);
+    assert_eq!(scores_of(&alone(2)).dpp, [1.0]);
+    assert_eq!(scores_of(&alone(3)).dpp, [0.5]);
+    assert_eq!(scores_of(&alone(4)).dpp, [0.0]);
 }
 
-/// A follower that a leader brought to one POI may leave another locked.
 #[test]
-fn who_opens_a_poi_is_missed_at_those_behind_it() {
+fn a_leader_gets_credit_for_pois_that_it_opens() {
     // Leader 0 alone observes POI 0 at step 1; leader 1 is at POI 1 at steps 1 and 2, which is observed at step 2.
     let near = vec![vec![vec![0], vec![1]], vec![vec![], vec![1]]];
     let rule = Rule { after: vec![vec![], vec![0]], ..PLAIN };
     let record = Record { leaders: 2, followers: 0, coupling: vec![1, 1], near, seen: vec![], rule, ..EMPTY };
-    let scores = by_hand(&record);
+    let scores = scores_of(&record);
     assert_eq!((scores.observed, scores.d), (2, vec![1.0, 0.5]));
-    // Observed at the same step, one opens no other.
+    // A POI does not open another at the same step.
     let near = record.near[..1].to_vec();
-    assert_eq!(by_hand(&Record { near, ..record.clone() }).observed, 1);
-    // A window that is over before it opens.
+    assert_eq!(scores_of(&Record { near, ..record.clone() }).observed, 1);
+    // The window of POI 1 ends before POI 0 opens it.
     let rule = Rule { windows: vec![[1, 2], [1, 1]], ..record.rule.clone() };
-    let scores = by_hand(&Record { rule, ..record });
+    let scores = scores_of(&Record { rule, ..record });
     assert_eq!((scores.observed, scores.d), (1, vec![0.5, 0.0]));
 }
 
-/// Where followers alone observe, a leader is worth what it led there.
 #[test]
-fn a_leader_that_does_not_observe_is_worth_its_followers() {
+fn df_credits_a_leader_if_only_followers_observe() {
     let near = vec![vec![vec![0, 1, 2]]];
     let rule = Rule { observers: Observers::Followers, ..PLAIN };
     let record =
         Record { leaders: 1, followers: 2, coupling: vec![2], near, seen: vec![vec![0], vec![1]], rule, ..EMPTY };
-    let scores = by_hand(&record);
+    let scores = scores_of(&record);
     assert_eq!(
         (scores.observed, &scores.d[..], &scores.df[..], &scores.dpp[..]),
         (1, &[0.0][..], &[1.0][..], &[0.0][..])
     );
     let near = vec![vec![vec![0, 1]]];
-    assert_eq!(by_hand(&Record { near, ..record }).observed, 0);
+    assert_eq!(scores_of(&Record { near, ..record }).observed, 0);
 }
 
-/// A follower that one leader brings to a POI and another to the next: Df gives both POIs to whom it saw most, Dt each to
-/// whoever led it there.
+/// One leader brings the follower to a POI, another leader brings it to the next. Df gives both POIs to the leader that
+/// the follower saw most.
 #[test]
-fn a_relay_is_told_apart_step_by_step() {
+fn dt_gives_each_poi_to_the_leader_that_led_there() {
     // The follower, agent 2, is at POI 0 at step 3, led by leader 0, and at POI 1 at step 5, led by leader 1.
     let mut near = vec![vec![vec![], vec![]]; 5];
     (near[2][0], near[4][1]) = (vec![2], vec![2]);
@@ -514,14 +517,14 @@ fn a_relay_is_told_apart_step_by_step() {
     let led = Led { within: 2, by: LedBy::MostSeen };
     let record =
         Record { leaders: 2, followers: 1, coupling: vec![1, 1], near, seen: vec![vec![3, 2]], sights, led, ..EMPTY };
-    let scores = by_hand(&record);
+    let scores = scores_of(&record);
     assert_eq!((scores.d, scores.df, scores.dt), (vec![0.0; 2], vec![1.0, 0.0], vec![0.5, 0.5]));
-    // Over all steps, leader 0 leads to the end, and of any both lead from step 4 on.
-    let of = |led: Led| by_hand(&Record { led, ..record.clone() }).dt;
-    assert_eq!(of(Led { within: 0, by: LedBy::MostSeen }), [1.0, 0.0]);
-    assert_eq!(of(Led { within: 0, by: LedBy::AnySeen }), [1.0, 0.5]);
-    assert_eq!(of(Led { within: 1, by: LedBy::AnySeen }), [0.5, 0.5]);
-    // Behind the first POI, the second is lost with it.
+    // Counted over all steps, leader 0 leads until the end. With `AnySeen`, leader 1 leads as well from step 4 on.
+    let dt = |led: Led| scores_of(&Record { led, ..record.clone() }).dt;
+    assert_eq!(dt(Led { within: 0, by: LedBy::MostSeen }), [1.0, 0.0]);
+    assert_eq!(dt(Led { within: 0, by: LedBy::AnySeen }), [1.0, 0.5]);
+    assert_eq!(dt(Led { within: 1, by: LedBy::AnySeen }), [0.5, 0.5]);
+    // If the first POI opens the second, both depend on leader 0.
     let rule = Rule { after: vec![vec![], vec![0]], ..PLAIN };
-    assert_eq!(by_hand(&Record { rule, ..record.clone() }).dt, [1.0, 0.5]);
+    assert_eq!(scores_of(&Record { rule, ..record.clone() }).dt, [1.0, 0.5]);
 }
