@@ -75,7 +75,7 @@ flotilla does not control the following. Each line names the functions in `tests
 | sines, cosines and logarithms of the host | each platform's library rounds them differently | none is called: `no_source_calls_the_platforms_math_functions` |
 | Rust's compiler neither fuses nor reorders | it does so only on request | golden digests with every instruction set: `every_instruction_set` |
 | instruction sets round alike | masks and conversions differ in corner cases | `levels_give_the_same_bits`, `every_instruction_set` |
-| text becomes the nearest float, and floats become text and back | Rust's own library does both | `the_program_tells_the_same_digest` |
+| text becomes the nearest float, and floats become text and back | Rust's own library does both | `train_records_the_same_digest` |
 
 Two things are not promised: times, and processes that change the rounding mode of their threads. Intervals and p-values are computed
 with `libm`, too.

@@ -1,7 +1,7 @@
-//! Golden digests of whole training runs: the same bits on any number of threads, by every instruction set, in one
-//! batch or in many, and the same as when they were minted.
+//! Compares whole training runs with recorded digests ("golden digests").
 //!
-//! `tests/golden.txt` says what each of its lines covers and when they may be minted anew.
+//! The digests have to be the same on any number of threads, every instruction set and every GPU, and in batches of any
+//! size. `tests/golden.txt` describes each digest, and says when it may be recorded again.
 
 #[cfg(feature = "gpu")]
 mod support;
@@ -21,7 +21,7 @@ use sha2::{Digest, Sha256};
 const GENERALLY_FORWARD: &str = include_str!("../configs/generally_forward.toml");
 const STRICTLY_FORWARD: &str = include_str!("../configs/strictly_forward.toml");
 const CHAOTIC: &str = include_str!("../configs/chaotic.toml");
-/// Ten groups of a leader and three followers: a set of agents takes two words.
+/// Ten groups of one leader and three followers. A set of 40 agents needs two words.
 const FORTY_AGENTS: &str = "
 [world]
 leaders = [[5, 5], [15, 5], [25, 5], [35, 5], [45, 5], [5, 40], [15, 40], [25, 40], [35, 40], [45, 40]]
@@ -34,17 +34,17 @@ pois = [[5, 12], [20, 12], [45, 12], [10, 47], [30, 47], [48, 30]]
 coupling = 4
 ";
 
-/// Name, what is covered, the config and what of it is changed.
+/// Name, description, config, and the keys that are changed.
 type Case = (&'static str, &'static str, &'static str, &'static [(&'static str, &'static str)]);
 
-/// Together these cases cover every choice that a config has, and sizes on both sides of every special case.
+/// Together these cases cover every choice in a config, and sizes on both sides of every special case.
 const CASES: [Case; 33] = [
     ("generally-forward", "first layout, leader-follower, Df", GENERALLY_FORWARD, &[]),
     ("strictly-forward", "second layout, D++", STRICTLY_FORWARD, &[("learning.fitness", "'D++'")]),
     ("chaotic", "third layout, G", CHAOTIC, &[("learning.fitness", "'G'")]),
     (
         "all-leaders",
-        "all-leaders, D, two agents at a POI",
+        "all-leaders, D, coupling 2",
         GENERALLY_FORWARD,
         &[("learning.paradigm", "'all-leaders'"), ("learning.fitness", "'D'"), ("world.coupling", "2")],
     ),
@@ -56,7 +56,7 @@ const CASES: [Case; 33] = [
     ),
     (
         "jittered",
-        "three episodes a team from jittered starts, D",
+        "three episodes per team from jittered starts, D",
         GENERALLY_FORWARD,
         &[
             ("learning.start_jitter", "0.75"),
@@ -78,7 +78,7 @@ const CASES: [Case; 33] = [
     ),
     (
         "inverse",
-        "inverse density, POIs sensed only when near",
+        "inverse density, POIs sensed up to a distance of 12",
         GENERALLY_FORWARD,
         &[("sense.density", "'inverse'"), ("sense.poi_range", "12.0")],
     ),
@@ -92,11 +92,11 @@ const CASES: [Case; 33] = [
     ("no-hidden", "no hidden layer", GENERALLY_FORWARD, &[("policy.hidden", "[]")]),
     (
         "each-coupling",
-        "a coupling for each POI, a seed above 32 bits",
+        "one coupling per POI, a seed above 32 bits",
         CHAOTIC,
         &[("world.coupling", "[1, 2, 5, 7]"), ("learning.seed", "81985529216486895")],
     ),
-    ("forty-agents", "40 agents, two words a set, six POIs", FORTY_AGENTS, &[]),
+    ("forty-agents", "40 agents, two words per set, six POIs", FORTY_AGENTS, &[]),
     (
         "followers-observe",
         "only followers observe, Df",
@@ -111,13 +111,13 @@ const CASES: [Case; 33] = [
     ),
     (
         "windows",
-        "POIs that can be observed at some steps, D",
+        "POIs that can be observed only in windows of steps, D",
         CHAOTIC,
         &[("world.windows", "[[1, 20], [16, 24], [30, 50], [21, 21]]"), ("learning.fitness", "'D'")],
     ),
     (
         "after",
-        "POIs one after the other, Df, two words a set",
+        "POIs that have to be observed in order, Df, two words per set",
         FORTY_AGENTS,
         &[("world.after", "[[], [0], [1], [0], [3], [3]]"), ("world.coupling", "3")],
     ),
@@ -152,13 +152,13 @@ const CASES: [Case; 33] = [
     ),
     (
         "moved-pois",
-        "two episodes a team with POIs elsewhere",
+        "two episodes per team with moved POIs",
         GENERALLY_FORWARD,
         &[("learning.poi_jitter", "3.0"), ("learning.episodes_per_team", "2"), ("learning.population", "13")],
     ),
     (
         "stages",
-        "coupling 1, from generation 3 on 3 with moved starts, from generation 6 on all of a team's speed",
+        "coupling 1, from generation 3 on coupling 3 and jittered starts, from generation 6 on a larger speed",
         GENERALLY_FORWARD,
         &[(
             "stages",
@@ -166,10 +166,15 @@ const CASES: [Case; 33] = [
              {from = 6, set = {'motion.max_speed' = 10.0}}]",
         )],
     ),
-    ("led-step-by-step", "Dt, led by whom it saw most so far", CHAOTIC, &[("learning.fitness", "'Dt'")]),
+    (
+        "led-step-by-step",
+        "Dt, followers led by the leader that they saw most so far",
+        CHAOTIC,
+        &[("learning.fitness", "'Dt'")],
+    ),
     (
         "relay",
-        "Dt, led by any of the last 3 steps, only followers observe, one POI after the other",
+        "Dt, followers led by all leaders seen in the last 3 steps, only followers observe, order and windows",
         CHAOTIC,
         &[
             ("learning.fitness", "'Dt'"),
@@ -189,13 +194,13 @@ const CASES: [Case; 33] = [
     ),
     (
         "partners",
-        "the mean of three teams a policy, D",
+        "the mean of three teams per policy, D",
         GENERALLY_FORWARD,
         &[("learning.partners", "3"), ("learning.fitness", "'D'"), ("world.coupling", "2")],
     ),
     (
         "lenient",
-        "the best of two teams a policy, all-leaders, two episodes from jittered starts",
+        "the best of two teams per policy, all-leaders, two episodes from jittered starts",
         CHAOTIC,
         &[
             ("learning.partners", "2"),
@@ -208,7 +213,7 @@ const CASES: [Case; 33] = [
     ),
     (
         "hall-of-fame",
-        "two teams a policy and one with the champions of a generation out of the last three, all-leaders, Df",
+        "two teams per policy and one with champions of one of the last three generations, all-leaders, Df",
         CHAOTIC,
         &[
             ("learning.hall_of_fame", "3"),
@@ -219,7 +224,7 @@ const CASES: [Case; 33] = [
     ),
     (
         "sense-gain",
-        "inputs of the inverse density times 8, three agents at a POI, all-leaders, D++",
+        "inverse density with a gain of 8, coupling 3, all-leaders, D++",
         CHAOTIC,
         &[
             ("sense.density", "'inverse'"),
@@ -231,7 +236,7 @@ const CASES: [Case; 33] = [
     ),
     (
         "openai-es",
-        "evolution strategy of OpenAI, an odd population",
+        "OpenAI's evolution strategy, an odd population",
         GENERALLY_FORWARD,
         &[
             ("learning.method", "'openai-es'"),
@@ -254,7 +259,7 @@ const CASES: [Case; 33] = [
     ),
     (
         "shared-openai-es",
-        "evolution strategy of OpenAI, all leaders share a policy, more of the gradient from generation 4 on",
+        "OpenAI's evolution strategy, all leaders share a policy, larger steps from generation 4 on",
         GENERALLY_FORWARD,
         &[
             ("learning.method", "'openai-es'"),
@@ -286,38 +291,39 @@ fn hex(bytes: &[u8]) -> String {
 /// The result of a run.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Golden {
-    /// Bytes hashed and their SHA-256, as `flotilla train` tells it.
+    /// The number of bytes hashed, and their SHA-256 as `flotilla train` prints it.
     pub bytes: usize,
     pub sha256: String,
-    /// SHA-256 of every stage of every step of the last policies: one flipped bit need not change what is selected.
+    /// SHA-256 of every stage of every step that the last policies play. It detects a changed bit even if this bit does
+    /// not change the selection.
     pub episodes: String,
 }
 
-/// Trains all configs side by side: what each came to, and the most that a team of it observed.
+/// Trains all configs side by side. Returns the digests and the largest G for each.
 pub fn train(configs: &[Config], backend: &mut dyn Backend) -> Vec<(Golden, f64)> {
     let mut trainer = Trainer::new(ValidConfig::all(configs).unwrap());
     let mut texts = vec![String::from("trial,generation,best_g,mean_g,champion_g\n"); configs.len()];
-    let mut most = vec![0f64; configs.len()];
+    let mut largest_g = vec![0f64; configs.len()];
     for row in trainer.finish(backend).unwrap() {
-        most[row.experiment] = most[row.experiment].max(row.best_g);
-        let Row { experiment: arm, trial, generation, best_g, mean_g, champion_g } = row;
-        writeln!(texts[arm], "{trial},{generation},{best_g},{mean_g},{champion_g}").unwrap();
+        largest_g[row.experiment] = largest_g[row.experiment].max(row.best_g);
+        let Row { experiment, trial, generation, best_g, mean_g, champion_g } = row;
+        writeln!(texts[experiment], "{trial},{generation},{best_g},{mean_g},{champion_g}").unwrap();
     }
-    let golden = |(arm, text): (usize, &String)| {
+    let golden = |(experiment, text): (usize, &String)| {
         let mut hash = Sha256::new_with_prefix(text);
-        let policies = trainer.policies(arm).concat();
+        let policies = trainer.policies(experiment).concat();
         hash.update(bytemuck::cast_slice::<f32, u8>(&policies));
         let golden = Golden {
             bytes: text.len() + size_of_val(&policies[..]),
             sha256: hex(&hash.finalize()),
-            episodes: trace(backend, &configs[arm], trainer.world(arm), &trainer.policies(arm)[0]),
+            episodes: trace(backend, &configs[experiment], trainer.world(experiment), &trainer.policies(experiment)[0]),
         };
-        (golden, most[arm])
+        (golden, largest_g[experiment])
     };
     texts.iter().enumerate().map(golden).collect()
 }
 
-/// Plays a trial's policies, team j of the policies with index j, and hashes every float without the sign of a zero.
+/// Plays the policies of a trial and hashes every float. Team j has the policies with index j. Zeros lose their sign.
 fn trace(backend: &mut dyn Backend, config: &Config, world: &World, weights: &[f32]) -> String {
     let policies = config.learning.population;
     let teams: Vec<u32> = (0..policies * world.leaders()).map(|place| (place / world.leaders()) as u32).collect();
@@ -335,21 +341,21 @@ fn trace(backend: &mut dyn Backend, config: &Config, world: &World, weights: &[f
     hex(&Sha256::digest(bytemuck::cast_slice::<f32, u8>(&floats)))
 }
 
-/// The recorded runs. `FLOTILLA_MINT=1` records them anew.
+/// The recorded digests. `FLOTILLA_MINT=1` records them again.
 static GOLDEN: LazyLock<Vec<Golden>> = LazyLock::new(|| {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/golden.txt");
-    // Not read from disk, where there is none.
+    // Part of the program, because WebAssembly has no file system.
     let mut text = String::from(include_str!("golden.txt"));
     if std::env::var("FLOTILLA_MINT").as_deref() == Ok("1") {
         text = HEADER.into();
         let minted = train(&CONFIGS, &mut Cpu::default());
-        for ((name, what, ..), (Golden { bytes, sha256, episodes }, _)) in CASES.iter().zip(minted) {
-            writeln!(text, "{name:<20} {bytes:>6} {sha256} {episodes}  {what}").unwrap();
+        for ((name, description, ..), (Golden { bytes, sha256, episodes }, _)) in CASES.iter().zip(minted) {
+            writeln!(text, "{name:<20} {bytes:>6} {sha256} {episodes}  {description}").unwrap();
         }
         std::fs::write(path, &text).unwrap();
     }
     let lines: Vec<&str> = text.lines().filter(|line| !line.starts_with('#')).collect();
-    assert_eq!(lines.len(), CASES.len(), "{path} has a line a case");
+    assert_eq!(lines.len(), CASES.len(), "{path} needs one line per case");
     let golden = |((name, ..), line): (&Case, &&str)| {
         let mut words = line.split_whitespace();
         assert_eq!(words.next(), Some(*name), "{path}: {line}");
@@ -360,21 +366,22 @@ static GOLDEN: LazyLock<Vec<Golden>> = LazyLock::new(|| {
 });
 
 const HEADER: &str = "\
-# Digests of whole training runs, one a line: name, bytes hashed, SHA-256 of the run, SHA-256 of its last episodes, what
-# the line covers.
+# Digests of whole training runs, one per line: name, bytes hashed, SHA-256 of the run, SHA-256 of its last episodes,
+# description.
 #
-# Each is a layout of the paper, or one of tests/golden.rs, with 2 trials of 8 generations of 20 policies, changed as
-# that file says. Of the run, the rows of metrics.csv without the seconds and then the policies are hashed: the digest
-# that `flotilla train` prints. Of the episodes, every stage of every step that the first trial's last policies play.
+# Each config is a layout of the paper, or of tests/golden.rs, with 2 trials of 8 generations of 20 policies and the
+# changes in that file. The first SHA-256 is the digest that `flotilla train` prints: of the rows of metrics.csv without
+# seconds, then of the policies. The second is of every stage of every step that the last policies of trial 0 play.
 #
-# These are promises to whoever has runs of earlier versions. Where results have to change, say why in the changelog and
-# mint them anew: FLOTILLA_MINT=1 cargo test --test golden
+# Users with runs of earlier versions rely on these digests. If results have to change, give the reason in the changelog
+# and record the digests again: FLOTILLA_MINT=1 cargo test --test golden
 ";
 
-pub fn check(what: &str, backend: &mut dyn Backend) {
-    for (((name, ..), golden), (found, most)) in CASES.iter().zip(&*GOLDEN).zip(train(&CONFIGS, backend)) {
-        assert!(most > 0.0, "{name}: nothing was observed, so selection had nothing to go by");
-        assert_eq!(found, *golden, "{name}, {what}");
+/// Trains all cases and compares them with the recorded digests.
+pub fn check(machine: &str, backend: &mut dyn Backend) {
+    for (((name, ..), golden), (found, largest_g)) in CASES.iter().zip(&*GOLDEN).zip(train(&CONFIGS, backend)) {
+        assert!(largest_g > 0.0, "{name}: no team observed a POI, so selection is not tested");
+        assert_eq!(found, *golden, "{name}, {machine}");
     }
 }
 
@@ -385,7 +392,7 @@ fn on_threads(count: usize, work: impl FnOnce() + Send) {
 
 #[cfg(feature = "parallel")]
 #[test]
-fn any_number_of_threads() {
+fn digests_are_the_same_on_any_number_of_threads() {
     for count in [1, 2, 8] {
         on_threads(count, || check(&format!("{count} threads"), &mut Cpu::default()));
     }
@@ -400,29 +407,29 @@ fn every_instruction_set() {
 
 #[cfg(feature = "gpu")]
 #[test]
-fn every_adapter() {
-    for (request, info) in support::adapters("every_adapter") {
+fn digests_are_the_same_on_every_adapter() {
+    for (request, info) in support::adapters("digests_are_the_same_on_every_adapter") {
         check(&info.to_string(), &mut GpuBackend::new(gpu::open(request).unwrap()).unwrap());
     }
 }
 
-/// Plays so many teams at a time: each group, and each group's teams, in rollouts of their own.
-struct Few {
+/// Plays at most `teams` teams per rollout.
+struct SmallBatches {
     teams: usize,
     backend: Cpu,
 }
 
-impl Backend for Few {
+impl Backend for SmallBatches {
     fn play(&mut self, groups: &[Group<'_>]) -> Result<Vec<GroupScores>, BackendError> {
-        let mut all = vec![GroupScores::default(); groups.len()];
-        for (group, all) in groups.iter().zip(&mut all) {
+        let mut scores = vec![GroupScores::default(); groups.len()];
+        for (group, scores) in groups.iter().zip(&mut scores) {
             for teams in group.teams.chunks(self.teams * group.world.leaders()) {
-                let few = self.backend.play(&[Group { teams, ..*group }])?.remove(0);
-                all.observed.extend(few.observed);
-                all.scores.extend(few.scores);
+                let batch = self.backend.play(&[Group { teams, ..*group }])?.remove(0);
+                scores.observed.extend(batch.observed);
+                scores.scores.extend(batch.scores);
             }
         }
-        Ok(all)
+        Ok(scores)
     }
 
     fn trace(&mut self, group: &Group<'_>) -> Result<Trace, BackendError> {
@@ -435,17 +442,17 @@ impl Backend for Few {
 }
 
 #[test]
-fn one_batch_or_many() {
+fn digests_are_the_same_in_small_batches() {
     for teams in [1, 5, 16] {
-        let mut backend = Few { teams, backend: Cpu::default() };
+        let mut backend = SmallBatches { teams, backend: Cpu::default() };
         check(&backend.describe(), &mut backend);
     }
 }
 
-/// Alone and from the command line, a case ends as it does here, side by side with all others.
+/// The program trains each case alone, not side by side with the others.
 #[cfg(feature = "cli")]
 #[test]
-fn the_program_tells_the_same_digest() {
+fn train_records_the_same_digest() {
     let folder = tempfile::tempdir().unwrap();
     for (index, (name, ..)) in CASES.iter().enumerate() {
         let file = folder.path().join(format!("{name}.toml"));
