@@ -1,5 +1,7 @@
-//! Teams stepped by hand come to what a backend's traces say, whatever instruction set, number of teams and order of
-//! resets; what cannot be stepped is told, and nothing moves then.
+//! Tests that teams stepped by hand have the same states, observations and scores as in a backend's traces.
+//!
+//! They have to be equal bit for bit, with every instruction set, number of teams and order of resets. Invalid input is
+//! refused and changes nothing.
 
 mod support;
 
@@ -15,7 +17,7 @@ use flotilla::stepping::{StepError, Stepper};
 use flotilla::world::World;
 use glam::Vec2;
 
-/// Actions of teams of random policies from some starts.
+/// Episodes of teams of random policies, played by the CPU.
 struct Played {
     world: World,
     starts: Vec<Vec2>,
@@ -41,11 +43,11 @@ impl Played {
             teams: &order,
             fitnesses: &[Fitness::Dt],
         };
-        let trace = Cpu::default().trace(&group).expect("the group fits the world");
+        let trace = Cpu::default().trace(&group).expect("the group is valid");
         Played { world, starts, trace }
     }
 
-    /// The leaders' actions of a team at a step, from 0.
+    /// Returns the actions of a team's leaders at a step, with steps from 0.
     fn actions(&self, step: usize, team: usize) -> impl Iterator<Item = f32> {
         (0..self.world.leaders()).flat_map(move |leader| self.trace.moment(step + 1, team, leader).outputs)
     }
@@ -54,19 +56,15 @@ impl Played {
         bytemuck::cast_slice(&self.starts).repeat(teams)
     }
 
-    /// The expected state of a stepper's team after a step, as bits.
-    fn check(&self, stepper: &mut Stepper, step: usize, team: usize, about: &str) {
+    /// Compares the state of a stepper's team after a step with the trace, bit for bit.
+    fn check(&self, stepper: &mut Stepper, step: usize, team: usize, case: &str) {
         let (leaders, agents) = (self.world.leaders(), self.world.agents());
-        let about = format!("{about}, team {team}, step {step}");
+        let case = format!("{case}, team {team}, step {step}");
         let bits = |numbers: &[f32]| numbers.iter().map(|number| number.to_bits()).collect::<Vec<_>>();
         let moments = |step: usize, count| (0..count).map(move |agent| *self.trace.moment(step, team, agent));
         if step < self.world.steps() {
             let sensed: Vec<f32> = moments(step + 1, leaders).flat_map(|moment| moment.inputs).collect();
-            assert_eq!(
-                bits(&stepper.inputs()[team * sensed.len()..][..sensed.len()]),
-                bits(&sensed),
-                "inputs, {about}"
-            );
+            assert_eq!(bits(&stepper.inputs()[team * sensed.len()..][..sensed.len()]), bits(&sensed), "inputs, {case}");
         }
         let states = stepper.states();
         let expected: [Vec<f32>; 3] = [
@@ -75,24 +73,24 @@ impl Played {
             moments(step, agents).map(|Moment { speed, .. }| speed).collect(),
         ];
         for (found, expected) in [states.positions, states.headings, states.speeds].into_iter().zip(expected) {
-            assert_eq!(bits(&found[team * expected.len()..][..expected.len()]), bits(&expected), "states, {about}");
+            assert_eq!(bits(&found[team * expected.len()..][..expected.len()]), bits(&expected), "states, {case}");
         }
         let (pois, words) = (self.world.pois.len(), self.world.constants.words as usize);
         let sets = self.trace.sets[team * self.world.set_words()..][..self.world.set_words()].chunks(pois * words);
         let sets: Vec<&[u32]> = sets.collect();
         let now = step.checked_sub(1).map_or(vec![0; pois * words], |step| sets[step].to_vec());
-        assert_eq!(stepper.near()[team * now.len()..][..now.len()], now, "near, {about}");
+        assert_eq!(stepper.near()[team * now.len()..][..now.len()], now, "near, {case}");
         let words = &self.trace.sets[team * self.world.set_words()..][..self.world.set_words()];
         let at = credit::observed_at(credit::Strided { words, stride: 1, offset: 0 }, &self.world);
         let by = |step: usize| at.iter().map(move |at| at.is_some_and(|at| at <= step)).collect::<Vec<bool>>();
         let (observed, before) = (by(step), by(step.saturating_sub(1)));
         let newly: Vec<bool> = observed.iter().zip(before).map(|(&observed, before)| observed && !before).collect();
-        assert_eq!(stepper.observed()[team * pois..][..pois], observed, "observed, {about}");
-        assert_eq!(stepper.steps()[team] as usize, step, "{about}");
-        assert_eq!(stepper.is_over(team), step == self.world.steps(), "{about}");
-        // A team that was over before the last step observed nothing by it: its caller knows.
+        assert_eq!(stepper.observed()[team * pois..][..pois], observed, "observed, {case}");
+        assert_eq!(stepper.steps()[team] as usize, step, "{case}");
+        assert_eq!(stepper.is_over(team), step == self.world.steps(), "{case}");
+        // A team that was over before the last call of `step` newly observed nothing, unlike its trace.
         if step < self.world.steps() || stepper.newly_observed()[team * pois..][..pois].contains(&true) {
-            assert_eq!(stepper.newly_observed()[team * pois..][..pois], newly, "newly observed, {about}");
+            assert_eq!(stepper.newly_observed()[team * pois..][..pois], newly, "newly observed, {case}");
         }
     }
 
@@ -102,25 +100,25 @@ impl Played {
 }
 
 #[test]
-fn a_policys_own_answers_give_the_bits_of_its_trace() {
+fn stepping_with_traced_actions_gives_the_bits_of_the_trace() {
     for level in Cpu::levels() {
-        // Less than the lanes, as many, one more, and more vectors than one thread takes.
+        // Fewer teams than a vector has lanes, as many, one more, and more vectors than one thread plays.
         for (seed, teams) in (0..40).zip([1, 3, 16, 17, 37, 150].into_iter().cycle()) {
             let played = Played::new(seed, teams);
-            let about = format!("seed {seed}, {teams} teams, {}", level_name(level));
+            let case = format!("seed {seed}, {teams} teams, {}", level_name(level));
             let stepper = Stepper::at_level(level, played.world.clone(), teams, true).and_then(Stepper::with_sights);
-            let mut stepper = stepper.unwrap_or_else(|error| panic!("{about}: {error}"));
-            stepper.reset_to(&played.starts_of(teams)).expect("they are on the map");
+            let mut stepper = stepper.unwrap_or_else(|error| panic!("{case}: {error}"));
+            stepper.reset_to(&played.starts_of(teams)).expect("the starts are on the map");
             let mut observed = vec![0; teams];
             for step in 0..=played.world.steps() {
-                (0..teams).for_each(|team| played.check(&mut stepper, step, team, &about));
+                (0..teams).for_each(|team| played.check(&mut stepper, step, team, &case));
                 let newly = stepper.newly_observed().chunks(played.world.pois.len());
                 observed.iter_mut().zip(newly).for_each(|(sum, newly)| {
                     *sum += newly.iter().filter(|&&newly| newly).count() as u32;
                 });
                 if step < played.world.steps() {
                     let actions: Vec<f32> = (0..teams).flat_map(|team| played.actions(step, team)).collect();
-                    stepper.step(&actions).unwrap_or_else(|error| panic!("{about}: {error}"));
+                    stepper.step(&actions).unwrap_or_else(|error| panic!("{case}: {error}"));
                 }
             }
             let leaders = played.world.leaders();
@@ -130,24 +128,24 @@ fn a_policys_own_answers_give_the_bits_of_its_trace() {
             stepper.fitness(Fitness::Dt, &mut dt).expect("sights are kept");
             for (team, dpp) in dpp.chunks(leaders).enumerate() {
                 let scores = played.scores(team);
-                assert_eq!(stepper.scores(team).as_ref(), Ok(&scores), "{about}, team {team}");
-                assert_eq!((scores.observed, &scores.dpp[..]), (observed[team], dpp), "{about}, team {team}");
-                assert_eq!(scores.dt, dt[team * leaders..][..leaders], "{about}, team {team}");
+                assert_eq!(stepper.scores(team).as_ref(), Ok(&scores), "{case}, team {team}");
+                assert_eq!((scores.observed, &scores.dpp[..]), (observed[team], dpp), "{case}, team {team}");
+                assert_eq!(scores.dt, dt[team * leaders..][..leaders], "{case}, team {team}");
             }
         }
     }
 }
 
-/// Teams start again at different times, and stand still in between.
+/// A team that is over does not move until its reset.
 #[test]
-fn each_team_has_its_own_time() {
+fn each_team_can_be_reset_at_any_step() {
     for (seed, level) in (0..20).zip(Cpu::levels().into_iter().cycle()) {
         let teams = 21;
         let played = Played::new(seed, teams);
         let (last, starts) = (played.world.steps(), played.starts_of(teams));
         let stepper = Stepper::at_level(level, played.world.clone(), teams, true).and_then(Stepper::with_sights);
         let mut stepper = stepper.unwrap_or_else(|error| panic!("{error}"));
-        stepper.reset_to(&starts).expect("they are on the map");
+        stepper.reset_to(&starts).expect("the starts are on the map");
         let mut steps = vec![0; teams];
         let mut over = 0;
         for tick in 0..3 * last {
@@ -157,12 +155,12 @@ fn each_team_has_its_own_time() {
                     _ => vec![0.3; 2 * played.world.leaders()],
                 })
                 .collect();
-            stepper.step(&actions).expect("they are actions");
+            stepper.step(&actions).expect("the actions are valid");
             over += steps.iter().filter(|&&step| step == last).count();
             steps.iter_mut().for_each(|step| *step = last.min(*step + 1));
-            // Some after their end, some in the middle, the first by itself too.
+            // Some of these teams are over, others are in the middle of an episode.
             let chosen: Vec<bool> = (0..teams).map(|team| (tick * 7 + team * 5).is_multiple_of(2 * last)).collect();
-            stepper.reset_some(&chosen, Some(&starts)).expect("they are on the map");
+            stepper.reset_some(&chosen, Some(&starts)).expect("the starts are on the map");
             for (team, step) in steps.iter_mut().enumerate() {
                 *step = if chosen[team] { 0 } else { *step };
                 played.check(&mut stepper, *step, team, &format!("seed {seed}, {}", level_name(level)));
@@ -181,14 +179,14 @@ fn world() -> World {
 
 const RULE: &str = "observers, windows and order of POIs";
 
-/// Puts a network with one hidden layer into a world.
+/// Sets the layer widths of a world's policies, with the number of parameters for one hidden layer.
 fn network(world: &mut World, widths: [u32; 5]) {
     let policy = &mut world.constants.policy;
     (policy.widths, policy.parameters) = (widths, (widths[0] + 1) * widths[1] + (widths[1] + 1) * widths[2]);
 }
 
 #[test]
-fn what_cannot_be_stepped_is_told_and_nothing_moves() {
+fn invalid_input_is_refused_and_changes_nothing() {
     let world = world();
     assert!(matches!(Stepper::new(world.clone(), 0), Err(StepError::Teams(0))));
     assert!(matches!(Stepper::new(world.clone(), MAX_POPULATION + 1), Err(StepError::Teams(_))));
@@ -196,19 +194,19 @@ fn what_cannot_be_stepped_is_told_and_nothing_moves() {
     let changed = |change: fn(&mut World)| {
         let mut world = world.clone();
         change(&mut world);
-        let error = Stepper::new(world.clone(), 1).err().expect("its parts do not fit");
-        let none = vec![0.0; world.leaders() * world.parameters()];
+        let error = Stepper::new(world.clone(), 1).err().expect("the world is inconsistent");
+        let weights = vec![0.0; world.leaders() * world.parameters()];
         let teams = vec![0; world.leaders()];
         let group = Group {
             world: &world,
             starts: &world.starts,
-            weights: none[..].into(),
+            weights: weights[..].into(),
             policies: 1,
             sharing: Sharing::PerLeader,
             teams: &teams,
             fitnesses: &[],
         };
-        let refused = Cpu::default().play(&[group]).expect_err("nor here");
+        let refused = Cpu::default().play(&[group]).expect_err("the world is inconsistent");
         assert!(matches!(refused, BackendError::InvalidInput(_)), "{refused}");
         error
     };
@@ -228,7 +226,7 @@ fn what_cannot_be_stepped_is_told_and_nothing_moves() {
         ("start positions", |world| _ = world.starts.pop()),
         ("start positions", |world| world.constants.followers += 1),
         ("sets", |world| world.constants.words = 2),
-        // Of more agents, of fewer POIs, from before the first step on, and each after the other.
+        // Too many agents, windows for too few POIs, a window from step 0, an order for too few POIs, a cycle.
         (RULE, |world| world.rule = Rule::new(0..1, 64, &[], &[])),
         (RULE, |world| world.rule = Rule::new(0..12, 12, &[[1, 2]; 3], &[])),
         (RULE, |world| world.rule = Rule::new(0..12, 12, &[[0, 2]; 4], &[])),
@@ -239,7 +237,7 @@ fn what_cannot_be_stepped_is_told_and_nothing_moves() {
         ("policies", |world| world.constants.policy.layers = 9),
         ("policies", |world| world.constants.policy.layers = 0),
         ("policies", |world| world.constants.policy.widths[1] = u32::MAX),
-        // Networks whose weights are counted right: too wide, of 9 inputs, of 3 outputs, with a width left over.
+        // The number of weights is right, but the network is too wide, or has 9 inputs, 3 outputs, or an extra width.
         ("policies", |world| network(world, [8, 65, 2, 0, 0])),
         ("policies", |world| network(world, [9, 10, 2, 0, 0])),
         ("policies", |world| network(world, [8, 10, 3, 0, 0])),
@@ -249,34 +247,34 @@ fn what_cannot_be_stepped_is_told_and_nothing_moves() {
         assert!(matches!(error, StepError::World(found) if found == what), "{what}: {error}");
     }
 
-    let mut stepper = Stepper::new(world.clone(), 3).expect("three teams are few");
+    let mut stepper = Stepper::new(world.clone(), 3).expect("three teams are allowed");
     let (good, leaders) = ([0.25; 24], world.leaders());
-    stepper.step(&good).expect("they are actions");
+    stepper.step(&good).expect("the actions are valid");
     let before = (stepper.inputs().to_vec(), stepper.states().positions.to_vec(), stepper.steps().to_vec());
-    let tell = |error: Result<(), StepError>| error.expect_err("it is refused").to_string();
-    let mut told = vec![
-        tell(stepper.step(&good[1..])),
-        tell(stepper.step(&[])),
-        tell(stepper.reset_to(&[1.0; 71])),
-        tell(stepper.reset_some(&[true; 2], None)),
-        tell(stepper.reset_some(&[true, false, true], Some(&[f32::NAN; 72]))),
-        tell(stepper.fitness(Fitness::D, &mut [0.0; 11])),
-        tell(stepper.fitness(Fitness::D, &mut [0.0; 12])),
-        tell(stepper.scores(1).map(drop)),
-        tell(stepper.scores(3).map(drop)),
+    let message = |result: Result<(), StepError>| result.expect_err("the input is invalid").to_string();
+    let mut messages = vec![
+        message(stepper.step(&good[1..])),
+        message(stepper.step(&[])),
+        message(stepper.reset_to(&[1.0; 71])),
+        message(stepper.reset_some(&[true; 2], None)),
+        message(stepper.reset_some(&[true, false, true], Some(&[f32::NAN; 72]))),
+        message(stepper.fitness(Fitness::D, &mut [0.0; 11])),
+        message(stepper.fitness(Fitness::D, &mut [0.0; 12])),
+        message(stepper.scores(1).map(drop)),
+        message(stepper.scores(3).map(drop)),
     ];
     for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
         let mut actions = good;
         actions[(leaders + 2) * 2 + 1] = bad;
-        told.push(tell(stepper.step(&actions)));
+        messages.push(message(stepper.step(&actions)));
     }
     for at in [-0.001, 50.001, f32::NAN, f32::INFINITY] {
         let mut starts = [1.0; 72];
         starts[2 * 24 + 2 * 5 + 1] = at;
-        told.push(tell(stepper.reset_to(&starts)));
-        // Who is not chosen may be anywhere.
-        let mut other = Stepper::new(world.clone(), 3).expect("three teams are few");
-        other.reset_some(&[true, true, false], Some(&starts)).expect("the others are on the map");
+        messages.push(message(stepper.reset_to(&starts)));
+        // Starts of teams that are not reset are not validated.
+        let mut other = Stepper::new(world.clone(), 3).expect("three teams are allowed");
+        other.reset_some(&[true, true, false], Some(&starts)).expect("the starts of the chosen teams are on the map");
     }
     let expected = [
         "23 actions, but [teams][leaders][2] are 24",
@@ -296,44 +294,44 @@ fn what_cannot_be_stepped_is_told_and_nothing_moves() {
         "agent 5 of team 2 would start at (1, NaN), which is not on the map",
         "agent 5 of team 2 would start at (1, inf), which is not on the map",
     ];
-    assert_eq!(told, expected);
+    assert_eq!(messages, expected);
     assert_eq!((stepper.inputs().to_vec(), stepper.states().positions.to_vec(), stepper.steps().to_vec()), before);
 }
 
 #[test]
-fn actions_are_taken_within_their_range_and_starts_on_the_grid() {
+fn actions_are_clamped_and_starts_are_rounded_to_the_grid() {
     let world = world();
     let positions = |action: [f32; 2], starts: Option<&[f32]>| {
-        let mut stepper = Stepper::new(world.clone(), 5).expect("five teams are few");
-        starts.into_iter().for_each(|starts| stepper.reset_to(starts).expect("they are on the map"));
-        (0..10).for_each(|_| stepper.step(&action.repeat(5 * world.leaders())).expect("they are actions"));
+        let mut stepper = Stepper::new(world.clone(), 5).expect("five teams are allowed");
+        starts.into_iter().for_each(|starts| stepper.reset_to(starts).expect("the starts are on the map"));
+        (0..10).for_each(|_| stepper.step(&action.repeat(5 * world.leaders())).expect("the actions are valid"));
         stepper.states().positions.to_vec()
     };
     assert_eq!(positions([7.0, 1e30], None), positions([1.0, 1.0], None));
     assert_eq!(positions([-1.5, -9.0], None), positions([-1.0, -1.0], None));
     assert_ne!(positions([1.0, 0.9], None), positions([1.0, 1.0], None));
 
-    // Rounding leaves this speed a bit short of the highest, however much more is asked for.
+    // Rounding leaves this speed one ULP below the maximum, also for actions above 1.
     let mut config = support::layout("generally_forward");
     (config.motion.max_speed, config.motion.max_acceleration) = (f64::from(3f32.next_up()), 100.0);
     config.world.speed = 0.5 + f64::from(f32::EPSILON);
     let speed = |wanted: f32| {
-        let mut stepper = Stepper::new(World::new(&config), 1).expect("a team is few");
-        stepper.step(&[0.0, wanted].repeat(stepper.world().leaders())).expect("they are actions");
+        let mut stepper = Stepper::new(World::new(&config), 1).expect("one team is allowed");
+        stepper.step(&[0.0, wanted].repeat(stepper.world().leaders())).expect("the actions are valid");
         stepper.states().speeds[0]
     };
     assert_eq!((speed(1.0), speed(7.0)), (3.0, 3.0));
 
     let on_grid: Vec<f32> = bytemuck::cast_slice(&world.starts).repeat(5);
     assert_eq!(positions([0.1, 0.2], Some(&on_grid)), positions([0.1, 0.2], None));
-    // Between two places of the grid, nearer to the first.
-    let beside: Vec<f32> =
+    // Starts between two points of the grid, nearer to the first.
+    let off_grid: Vec<f32> =
         on_grid.iter().map(|at| at + if *at < 16.0 { 1.0 / (1 << 20) as f32 } else { 0.0 }).collect();
-    assert_ne!(beside, on_grid);
-    let mut stepper = Stepper::new(world.clone(), 5).expect("five teams are few");
-    stepper.reset_to(&beside).expect("they are on the map");
+    assert_ne!(off_grid, on_grid);
+    let mut stepper = Stepper::new(world.clone(), 5).expect("five teams are allowed");
+    stepper.reset_to(&off_grid).expect("the starts are on the map");
     assert_eq!(stepper.states().positions, on_grid);
-    assert_eq!(positions([0.1, 0.2], Some(&beside)), positions([0.1, 0.2], None));
+    assert_eq!(positions([0.1, 0.2], Some(&off_grid)), positions([0.1, 0.2], None));
 }
 
 #[test]
@@ -347,7 +345,7 @@ fn a_restored_stepper_continues_with_the_same_bits() {
             if seed % 2 == 0 { stepper.with_sights().unwrap() } else { stepper }
         };
         let mut original = make(Level::new());
-        // Every third world has POIs of its own in each team.
+        // In every third world, each team has its own POIs.
         let moved = if seed % 3 == 0 { pois } else { 0 };
         let starts: Vec<f32> = (0..teams * (agents + moved))
             .flat_map(|place| [(place % 7) as f32, (place % 5) as f32].map(|at| at * 0.125 * world.map().min_element()))
@@ -370,37 +368,37 @@ fn a_restored_stepper_continues_with_the_same_bits() {
             reference.restore(&state).unwrap();
             assert_eq!(restored.save(), state, "world {seed}");
             for step in 0..world.steps() + 2 {
-                let show = |stepper: &mut Stepper| {
+                let results = |stepper: &mut Stepper| {
                     let states = stepper.states();
                     let bits = [states.positions, states.headings, states.speeds].concat();
                     let bits: Vec<u32> = bits.iter().chain(stepper.inputs()).map(|number| number.to_bits()).collect();
-                    let shown = (stepper.near().to_vec(), stepper.observed().to_vec(), stepper.steps().to_vec());
+                    let counts = (stepper.near().to_vec(), stepper.observed().to_vec(), stepper.steps().to_vec());
                     (
                         bits,
-                        shown,
+                        counts,
                         stepper.newly_observed().to_vec(),
                         (0..teams).map(|t| stepper.scores(t)).collect::<Vec<_>>(),
                     )
                 };
-                assert_eq!(show(&mut restored), show(&mut reference), "world {seed} step {step}");
+                assert_eq!(results(&mut restored), results(&mut reference), "world {seed} step {step}");
                 restored.step(&actions(step)).unwrap();
                 reference.step(&actions(step)).unwrap();
             }
         }
-        // The original was never put together from bytes.
-        let mut after: Vec<Vec<u32>> = vec![];
+        // The stepper that was never restored continues with the same bits.
+        let mut inputs: Vec<Vec<u32>> = vec![];
         let mut restored = make(Level::new());
         restored.restore(&state).unwrap();
         for stepper in [&mut original, &mut restored] {
             (0..world.steps()).for_each(|step| stepper.step(&actions(step)).unwrap());
-            after.push(stepper.inputs().iter().map(|input| input.to_bits()).collect());
+            inputs.push(stepper.inputs().iter().map(|input| input.to_bits()).collect());
         }
-        assert_eq!(after[0], after[1], "world {seed}");
+        assert_eq!(inputs[0], inputs[1], "world {seed}");
     }
 }
 
 #[test]
-fn a_state_that_does_not_fit_changes_nothing() {
+fn an_invalid_saved_state_is_refused_without_a_panic() {
     let world = World::new(&sample::world(1));
     let mut stepper = Stepper::recording(world.clone(), 3).unwrap();
     stepper.step(&vec![0.5; 3 * world.leaders() * 2]).unwrap();
@@ -417,7 +415,7 @@ fn a_state_that_does_not_fit_changes_nothing() {
     for word in 0..state.len() / 4 {
         let mut damaged = state.clone();
         damaged[word * 4..word * 4 + 4].copy_from_slice(&f32::NAN.to_le_bytes());
-        // Counts and sets may hold any bits, so not every damage is found, but none panics.
+        // Counts and sets can have any bits, so some damage is accepted. None may cause a panic.
         let _ = stepper.restore(&damaged);
     }
     stepper.restore(&state).unwrap();
@@ -425,7 +423,7 @@ fn a_state_that_does_not_fit_changes_nothing() {
 }
 
 #[test]
-fn teams_may_have_pois_of_their_own() {
+fn each_team_can_have_its_own_pois() {
     let world = World::new(&sample::world(2));
     let (teams, agents, pois) = (9, world.agents(), world.pois.len());
     let starts = Starts::Drawn { episodes: teams as u32, seed: 5, jitter: 1.0, poi_jitter: 3.0 };
@@ -435,7 +433,7 @@ fn teams_may_have_pois_of_their_own() {
     together.reset_to(&flat).unwrap();
     let actions = vec![0.75; world.leaders() * 2];
     for (team, places) in drawn.iter().enumerate() {
-        // The same world with its POIs there.
+        // The same world with the POIs of this team.
         let own = World { pois: places[agents..].to_vec(), ..world.clone() };
         let mut alone = Stepper::new(own, 1).unwrap();
         let start: Vec<f32> = places[..agents].iter().flat_map(|place| place.to_array()).collect();
@@ -450,7 +448,7 @@ fn teams_may_have_pois_of_their_own() {
             assert_eq!(&together.observed()[team * pois..][..pois], alone.observed());
         }
     }
-    // A reset to the world's start brings back the world's POIs, for the chosen team alone.
+    // A reset to the world's starts restores the world's POIs, for the chosen team only.
     let chosen: Vec<bool> = (0..teams).map(|team| team == 2).collect();
     together.reset_some(&chosen, None).unwrap();
     assert_eq!((together.pois(2), together.pois(3)), (&world.pois[..], &drawn[3][agents..]));
