@@ -1,12 +1,13 @@
-//! The exact core against f64, over the floats of each range; its levels against each other; its random words.
+//! Compares the exact math functions with f64, over the floats of each range, and with their twins in WGSL.
 //!
-//! Of the floats every fourth block of neighbours is walked, and the last; with `FLOTILLA_LONG=1` every one.
+//! Also compares instruction sets with each other, and tests the quality of random words and normal deviates. Every
+//! fourth block of neighbouring floats is tested, and the last block. With `FLOTILLA_LONG=1`, all blocks are.
 
 use fearless_simd::{Level, dispatch, prelude::*};
 use flotilla::kernels::math;
 use rayon::prelude::*;
 
-/// A function over slices to test.
+/// A function to test.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Function {
     Rsqrt,
@@ -47,7 +48,7 @@ fn run(level: Level, function: Function, input: &[f32]) -> Vec<f32> {
     output
 }
 
-/// The largest errors over a range: absolute, relative, and in ULP of the exact value.
+/// The largest errors over a range: absolute, relative, and in ULP of the exact value. `largest` is the largest output.
 #[derive(Clone, Copy, Debug, Default)]
 struct Errors {
     absolute: f64,
@@ -67,7 +68,7 @@ impl Errors {
     }
 }
 
-/// The floats from `low` to `high`, both positive, in blocks.
+/// Returns the errors over the floats from `low` to `high`, both positive.
 fn sweep(function: Function, low: f32, high: f32, exact: impl Fn(f64) -> f64 + Sync) -> Errors {
     const BLOCK: usize = 1 << 14;
     let level = Level::new();
@@ -78,7 +79,7 @@ fn sweep(function: Function, low: f32, high: f32, exact: impl Fn(f64) -> f64 + S
         .into_par_iter()
         .filter(|block| block % step == 0 || block + 1 == blocks)
         .map(|block| {
-            // The last block runs past the range, and is cut to it.
+            // The last block exceeds the range, so its inputs are clamped.
             let first = patterns.start + (block * BLOCK) as u32;
             let input: Vec<f32> =
                 (0..BLOCK as u32).map(|i| f32::from_bits((first + i).min(patterns.end - 1))).collect();
@@ -115,7 +116,7 @@ fn rsqrt_is_within_2_ulp() {
 }
 
 #[test]
-fn root_is_within_2_ulp() {
+fn exact_sqrt_is_within_2_1_ulp() {
     assert!(sweep(Root, power(-80), power(48), f64::sqrt).ulp < 2.1);
     assert_eq!(run(Level::new(), Root, &[0.0; 16])[0].to_bits(), 0);
 }
@@ -126,7 +127,7 @@ fn recip_is_within_2_ulp() {
 }
 
 #[test]
-fn tanh_keeps_its_error_and_its_range() {
+fn tanh_has_its_documented_error_and_range() {
     let series = |x: f64| x - x * x * x * (1.0 / 3.0 - x * x * (2.0 / 15.0 - x * x * (17.0 / 315.0)));
     let low = sweep(Tanh, power(-40), power(-6), series);
     let high = sweep(Tanh, power(-6), 8.0, f64::tanh);
@@ -138,7 +139,7 @@ fn tanh_keeps_its_error_and_its_range() {
 }
 
 #[test]
-fn sin_and_cos_keep_their_error() {
+fn sin_and_cos_have_their_documented_errors() {
     let turn = std::f32::consts::PI;
     let sin = |x: f64| x - x * x * x * (1.0 / 6.0 - x * x * (1.0 / 120.0 - x * x * (1.0 / 5040.0)));
     let cos = |x: f64| 1.0 - x * x * (0.5 - x * x * (1.0 / 24.0 - x * x * (1.0 / 720.0)));
@@ -154,7 +155,7 @@ fn sin_and_cos_keep_their_error() {
 }
 
 #[test]
-fn odd_functions_are_odd_and_zeros_are_exact() {
+fn odd_and_even_functions_are_symmetric_and_exact_at_zero() {
     let positive: Vec<f32> = (0..1 << 16).map(|i| power(-40) + i as f32 * 4.7e-5).collect();
     let negative: Vec<f32> = positive.iter().map(|x| -x).collect();
     for (function, sign) in [(Tanh, -1.0), (Sin, -1.0), (Cos, 1.0)] {
@@ -167,13 +168,13 @@ fn odd_functions_are_odd_and_zeros_are_exact() {
 }
 
 #[test]
-fn ln_keeps_its_error() {
+fn ln_has_its_documented_error() {
     let errors = sweep(Ln, power(-24), 1.0 - power(-24), f64::ln);
     assert!(errors.relative < 3.2e-7, "{errors:?}");
     assert_eq!(run(Level::new(), Ln, &[1.0; 16])[0], 0.0);
 }
 
-/// Every level this processor has, the best first.
+/// Returns the instruction sets of this processor, the best first.
 fn levels() -> Vec<Level> {
     let best = Level::new();
     #[cfg(target_arch = "x86_64")]
@@ -184,7 +185,7 @@ fn levels() -> Vec<Level> {
     [Some(best)].into_iter().chain(others).flatten().collect()
 }
 
-/// Mantissas from the generator, exponents within the function's range.
+/// Returns random floats within the function's range.
 fn samples(function: Function, count: u32) -> Vec<f32> {
     let (low, high) = match function {
         Rsqrt | Root => (power(-80), power(40)),
@@ -219,7 +220,7 @@ fn levels_give_the_same_bits() {
     }
 }
 
-/// The words of `draw` for counters 0.. in the given place of the four.
+/// Returns the random words for the counters 0, 1, and so on at index `place`. The other three counters are 7.
 fn draws(level: Level, place: usize, count: usize) -> Vec<[u32; 4]> {
     #[inline(always)]
     fn kernel<S: Simd>(simd: S, place: usize, draws: &mut [[u32; 4]]) {
@@ -246,7 +247,7 @@ fn draws(level: Level, place: usize, count: usize) -> Vec<[u32; 4]> {
 }
 
 #[test]
-fn draw_scalar_is_a_lane_of_draw() {
+fn pcg4d_scalar_equals_each_lane_of_pcg4d() {
     for level in levels() {
         for place in 0..4 {
             for (i, lane) in draws(level, place, 1 << 16).into_iter().enumerate() {
@@ -258,15 +259,15 @@ fn draw_scalar_is_a_lane_of_draw() {
     }
 }
 
-/// Standard deviations by which a count of `n` fair coins is off.
-fn surprise(count: usize, n: usize) -> f64 {
+/// Returns how many standard deviations a count of heads among `n` fair coins is away from its mean.
+fn deviations(count: usize, n: usize) -> f64 {
     (count as f64 - n as f64 / 2.0).abs() / (n as f64 / 4.0).sqrt()
 }
 
 #[test]
 fn draws_look_uniform_and_uncorrelated() {
     const COUNT: usize = 1 << 20;
-    // 2 · 10^5 coins are weighed below: 6.5 deviations would come up once in 10^5 runs of a fair generator.
+    // About 4 · 10^5 counts are tested below. For a fair generator, one of 3 · 10^4 such tests would exceed 6.5.
     const LIMIT: f64 = 6.5;
     (0..16).into_par_iter().for_each(|case| {
         let (place, word) = (case / 4, case % 4);
@@ -279,7 +280,7 @@ fn draws_look_uniform_and_uncorrelated() {
             let chi2: f64 = bins.iter().map(|bin| (bin - mean) * (bin - mean) / mean).sum();
             assert!((chi2 - 255.0).abs() < LIMIT * 510f64.sqrt(), "counter {place}, word {word}: chi-square {chi2}");
         }
-        // Each bit against each bit of the next draws, near and far, and of the other words of the same draw.
+        // Compares each bit with each bit of later draws, and of the other words of the same draw.
         for lag in [0, 1, 2, 16, 256, 1 << 16, 1 << 19] {
             for other in (0..4).filter(|&other| lag > 0 || other != word) {
                 let (pairs, later) = (1 << 15, &stream[lag..]);
@@ -290,7 +291,7 @@ fn draws_look_uniform_and_uncorrelated() {
                         ones.iter_mut().enumerate().for_each(|(bit, ones)| *ones += (differing >> bit & 1) as usize);
                     }
                     for (bit, &ones) in ones.iter().enumerate() {
-                        let off = surprise(ones, pairs);
+                        let off = deviations(ones, pairs);
                         assert!(off < LIMIT, "counter {place}, word {word}, bit {bit}, lag {lag}, {other}: {off}");
                     }
                 }
@@ -300,7 +301,7 @@ fn draws_look_uniform_and_uncorrelated() {
 }
 
 #[test]
-fn every_counter_bit_moves_every_drawn_bit() {
+fn every_counter_bit_affects_every_random_bit() {
     const COUNT: usize = 1 << 14;
     (0..128usize).into_par_iter().for_each(|flipped| {
         let mut ones = [[0usize; 32]; 4];
@@ -322,7 +323,7 @@ fn every_counter_bit_moves_every_drawn_bit() {
     });
 }
 
-/// Normal deviates from counters 0..
+/// Returns normal deviates for the counters 0, 1, and so on.
 fn normals(level: Level, count: usize) -> Vec<f32> {
     #[inline(always)]
     fn kernel<S: Simd>(simd: S, words: &[[u32; 4]], output: &mut [f32]) {
@@ -344,18 +345,18 @@ fn normals(level: Level, count: usize) -> Vec<f32> {
 }
 
 #[test]
-fn normals_are_normal() {
+fn normal_deviates_have_a_normal_distribution() {
     const COUNT: usize = 1 << 24;
     let deviates = normals(Level::new(), COUNT);
     let n = COUNT as f64;
     let moment = |power: i32| deviates.iter().map(|&x| (x as f64).powi(power)).sum::<f64>() / n;
-    // A sample moment of order k scatters by sqrt((m_2k - m_k²) / n).
+    // The standard deviation of a sample moment of order k is sqrt((m_2k - m_k²) / n).
     for (power, expected, scatter) in [(1, 0.0, 1.0), (2, 1.0, 2.0), (3, 0.0, 15.0), (4, 3.0, 96.0), (6, 15.0, 10170.0)]
     {
         let off = (moment(power) - expected) / (scatter / n).sqrt();
         assert!(off.abs() < 5.0, "moment {power}: {off} deviations off");
     }
-    // 200 bins from -4 to 4 and the two tails, against the integral of the density (Simpson's rule).
+    // Compares 200 bins from -4 to 4, and the tails, with the integral of the density (Simpson's rule).
     const BINS: usize = 200;
     let width = 8.0 / BINS as f64;
     let mut counts = [0f64; BINS];
@@ -400,19 +401,20 @@ const WGSL: &str = include_str!("../shaders/lib/math.wgsl");
 
 #[cfg(feature = "gpu")]
 #[test]
-fn the_shader_is_valid() {
+fn the_math_shader_is_valid() {
     let module = naga::front::wgsl::parse_str(WGSL).unwrap_or_else(|error| panic!("{}", error.emit_to_string(WGSL)));
     naga::valid::Validator::new(naga::valid::ValidationFlags::all(), naga::valid::Capabilities::empty())
         .validate(&module)
         .unwrap();
 }
 
-/// The numbers in the body of a function, in order.
+/// Returns the numbers in the body of a function, in order.
 fn numbers(source: &str, function: &str) -> Vec<f64> {
     let start = source.find(&format!("fn {function}")).unwrap_or_else(|| panic!("no {function}"));
     let body = &source[start..];
     let body = &body[body.find('{').unwrap()..body.find("\n}").unwrap()];
     let code: String = body.lines().map(|line| line.split("//").next().unwrap()).collect::<Vec<_>>().join("\n");
+    // A minus sign in an exponent does not separate numbers.
     let code = code.replace("e-", "e~");
     code.split(|c: char| !(c.is_ascii_alphanumeric() || "._~".contains(c)))
         .filter(|token| token.starts_with(|c: char| c.is_ascii_digit()))
