@@ -1,7 +1,7 @@
-//! GPUs against the CPU, bit for bit: stage by stage on random worlds, whole batches, whole training runs; and that
-//! the comparison can fail.
+//! Compares GPUs with the CPU, bit for bit: every stage on random worlds, batches, and training runs.
 //!
-//! Every test walks all adapters. What each has caught is said where it stands.
+//! Every test uses all adapters. One test edits shaders to show that the comparison can fail. Comments name the bugs
+//! that tests have found.
 
 #![cfg(feature = "gpu")]
 
@@ -22,17 +22,17 @@ use flotilla::verify::{Agreement, Plan, compare};
 use flotilla::world::{Constants, World};
 use flotilla::{backend::gpu, sample};
 
-/// The generic one plays more worlds: the other has to be compiled for each, which takes software drivers a second.
+/// The specialised kernel plays fewer worlds, because software drivers need a second to compile it for each world.
 const KERNELS: [Kernel; 2] = [Kernel::Generic, Kernel::Specialised];
 
-/// One that holds all populations and packs all records.
+/// Opens a GPU that holds all populations and packs all records.
 fn open(request: &Request, pass: Pass, kernel: Kernel) -> GpuBackend {
     let gpu = gpu::open(Request { pass: Some(pass), ..request.clone() }).unwrap();
     GpuBackend::new(gpu).unwrap().playing(kernel).holding(ResidencyPolicy::Always).with_records(Records::Packed)
 }
 
-/// Teams that choose from each leader's own policies, scored by every fitness.
-fn of_random_policies<'a>(world: &'a World, weights: &'a [f32], policies: usize, teams: &'a [u32]) -> Group<'a> {
+/// Returns a group of teams with separate policies per leader, scored by every fitness.
+fn group_of_teams<'a>(world: &'a World, weights: &'a [f32], policies: usize, teams: &'a [u32]) -> Group<'a> {
     let (starts, sharing, fitnesses) = (&world.starts, Sharing::PerLeader, SCORES_AND_DT);
     Group { world, starts, weights: weights.into(), policies, sharing, teams, fitnesses }
 }
@@ -41,7 +41,7 @@ fn check(plan: &Plan, mut backend: GpuBackend) -> Agreement {
     compare(plan, &mut Cpu::default(), &mut backend, |_| ()).unwrap()
 }
 
-/// Caught an empty slice of moments that was cast at the wrong alignment in rollouts.
+/// Found a rollout that cast an empty slice of moments with the wrong alignment.
 #[test]
 fn random_worlds_agree_under_both_passes_and_kernels() {
     for (request, info) in support::adapters("random_worlds_agree_under_both_passes_and_kernels") {
@@ -71,9 +71,9 @@ fn checked_shaders_and_default_limits_agree() {
     }
 }
 
-/// The canary of the twins: one constant of one shader changed is found, in the stage that it belongs to.
+/// Each edit changes a constant or a comparison in one shader. The reported mismatch has to name its stage.
 #[test]
-fn a_changed_twin_is_named_by_its_stage() {
+fn a_changed_shader_is_reported_with_its_stage() {
     type Edit = fn(String) -> String;
     let edits: [(&str, Edit); 13] = [
         ("sense", |text| replaced(text, "return 1.0 - exact_sqrt(d2)", "return 1.0000001 - exact_sqrt(d2)")),
@@ -90,7 +90,7 @@ fn a_changed_twin_is_named_by_its_stage() {
         ("sight", |text| replaced(text, "return within(dx, dy, world.attr", "return within(dx, dy, 0.99 * world.attr")),
         ("sight", |text| replaced(text, "sights + (step * rows + row)", "sights + (step * rows + rows - 1u - row)")),
     ];
-    for (request, info) in support::adapters("a_changed_twin_is_named_by_its_stage") {
+    for (request, info) in support::adapters("a_changed_shader_is_reported_with_its_stage") {
         for ((stage, edit), kernel) in edits.into_iter().zip(KERNELS.into_iter().cycle()) {
             // SAFETY: the edits change numbers, and an index within its row; loops stay as they are.
             #[expect(unsafe_code, reason = "an edited shader is compiled without bounds checks")]
@@ -102,13 +102,13 @@ fn a_changed_twin_is_named_by_its_stage() {
     }
 }
 
-/// An edit of the one shader among several that has this text.
+/// Replaces `from` in the one shader that contains it.
 fn replaced(text: String, from: &str, to: &str) -> String {
-    assert!(text.matches(from).count() <= 1, "{from} is there once");
+    assert!(text.matches(from).count() <= 1, "{from} occurs more than once");
     text.replace(from, to)
 }
 
-/// The largest worlds: several agents a thread, many words a set, three wide layers.
+/// Large worlds have several agents per thread, many words per set, and three wide layers.
 #[test]
 fn large_worlds_agree() {
     let config = |text: &str| Config::parse(text, "large.toml").unwrap();
@@ -129,8 +129,8 @@ fn large_worlds_agree() {
     for (request, info) in support::adapters("large_worlds_agree") {
         let worlds = vec![("crowd".into(), crowd.clone()), ("leaders only".into(), leaders_only.clone())];
         let plan = Plan { worlds, teams: 2, seed: 0, generations: 0 };
-        let backend = GpuBackend::new(gpu::open(request).unwrap()).unwrap().with_records(Records::Packed);
-        // Training them would take the software drivers minutes: traces and batches are enough.
+        let backend = GpuBackend::new(gpu::open(request).unwrap()).unwrap().bringing(Records::Packed);
+        // Training would take minutes on software drivers, so these worlds are only traced and played in batches.
         let plan = Plan { worlds: plan.worlds.into_iter().map(small_population).collect(), ..plan };
         assert_eq!(check(&plan, backend).mismatch, None, "{info}");
     }
@@ -141,7 +141,7 @@ fn small_population((name, mut config): (String, Config)) -> (String, Config) {
     (name, config)
 }
 
-/// Long episodes take several dispatches. Caught llvmpipe leaving all loops after 65 535 turns.
+/// Long episodes need several dispatches. Found that llvmpipe ends all loops after 65 535 iterations.
 #[test]
 fn long_episodes_agree() {
     let text = "[world]\nleaders = [[10.0, 5.0], [20.0, 5.0]]\nfollowers = [[12.0, 2.0], [8.0, 2.0]]\n\
@@ -157,17 +157,17 @@ fn long_episodes_agree() {
     }
 }
 
-/// Batches are cut to the device's memory; where they are cut must not show.
+/// The size of batches depends on the device's memory.
 #[test]
-fn batches_cut_small_give_the_same_scores() {
+fn small_batches_give_the_same_scores() {
     let config = sample::world(3);
     let world = World::new(&config);
     let (policies, teams) = (4, 300);
     let weights = sample::weights(&world, policies, 1);
     let choice: Vec<u32> = (0..teams * world.leaders()).map(|i| (i * 7 % policies) as u32).collect();
-    let group = of_random_policies(&world, &weights, policies, &choice);
+    let group = group_of_teams(&world, &weights, policies, &choice);
     let expected = Cpu::default().play(&[group]).unwrap();
-    for (request, info) in support::adapters("batches_cut_small_give_the_same_scores") {
+    for (request, info) in support::adapters("small_batches_give_the_same_scores") {
         for bytes in [1 << 12, 1 << 15, 1 << 28] {
             let backend = GpuBackend::new(gpu::open(request.clone()).unwrap()).unwrap();
             assert_eq!(backend.batched(bytes).play(&[group]).unwrap(), expected, "{info}, batches of {bytes} bytes");
@@ -175,7 +175,7 @@ fn batches_cut_small_give_the_same_scores() {
     }
 }
 
-/// Several experiments side by side end in the bits of each alone, on the GPU as on the CPU.
+/// Experiments trained side by side also have the same weights as each alone.
 #[test]
 fn training_gives_the_same_metrics_and_weights() {
     let mut config = support::layout("generally_forward");
@@ -192,25 +192,25 @@ fn training_gives_the_same_metrics_and_weights() {
     let train = |backend: &mut dyn Backend, configs: &[Config]| {
         let mut trainer = Trainer::new(ValidConfig::all(configs).unwrap());
         let rows = trainer.finish(backend).unwrap();
-        let weights: Vec<Vec<Vec<f32>>> = (0..configs.len()).map(|arm| trainer.policies(arm)).collect();
+        let weights: Vec<Vec<Vec<f32>>> = (0..configs.len()).map(|experiment| trainer.policies(experiment)).collect();
         (rows, weights)
     };
-    let both = [config.clone(), jittered.clone(), relay.clone()];
-    let (rows, weights) = train(&mut Cpu::default(), &both);
-    assert!(rows.iter().any(|row| row.experiment == 2 && row.best_g > 0.0), "nothing was relayed: {rows:?}");
-    assert!(rows.iter().any(|row| row.best_g > 0.0), "nothing was observed: {rows:?}");
-    for (arm, config) in both.iter().enumerate() {
-        assert_eq!(train(&mut Cpu::default(), std::slice::from_ref(config)).1[0], weights[arm]);
+    let configs = [config.clone(), jittered.clone(), relay.clone()];
+    let (rows, weights) = train(&mut Cpu::default(), &configs);
+    assert!(rows.iter().any(|row| row.experiment == 2 && row.best_g > 0.0), "the relay observed no POI: {rows:?}");
+    assert!(rows.iter().any(|row| row.best_g > 0.0), "no POI was observed: {rows:?}");
+    for (experiment, config) in configs.iter().enumerate() {
+        assert_eq!(train(&mut Cpu::default(), std::slice::from_ref(config)).1[0], weights[experiment]);
     }
     for (request, info) in support::adapters("training_gives_the_same_metrics_and_weights") {
         let mut backend = GpuBackend::new(gpu::open(request).unwrap()).unwrap();
-        assert_eq!(train(&mut backend, &both), (rows.clone(), weights.clone()), "{info}");
+        assert_eq!(train(&mut backend, &configs), (rows.clone(), weights.clone()), "{info}");
     }
 }
 
-/// The structs of the shaders lie in memory as the host writes them: no side pads what the other does not.
+/// A difference would mean that only one side has padding.
 #[test]
-fn structs_lie_alike_on_both_sides() {
+fn structs_have_the_same_size_in_shaders_and_on_the_host() {
     let texts = gpu::shaders();
     let modules: Vec<_> = texts.iter().map(|(_, text)| exact::parse(text).unwrap().0).collect();
     fn check<T: GpuStruct>(modules: &[naga::Module]) {
@@ -227,32 +227,36 @@ fn structs_lie_alike_on_both_sides() {
     check::<Moment>(&modules);
 }
 
-/// Drawn starts make one group an episode: batches of many groups, of which each has a few teams.
+/// Drawn starts make one group per episode, so a batch has many groups of few teams.
 #[test]
-fn held_out_episodes_come_to_the_same_on_every_backend() {
+fn held_out_episodes_give_the_same_results_on_every_backend() {
     let mut config = support::layout("generally_forward");
-    // Agents see each other at steps of their own.
+    // In longer episodes, agents see each other at different steps.
     config.world.steps = 40;
     let world = World::new(&config);
     let (policies, leaders) = (5, world.leaders());
     let weights = sample::weights(&world, policies, 11);
     let teams: Vec<u32> = (0..policies as u32).flat_map(|policy| std::iter::repeat_n(policy, leaders)).collect();
-    let group = of_random_policies(&world, &weights, policies, &teams);
+    let group = group_of_teams(&world, &weights, policies, &teams);
     let starts = Starts::Drawn { episodes: 300, seed: 5, jitter: 6.0, poi_jitter: 4.0 };
     let expected = evaluate(&mut Cpu::default(), &group, &starts, &mut |_| ()).unwrap();
     let others = Starts::Drawn { episodes: 300, seed: 5, jitter: 6.0, poi_jitter: 0.0 };
-    assert_ne!(evaluate(&mut Cpu::default(), &group, &others, &mut |_| ()).unwrap(), expected, "moved POIs matter");
+    assert_ne!(
+        evaluate(&mut Cpu::default(), &group, &others, &mut |_| ()).unwrap(),
+        expected,
+        "moved POIs changed nothing"
+    );
     let spreads: Vec<_> = (0..policies).map(|team| expected.team(team)).collect();
-    assert!(spreads.iter().any(|spread| spread.deviation > Some(0.0)), "nobody observes anything: {spreads:?}");
-    for (request, info) in support::adapters("held_out_episodes_come_to_the_same_on_every_backend") {
+    assert!(spreads.iter().any(|spread| spread.deviation > Some(0.0)), "no team observes a POI: {spreads:?}");
+    for (request, info) in support::adapters("held_out_episodes_give_the_same_results_on_every_backend") {
         let found = evaluate(&mut open(&request, Pass::Guarded, Kernel::Best), &group, &starts, &mut |_| ()).unwrap();
         assert_eq!(found, expected, "{info}");
     }
 }
 
 #[test]
-fn verify_tells_as_json_what_it_compared() {
-    for (index, (_, info)) in support::adapters("verify_tells_as_json_what_it_compared").into_iter().enumerate() {
+fn verify_json_lists_every_comparison() {
+    for (index, (_, info)) in support::adapters("verify_json_lists_every_comparison").into_iter().enumerate() {
         let adapter = index.to_string();
         let line = ["verify", "--worlds", "2", "--teams", "3", "--json", "-q", "--adapter", &adapter];
         let output = assert_cmd::cargo::cargo_bin_cmd!("flotilla").args(line).output().unwrap();
@@ -268,14 +272,14 @@ fn verify_tells_as_json_what_it_compared() {
     }
 }
 
-/// Inconsistent input is an error that names it, on every backend, before anything is played.
+/// The error names the inconsistency. No team is played.
 #[test]
-fn a_wrong_index_is_an_error() {
+fn inconsistent_input_is_an_error_on_every_backend() {
     let world = World::new(&support::layout("generally_forward"));
     let (policies, leaders) = (3, world.leaders());
     let weights = sample::weights(&world, policies, 1);
     let teams: Vec<u32> = (0..2 * leaders as u32).map(|place| place % 3).collect();
-    let good = of_random_policies(&world, &weights, policies, &teams);
+    let good = group_of_teams(&world, &weights, policies, &teams);
     let mut wrong = teams.clone();
     wrong[leaders + 2] = 3;
     let few = &weights[1..];
@@ -287,7 +291,7 @@ fn a_wrong_index_is_an_error() {
         (Group { sharing: Sharing::Shared, ..good }, "1 populations of 3 have 336"),
     ];
     let mut backends: Vec<Box<dyn Backend>> = vec![Box::new(Cpu::default())];
-    for (request, _) in support::adapters("a_wrong_index_is_an_error") {
+    for (request, _) in support::adapters("inconsistent_input_is_an_error_on_every_backend") {
         backends.push(Box::new(GpuBackend::new(gpu::open(request).unwrap()).unwrap().holding(ResidencyPolicy::Always)));
     }
     for backend in &mut backends {
@@ -312,25 +316,26 @@ fn a_wrong_index_is_an_error() {
                 assert!(error.to_string().contains(named), "{}: {error}", backend.describe());
             }
         }
-        // What it holds is as it was, and no stand-in for populations of other sizes.
+        // The errors left the population unchanged. It cannot be used with another number of policies.
         let mut found = vec![0.0; weights.len()];
         held.fetch(&mut found).unwrap();
         assert_eq!(found, weights);
         let other = Group { weights: Weights::OnDevice(&*held), policies: 4, ..good };
-        let error = backend.play(&[other]).expect_err("there are three");
+        let error = backend.play(&[other]).expect_err("the population has three policies");
         assert!(error.to_string().contains("populations of sizes [4, 3, 112]"), "{error}");
     }
 }
 
-/// Kernels are kept by what differs in their code, and a batch of many different worlds does not compile for minutes.
+/// Worlds that differ only in numbers share a kernel. A batch of many different worlds uses the generic kernel, because
+/// compiling one for each would take minutes.
 #[test]
 fn kernels_are_compiled_for_few_worlds_and_shared() {
-    // Small ones, for the sake of software drivers.
+    // The worlds are small, because software drivers are slow.
     let text = "[world]\nleaders = [[10.0, 5.0]]\npois = [[10.0, 15.0]]\nsteps = 2\n[policy]\nhidden = []";
     let config = Config::parse(text, "small.toml").unwrap();
     let play = |backend: &mut GpuBackend, worlds: &[World]| {
         let weights: Vec<Vec<f32>> = worlds.iter().map(|world| sample::weights(world, 1, 0)).collect();
-        let groups = worlds.iter().zip(&weights).map(|(world, weights)| of_random_policies(world, weights, 1, &[0]));
+        let groups = worlds.iter().zip(&weights).map(|(world, weights)| group_of_teams(world, weights, 1, &[0]));
         backend.play(&groups.collect::<Vec<_>>()).unwrap();
         backend.compiled()
     };
@@ -351,14 +356,13 @@ fn kernels_are_compiled_for_few_worlds_and_shared() {
         assert_eq!(play(&mut backend, &sizes), [1, 16], "{info}: the other worlds share the generic kernel");
         assert_eq!(play(&mut backend, &sizes), [1, 16], "{info}: nothing is compiled twice");
         backend = backend.playing(Kernel::Generic);
-        assert_eq!(play(&mut backend, &gains), [1, 16], "{info}: what is there is used");
+        assert_eq!(play(&mut backend, &gains), [1, 16], "{info}: compiled kernels are used");
     }
 }
 
-/// Where there are kernels for many worlds, a driver would keep megabytes of each: few are kept, and whatever that does to
-/// batches, records are the same.
+/// A driver needs megabytes per kernel, so a backend keeps only a few. The limit changes batches, but not scores.
 #[test]
-fn few_kernels_are_kept() {
+fn the_number_of_kernels_is_limited_without_changing_scores() {
     let worlds: Vec<World> = (1..=5u32)
         .map(|pois| {
             let places: Vec<String> = (0..pois).map(|poi| format!("[{}.0, 7.0]", 2 * poi)).collect();
@@ -371,14 +375,13 @@ fn few_kernels_are_kept() {
         .collect();
     let weights: Vec<Vec<f32>> = worlds.iter().map(|world| sample::weights(world, 7, 0)).collect();
     let teams: Vec<u32> = (0..7).collect();
-    // The first world comes once more, so that its kernel is let go of and made again.
+    // The first world is repeated, so that its kernel is evicted and compiled again.
     let order = [0, 1, 2, 3, 4, 0];
-    let groups: Vec<Group<'_>> =
-        order.map(|index| of_random_policies(&worlds[index], &weights[index], 7, &teams)).into();
+    let groups: Vec<Group<'_>> = order.map(|index| group_of_teams(&worlds[index], &weights[index], 7, &teams)).into();
     let play = |backend: &mut dyn Backend, groups: &[Group<'_>]| backend.play(groups).unwrap();
     let expected = play(&mut Cpu::default(), &groups);
     assert!(expected.iter().any(|scores| scores.observed.iter().any(|&observed| observed > 0)));
-    for (request, info) in support::adapters("few_kernels_are_kept") {
+    for (request, info) in support::adapters("the_number_of_kernels_is_limited_without_changing_scores") {
         for most in [1, 2, 64] {
             let gpu = gpu::open(request.clone()).unwrap();
             let mut backend = GpuBackend::new(gpu).unwrap().playing(Kernel::Specialised).keeping(most, 1000);
@@ -387,7 +390,7 @@ fn few_kernels_are_kept() {
                 assert_eq!(backend.compiled(), [0, most.min(5)], "{info}");
             }
         }
-        // Those that two plays had no use for are let go of.
+        // Kernels that two rollouts in a row did not use are evicted.
         let gpu = gpu::open(request.clone()).unwrap();
         let mut backend = GpuBackend::new(gpu).unwrap().playing(Kernel::Best).keeping(64, 2);
         assert_eq!(play(&mut backend, &groups), expected, "{info}");
@@ -400,8 +403,7 @@ fn few_kernels_are_kept() {
     }
 }
 
-/// Agents that face elsewhere each, and leaders that sense nothing by a range of 0, have the same bits on the GPU. The
-/// agents share one place, where a distance of 0 is within a range of 0.
+/// Every agent has its own heading. Leaders with a range of 0 sense nothing, not even agents at the same position.
 #[test]
 fn own_headings_and_ranges_of_zero_agree() {
     let config = |ranges: &str| {
@@ -418,7 +420,7 @@ fn own_headings_and_ranges_of_zero_agree() {
         let world = World::new(config);
         let weights = sample::weights(&world, 3, 5);
         let teams: Vec<u32> = (0..6).map(|slot| slot / 2).collect();
-        let group = of_random_policies(&world, &weights, 3, &teams);
+        let group = group_of_teams(&world, &weights, 3, &teams);
         let trace = Cpu::default().trace(&group).unwrap();
         for (agent, heading) in world.headings.iter().enumerate() {
             assert_eq!(trace.moment(0, 0, agent).heading, heading.to_array(), "{ranges}, agent {agent}");
