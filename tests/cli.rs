@@ -506,7 +506,7 @@ fn bench_measures_every_combination() {
 
 #[test]
 fn bench_profile_reports_the_parts_of_a_generation() {
-    let [object] = &bench_json(&["--teams", "50", "--profile"])[..] else { panic!("one combination") };
+    let [object] = &bench_json(&["--teams", "50", "--profile"])[..] else { panic!("one combination gives one object") };
     let profile = object["profile"].as_object().unwrap();
     let ms = |part: &str| profile[part].as_f64().filter(|&ms| ms > 0.0).unwrap_or_else(|| panic!("{part}: {object}"));
     let [rollout, rest @ ..] =

@@ -176,7 +176,7 @@ fn reference() -> (Outcome, Vec<Vec<Snapshot>>) {
 #[test]
 fn training_is_the_same_wherever_populations_are_stored() {
     let (expected, snapshots) = reference();
-    assert!(expected.rows.iter().any(|row| row.best_g > 0.0), "nothing was observed");
+    assert!(expected.rows.iter().any(|row| row.best_g > 0.0), "no POI was observed");
     for (request, info) in support::adapters("training_is_the_same_wherever_populations_are_stored") {
         let gpu = gpu::open(request).unwrap();
         let open = |holding| GpuBackend::new(gpu.clone()).unwrap().holding(holding);
