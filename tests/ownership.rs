@@ -259,10 +259,10 @@ fn files_of_others_in_sweeps_man_pages_and_papers_are_kept() {
 
 #[test]
 fn folders_of_other_users_are_entered_only_if_named() {
-    assert!(ownership::may_enter(1000, 1000, false));
-    assert!(!ownership::may_enter(1001, 1000, false));
-    assert!(!ownership::may_enter(0, 1000, false) && !ownership::may_enter(1000, 0, false));
-    assert!(ownership::may_enter(1001, 1000, true));
+    assert!(ownership::may_write(1000, 1000, false));
+    assert!(!ownership::may_write(1001, 1000, false));
+    assert!(!ownership::may_write(0, 1000, false) && !ownership::may_write(1000, 0, false));
+    assert!(ownership::may_write(1001, 1000, true));
 }
 
 #[cfg(unix)]

@@ -129,7 +129,7 @@ fn large_worlds_agree() {
     for (request, info) in support::adapters("large_worlds_agree") {
         let worlds = vec![("crowd".into(), crowd.clone()), ("leaders only".into(), leaders_only.clone())];
         let plan = Plan { worlds, teams: 2, seed: 0, generations: 0 };
-        let backend = GpuBackend::new(gpu::open(request).unwrap()).unwrap().bringing(Records::Packed);
+        let backend = GpuBackend::new(gpu::open(request).unwrap()).unwrap().with_records(Records::Packed);
         // Training would take minutes on software drivers, so these worlds are only traced and played in batches.
         let plan = Plan { worlds: plan.worlds.into_iter().map(small_population).collect(), ..plan };
         assert_eq!(check(&plan, backend).mismatch, None, "{info}");
