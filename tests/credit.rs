@@ -341,7 +341,8 @@ fn compare(record: &Record, credit: &mut Credit, rng: &mut ChaCha8Rng, stride: u
             Fitness::G => &g,
             Fitness::D => &expected.d,
             Fitness::Df => &expected.df,
-            Fitness::Dpp | Fitness::Dt => &expected.dpp,
+            Fitness::Dpp => &expected.dpp,
+            Fitness::Dt => unreachable!("Dt is tested by itself"),
         };
         assert_eq!(&scores, expected_scores, "{request:?}");
     }

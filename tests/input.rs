@@ -350,19 +350,18 @@ fn control_characters_in_arguments_are_refused_and_not_printed() {
 fn special_characters_in_names_are_escaped_in_every_output() {
     let place = place();
     let special = "it's \"a\" </script><b>|,%#`touch x`$(touch y);&{}";
-    // A folder's name cannot contain a slash.
-    let special = special.replace('/', "");
-    place.good(&["train", "small.toml", "--out", &special, "--quiet"]);
+    // The slash makes it a folder in a folder, and the path closes a script in a page.
+    place.good(&["train", "small.toml", "--out", special, "--quiet"]);
     place.good("train small.toml --out other --seed 2 --quiet");
-    place.good(&["replay", &special, "--out", "page.html"]);
+    place.good(&["replay", special, "--out", "page.html"]);
     let page = place.read("page.html");
     let data = page.split("id=\"data\">").nth(1).unwrap().split("</script>").next().unwrap();
     let data: serde_json::Value = serde_json::from_str(data).unwrap();
-    assert_eq!(data["run"], special.as_str());
+    assert_eq!(data["run"], special);
     assert!(!page.contains("<b>"));
     // Runs with equal configs are labelled by their folder.
     place.good("train small.toml --out same --quiet");
-    place.good(&["plot", &special, "same", "--out", "both.svg"]);
+    place.good(&["plot", special, "same", "--out", "both.svg"]);
     let svg = place.read("both.svg");
     assert!(!svg.contains("<b>") && svg.contains("</svg>"));
     // The script of a sweep with such a name works, and does not run the commands in the name.

@@ -99,6 +99,8 @@ fn other_commands_print_json() {
     let verify = verify.args(report).arg("--json").env("VK_DRIVER_FILES", "/nowhere").output().unwrap();
     let verified: Value = serde_json::from_slice(&verify.stdout).unwrap();
     assert_eq!(verified["equal"], true);
+    let report: Value = serde_json::from_str(&place.read("r.json")).unwrap();
+    assert!(report["rows"].as_array().is_some_and(|rows| !rows.is_empty()), "{report}");
 }
 
 #[test]

@@ -188,7 +188,7 @@ fn levels() -> Vec<Level> {
 /// Returns random floats within the function's range.
 fn samples(function: Function, count: u32) -> Vec<f32> {
     let (low, high) = match function {
-        Rsqrt | Root => (power(-80), power(40)),
+        Rsqrt | Root => (power(-80), power(48)),
         Recip => (power(-40), power(40)),
         Tanh => (power(-40), power(10)),
         Sin | Cos => (power(-40), std::f32::consts::PI),

@@ -356,7 +356,8 @@ fn compiling() {
     for (request, info) in support::adapters("compiling") {
         for (name, configs) in &cases {
             let backend = || GpuBackend::new(gpu::open(request.clone()).unwrap()).unwrap();
-            let gpu = backend().playing(Kernel::Best).holding(ResidencyPolicy::Always).with_records(Records::PackedFrom(0));
+            let gpu =
+                backend().playing(Kernel::Best).holding(ResidencyPolicy::Always).with_records(Records::PackedFrom(0));
             for (setup, mut backend) in [("by default", backend()), ("as on a GPU", gpu)] {
                 let mut trainer = Trainer::new(ValidConfig::all(configs).unwrap());
                 let mut seconds = || {

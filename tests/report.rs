@@ -158,10 +158,12 @@ fn plot_writes_svg_and_png() {
 #[test]
 fn curves_follow_the_metrics() {
     // A single trial has no error band, and the mean over trials is the trial itself.
-    let run = Run::new(CONFIG, &["--trials", "1"]);
-    succeed(&["plot", &run.text()]);
-    let svg = fs::read_to_string(run.file("curves.svg")).unwrap();
-    assert_eq!(count(&svg, "polygon"), count(&svg.replace("stroke=\"#ffffff\"", ""), "polygon"));
+    let [run, several] = ["1", "3"].map(|trials| Run::new(CONFIG, &["--trials", trials]));
+    let [svg, with_bands] = [&run, &several].map(|run| {
+        succeed(&["plot", &run.text()]);
+        fs::read_to_string(run.file("curves.svg")).unwrap()
+    });
+    assert!(count(&svg, "polygon") < count(&with_bands, "polygon"));
     let line = svg.lines().filter(|line| line.starts_with("<polyline")).find(|line| line.matches(',').count() == 7);
     let points = line.unwrap().split('"').nth(1).unwrap();
     let heights: Vec<f64> = points.split(' ').map(|point| point.split(',').nth(1).unwrap().parse().unwrap()).collect();

@@ -88,7 +88,11 @@ fn errors_in_stages_name_their_line() {
             3,
             "stages[0].set.learning.hall_of_fame: this key cannot change between stages",
         ),
-        (stage("0", "'learning.elites' = '50%'"), 3, "stages[0].set.learning.elites: this key cannot change between stages"),
+        (
+            stage("0", "'learning.elites' = '50%'"),
+            3,
+            "stages[0].set.learning.elites: this key cannot change between stages",
+        ),
         (
             stage("0", "'learning.parents' = 'elites'"),
             3,

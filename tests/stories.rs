@@ -10,6 +10,7 @@
 #![cfg(feature = "cli")]
 
 use std::fs;
+use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use flotilla::backend::cpu::Cpu;
