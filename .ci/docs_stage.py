@@ -1,11 +1,11 @@
-"""Copies docs/ to target/docs for the site, with what its pages link to elsewhere in the repository.
+"""Copies docs/ to target/docs for the site, and rewrites links.
 
     python3 .ci/docs_stage.py [FLOTILLA]
 
-A file outside docs/ that a page links to becomes repository/PATH in the site, and the links follow. `<!-- site: TEXT -->` on a
-page becomes TEXT, for links that only the site has: the Rust library's pages and the browser page. On the Python page, mkdocstrings
-takes the place of the text after the introduction. With the program's path, the page of commands gets the full help of each
-command.
+- A file outside docs/ that a page links to is copied to repository/PATH, and the links are adapted.
+- `<!-- site: TEXT -->` on a page becomes TEXT. It is for links that exist only on the site, such as the browser page.
+- On the Python page, mkdocstrings replaces the text after the introduction.
+- FLOTILLA is the program. If it is given, the page of commands gets the full help of each command.
 """
 
 import posixpath
@@ -25,13 +25,13 @@ LINK = re.compile(r"(\]\()([^)\s#]+)(#[^)\s]*)?(\))")
 
 
 def in_site(path):
-    """Returns where a file of the repository is in the site."""
-    # MkDocs leaves out names that begin with a dot.
+    """Returns the path in the site of a file of the repository."""
+    # MkDocs ignores names that begin with a dot.
     return path.removeprefix("docs/") if path.startswith("docs/") else "repository/" + path.lstrip(".")
 
 
 def target(page, link):
-    """Returns the repository's file that a link of a page leads to, if it is one."""
+    """Returns the path of the file in the repository that a link leads to, or None for any other link."""
     if re.match(r"[a-z]+:", link):
         return None
     path = posixpath.normpath(posixpath.join(posixpath.dirname(page), link))
@@ -39,6 +39,8 @@ def target(page, link):
 
 
 def rewritten(text, page):
+    """Returns a page's text with its links adapted to the site."""
+
     def link(match):
         path = target(page, match[2])
         if path is None:
@@ -50,6 +52,8 @@ def rewritten(text, page):
 
 
 def command_help(program):
+    """Returns a section with the full help of each command."""
+
     def printed(*arguments):
         return subprocess.run([program, *arguments], check=True, capture_output=True, text=True).stdout
 
@@ -59,7 +63,7 @@ def command_help(program):
 
 
 def stage_python():
-    """Copies the Python package with its docstrings as mkdocstrings reads them: sections of examples, no roles of Sphinx."""
+    """Copies the Python package and adapts its docstrings to mkdocstrings: sections "Examples", and no Sphinx roles."""
     shutil.rmtree(PYTHON, ignore_errors=True)
     for path in [*(ROOT / "python/flotilla").glob("*.py"), *(ROOT / "python/flotilla").glob("*.pyi")]:
         text = re.sub(r"^( *)Example:$", r"\1Examples:", path.read_text(), flags=re.M)
@@ -99,7 +103,7 @@ def main():
     for built, place in (("target/doc", "rust"), ("web/dist", "page")):
         if not (ROOT / built).is_dir():
             sys.exit(f"{built} is missing; .ci/docs builds it")
-        # rustdoc's pages of source code take most of its space.
+        # rustdoc's pages of source code would take most of the site's space.
         shutil.copytree(ROOT / built, STAGE / place, ignore=shutil.ignore_patterns("src", ".lock"))
 
 

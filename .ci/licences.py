@@ -2,8 +2,8 @@
 
     python3 .ci/licences.py TARGET [PACKAGE] > THIRD-PARTY-LICENSES.txt
 
-PACKAGE is flotilla-teams or flotilla-python. Crates come from `cargo metadata`: those that are linked for TARGET, without
-the ones that only build scripts and tests use. Fails if a crate declares no licence or comes without its text.
+PACKAGE is flotilla-teams or flotilla-python. The crates are those that `cargo metadata` reports as linked for TARGET,
+without those that only build scripts and tests use. Fails if a crate declares no licence, or if its text is missing.
 """
 
 import json
@@ -13,14 +13,15 @@ import sys
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 NAMES = ("LICENSE", "LICENCE", "COPYING", "NOTICE", "UNLICENSE", "COPYRIGHT")
-# Parts that are no crates: what they are, and the file with their licence.
+# Parts that are not crates: a description, and the file with their licence.
 OTHERS = [("DejaVu Sans, the font of pictures", ROOT / "src/report/font/LICENSE")]
 
 
 def linked(metadata, package):
-    """Returns the ids of the packages that `package` links, itself excluded."""
+    """Returns the ids of the packages that `package` links, without its own."""
     nodes = {node["id"]: node for node in metadata["resolve"]["nodes"]}
-    macros = {each["id"] for each in metadata["packages"] if any("proc-macro" in target["kind"] for target in each["targets"])}
+    macros = {each["id"] for each in metadata["packages"]
+              if any("proc-macro" in target["kind"] for target in each["targets"])}
     root = next(each["id"] for each in metadata["packages"] if each["name"] == package)
     found, open_ids = {root}, [root]
     while open_ids:
@@ -41,10 +42,13 @@ def texts(folder):
 
 
 def standard(crate):
-    """Returns the standard text for a crate whose package has none, with a line that says whose it is."""
-    name = "LICENSE-APACHE" if "Apache-2.0" in crate["license"] else "LICENSE-MIT" if "MIT" in crate["license"] else None
-    if name is None:
-        sys.exit(f"{crate['name']}: {crate['license']}, but its package has no text of it")
+    """Returns the standard text, with the copyright holders, for a crate whose package has no licence file."""
+    if "Apache-2.0" in crate["license"]:
+        name = "LICENSE-APACHE"
+    elif "MIT" in crate["license"]:
+        name = "LICENSE-MIT"
+    else:
+        sys.exit(f"{crate['name']}: its licence is {crate['license']}, but its package does not contain the text")
     lines = [line for line in (ROOT / name).read_text().strip().splitlines() if not line.startswith("Copyright")]
     holders = ", ".join(crate["authors"]) or f"the authors of {crate['name']}"
     return [f"Copyright (c) {holders}\n{crate['repository'] or ''}\n\n" + "\n".join(lines) + "\n"]
@@ -55,7 +59,7 @@ def main(target, package="flotilla-teams"):
     metadata = json.loads(subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.PIPE).stdout)
     ids = linked(metadata, package)
     crates = [each for each in metadata["packages"] if each["id"] in ids and each["source"]]
-    # Name and version, licence, texts.
+    # Tuples of name with version, licence expression, and texts.
     parts = []
     for crate in sorted(crates, key=lambda each: (each["name"], each["version"])):
         name, expression = f"{crate['name']} {crate['version']}", crate["license"]
