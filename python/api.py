@@ -1,4 +1,4 @@
-"""Prints docs/reference/python.md: what the package's docstrings and signatures say."""
+"""Prints docs/reference/python.md, made from the package's docstrings and signatures."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import re
 import sys
 import textwrap
 
-# The package that is installed is looked at, not the sources beside this file, which have no native part.
+# Import the installed package. The sources next to this file have no native module.
 sys.path = sys.path[1:]
 import flotilla
 
@@ -16,7 +16,8 @@ OPENING = """\
 
 For Python users: every function and class of `import flotilla`.
 
-[The same in Python](../tutorial/python.md) is a gentler start. Arrays are NumPy's; shapes are written `[teams, leaders, 8]`. Every
+[The same in Python](../tutorial/python.md) is a gentler start. Arrays are NumPy's; shapes are written \
+`[teams, leaders, 8]`. Every
 example is run by the package's tests, with `np` for NumPy.
 
 This page is made from the docstrings by `python python/api.py > docs/reference/python.md`.
@@ -34,7 +35,7 @@ ORDER = [
 
 
 def markdown(text: str) -> str:
-    """A docstring as Markdown: its sections as paragraphs and lists, its examples as code."""
+    """Returns a docstring as Markdown: sections become paragraphs and lists, and examples become code blocks."""
     text = re.sub(r":(?:func|meth|class):`([^`]*)`", r"`\1`", text).replace("``", "`")
     lines, made, section = text.splitlines(), [], None
     index = 0
@@ -68,19 +69,25 @@ def markdown(text: str) -> str:
 
 
 def signature(name: str, thing: object) -> str:
+    """Returns the name and the parameters of a function or class, without `self`, `cls` and quoted types."""
     try:
-        found = str(inspect.signature(thing))  # type: ignore[arg-type]
+        text = str(inspect.signature(thing))  # type: ignore[arg-type]
     except (TypeError, ValueError):
         return name
-    found = re.sub(r"'([^']*)'", lambda part: part.group(0) if part.group(1) in ("", *WORDS) else part.group(1), found)
-    found = found.replace("(cls, ", "(").replace("(cls)", "()")
-    return name + found.replace("(self, ", "(").replace("(self)", "()")
+    # Postponed annotations are strings, whose quotes are removed. Defaults keep theirs.
+    text = re.sub(r"'([^']*)'", lambda part: part.group(0) if part.group(1) in ("", *DEFAULTS) else part.group(1), text)
+    text = text.replace("(cls, ", "(").replace("(cls)", "()")
+    return name + text.replace("(self, ", "(").replace("(self)", "()")
 
 
-WORDS = {"auto", "last", "Df", "G", "generally_forward", "leader-follower", "best_g", "the config", "paper", "next_step"}
+# Default arguments that are strings.
+DEFAULTS = {
+    "auto", "last", "Df", "G", "generally_forward", "leader-follower", "best_g", "the config", "paper", "next_step"
+}
 
 
-def told(name: str, thing: object, level: str) -> str:
+def entry(name: str, thing: object, level: str) -> str:
+    """Returns the heading, the signature and the text for one name."""
     title = f"{level} `{name}`\n\n"
     if isinstance(thing, property):
         return title + markdown(inspect.getdoc(thing) or "")
@@ -92,7 +99,7 @@ def told(name: str, thing: object, level: str) -> str:
     return title + shown + markdown(inspect.getdoc(thing) or "")
 
 
-# Made by functions, not by whoever reads this.
+# Classes that users do not construct, because functions return them. Their signatures are not shown.
 HIDDEN = {"Run", "Replay", "Figure", "Rollout", "Trace", "Sweep", "Generation", "Asked", "Played", "Collected"}
 
 
@@ -102,7 +109,7 @@ def page() -> str:
         parts.append(f"## {title}\n")
         for name in names:
             thing = getattr(flotilla, name)
-            parts.append(told(name, thing, "###"))
+            parts.append(entry(name, thing, "###"))
             if inspect.isclass(thing):
                 members = [(member, value) for member, value in vars(thing).items() if not member.startswith("_")]
                 for member, value in members:
@@ -110,11 +117,11 @@ def page() -> str:
                         continue
                     function = getattr(value, "__func__", value)
                     if inspect.isfunction(function) or (isinstance(value, property) and inspect.getdoc(value)):
-                        parts.append(told(f"{name}.{member}", function, "####"))
+                        parts.append(entry(f"{name}.{member}", function, "####"))
             elif inspect.ismodule(thing):
                 for member, value in vars(thing).items():
                     if inspect.isfunction(value) and value.__module__ == thing.__name__:
-                        parts.append(told(f"{name}.{member}", value, "####"))
+                        parts.append(entry(f"{name}.{member}", value, "####"))
     missing = set(flotilla.__all__) - {name for _, names in ORDER for name in names}
     assert not missing, f"the page leaves out {missing}"
     return "\n".join(parts)

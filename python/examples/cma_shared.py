@@ -1,10 +1,13 @@
-"""One policy that all leaders share, by CMA-ES: any optimiser that asks and tells can drive flotilla.
+"""Trains one policy that all leaders share, with CMA-ES.
 
     pip install cma
     python cma_shared.py [GENERATIONS]
 
-Every candidate is a team whose leaders all play it: policies of shape [1, candidates, parameters]. What is told is the G of
-the team, and a little of its leaders' D++, which tells apart teams that observe nothing.
+Any optimiser with an ask-and-tell interface can drive flotilla like this. Each candidate is one team, in which every
+leader uses the same policy. The array of policies therefore has the shape [1, candidates, parameters].
+
+The fitness is G of the team plus 0.05 times the mean D++ of its leaders. D++ ranks the teams that observe no POI, whose
+G is 0.
 """
 
 import pathlib
@@ -18,13 +21,14 @@ import flotilla
 
 
 def main(generations: int = 60) -> None:
-    # Four groups that have to meet, a task that no constant speed solves.
+    # Four groups have to meet. No constant speed solves this task.
     config = flotilla.Config.load(pathlib.Path(__file__).parents[2] / "configs/tasks/merge.toml")
     strategy = cma.CMAEvolutionStrategy(config.parameters * [0.0], 1.0, {"seed": 1, "popsize": 64, "verbose": -9})
     start, best = time.perf_counter(), 0.0
     for generation in range(generations):
         candidates = strategy.ask()
         scores = flotilla.rollout(config, np.asarray(candidates)[None], backend="cpu")
+        # CMA-ES minimises.
         strategy.tell(candidates, list(-scores.g - 0.05 * scores.dpp.mean(axis=1)))
         best = max(best, float(scores.g.max()))
         if generation % 10 == 0 or generation == generations - 1:

@@ -1,9 +1,9 @@
-"""Leaders' policies by an evolution strategy of a few lines, each leader's by its own credit.
+"""Trains leaders with an evolution strategy of a few lines: one strategy per leader, each with that leader's credit.
 
     python leaders_by_es.py [GENERATIONS]
 
-Every leader has a mean of its own, and asks for as many candidates; team t is made of every leader's candidate t. What a
-leader's strategy is told is that leader's Df, so that it learns from what it was worth, not from the luck of its team.
+Each leader draws candidates around its own mean policy. Team t consists of candidate t of every leader. The strategy of
+a leader maximises that leader's Df. Df measures the leader's own contribution, while G also depends on its partners.
 """
 
 import sys
@@ -22,16 +22,17 @@ def main(generations: int = 60) -> None:
     means = rng.normal(0, 0.5, (config.num_learners, 1, config.parameters))
     start = time.perf_counter()
     for generation in range(generations):
-        # Every draw and its mirror.
+        # Mirrored sampling: each draw is used with both signs.
         half = rng.normal(size=(config.num_learners, CANDIDATES // 2, config.parameters))
         noise = np.concatenate([half, -half], axis=1)
         scores = flotilla.rollout(config, means + SIGMA * noise, backend="cpu")
+        # Credits become ranks from -0.5 to 0.5. A leader whose candidates have equal credits is not changed.
         ranks = scores.df.T.argsort(axis=1).argsort(axis=1) / (CANDIDATES - 1) - 0.5
         ranks[scores.df.T.std(axis=1) == 0] = 0
         means += RATE / SIGMA * np.einsum("lc,lcp->lp", ranks, noise)[:, None] / CANDIDATES
         if generation % 10 == 0 or generation == generations - 1:
-            alone = flotilla.rollout(config, means, backend="cpu")
-            print(f"generation {generation:3}: G {alone.g[0]:.2f} of the means, of their candidates {scores.g.mean():.2f}")
+            g = flotilla.rollout(config, means, backend="cpu").g[0]
+            print(f"generation {generation:3}: G {g:.2f} of the means, {scores.g.mean():.2f} of the candidates")
     print(f"{time.perf_counter() - start:.1f} s")
 
 

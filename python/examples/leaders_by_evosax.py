@@ -1,10 +1,10 @@
-"""Leaders' policies by evosax, a strategy a leader, each told its own leader's credit.
+"""Trains leaders with evosax: one strategy per leader, each with that leader's credit.
 
     pip install evosax
     python leaders_by_evosax.py [GENERATIONS]
 
-Team t is made of every leader's candidate t, and a leader's strategy is told that leader's Df, as in leaders_by_es.py; here
-the strategies are evosax's, all leaders' asked and told at once by JAX.
+As in leaders_by_es.py, team t consists of candidate t of every leader, and the strategy of a leader maximises that
+leader's Df. Here the strategies are evosax's Open_ES. JAX runs those of all leaders at once with vmap.
 """
 
 import sys
@@ -23,8 +23,8 @@ CANDIDATES = 200
 
 def main(generations: int = 60) -> None:
     config = flotilla.Config.paper("generally_forward")
-    rate = optax.adam(0.05)
-    strategy = Open_ES(CANDIDATES, jnp.zeros(config.parameters), optimizer=rate, std_schedule=optax.constant_schedule(0.3))
+    rate, schedule = optax.adam(0.05), optax.constant_schedule(0.3)
+    strategy = Open_ES(CANDIDATES, jnp.zeros(config.parameters), optimizer=rate, std_schedule=schedule)
     params = strategy.default_params
     init, ask = (jax.jit(jax.vmap(call, (0, 0, None))) for call in (strategy.init, strategy.ask))
     tell = jax.jit(jax.vmap(strategy.tell, (0, 0, 0, 0, None)))
@@ -38,11 +38,11 @@ def main(generations: int = 60) -> None:
     for generation in range(generations):
         candidates, state = ask(keys(2 * generation + 1), state, params)
         scores = flotilla.rollout(config, np.asarray(candidates), backend="cpu")
-        # It makes small what it is told.
+        # evosax minimises.
         state, _ = tell(keys(2 * generation + 2), candidates, -jnp.asarray(scores.df.T), state, params)
         if generation % 10 == 0 or generation == generations - 1:
-            alone = flotilla.rollout(config, np.asarray(state.mean)[:, None], backend="cpu")
-            print(f"generation {generation:3}: G {alone.g[0]:.2f} of the means, of their candidates {scores.g.mean():.2f}")
+            g = flotilla.rollout(config, np.asarray(state.mean)[:, None], backend="cpu").g[0]
+            print(f"generation {generation:3}: G {g:.2f} of the means, {scores.g.mean():.2f} of the candidates")
     print(f"{time.perf_counter() - start:.1f} s")
 
 
