@@ -2,7 +2,8 @@
 
     python3 docs/count_words.py [PAGE ...]
 
-Code blocks, comments, link targets and headings do not count as prose. Generated pages are listed apart from the total.
+Code blocks, comments, link targets and headings do not count as prose. The total is without generated pages. If pages
+are named, sentences of more than 30 words are printed, too.
 """
 
 import re
@@ -10,8 +11,8 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-GENERATED = {"docs/reference/config.md", "docs/reference/python.md", "docs/develop/evidence.md", "docs/results/claims-measured.md",
-             "docs/results/questions-tables.md", "benches/static-figures.md"}
+GENERATED = {"docs/reference/config.md", "docs/reference/python.md", "docs/develop/evidence.md",
+             "docs/results/claims-measured.md", "docs/results/questions-tables.md", "benches/static-figures.md"}
 LOGS = ["benches/README.md", "benches/peers/README.md", "benches/static-figures.md"]
 
 
@@ -33,10 +34,12 @@ def parts(text):
 
 
 def words(text):
+    """Returns the words of a text; punctuation alone is not a word."""
     return [word for word in text.split() if re.search(r"\w", word)]
 
 
 def sentences(paragraphs):
+    """Yields the sentences of paragraphs."""
     for paragraph in paragraphs:
         text = re.sub(r"`[^`]*`", lambda code: code.group(0).replace(".", "·").replace(" ", "·"), paragraph)
         text = re.sub(r"\b(e\.g|i\.e|Fig|vs|al)\.", r"\1", text)
@@ -46,8 +49,8 @@ def sentences(paragraphs):
 
 
 def main():
-    given = [Path(name).resolve() for name in sys.argv[1:]]
-    pages = given or [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md")),
+    named = [Path(name).resolve() for name in sys.argv[1:]]
+    pages = named or [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md")),
                       *(ROOT / log for log in LOGS)]
     total = 0
     print(f"{'prose':>6} {'table':>6} {'mean':>5} {'max':>4}  page")
@@ -60,11 +63,12 @@ def main():
         mean = sum(lengths) / max(len(lengths), 1)
         note = "  (generated)" if name in GENERATED else ""
         print(f"{counted:6} {in_tables:6} {mean:5.1f} {max(lengths, default=0):4}  {name}{note}")
-        if given:
+        # Show which sentences are too long.
+        if named:
             for sentence in sentences(prose):
                 if len(words(sentence)) > 30:
                     print(f"       {len(words(sentence))}: {sentence.strip()}")
-    print(f"{total:6} words in all, prose and tables, without generated pages")
+    print(f"{total:6} words in total, prose and tables, without generated pages")
 
 
 main()

@@ -3,7 +3,7 @@
     pip install matplotlib
     python3 docs/coupling_figure.py
 
-It reads docs/results/scale/scale_coupling-5000.csv.
+The input is docs/results/scale/scale_coupling-5000.csv.
 """
 
 import csv
@@ -21,9 +21,9 @@ POPULATION = 5000
 LIMIT = 101 * POPULATION
 TITLE = "Teams played until one has G of 0.75, by coupling"
 DESCRIPTION = (
-    "On a logarithmic axis: all-leaders teams need more from coupling 3 to 4 and never succeed later; leader-follower teams "
-    "need more from coupling 3 to 6 and never succeed later. Dashed lines show how the numbers would grow if each further "
-    "agent multiplied them by the same factor."
+    "On a logarithmic axis: all-leaders teams need more from coupling 3 to 4 and never succeed later; leader-follower"
+    " teams need more from coupling 3 to 6 and never succeed later. Dashed lines show how the numbers would grow if "
+    "each further agent multiplied them by the same factor."
 )
 
 
@@ -38,7 +38,7 @@ def teams(paradigm):
             if int(row["reached"]) == 0:
                 never.append(coupling)
             else:
-                # Generation 0 is played, too.
+                # A trial that reaches G in generation n plays n + 1 generations, because generation 0 counts.
                 found[coupling] = [POPULATION * (1 + float(row[key])) for key in ("value", "low", "high")]
     return found, never
 
@@ -58,12 +58,13 @@ for paradigm, colour, fitted in [("leader-follower", "#0072b2", (4, 5)), ("all-l
               linewidth=1, label=f"{paradigm}, if each further agent costs {second / first:.1f} times as much")
 axes.axhline(LIMIT, color="#888888", linewidth=0.8)
 axes.text(3, LIMIT * 1.12, "triangles: never solved", color="#555555", fontsize=9)
-axes.set(xlabel="coupling: agents that a POI needs at once", ylabel="teams played until one has G of 0.75", yscale="log",
-         ylim=(4000, 3e7), xticks=range(3, 9))
+axes.set(xlabel="coupling: agents that a POI needs at once", ylabel="teams played until one has G of 0.75",
+         yscale="log", ylim=(4000, 3e7), xticks=range(3, 9))
 axes.legend(loc="upper left", frameon=False, fontsize=10)
 axes.spines[["top", "right"]].set_visible(False)
 text = io.StringIO()
 figure.savefig(text, format="svg", metadata={"Date": None})
+# Matplotlib writes no title and description, which screen readers need.
 described = '''<svg role="img" aria-labelledby="title description" ''', f'''>
 <title id="title">{TITLE}</title>
 <desc id="description">{DESCRIPTION}</desc>

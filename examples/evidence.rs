@@ -1,4 +1,4 @@
-//! Makes `docs/develop/evidence.md` from the files in `docs/develop/evidence/`, each of which a run wrote.
+//! Makes `docs/develop/evidence.md` from the files in `docs/develop/evidence/`, one per machine.
 //!
 //! ```text
 //! flotilla verify --report docs/develop/evidence/my-machine.json
@@ -12,7 +12,7 @@ use std::{env, fs};
 
 use flotilla::record::evidence::{Compared, MachineReport, Tier};
 
-#[allow(dead_code, reason = "a test that takes this file in calls `page`")]
+#[allow(dead_code, reason = "tests/evidence.rs includes this file and calls only `page`, `read` and `digests`")]
 fn main() -> ExitCode {
     let docs = env::args_os().nth(1).map_or("docs/develop".into(), PathBuf::from);
     let written = page(&docs.join("evidence")).and_then(|page| {
@@ -85,10 +85,10 @@ operation with a word read from a buffer, whose value no compiler can know. Nobo
 yet.
 ";
 
-/// The page, of all files of a folder.
+/// Returns the page for the files of a directory.
 ///
 /// # Errors
-/// A file cannot be read, or is not what `flotilla verify --report` writes.
+/// A file cannot be read, or `flotilla verify --report` did not write it.
 pub fn page(folder: &Path) -> Result<String, String> {
     let rows = read(folder)?;
     let mut text = format!("{HEAD}\n{}", overview(&rows));
@@ -96,34 +96,35 @@ pub fn page(folder: &Path) -> Result<String, String> {
         [(Tier::Executed, "Executed"), (Tier::MachineCodeRead, "Machine code read"), (Tier::Compiled, "Compiled")]
     {
         text += &format!("\n## {title}\n");
-        let there: Vec<_> = rows.iter().filter(|(_, evidence)| evidence.tier == tier).collect();
-        there.iter().for_each(|(name, evidence)| text += &section(name, evidence));
-        text += if there.is_empty() { "\nNothing so far.\n" } else { "" };
+        let of_tier: Vec<_> = rows.iter().filter(|(_, evidence)| evidence.tier == tier).collect();
+        of_tier.iter().for_each(|(name, evidence)| text += &section(name, evidence));
+        text += if of_tier.is_empty() { "\nNothing so far.\n" } else { "" };
     }
     Ok(format!("{text}\n{TAIL}"))
 }
 
-/// Every file of a folder, by its name without ending.
+/// Reads all reports of a directory. Keys are file names without extension.
 ///
 /// # Errors
 /// As for [`page`].
 pub fn read(folder: &Path) -> Result<BTreeMap<String, MachineReport>, String> {
-    let told = |path: &Path, error: &dyn std::fmt::Display| format!("{}: {error}", path.display());
+    let message = |path: &Path, error: &dyn std::fmt::Display| format!("{}: {error}", path.display());
     let mut rows = BTreeMap::new();
-    for entry in fs::read_dir(folder).map_err(|error| told(folder, &error))? {
-        let path = entry.map_err(|error| told(folder, &error))?.path();
-        let text = fs::read_to_string(&path).map_err(|error| told(&path, &error))?;
-        let evidence = MachineReport::parse(&text).map_err(|error| told(&path, &error))?;
+    for entry in fs::read_dir(folder).map_err(|error| message(folder, &error))? {
+        let path = entry.map_err(|error| message(folder, &error))?.path();
+        let text = fs::read_to_string(&path).map_err(|error| message(&path, &error))?;
+        let evidence = MachineReport::parse(&text).map_err(|error| message(&path, &error))?;
         let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         rows.insert(name, evidence);
     }
     Ok(rows)
 }
 
-/// One line a file, and the digests.
+/// Returns a table with one row per file, and a table of the digests.
 fn overview(rows: &BTreeMap<String, MachineReport>) -> String {
     let mut text = String::from(
-        "## All rows\n\n| row | tier | built for | compared | agent-steps | result | short trainings | date |\n|---|---|---|---|---|---|---|---|\n",
+        "## All rows\n\n| row | tier | built for | compared | agent-steps | result | short trainings | date |\n\
+         |---|---|---|---|---|---|---|---|\n",
     );
     let digests = digests(rows);
     for (name, evidence) in rows {
@@ -137,9 +138,9 @@ fn overview(rows: &BTreeMap<String, MachineReport>) -> String {
         let result = match (evidence.comparisons.len(), failed) {
             (0, _) => "·".into(),
             (_, 0) => "equal".into(),
-            (all, failed) => format!("**{failed} of {all} different**"),
+            (total, failed) => format!("**{failed} of {total} different**"),
         };
-        let trained = match evidence.trained.iter().filter(|came| digests[&came.config] != came.digest).count() {
+        let trained = match evidence.trained.iter().filter(|run| digests[&run.config] != run.digest).count() {
             _ if evidence.trained.is_empty() => "·".into(),
             0 => "equal".to_string(),
             others => format!("**{others} of {} other digests**", evidence.trained.len()),
@@ -152,20 +153,21 @@ fn overview(rows: &BTreeMap<String, MachineReport>) -> String {
         );
     }
     if !digests.is_empty() {
-        let of = rows.values().filter(|evidence| !evidence.trained.is_empty()).count();
+        let reports = rows.values().filter(|evidence| !evidence.trained.is_empty()).count();
         text += &format!(
-            "\nThe short trainings (two trials of ten generations) and the digests of most of {of} rows:\n\n| training | SHA-256 |\n|---|---|\n"
+            "\nThe short trainings (two trials of ten generations) and the digests of most of {reports} rows:\n\n\
+             | training | SHA-256 |\n|---|---|\n"
         );
         digests.iter().for_each(|(config, digest)| text += &format!("| {config} | `{digest}` |\n"));
     }
     text
 }
 
-/// By training, the digest that the most rows have.
+/// Returns the most frequent digest of each training.
 pub fn digests(rows: &BTreeMap<String, MachineReport>) -> BTreeMap<String, String> {
     let mut votes: BTreeMap<&str, BTreeMap<&str, usize>> = BTreeMap::new();
-    for came in rows.values().flat_map(|evidence| &evidence.trained) {
-        *votes.entry(&came.config).or_default().entry(&came.digest).or_default() += 1;
+    for run in rows.values().flat_map(|evidence| &evidence.trained) {
+        *votes.entry(&run.config).or_default().entry(&run.digest).or_default() += 1;
     }
     let most = |votes: BTreeMap<&str, usize>| {
         votes.into_iter().max_by_key(|(_, votes)| *votes).map(|(digest, _)| digest.into())
@@ -173,14 +175,14 @@ pub fn digests(rows: &BTreeMap<String, MachineReport>) -> BTreeMap<String, Strin
     votes.into_iter().filter_map(|(config, votes)| Some((config.into(), most(votes)?))).collect()
 }
 
-/// All of one file.
+/// Returns the section of one file.
 fn section(name: &str, evidence: &MachineReport) -> String {
     let MachineReport { date, version, commit, target, toolchain, processor, instructions, note, .. } = evidence;
     let commit =
         commit.as_ref().map_or(String::new(), |commit| format!(" of commit {}", &commit[..commit.len().min(10)]));
     let mut text = format!("\n### {name}\n\nflotilla {version}{commit}, built for {target} by {toolchain}");
-    for (what, told) in [("", processor), ("widest instructions ", instructions), ("", note)] {
-        text.extend(told.iter().map(|told| format!("; {what}{told}")));
+    for (label, value) in [("", processor), ("widest instructions ", instructions), ("", note)] {
+        text.extend(value.iter().map(|value| format!("; {label}{value}")));
     }
     text += &format!(". {date}.\n");
     if !evidence.findings.is_empty() {
@@ -202,7 +204,7 @@ fn section(name: &str, evidence: &MachineReport) -> String {
     text
 }
 
-/// With a space between thousands; nothing for none.
+/// Formats a number with spaces between thousands, and 0 as a dot.
 fn count(number: u64) -> String {
     let digits = number.to_string();
     let spaced = digits.char_indices().map(|(at, digit)| match (digits.len() - at) % 3 {

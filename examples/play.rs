@@ -1,4 +1,4 @@
-//! Plays policies that come from elsewhere, here from a random search: one policy shared by all leaders of a team.
+//! Plays policies that flotilla did not train, here random ones. All leaders of a team share a policy.
 //!
 //! ```text
 //! cargo run --release --example play
@@ -17,7 +17,7 @@ pub fn main() -> Result<(), Box<dyn Error>> {
     let config = Config::load(Path::new("configs/chaotic.toml"))?;
     let ((mut backend, _), _) = flotilla::open(&Processor::Auto)?;
 
-    // [1][teams][parameters]: every leader of a team plays the same.
+    // [1][teams][parameters]: one policy for all leaders of a team.
     let (teams, parameters) = (1000, config.parameters());
     let mut random = ChaCha8Rng::seed_from_u64(1);
     let policies: Vec<f32> = (0..teams * parameters).map(|_| random.random_range(-2.0..2.0)).collect();
@@ -25,7 +25,7 @@ pub fn main() -> Result<(), Box<dyn Error>> {
     let best = (0..teams).fold(0, |best, team| if played.g[team] > played.g[best] { team } else { best });
     println!("the best of {teams} random policies observes {} POIs", played.observed[best]);
 
-    // The same policy from other starts, and what each leader was worth there.
+    // Play the best policy from 100 random starts, for its mean score and the leaders' credits.
     let policy = &policies[best * parameters..][..parameters];
     let starts = Starts::Drawn { episodes: 100, seed: 1, jitter: 0.5, poi_jitter: 0.0 };
     let played = flotilla::play(&config, &mut *backend, 1, policy, &starts)?;

@@ -1,4 +1,5 @@
-//! Steps a batch of teams by hand: every leader turns to where it senses most POIs, and slows down among other agents.
+//! Steps a batch of teams with a hand-written rule. Every leader turns to the quadrant with the most POIs, and slows
+//! down near other agents.
 //!
 //! ```text
 //! cargo run --release --example step
@@ -10,8 +11,8 @@ use std::path::Path;
 use flotilla::Config;
 use flotilla::evaluate::Starts;
 
-/// Turns of the four quadrants that a leader senses, in parts of a half turn to the left: back right, front right, front
-/// left, back left.
+/// The turn towards each quadrant that a leader senses, as a share of a half turn to the left. The quadrants are back
+/// right, front right, front left and back left.
 const TURNS: [f32; 4] = [-0.75, -0.25, 0.25, 0.75];
 
 pub fn main() -> Result<(), Box<dyn Error>> {
@@ -19,7 +20,7 @@ pub fn main() -> Result<(), Box<dyn Error>> {
     let teams = 100;
     let mut stepper = flotilla::stepper(&config, teams, true)?;
 
-    // Every team from a start of its own.
+    // Every team gets its own random start.
     let drawn = Starts::Drawn { episodes: teams as u32, seed: 1, jitter: 0.5, poi_jitter: 0.0 };
     let starts = (0..teams).flat_map(|team| drawn.of(team, stepper.world()));
     let starts: Vec<f32> = starts.flat_map(|start| start.to_array()).collect();
@@ -37,7 +38,7 @@ pub fn main() -> Result<(), Box<dyn Error>> {
     }
 
     let observed = stepper.observed().iter().filter(|&&observed| observed).count();
-    println!("{teams} teams of one rule observe {:.2} POIs on average", observed as f64 / teams as f64);
+    println!("{teams} teams with this rule observe {:.2} POIs on average", observed as f64 / teams as f64);
     let scores = stepper.scores(0)?;
     println!("in team 0, which observes {}, the leaders' D are {:?}", scores.observed, scores.d);
     Ok(())

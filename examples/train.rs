@@ -1,4 +1,5 @@
-//! Trains the paper's first experiment, stops where every trial's champion observes all POIs, and prints the curve.
+//! Trains the paper's first experiment, and prints the curve. Training stops when every trial's champion observes all
+//! POIs.
 //!
 //! ```text
 //! cargo run --release --example train
@@ -17,8 +18,8 @@ pub fn main() -> Result<(), Box<dyn Error>> {
     let ((mut backend, _), _) = flotilla::open(&Processor::Auto)?;
 
     let trained = flotilla::train(&config, &mut *backend, |generation| {
-        let all = generation.rows.iter().all(|row| row.champion_g == 1.0);
-        if all { Break(()) } else { Continue(()) }
+        let solved = generation.rows.iter().all(|row| row.champion_g == 1.0);
+        if solved { Break(()) } else { Continue(()) }
     })?;
 
     let columns = trained.config.learning.generations + 1;
