@@ -1,4 +1,4 @@
-"""What the tests share. They run against the package that is installed, never against the source tree."""
+"""Fixtures and helpers. The tests run against the installed package, not against the source tree."""
 
 import os
 import pathlib
@@ -16,31 +16,32 @@ SOURCE = pathlib.Path(__file__).parents[1] / "flotilla"
 
 
 def pytest_sessionstart() -> None:
-    found = pathlib.Path(flotilla.__file__).parent
-    if found == SOURCE and os.environ.get("FLOTILLA_IN_PLACE") != "1":
-        pytest.exit(f"the tests are of the installed package, but flotilla is {found}", 3)
+    imported = pathlib.Path(flotilla.__file__).parent
+    if imported == SOURCE and os.environ.get("FLOTILLA_IN_PLACE") != "1":
+        pytest.exit(f"flotilla was imported from the source tree, {imported}; install the package to test it", 3)
 
 
 @pytest.fixture
 def config() -> flotilla.Config:
-    return flotilla.Config.paper("generally_forward").replace(learning={"trials": 2, "generations": 6, "population": 20})
+    learning = {"trials": 2, "generations": 6, "population": 20}
+    return flotilla.Config.paper("generally_forward").replace(learning=learning)
 
 
 @pytest.fixture
 def program():
-    """Runs the program as in a shell, and gives what it printed."""
+    """Returns a function that runs the program and returns its output, or its error output if `status` is not 0."""
 
     def run(*words, status=0, cwd=None) -> str:
         command = [sys.executable, "-m", "flotilla", *map(os.fspath, words)]
-        ended = subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300)
-        assert ended.returncode == status, ended.stderr
-        return ended.stdout if status == 0 else ended.stderr
+        finished = subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300)
+        assert finished.returncode == status, finished.stderr
+        return finished.stdout if status == 0 else finished.stderr
 
     return run
 
 
 @pytest.fixture(autouse=True)
-def _elsewhere(tmp_path, monkeypatch) -> None:
+def _in_a_temporary_directory(tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
 
 
@@ -50,7 +51,7 @@ def random_policies(config: flotilla.Config, teams: int, seed: int = 0, leaders:
 
 
 def random_config(seed: int) -> flotilla.Config:
-    """A small config of some kind."""
+    """Returns a small random config."""
     rng = np.random.default_rng(seed)
     leaders, followers, pois = rng.integers(1, 5), rng.integers(0, 9), rng.integers(1, 6)
     world = {

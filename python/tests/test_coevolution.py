@@ -1,4 +1,7 @@
+"""Tests `Coevolution`, the initial policies of `train`, and callbacks."""
+
 import gc
+import os
 import pickle
 import warnings
 
@@ -11,7 +14,7 @@ from flotilla import Coevolution, Config, rollout, train
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_told_its_own_fitness_it_gives_the_bits_of_train(seed):
+def test_with_the_configs_fitness_it_gives_the_bits_of_train(seed):
     config = random_config(seed)
     coevolution = Coevolution(config)
     while not coevolution.done:
@@ -21,47 +24,47 @@ def test_told_its_own_fitness_it_gives_the_bits_of_train(seed):
     assert np.array_equal(coevolution.run.metrics["mean_g"], run.metrics["mean_g"])
 
 
-def test_what_is_asked_is_what_is_played(config):
+def test_rollouts_of_the_asked_teams_give_the_scores_of_play(config):
     coevolution = Coevolution(config, seed=3)
     asked, played = coevolution.ask(), coevolution.play()
     for trial in range(2):
         teams = np.stack([asked.policies[trial, leader, asked.teams[trial, :, leader]] for leader in range(4)])
         scores = rollout(config, teams)
         assert np.array_equal(scores.g, played.g[trial]) and np.array_equal(scores["Df"], played.fitness[trial])
-    # So a fitness that is computed from rollouts gives the run of train, too.
+    # A fitness computed from these rollouts gives the run of train.
     while not coevolution.done:
         asked = coevolution.ask()
-        told = [
+        fitness = [
             rollout(config, np.stack([policies[leader][teams[:, leader]] for leader in range(4)]))["Df"]
             for policies, teams in zip(asked.policies, asked.teams)
         ]
-        coevolution.tell(np.stack(told))
+        coevolution.tell(np.stack(fitness))
     assert coevolution.run.digest == train(config, seed=3).digest
 
 
 @pytest.mark.parametrize("episodes", [1, 2])
 @pytest.mark.parametrize("leniency", ["mean", "max"])
 def test_policies_play_with_several_partners(config, leniency, episodes):
-    learning = {"partners": 3, "leniency": leniency, "episodes_per_team": episodes, "start_jitter": 1.0, "fitness": "D++"}
-    config = config.replace(learning=learning)
+    learning = {"partners": 3, "leniency": leniency, "episodes_per_team": episodes, "start_jitter": 1.0}
+    config = config.replace(learning={**learning, "fitness": "D++"})
     coevolution = Coevolution(config, seed=3)
     asked, played = coevolution.ask(), coevolution.play()
-    # Each policy plays once per round, with others every time.
+    # Each policy plays once per round, and each round has other teams.
     rounds = asked.teams.reshape(2, 3, 20, 4)
     assert np.array_equal(np.sort(rounds, axis=2), np.broadcast_to(np.arange(20)[:, None], rounds.shape))
     assert not np.array_equal(rounds[:, 0], rounds[:, 1]) and not np.array_equal(rounds[:, 1], rounds[:, 2])
     assert played.g.shape == (2, 60) and played.fitness.shape == (2, 60, 4)
-    # The champion has the best mean or the best single score.
-    told = np.random.default_rng(1).random(played.fitness.shape).astype(np.float32)
+    # The champion is the policy with the best mean score, or with the best single score.
+    fitness = np.random.default_rng(1).random(played.fitness.shape).astype(np.float32)
     other = pickle.loads(pickle.dumps(coevolution))
-    other.tell(told)
+    other.tell(fitness)
     for trial in range(2):
         for leader in range(4):
             scores = np.empty((3, 20))
             for number, teams in enumerate(rounds[trial]):
-                scores[number, teams[:, leader]] = told[trial].reshape(3, 20, 4)[number, :, leader]
-            worth = scores.mean(0) if leniency == "mean" else scores.max(0)
-            assert np.array_equal(other.best[trial, leader], asked.policies[trial, leader, worth.argmax()])
+                scores[number, teams[:, leader]] = fitness[trial].reshape(3, 20, 4)[number, :, leader]
+            combined = scores.mean(0) if leniency == "mean" else scores.max(0)
+            assert np.array_equal(other.best[trial, leader], asked.policies[trial, leader, combined.argmax()])
     while not coevolution.done:
         coevolution.tell(coevolution.play().fitness)
         coevolution = pickle.loads(pickle.dumps(coevolution))
@@ -75,15 +78,15 @@ def test_another_fitness_gives_another_run(config):
     assert coevolution.run.digest != train(config, seed=3).digest
 
 
-def test_it_continues_after_pickling_and_from_its_state(config):
-    whole, expected = Coevolution(config, seed=1), train(config, seed=1).digest
+def test_pickles_and_states_resume_with_the_same_bits(config):
+    coevolution, expected = Coevolution(config, seed=1), train(config, seed=1).digest
     states = []
-    while not whole.done:
-        states.append(whole.state)
-        whole = pickle.loads(pickle.dumps(whole))
-        whole.tell(whole.play().fitness)
-    states.append(whole.state)
-    assert pickle.loads(pickle.dumps(whole)).run.digest == expected
+    while not coevolution.done:
+        states.append(coevolution.state)
+        coevolution = pickle.loads(pickle.dumps(coevolution))
+        coevolution.tell(coevolution.play().fitness)
+    states.append(coevolution.state)
+    assert pickle.loads(pickle.dumps(coevolution)).run.digest == expected
     for state in states:
         other = Coevolution(config, seed=1)
         other.state = state
@@ -96,14 +99,14 @@ def test_it_continues_after_pickling_and_from_its_state(config):
         Coevolution(config).state = {**states[2], "policies": states[2]["policies"] * np.nan}
 
 
-def test_wrong_fitness_changes_nothing(config):
+def test_an_invalid_fitness_is_rejected_and_changes_nothing(config):
     coevolution = Coevolution(config)
-    right = coevolution.play().fitness
-    for wrong in (right[:1], right[..., :2], right * np.nan, np.full_like(right, np.inf)):
+    valid = coevolution.play().fitness
+    for wrong in (valid[:1], valid[..., :2], valid * np.nan, np.full_like(valid, np.inf)):
         with pytest.raises(ValueError, match="fitness"):
             coevolution.tell(wrong)
     with pytest.raises(TypeError):
-        coevolution.tell(right > 0)
+        coevolution.tell(valid > 0)
     assert coevolution.generation == 0
     with pytest.raises(ValueError, match="no generation has a fitness yet"):
         coevolution.best
@@ -112,24 +115,24 @@ def test_wrong_fitness_changes_nothing(config):
     while not coevolution.done:
         coevolution.tell(coevolution.play().fitness)
     with pytest.raises(ValueError, match="all generations"):
-        coevolution.tell(right)
+        coevolution.tell(valid)
 
 
-def test_it_starts_from_arrays_as_train_does(config):
-    first = random_policies(config, 12)
-    coevolution = Coevolution(config, init=first)
-    assert np.array_equal(coevolution.ask().policies[1][:, :12], first)
+def test_initial_policies_may_be_arrays(config):
+    initial = random_policies(config, 12)
+    coevolution = Coevolution(config, init=initial)
+    assert np.array_equal(coevolution.ask().policies[1][:, :12], initial)
     while not coevolution.done:
         coevolution.tell(coevolution.play().fitness)
-    run = train(config, init=first)
+    run = train(config, init=initial)
     assert coevolution.run.digest == run.digest
-    kept = train(config, init=[first, first], out="kept")
-    assert kept.digest == run.digest
-    assert train(config, init=kept).digest != run.digest
-    for wrong in (first[:3], first[:, :1], [first] * 3, first[..., 1:]):
+    in_a_directory = train(config, init=[initial, initial], out="kept")
+    assert in_a_directory.digest == run.digest
+    assert train(config, init=in_a_directory).digest != run.digest
+    for wrong in (initial[:3], initial[:, :1], [initial] * 3, initial[..., 1:]):
         with pytest.raises(ValueError, match="init"):
             train(config, init=wrong)
-    for wrong in (7, object(), [1, 2], first > 0):
+    for wrong in (7, object(), [1, 2], initial > 0):
         with pytest.raises((TypeError, ValueError), match="init"):
             train(config, init=wrong)
     run.save("saved")
@@ -139,9 +142,9 @@ def test_it_starts_from_arrays_as_train_does(config):
 
 
 def test_callbacks_get_champions(config):
-    seen, also = [], []
-    run = train(config, callback=[seen.append, also.append], champions=True)
-    assert run.digest == train(config).digest and seen == also
+    seen, seen_too = [], []
+    run = train(config, callback=[seen.append, seen_too.append], champions=True)
+    assert run.digest == train(config).digest and seen == seen_too
     assert [generation.generation for generation in seen] == list(range(7))
     assert np.array_equal(seen[-1].champions, np.stack([policies[:, 0] for policies in run.policies]))
     for generation in seen:
@@ -173,13 +176,11 @@ def test_loggers_close_when_training_stops_early(config):
     assert closed == [1, 2]
 
 
-def test_no_resource_warning(config):
+def test_a_deleted_run_causes_no_resource_warning(config):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         run = train(config)
         folder = run.folder
         del run
         gc.collect()
-    import os
-
     assert not os.path.exists(folder)
