@@ -1,4 +1,4 @@
-"""Every example in a docstring and every snippet of the pages is run; the API page says what the docstrings say."""
+"""Runs the examples in docstrings and the Python snippets of the documentation. Checks that the API page is current."""
 
 import doctest
 import inspect
@@ -17,7 +17,7 @@ NEEDS = {"parallel_env": "pettingzoo", "team_env": "gymnasium", "VectorEnv": "gy
 
 
 def documented():
-    """Everything that is public, with its docstring."""
+    """Yields the name and the object of everything public."""
     for name in flotilla.__all__:
         thing = getattr(flotilla, name)
         yield name, thing
@@ -33,31 +33,34 @@ def documented():
 
 
 @pytest.mark.parametrize("name, thing", list(documented()), ids=lambda value: value if isinstance(value, str) else "")
-def test_examples_do_what_they_say(name, thing):
+def test_docstring_examples_run(name, thing):
     text = inspect.getdoc(thing)
     assert text, f"{name} has no docstring"
     if name in NEEDS:
         pytest.importorskip(NEEDS[name], reason=f"{NEEDS[name]} is not installed")
     os.symlink(ROOT / "configs", "configs")
-    known = {"flotilla": flotilla, "np": np, "os": os, **{name: getattr(flotilla, name) for name in flotilla.__all__}}
-    test = doctest.DocTestParser().get_doctest(text, known, name, None, 0)
-    said = []
+    scope = {"flotilla": flotilla, "np": np, "os": os, **{name: getattr(flotilla, name) for name in flotilla.__all__}}
+    test = doctest.DocTestParser().get_doctest(text, scope, name, None, 0)
+    failures = []
     flags = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
-    doctest.DocTestRunner(optionflags=flags).run(test, out=said.append)
-    assert not said, "".join(said)
+    doctest.DocTestRunner(optionflags=flags).run(test, out=failures.append)
+    assert not failures, "".join(failures)
 
 
 SNIPPET = re.compile(
-    r"(?P<why><!-- not run: .*? -->\n\n?)?```python\n(?P<code>.*?)```(?:\n+<!-- output -->\n+```text\n(?P<output>.*?)```)?", re.S
+    r"(?P<skipped><!-- not run: .*? -->\n\n?)?```python\n(?P<code>.*?)```"
+    r"(?:\n+<!-- output -->\n+```text\n(?P<output>.*?)```)?",
+    re.S,
 )
 
 
 def snippets():
-    """Every Python block of every page, with the output that the page shows."""
-    for page in sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "python/README.md", *(ROOT / "docs").rglob("*.md")]):
-        for number, found in enumerate(SNIPPET.finditer(page.read_text())):
-            if not found["why"] and ">>>" not in found["code"]:
-                yield pytest.param(found["code"], found["output"], id=f"{page.relative_to(ROOT)} {number}")
+    """Yields the Python blocks of all pages, with the output that the page shows."""
+    readmes = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "python/README.md"]
+    for page in sorted([*readmes, *(ROOT / "docs").rglob("*.md")]):
+        for number, snippet in enumerate(SNIPPET.finditer(page.read_text())):
+            if not snippet["skipped"] and ">>>" not in snippet["code"]:
+                yield pytest.param(snippet["code"], snippet["output"], id=f"{page.relative_to(ROOT)} {number}")
 
 
 @pytest.mark.parametrize("code, output", list(snippets()))
@@ -69,5 +72,6 @@ def test_snippets_run(code, output, capsys):
 
 
 def test_the_api_page_is_current():
-    made = subprocess.run([sys.executable, ROOT / "python/api.py"], capture_output=True, text=True, check=True).stdout
-    assert made == (ROOT / "docs/reference/python.md").read_text(), "make it anew: python python/api.py > docs/reference/python.md"
+    page = subprocess.run([sys.executable, ROOT / "python/api.py"], capture_output=True, text=True, check=True).stdout
+    current = (ROOT / "docs/reference/python.md").read_text()
+    assert page == current, "run: python python/api.py > docs/reference/python.md"

@@ -1,4 +1,7 @@
-"""The notebooks and the examples run; where what they need is small."""
+"""Runs the notebooks and the examples. Those that need large packages run only in the long form of the tests.
+
+`test_trainers.py` runs the other examples.
+"""
 
 import os
 import re
@@ -19,8 +22,8 @@ def test_notebooks_run(path):
     pytest.importorskip("ipykernel", reason="ipykernel is not installed")
     pytest.importorskip("pandas", reason="pandas is not installed")
     book = nbformat.read(path, as_version=4)
-    kept = [cell for cell in book.cells if cell.cell_type == "code"]
-    assert all(cell.outputs for cell in kept if "print" in cell.source), "the outputs are to be read on the web"
+    cells = [cell for cell in book.cells if cell.cell_type == "code"]
+    assert all(cell.outputs for cell in cells if "print" in cell.source), "commit the notebook with its outputs"
     nbclient.NotebookClient(book, timeout=300).execute()
 
 
@@ -32,13 +35,13 @@ def test_there_are_notebooks():
     "name, needs",
     [
         ("leaders_by_es", "numpy"),
-        # These bring hundreds of megabytes: by request.
+        # These need packages of hundreds of megabytes.
         pytest.param("leaders_by_evosax", "evosax", marks=long),
         pytest.param("ppo", "torch", marks=long),
     ],
 )
 def test_examples_run(name, needs):
     pytest.importorskip(needs, reason=f"{needs} is not installed")
-    words = [sys.executable, ROOT / f"python/examples/{name}.py", "2"]
-    said = subprocess.run(words, capture_output=True, text=True, check=True).stdout
-    assert re.search(r"^(generation|iteration)   1: G", said, re.M), said
+    command = [sys.executable, ROOT / f"python/examples/{name}.py", "2"]
+    output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert re.search(r"^(generation|iteration)   1: G", output, re.M), output

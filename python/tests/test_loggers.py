@@ -1,4 +1,4 @@
-"""Each generation's numbers, logged where they can be read again."""
+"""Tests that the loggers pass each generation's numbers to TensorBoard, Weights & Biases and MLflow."""
 
 import os
 import pathlib
@@ -17,22 +17,22 @@ def test_event_files_are_written(config):
     assert all(content.count(name) == 7 for name in (b"best_g", b"mean_g", b"champion_g"))
 
 
-def test_weights_and_biases_offline(config, monkeypatch):
+def test_weights_and_biases_writes_an_offline_run(config, monkeypatch):
     pytest.importorskip("wandb", reason="wandb is not installed")
     monkeypatch.setenv("WANDB_SILENT", "true")
     train(config, callback=loggers.wandb(config, mode="offline", project="teams"))
     assert any(name.startswith("offline-run") for name in os.listdir("wandb"))
 
 
-def test_mlflow_in_a_folder(config):
+def test_mlflow_stores_the_last_generation(config):
     mlflow = pytest.importorskip("mlflow", reason="mlflow is not installed")
     mlflow.set_tracking_uri(pathlib.Path("runs.db").absolute().as_uri().replace("file:", "sqlite:"))
     run = train(config, callback=loggers.mlflow(config))
-    (found,) = mlflow.search_runs(output_format="list")
-    assert found.data.metrics["best_g"] == pytest.approx(run.metrics["best_g"][:, -1].mean())
+    (logged,) = mlflow.search_runs(output_format="list")
+    assert logged.data.metrics["best_g"] == pytest.approx(run.metrics["best_g"][:, -1].mean())
 
 
-def test_means_over_trials_are_told(config):
-    told = []
-    run = train(config, callback=lambda generation: told.append(loggers.scalars(generation)))
-    assert [row["mean_g"] for row in told] == pytest.approx(run.metrics["mean_g"].mean(axis=0))
+def test_scalars_are_means_over_trials(config):
+    rows = []
+    run = train(config, callback=lambda generation: rows.append(loggers.scalars(generation)))
+    assert [row["mean_g"] for row in rows] == pytest.approx(run.metrics["mean_g"].mean(axis=0))

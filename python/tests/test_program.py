@@ -1,4 +1,4 @@
-"""The program's commands, and the program as it comes with the package."""
+"""Tests the command `flotilla` of the package, and the functions that run its commands: compare, paper and verify."""
 
 import json
 import os
@@ -16,26 +16,27 @@ from flotilla import Run, train
 
 def test_the_command_comes_with_the_package():
     command = os.path.join(sysconfig.get_path("scripts"), "flotilla")
-    told = subprocess.run([command, "--version"], capture_output=True, text=True, check=True).stdout
-    assert told.startswith(f"flotilla {flotilla.__version__}")
+    version = subprocess.run([command, "--version"], capture_output=True, text=True, check=True).stdout
+    assert version.startswith(f"flotilla {flotilla.__version__}")
     wrong = subprocess.run([command, "train"], capture_output=True, text=True)
     assert wrong.returncode == 2 and "CONFIG" in wrong.stderr
     failed = subprocess.run([command, "train", "nowhere.toml"], capture_output=True, text=True)
     assert failed.returncode == 1 and failed.stderr.startswith("error: nowhere.toml: cannot be read")
 
 
-def test_the_program_s_record_says_what_was_typed(config, program, tmp_path):
+def test_run_json_has_the_command_line(config, program, tmp_path):
     (tmp_path / "c.toml").write_text(config.to_toml())
     program("train", "c.toml", "--out", "run", "--quiet")
     command = json.loads((tmp_path / "run/run.json").read_text())["command"]
     assert command.split()[0].endswith("flotilla") and command.endswith("train c.toml --out run --quiet")
-    (tmp_path / "s.toml").write_text(config.to_toml().replace("coupling = 3", "") + '[grid]\n"world.coupling" = [1, 2]\n')
+    sweep = config.to_toml().replace("coupling = 3", "") + '[grid]\n"world.coupling" = [1, 2]\n'
+    (tmp_path / "s.toml").write_text(sweep)
     script = program("sweep", "s.toml", "--slurm", "--shards", "2")
     assert command.split()[0] in script
 
 
-@pytest.mark.skipif(os.name == "nt", reason="signals are another thing there")
-def test_the_command_saves_before_it_stops(config, tmp_path):
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for one process")
+def test_an_interrupted_command_exits_with_75_and_offers_resume(config, tmp_path):
     (tmp_path / "c.toml").write_text(config.replace(learning={"generations": 100_000}).to_toml())
     words = [sys.executable, "-m", "flotilla", "train", "c.toml", "--out", "run", "--quiet", "--backend", "cpu"]
     with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as running:
@@ -43,15 +44,15 @@ def test_the_command_saves_before_it_stops(config, tmp_path):
             assert running.poll() is None
             time.sleep(0.05)
         running.send_signal(signal.SIGINT)
-        told = running.communicate(timeout=60)[1]
-    assert running.returncode == 75 and told.startswith("stopped: ") and "--resume" in told
+        message = running.communicate(timeout=60)[1]
+    assert running.returncode == 75 and message.startswith("stopped: ") and "--resume" in message
 
 
 def test_runs_are_compared(config):
     runs = [train(config.replace(learning={"fitness": fitness})) for fitness in ("G", "Df")]
-    found = flotilla.compare(runs)
-    assert found["test"] == "mann-whitney" and len(found["comparisons"][0]["arms"]) == 2
-    best = found["comparisons"][0]["measures"][0]["arms"][0]
+    comparison = flotilla.compare(runs)
+    assert comparison["test"] == "mann-whitney" and len(comparison["comparisons"][0]["arms"]) == 2
+    best = comparison["comparisons"][0]["measures"][0]["arms"][0]
     assert best["value"] == pytest.approx(runs[0].metrics["best_g"][:, -1].mean())
     assert flotilla.compare(runs, paired=True)["test"] == "wilcoxon"
     with pytest.raises(ValueError):
@@ -62,10 +63,10 @@ def test_runs_are_compared(config):
         flotilla.compare(["one", "two"])
 
 
-def test_the_paper_is_played():
-    found = flotilla.paper("paper", trials=2, generations=2, backend="cpu")
-    assert len(found["arms"]) >= 18 and os.path.exists("paper/claims.md")
-    for arm in found["arms"][:3]:
+def test_the_paper_is_reproduced():
+    reproduced = flotilla.paper("paper", trials=2, generations=2, backend="cpu")
+    assert len(reproduced["arms"]) >= 18 and os.path.exists("paper/claims.md")
+    for arm in reproduced["arms"][:3]:
         assert Run.open(arm["folder"]).digest == arm["digest"]
     with pytest.raises(flotilla.Error, match="paper"):
         flotilla.paper("paper", trials=2, generations=2)
@@ -77,6 +78,6 @@ def test_devices_and_verify():
     if not devices:
         with pytest.raises(flotilla.Error, match="no GPU"):
             flotilla.verify(worlds=2)
-        pytest.skip("there is no GPU here to compare with the CPU")
-    found = flotilla.verify(worlds=2, teams=8, adapter=0)
-    assert found["equal"] and found["comparisons"][0]["worlds"] == 2
+        pytest.skip("no GPU to compare with the CPU")
+    report = flotilla.verify(worlds=2, teams=8, adapter=0)
+    assert report["equal"] and report["comparisons"][0]["worlds"] == 2
