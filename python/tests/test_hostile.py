@@ -1,4 +1,4 @@
-"""Whatever is given to whatever there is: a sentence, never a panic, a crash or a leak."""
+"""Tests that wrong arguments raise ordinary exceptions and never panic or crash, and that calls leak no memory."""
 
 import gc
 import inspect
@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as arrays
 import flotilla
 from flotilla import Config, VectorEnv
 
-# What a call may raise. Whatever a panic becomes is none of these, and no Exception at all.
+# What a call may raise. A panic becomes PanicException, which is not a subclass of Exception.
 ALLOWED = (ValueError, TypeError, KeyError, MemoryError, OverflowError, OSError, flotilla.Error, ImportError)
 SMALL = Config(
     world={"leaders": [[5, 5], [9, 5]], "followers": [[4, 3]], "pois": [[5, 9]], "steps": 3},
@@ -22,17 +22,21 @@ SMALL = Config(
 )
 RUN = flotilla.train(SMALL)
 ENV = VectorEnv(SMALL, 4, "Df")
-# Of each function: in all 10 000 in the short form, and 200 000 in the long one.
+# Calls per entry of FUNCTIONS: about 10 000 in total in the short form, and 200 000 in the long one.
 EXAMPLES = int(os.environ.get("FLOTILLA_WRONG", "10000" if os.environ.get("FLOTILLA_LONG") else "500"))
 
 numbers = st.one_of(st.integers(), st.integers(-3, 3), st.floats(), st.booleans(), st.complex_numbers())
 text = st.one_of(st.text(max_size=20), st.sampled_from(["Df", "cpu", "auto", "", "\0", "..", "chaotic", "\ud800", "-"]))
-shapes = st.one_of(arrays.array_shapes(min_dims=0, max_dims=4, min_side=0, max_side=5), st.sampled_from([(2, 3, 112), (4, 2, 2), (8,), (1, 1, 112), (4,)]))
+shapes = st.one_of(
+    arrays.array_shapes(min_dims=0, max_dims=4, min_side=0, max_side=5),
+    st.sampled_from([(2, 3, 112), (4, 2, 2), (8,), (1, 1, 112), (4,)]),
+)
 kinds = st.sampled_from([np.float32, np.float64, np.int64, np.bool_, np.complex64, np.float16, ">f4", "U3", object])
 
 
 @st.composite
 def tensors(draw):
+    """Arrays of any shape and type, with extreme numbers, in any memory order."""
     shape, kind = draw(shapes), np.dtype(draw(kinds))
     filled = draw(st.sampled_from([0, 1, -1, 1e30, np.nan, np.inf, -np.inf, 1e-40]))
     with np.errstate(all="ignore"):
@@ -41,10 +45,15 @@ def tensors(draw):
 
 
 things = st.recursive(
-    st.one_of(st.none(), numbers, text, tensors(), st.binary(max_size=8), st.just(object()), st.just(SMALL), st.just(RUN)),
-    lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(text, inner, max_size=3), st.tuples(inner, inner)),
+    st.one_of(
+        st.none(), numbers, text, tensors(), st.binary(max_size=8), st.just(object()), st.just(SMALL), st.just(RUN)
+    ),
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=3), st.dictionaries(text, inner, max_size=3), st.tuples(inner, inner)
+    ),
     max_leaves=5,
 )
+# Names of calls, and functions that make them with four arbitrary arguments.
 FUNCTIONS = {
     "Config": lambda *a: Config(**{"world": a[0], "learning": a[1]}),
     "Config.parse": Config.parse,
@@ -55,7 +64,11 @@ FUNCTIONS = {
     "getitem": lambda *a: SMALL[a[0]],
     "rollout": lambda *a: flotilla.rollout(SMALL, a[0]),
     "rollout anything": lambda *a: flotilla.rollout(*a[:2]),
-    "rollout starts": lambda *a: flotilla.rollout(SMALL, RUN.policies[0], episodes=a[0], seed=a[1], jitter=a[2]) if not isinstance(a[0], int) or a[0] < 100 else None,
+    "rollout starts": lambda *a: (
+        flotilla.rollout(SMALL, RUN.policies[0], episodes=a[0], seed=a[1], jitter=a[2])
+        if not isinstance(a[0], int) or a[0] < 100
+        else None
+    ),
     "rollout backend": lambda *a: flotilla.rollout(SMALL, RUN.policies[0], backend=a[0]),
     "forward": lambda *a: flotilla.forward(*a[:3]),
     "collect": lambda *a: flotilla.collect(SMALL, RUN.policies[0], a[0], a[1], jitter=a[2]),
@@ -72,10 +85,14 @@ FUNCTIONS = {
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_wrong_arguments_are_told(name):
+def test_wrong_arguments_raise_ordinary_exceptions(name):
     raised = []
 
-    @settings(max_examples=EXAMPLES, deadline=None, database=None, suppress_health_check=list(HealthCheck), derandomize=True)
+    health_checks = list(HealthCheck)
+
+    @settings(
+        max_examples=EXAMPLES, deadline=None, database=None, suppress_health_check=health_checks, derandomize=True
+    )
     @given(st.tuples(things, things, things, things))
     def call(arguments):
         try:
@@ -88,36 +105,37 @@ def test_wrong_arguments_are_told(name):
     assert raised
 
 
-def test_every_public_function_is_thrown_at():
-    """Or takes what others here take, or starts the program, whose own tests do that."""
-    others = {"compare", "devices", "paper", "parallel_env", "plot", "sweep", "team_env", "to_onnx", "verify"}
+def test_every_public_function_is_called_or_exempt():
+    # These take the same arguments as functions that are called here, or start the program, which has its own tests.
+    exempt = {"compare", "devices", "paper", "parallel_env", "plot", "sweep", "team_env", "to_onnx", "verify"}
     public = {name for name in flotilla.__all__ if inspect.isfunction(getattr(flotilla, name))}
-    assert public - others <= {name.split()[0] for name in FUNCTIONS}, public - others
+    assert public - exempt <= {name.split()[0] for name in FUNCTIONS}, public - exempt
 
 
 def memory() -> int:
-    """Bytes that this process holds now."""
+    """Returns the resident memory of this process, in bytes."""
     gc.collect()
     with open("/proc/self/statm") as file:
         return int(file.read().split()[1]) * resource.getpagesize()
 
 
-@pytest.mark.skipif(not os.path.exists("/proc/self/statm"), reason="how much memory is held is asked of Linux")
-@pytest.mark.parametrize("what", ["step", "train", "rollout"])
-def test_memory_is_flat(what):
+@pytest.mark.skipif(not os.path.exists("/proc/self/statm"), reason="only Linux has /proc/self/statm")
+@pytest.mark.parametrize("function", ["step", "train", "rollout"])
+def test_repeated_calls_leak_no_memory(function):
     env, actions = VectorEnv(Config.paper(), 100, "Df"), np.ones((100, 4, 2), np.float32)
     env.reset()
     config = SMALL.replace(learning={"generations": 2})
     policies = np.zeros((1, 200, SMALL.parameters), np.float32)
-    act = {
+    call = {
         "step": lambda: env.step(actions),
         "train": lambda: flotilla.train(config, backend="cpu", callback=lambda generation: None),
         "rollout": lambda: flotilla.rollout(SMALL, policies, trace=True),
-    }[what]
-    times = {"step": 10_000, "train": 1000, "rollout": 1000}[what]
+    }[function]
+    times = {"step": 10_000, "train": 1000, "rollout": 1000}[function]
+    # Warm up: the first calls allocate buffers that are kept.
     for _ in range(times // 5):
-        act()
+        call()
     before = memory()
     for _ in range(times):
-        act()
+        call()
     assert memory() - before < 4 << 20

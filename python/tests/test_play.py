@@ -1,3 +1,8 @@
+"""Tests functions that play policies: `rollout` with traces, `forward`, `collect` and `to_onnx`.
+
+Their results are compared with each other, with the program and with NumPy, mostly bit by bit.
+"""
+
 import csv
 import json
 import os
@@ -12,9 +17,10 @@ import flotilla
 from flotilla import Config, forward, rollout, train
 
 
-def test_scores_are_the_program_s(config, program, tmp_path):
+def test_scores_equal_the_program_s(config, program, tmp_path):
     run = train(config, out="run")
-    program("rollout", "run/config.toml", "--policies", "run/policies.safetensors", "--scores", "scores.csv", "--trial", "1")
+    arguments = ("run/config.toml", "--policies", "run/policies.safetensors", "--scores", "scores.csv")
+    program("rollout", *arguments, "--trial", "1")
     scores = rollout(config, run.policies[1])
     with open("scores.csv") as file:
         for row in csv.DictReader(file):
@@ -27,10 +33,10 @@ def test_scores_are_the_program_s(config, program, tmp_path):
     assert repr(scores).startswith("<flotilla.Rollout: 20 teams of 4 leaders")
 
 
-def test_drawn_starts_are_the_program_s(config, program):
+def test_random_starts_equal_the_program_s(config, program):
     run = train(config, out="run")
-    words = ("run/config.toml", "--policies", "run/policies.safetensors", "--scores", "scores.csv")
-    program("rollout", *words, "--episodes", "30", "--seed", "5", "--start-jitter", "2")
+    arguments = ("run/config.toml", "--policies", "run/policies.safetensors", "--scores", "scores.csv")
+    program("rollout", *arguments, "--episodes", "30", "--seed", "5", "--start-jitter", "2")
     scores = rollout(config, run.policies[0], episodes=30, seed=5, jitter=2)
     with open("scores.csv") as file:
         assert [float(row["pois"]) for row in csv.DictReader(file) if row["leader"] == "0"] == list(scores.observed)
@@ -44,23 +50,25 @@ ACTIONS = ("direct", "behaviours")
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_a_trace_is_what_policies_answered(seed):
-    config = random_config(seed).replace(policy={"hidden": [[10], [], [7, 5], [1, 2, 3]][seed % 4], "actions": ACTIONS[seed // 8]})
+def test_a_trace_agrees_with_forward_and_with_the_world(seed):
+    hidden = [[10], [], [7, 5], [1, 2, 3]][seed % 4]
+    config = random_config(seed).replace(policy={"hidden": hidden, "actions": ACTIONS[seed // 8]})
     policies = random_policies(config, 9, seed)
     trace = rollout(config, policies, trace=True).trace
     agents = len(config["world.leaders"]) + len(config["world.followers"])
     steps, pois = config["world.steps"], len(config["world.pois"])
     assert trace.positions.shape == trace.headings.shape == (9, steps + 1, agents, 2)
     assert trace.speeds.shape == (9, steps + 1, agents)
-    assert trace.inputs.shape == (9, steps, config.num_learners, 8) and trace.outputs.shape == (9, steps, config.num_learners, 2)
+    assert trace.inputs.shape == (9, steps, config.num_learners, 8)
+    assert trace.outputs.shape == (9, steps, config.num_learners, 2)
     assert trace.agents_at_poi.shape == (9, steps, pois, agents) and trace.agents_at_poi.dtype == np.bool_
-    # [teams, 1, leaders, parameters] against [teams, steps, leaders, 8]
+    # Policies [teams, 1, leaders, parameters] and inputs [teams, steps, leaders, 8] are broadcast.
     answers = forward(policies.transpose(1, 0, 2)[:, None], trace.inputs, config)
     assert np.array_equal(answers.view(np.uint32), trace.outputs.view(np.uint32))
     assert config["policy.actions"] == "direct" or set(np.unique(answers[..., 1])) <= {-1, 1}
-    # Who is near is near.
-    place = np.asarray(config["world.pois"])[None, None, :, None]
-    distance = np.linalg.norm(trace.positions[:, 1:, None] - place, axis=-1)
+    # Compare agents_at_poi with distances. Distances close to the radius are left out, because these are rounded.
+    pois = np.asarray(config["world.pois"])[None, None, :, None]
+    distance = np.linalg.norm(trace.positions[:, 1:, None] - pois, axis=-1)
     radius = config["world.observation_radius"]
     clear = np.abs(distance - radius) > 1e-3
     assert np.array_equal((distance < radius)[clear], trace.agents_at_poi[clear])
@@ -68,14 +76,14 @@ def test_a_trace_is_what_policies_answered(seed):
     assert np.array_equal(observed, rollout(config, policies).observed)
 
 
-def test_a_shared_policy_is_every_leader_s(config):
+def test_one_policy_is_used_for_every_leader(config):
     shared = random_policies(config, 5, leaders=1)
-    one, all_ = rollout(config, shared), rollout(config, np.repeat(shared, 4, axis=0))
+    once, repeated = rollout(config, shared), rollout(config, np.repeat(shared, 4, axis=0))
     for name in ("observed", "g", "d", "df", "dpp"):
-        assert np.array_equal(getattr(one, name), getattr(all_, name))
+        assert np.array_equal(getattr(once, name), getattr(repeated, name))
 
 
-def test_leaders_may_share_a_policy(config, program):
+def test_training_with_a_shared_policy(config, program):
     config = config.replace(learning={"sharing": "all"})
     run = train(config, out="run")
     assert [trial.shape for trial in run.policies] == [(1, 20, 112)] * 2
@@ -84,17 +92,17 @@ def test_leaders_may_share_a_policy(config, program):
     assert flotilla.Run.open("saved").digest == run.digest
 
 
-def test_other_arrays_are_converted(config):
+def test_arrays_of_other_types_and_orders_are_converted(config):
     policies = random_policies(config, 5)
     expected = rollout(config, policies).d
-    shapes = (policies.astype(np.float64), np.asfortranarray(policies), policies.tolist(), policies.astype(">f4"))
-    for other in (*shapes, np.repeat(policies, 2, axis=1)[:, ::2]):
+    converted = (policies.astype(np.float64), np.asfortranarray(policies), policies.tolist(), policies.astype(">f4"))
+    for other in (*converted, np.repeat(policies, 2, axis=1)[:, ::2]):
         assert np.array_equal(rollout(config, other).d, expected)
     assert rollout(config, policies, backend="cpu").d.flags.writeable
 
 
 @pytest.mark.parametrize(
-    "change, error, says",
+    "change, error, message",
     [
         (lambda p: p[:3], ValueError, r"policies are \[3, 5, 112\], allowed is \[leaders, teams, parameters\] = \[4, "),
         (lambda p: p[:, :, 1:], ValueError, r"\[4, 5, 111\]"),
@@ -110,10 +118,10 @@ def test_other_arrays_are_converted(config):
         (lambda p: None, TypeError, "policies are object"),
     ],
 )
-def test_wrong_policies_are_one_sentence(config, change, error, says):
-    with pytest.raises(error, match=says) as found:
+def test_invalid_policies_raise_a_one_line_error(config, change, error, message):
+    with pytest.raises(error, match=message) as raised:
         rollout(config, change(random_policies(config, 5)))
-    assert "\n" not in str(found.value)
+    assert "\n" not in str(raised.value)
 
 
 @pytest.mark.parametrize("hidden", [[64, 64, 64], [64], [3, 1], []])
@@ -124,7 +132,7 @@ def test_forward_is_exact_for_any_network(hidden, actions):
     trace = rollout(config, policies, record=("inputs", "outputs")).trace
     answers = forward(policies.transpose(1, 0, 2)[:, None], trace.inputs, config)
     assert np.array_equal(answers.view(np.uint32), trace.outputs.view(np.uint32))
-    # One policy for many inputs, and many policies for one.
+    # One policy with many inputs, and many policies with one input.
     one = forward(policies[2, 5], trace.inputs[5, :, 2], config)
     assert np.array_equal(one, trace.outputs[5, :, 2])
     first = forward(policies[:, :, :], trace.inputs[0, 0, 0], config)
@@ -132,28 +140,30 @@ def test_forward_is_exact_for_any_network(hidden, actions):
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_a_trace_is_played_once_with_the_scores_of_a_rollout(seed):
+def test_traces_change_no_score_and_have_the_requested_parts(seed):
     config = random_config(seed)
     policies = random_policies(config, 300, seed)
-    alone, traced = rollout(config, policies), rollout(config, policies, trace=True)
+    plain, traced = rollout(config, policies), rollout(config, policies, trace=True)
     for name in ("G", "D", "Df", "D++"):
-        assert np.array_equal(alone[name], traced[name]), name
-    assert (alone.dt is None) == (traced.dt is None) and (alone.dt is None or np.array_equal(alone.dt, traced.dt))
+        assert np.array_equal(plain[name], traced[name]), name
+    assert (plain.dt is None) == (traced.dt is None) and (plain.dt is None or np.array_equal(plain.dt, traced.dt))
     drawn = {"episodes": 3, "seed": 2, "jitter": 1.0, "poi_jitter": 2.0}
-    alone, traced = rollout(config, policies, **drawn), rollout(config, policies, **drawn, trace=True)
-    assert np.array_equal(alone.df, traced.df)
+    plain, traced = rollout(config, policies, **drawn), rollout(config, policies, **drawn, trace=True)
+    assert np.array_equal(plain.df, traced.df)
+    # With several episodes, the trace is that of the first.
     first = rollout(config, policies, **{**drawn, "episodes": 1}, trace=True)
     for name in ("positions", "headings", "speeds", "inputs", "outputs", "agents_at_poi"):
         whole = getattr(traced.trace, name)
         assert np.array_equal(whole, getattr(first.trace, name))
-        some = rollout(config, policies, **{**drawn, "episodes": 1}, record=(name,)).trace
-        assert np.array_equal(whole, getattr(some, name)) and sum(value is not None for value in vars(some).values()) == 1
+        part = rollout(config, policies, **{**drawn, "episodes": 1}, record=(name,)).trace
+        assert np.array_equal(whole, getattr(part, name))
+        assert sum(value is not None for value in vars(part).values()) == 1
         out = np.empty_like(whole)
-        given = rollout(config, policies, **{**drawn, "episodes": 1}, out={name: out}).trace
-        assert getattr(given, name) is out and np.array_equal(out, whole)
+        trace = rollout(config, policies, **{**drawn, "episodes": 1}, out={name: out}).trace
+        assert getattr(trace, name) is out and np.array_equal(out, whole)
 
 
-def test_blocks_change_nothing(config, monkeypatch):
+def test_results_do_not_depend_on_the_size_of_blocks(config, monkeypatch):
     policies = random_policies(config, 70)
     whole, batch = rollout(config, policies, trace=True), flotilla.collect(config, policies, episodes=5, jitter=1.0)
     monkeypatch.setattr(flotilla._play, "FIRST_BLOCK", 1)
@@ -165,7 +175,7 @@ def test_blocks_change_nothing(config, monkeypatch):
         assert np.array_equal(value, getattr(other, name)), name
 
 
-def test_wrong_records_are_told(config):
+def test_invalid_records_and_outputs_raise(config):
     policies = random_policies(config, 5)
     with pytest.raises(ValueError, match="record 'place'"):
         rollout(config, policies, record=("place",))
@@ -181,23 +191,22 @@ def test_episodes_without_jitter_warn(config):
         rollout(config, random_policies(config, 2), episodes=3)
 
 
-def test_each_episode_and_the_program_s_interval(config, program):
+def test_spread_gives_each_episode_and_the_program_s_interval(config, program):
     run = train(config, out="run")
     scores = rollout(config, run.policies[0], episodes=40, seed=5, jitter=2, spread=True)
     assert scores.episodes.shape == (40, 20) and np.allclose(scores.episodes.mean(0), scores.g, atol=1e-12)
     assert np.allclose(scores.episodes.std(0, ddof=1), scores.deviation, atol=1e-12)
-    words = ("run/config.toml", "--policies", "run/policies.safetensors", "--json")
-    told = json.loads(program("rollout", *words, "--episodes", "40", "--seed", "5", "--start-jitter", "2"))
-    best = told["best"]
+    arguments = ("run/config.toml", "--policies", "run/policies.safetensors", "--json")
+    best = json.loads(program("rollout", *arguments, "--episodes", "40", "--seed", "5", "--start-jitter", "2"))["best"]
     assert np.allclose(scores.interval[best["team"]] * 4, best["interval_95"], atol=1e-12)
-    # Alone, each episode has the same G.
-    one = rollout(config, run.policies[0], episodes=1, seed=5, jitter=2)
-    assert np.array_equal(one.g, scores.episodes[0])
+    # A rollout of one episode gives the G of the first of 40.
+    first = rollout(config, run.policies[0], episodes=1, seed=5, jitter=2)
+    assert np.array_equal(first.g, scores.episodes[0])
 
 
-@pytest.mark.skipif(os.name == "nt", reason="signals")
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for one process")
 @pytest.mark.parametrize("call", ["rollout(c, p, episodes=1_000_000, jitter=1)", "rollout(c, p, record=('speeds',))"])
-def test_ctrl_c_stops_within_a_second(call):
+def test_ctrl_c_stops_a_rollout_within_seconds(call):
     code = f"""
 import numpy as np, os, signal, threading, time
 from flotilla import Config, rollout
@@ -216,26 +225,27 @@ try:
 except KeyboardInterrupt:
     print(time.perf_counter() - asked)
 """
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
-    took = float(ended.stdout)
-    # A second on a machine that does nothing else.
-    assert 0 <= took < 5, ended
+    finished = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+    seconds = float(finished.stdout)
+    # It takes a second on an idle machine. A busy one gets five.
+    assert 0 <= seconds < 5, finished
 
 
 @pytest.mark.parametrize("reward", ["G", "D", "Df", "D++", "Dt"])
 @pytest.mark.parametrize("seed", range(4))
-def test_what_is_collected_is_what_the_environment_gives(reward, seed):
+def test_collect_equals_the_steps_of_an_environment(reward, seed):
     config = random_config(seed)
     policies = random_policies(config, 5, seed)
     batch = flotilla.collect(config, policies, noise=0.5, seed=3, episodes=2, jitter=1.0, poi_jitter=1.0, reward=reward)
-    assert np.array_equal(batch.means, forward(np.tile(policies.transpose(1, 0, 2), (2, 1, 1))[:, None], batch.observations, config))
+    by_row = np.tile(policies.transpose(1, 0, 2), (2, 1, 1))[:, None]
+    assert np.array_equal(batch.means, forward(by_row, batch.observations, config))
     starts = flotilla._native.starts(config._native, 3, 1.0, 1.0, 0, 2)
     env = flotilla.VectorEnv(config, 10, reward, autoreset="disabled")
     env._teams.stepper.reset(None, np.repeat(starts, 5, axis=0))
-    seen = env._teams.inputs()
+    observations = env._teams.inputs()
     for step in range(config["world.steps"]):
-        assert np.array_equal(seen, batch.observations[:, step])
-        seen, rewards, *_ = env.step(batch.actions[:, step])
+        assert np.array_equal(observations, batch.observations[:, step])
+        observations, rewards, *_ = env.step(batch.actions[:, step])
         assert np.array_equal(rewards, batch.rewards[:, step])
     assert np.array_equal(env.observed.mean(1), batch.g)
     assert batch.masks.sum() == 10 * (config["world.steps"] - 1) and not batch.masks[:, -1].any()
@@ -248,12 +258,12 @@ def test_noise_is_normal_and_drawn_from_the_seed():
     noise = batch.actions - batch.means
     assert not noise[..., 1].any()
     drawn = noise[..., 0].ravel() / 0.5
-    assert abs(drawn.mean()) < 0.01 and abs(drawn.std() - 1) < 0.01 and abs((np.abs(drawn) < 1).mean() - 0.6827) < 0.005
-    # Neighbours in every axis are independent.
-    shaped = noise[..., 0]
+    assert abs(drawn.mean()) < 0.01 and abs(drawn.std() - 1) < 0.01
+    assert abs((np.abs(drawn) < 1).mean() - 0.6827) < 0.005
+    # Neighbours along each axis are uncorrelated.
     for axis in range(3):
-        moved = np.swapaxes(shaped, 0, axis)
-        assert abs(np.corrcoef(moved[1:].ravel(), moved[:-1].ravel())[0, 1]) < 0.01
+        turns = np.swapaxes(noise[..., 0], 0, axis)
+        assert abs(np.corrcoef(turns[1:].ravel(), turns[:-1].ravel())[0, 1]) < 0.01
     again = flotilla.collect(config, policies, noise=[0.5, 0.0], seed=1, episodes=300)
     assert np.array_equal(again.actions, batch.actions[:300])
     other = flotilla.collect(config, policies, noise=[0.5, 0.0], seed=2, episodes=300)
@@ -263,7 +273,7 @@ def test_noise_is_normal_and_drawn_from_the_seed():
             flotilla.collect(config, policies, noise=wrong)
 
 
-def test_the_network_in_numpy():
+def test_forward_agrees_with_numpy():
     rng = np.random.default_rng(1)
     policy, inputs = rng.normal(size=112), rng.normal(size=8)
     hidden = np.tanh([*inputs, 1] @ policy[:90].reshape(9, 10))
@@ -275,7 +285,7 @@ def test_the_network_in_numpy():
         forward(policy, inputs[:7])
 
 
-def test_onnx_answers_the_same(tmp_path):
+def test_an_onnx_export_gives_the_same_answers(tmp_path):
     pytest.importorskip("onnx", reason="onnx is not installed")
     runtime = pytest.importorskip("onnxruntime", reason="onnxruntime is not installed")
     config = Config.paper().replace(policy={"hidden": [7, 5]})
