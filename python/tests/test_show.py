@@ -1,3 +1,5 @@
+"""Tests replays and pictures of runs, and that temporary runs are deleted."""
+
 import os
 
 import pytest
@@ -6,17 +8,17 @@ import flotilla
 from flotilla import Run, train
 
 
-def test_a_replay_is_shown_and_written(config):
+def test_replays_are_shown_and_saved_in_each_format(config):
     for run in (train(config), train(config, out="run")):
         replay = run.replay(trial=1, compare=0)
         assert [(episode.trial, episode.generation) for episode in replay.episodes] == [(1, 0), (1, 6)]
         assert [episode.best_g for episode in replay.episodes] == [run.metrics["best_g"][1, g] for g in (0, 6)]
         assert replay._repr_html_().startswith("<iframe srcdoc=") and "<script" in replay.page()
-        starts = {"html": b"<!", "gif": b"GIF89a", "svg": b"<svg", "pdf": b"%PDF", "png": b"\x89PNG"}
-        for kind, start in starts.items():
-            replay.save(f"team.{kind}", width=200 if kind in ("gif", "png") else None)
-            with open(f"team.{kind}", "rb") as file:
-                assert file.read(200).lstrip().startswith(start), kind
+        magic = {"html": b"<!", "gif": b"GIF89a", "svg": b"<svg", "pdf": b"%PDF", "png": b"\x89PNG"}
+        for extension, start in magic.items():
+            replay.save(f"team.{extension}", width=200 if extension in ("gif", "png") else None)
+            with open(f"team.{extension}", "rb") as file:
+                assert file.read(200).lstrip().startswith(start), extension
         assert replay.still(0).svg() != replay.still().svg()
         with pytest.raises(ValueError, match="its name must end in .html"):
             replay.save("team.txt")
@@ -36,7 +38,7 @@ def test_curves_are_drawn(config):
         flotilla.plot([])
 
 
-def test_a_run_in_memory_leaves_nothing_behind(config):
+def test_a_run_without_out_is_deleted_with_its_object(config):
     run = train(config)
     folder = run.folder
     assert Run.open(folder).digest == run.digest

@@ -1,3 +1,5 @@
+"""Tests `sweep`: its points equal single runs, in this process, in other processes, and with Dask and submitit."""
+
 import concurrent.futures
 import multiprocessing
 import os
@@ -16,72 +18,80 @@ def grid(config):
     return text + '[grid]\n"world.coupling" = [1, 3]\n"learning.fitness" = ["G", "Df"]\n'
 
 
-def digests(config):
-    all_ = [(coupling, fitness) for coupling in (1, 3) for fitness in ("G", "Df")]
-    configs = [config.replace(learning={"trials": 1, "fitness": fitness}, world={"coupling": coupling}) for coupling, fitness in all_]
-    return [train(own).digest for own in configs]
+def expected_digests(config):
+    """Trains each point of the grid by itself."""
+    points = [(coupling, fitness) for coupling in (1, 3) for fitness in ("G", "Df")]
+    return [
+        train(config.replace(learning={"trials": 1, "fitness": fitness}, world={"coupling": coupling})).digest
+        for coupling, fitness in points
+    ]
 
 
-def test_points_are_played_here(config, grid, tmp_path):
-    found = sweep(grid)
-    assert [point.run.digest for point in found] == digests(config)
-    assert found.axes == ["world.coupling", "learning.fitness"] and len(found) == 4
-    assert found.points[1].values == {"world.coupling": 1, "learning.fitness": "Df"}
-    assert found.metric("champion_g").shape == (4, 1)
+def digests(points):
+    return [point.run.digest for point in points]
+
+
+def test_points_equal_single_runs(config, grid, tmp_path):
+    points = sweep(grid)
+    assert digests(points) == expected_digests(config)
+    assert points.axes == ["world.coupling", "learning.fitness"] and len(points) == 4
+    assert points.points[1].values == {"world.coupling": 1, "learning.fitness": "Df"}
+    assert points.metric("champion_g").shape == (4, 1)
     (tmp_path / "grid.toml").write_text(grid)
-    kept = sweep("grid.toml", out="kept")
-    assert [point.run.digest for point in kept] == digests(config) and os.path.exists("kept/results.csv")
-    assert found.points[0].run.replay().episodes[0].trial == 0
-    assert repr(found) == "<flotilla.Sweep: 4 points over world.coupling, learning.fitness>"
+    saved = sweep("grid.toml", out="kept")
+    assert digests(saved) == expected_digests(config) and os.path.exists("kept/results.csv")
+    assert points.points[0].run.replay().episodes[0].trial == 0
+    assert repr(points) == "<flotilla.Sweep: 4 points over world.coupling, learning.fitness>"
 
 
 @pytest.mark.parametrize("method", [m for m in multiprocessing.get_all_start_methods() if m != "forkserver"])
-def test_points_are_played_by_other_processes(config, grid, method):
-    """Forked ones too, whose parent has threads at work."""
-    expected, told = digests(config), []
+def test_points_are_played_in_other_processes_and_threads(config, grid, method):
+    # `expected_digests` starts the thread pool of this process, so forked processes have a parent with threads.
+    expected, progress = expected_digests(config), []
     with concurrent.futures.ProcessPoolExecutor(2, multiprocessing.get_context(method)) as executor:
-        found = sweep(grid, executor, backend="cpu", progress=lambda *done: told.append(done))
-    assert [point.run.digest for point in found] == expected
-    assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
+        points = sweep(grid, executor, backend="cpu", progress=lambda *done: progress.append(done))
+    assert digests(points) == expected
+    assert progress == [(1, 4), (2, 4), (3, 4), (4, 4)]
     with concurrent.futures.ThreadPoolExecutor(2) as executor:
-        assert [point.run.digest for point in sweep(grid, executor)] == expected
+        assert digests(sweep(grid, executor)) == expected
 
 
-class Losing(concurrent.futures.ProcessPoolExecutor):
-    """Kills a worker once some points are handed out."""
+class KillingExecutor(concurrent.futures.ProcessPoolExecutor):
+    """Kills one worker after the second point is submitted."""
 
     def submit(self, *arguments, **named):
         future = super().submit(*arguments, **named)
-        if len(self._pending_work_items) == 2 and not getattr(self, "lost", False):
-            self.lost = True
+        if len(self._pending_work_items) == 2 and not getattr(self, "killed", False):
+            self.killed = True
             os.kill(next(iter(self._processes)), signal.SIGKILL)
         return future
 
 
-unix = pytest.mark.skipif(os.name == "nt", reason="a process cannot be killed like this there")
+unix = pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGKILL")
 
 
 @unix
-def test_a_lost_worker_s_points_are_played_again(config, grid):
-    with Losing(2, multiprocessing.get_context("spawn")) as executor, pytest.warns(RuntimeWarning, match="no worker plays it"):
-        found = sweep(grid, executor, backend="cpu")
-    assert executor.lost and [point.run.digest for point in found] == digests(config)
+def test_points_of_a_killed_worker_are_played_again(config, grid):
+    executor = KillingExecutor(2, multiprocessing.get_context("spawn"))
+    with executor, pytest.warns(RuntimeWarning, match="no worker plays it"):
+        points = sweep(grid, executor, backend="cpu")
+    assert executor.killed and digests(points) == expected_digests(config)
 
 
 @unix
-def test_dask_plays_points(config, grid):
+def test_dask_plays_points_and_survives_a_killed_worker(config, grid):
     distributed = pytest.importorskip("distributed", reason="dask.distributed is not installed")
     with distributed.LocalCluster(2, threads_per_worker=1, dashboard_address=None) as cluster:
         with distributed.Client(cluster) as client:
-            lost = []
+            killed = []
 
-            def lose(done, points):
-                if not lost:
-                    lost.append(next(iter(cluster.workers.values())).pid)
-                    os.kill(lost[0], signal.SIGKILL)
+            def kill_once(done, total):
+                if not killed:
+                    killed.append(next(iter(cluster.workers.values())).pid)
+                    os.kill(killed[0], signal.SIGKILL)
 
-            found = sweep(grid, client.get_executor(), backend="cpu", progress=lose)
-    assert [point.run.digest for point in found] == digests(config)
+            points = sweep(grid, client.get_executor(), backend="cpu", progress=kill_once)
+    assert digests(points) == expected_digests(config)
 
 
 @pytest.mark.skipif(os.name == "nt", reason="submitit is for Unix")
@@ -89,10 +99,10 @@ def test_submitit_plays_points(config, grid):
     submitit = pytest.importorskip("submitit", reason="submitit is not installed")
     executor = submitit.LocalExecutor("jobs")
     executor.update_parameters(timeout_min=5)
-    assert [point.run.digest for point in sweep(grid, executor, backend="cpu")] == digests(config)
+    assert digests(sweep(grid, executor, backend="cpu")) == expected_digests(config)
 
 
-def test_what_is_wrong_with_a_sweep_is_told(grid):
+def test_invalid_sweeps_raise(grid):
     with pytest.raises(ConfigError) as error:
         sweep(grid.replace("[1, 3]", "[1, 300]"))
     assert "world.coupling" in str(error.value) and error.value.problems[0].line is not None
@@ -107,8 +117,9 @@ def test_what_is_wrong_with_a_sweep_is_told(grid):
         sweep(Config.paper().to_toml())
 
 
-def test_a_table_of_points(grid):
+def test_points_convert_to_a_pandas_table(grid):
     pytest.importorskip("pandas", reason="pandas is not installed")
     table = sweep(grid).to_pandas()
-    assert list(table.columns) == ["point", "world.coupling", "learning.fitness", "trial", "best_g", "mean_g", "champion_g"]
+    axes, measures = ["world.coupling", "learning.fitness"], ["best_g", "mean_g", "champion_g"]
+    assert list(table.columns) == ["point", *axes, "trial", *measures]
     assert len(table) == 4 and np.isfinite(table["best_g"]).all()
