@@ -1,3 +1,5 @@
+"""Tests `train` and `Run`: the same bits and files as the program, resuming, callbacks, interrupts and threads."""
+
 import filecmp
 import json
 import os
@@ -18,41 +20,39 @@ from conftest import random_config
 import flotilla
 from flotilla import Config, Run, train
 
-PAPER = [(layout, paradigm) for layout in ("generally_forward", "strictly_forward", "chaotic") for paradigm in ("leader-follower", "all-leaders")]
-
-
-def same_as_the_program(config, program, tmp_path):
-    """Trains in memory, in a folder and by the program: one digest, and one file of policies."""
+def assert_same_as_the_program(config, program, tmp_path):
+    """Trains with the program, without a directory, and with one, and compares digests, policies and metrics."""
     (tmp_path / "config.toml").write_text(config.to_toml())
     program("train", "config.toml", "--out", "theirs", "--backend", "cpu", "--quiet")
     theirs = Run.open("theirs")
     ours = train(config, backend="cpu", progress=False)
     ours.save("saved")
-    kept = train(config, out="kept", backend="cpu")
-    told = json.loads((tmp_path / "theirs/run.json").read_text())["digest"]
-    assert {ours.digest, kept.digest, theirs.digest, Run.open("saved").digest} == {told}
-    for folder in ("saved", "kept"):
+    with_out = train(config, out="out", backend="cpu")
+    digest = json.loads((tmp_path / "theirs/run.json").read_text())["digest"]
+    assert {ours.digest, with_out.digest, theirs.digest, Run.open("saved").digest} == {digest}
+    for folder in ("saved", "out"):
         assert filecmp.cmp("theirs/policies.safetensors", f"{folder}/policies.safetensors", shallow=False)
         assert filecmp.cmp("theirs/config.toml", f"{folder}/config.toml", shallow=False)
-    for one, other in zip(ours.policies, theirs.policies):
-        assert np.array_equal(one.view(np.uint32), other.view(np.uint32))
+    for our_policies, their_policies in zip(ours.policies, theirs.policies):
+        assert np.array_equal(our_policies.view(np.uint32), their_policies.view(np.uint32))
     for name, values in ours.metrics.items():
         assert np.array_equal(values, theirs.metrics[name])
     assert ours.config == theirs.config == config
 
 
-@pytest.mark.parametrize("layout, paradigm", PAPER)
-def test_the_paper_s_configs_come_to_what_the_program_comes_to(layout, paradigm, program, tmp_path):
+@pytest.mark.parametrize("paradigm", ["leader-follower", "all-leaders"])
+@pytest.mark.parametrize("layout", ["generally_forward", "strictly_forward", "chaotic"])
+def test_the_paper_s_configs_give_the_program_s_results(layout, paradigm, program, tmp_path):
     config = Config.paper(layout, paradigm=paradigm).replace(learning={"generations": 4, "trials": 2})
-    same_as_the_program(config, program, tmp_path)
+    assert_same_as_the_program(config, program, tmp_path)
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_random_configs_come_to_what_the_program_comes_to(seed, program, tmp_path):
-    same_as_the_program(random_config(seed), program, tmp_path)
+def test_random_configs_give_the_program_s_results(seed, program, tmp_path):
+    assert_same_as_the_program(random_config(seed), program, tmp_path)
 
 
-def test_arrays_have_their_shapes(config):
+def test_metrics_and_policies_have_the_documented_shapes(config):
     run = train(config, seed=3)
     assert run.config["learning.seed"] == 3
     for name in ("best_g", "mean_g", "champion_g"):
@@ -60,12 +60,12 @@ def test_arrays_have_their_shapes(config):
     assert [trial.shape for trial in run.policies] == [(4, 20, 112)] * 2
     assert run.policies[0].dtype == np.float32 and run.policies[0].flags.c_contiguous
     assert run.digest != train(config, seed=4).digest
-    again = pickle.loads(pickle.dumps(run))
-    assert again.digest == run.digest and again.config == run.config
+    unpickled = pickle.loads(pickle.dumps(run))
+    assert unpickled.digest == run.digest and unpickled.config == run.config
     assert repr(run).startswith("<flotilla.Run: 2 trials, 6 generations, best G ")
 
 
-def test_the_program_goes_on_with_what_was_trained_here(config, program):
+def test_the_program_resumes_runs_of_the_package(config, program):
     train(config, out="run")
     program("train", "run/config.toml", "--out", "run", "--resume", "--generations", "9", "--quiet")
     longer = config.replace(learning={"generations": 9})
@@ -79,15 +79,15 @@ def test_the_program_goes_on_with_what_was_trained_here(config, program):
 
 
 def files_of(folder):
-    """The files of a run by name, without times, paths and who wrote them."""
+    """Returns the content of a run's files by name, without times, paths, and the program that wrote them."""
 
     def content(path):
         data = path.read_bytes()
         if path.name == "metrics.csv":
             return [line.rsplit(b",", 1)[0] for line in data.splitlines()]
         if path.name == "run.json":
-            who = ("started", "updated", "seconds", "command", "commit")
-            return {key: value for key, value in json.loads(data).items() if key not in who}
+            excluded = ("started", "updated", "seconds", "command", "commit")
+            return {key: value for key, value in json.loads(data).items() if key not in excluded}
         if path.parent.name == "checkpoints":
             length = int.from_bytes(data[:8], "little")
             header = json.loads(data[8 : 8 + length])
@@ -100,7 +100,7 @@ def files_of(folder):
 
 
 @pytest.mark.parametrize("method", ["tournament", "openai-es"])
-def test_a_run_has_the_same_files_however_it_was_trained(config, program, tmp_path, method):
+def test_all_ways_to_train_write_the_same_files(config, program, tmp_path, method):
     config = config.replace(learning={"method": method})
     (tmp_path / "config.toml").write_text(config.to_toml())
     program("train", "config.toml", "--out", "theirs", "--backend", "cpu", "--quiet")
@@ -113,26 +113,26 @@ def test_a_run_has_the_same_files_however_it_was_trained(config, program, tmp_pa
     assert {"config.toml", "curves.svg", "metrics.csv", "policies.safetensors", "run.json"} < set(expected)
     longer = train(config.replace(learning={"generations": 16}), backend="cpu").digest
     for folder in copies:
-        found = files_of(folder)
-        assert found.keys() == expected.keys(), folder
+        files = files_of(folder)
+        assert files.keys() == expected.keys(), folder
         for name, content in expected.items():
-            assert found[name] == content, (folder, name)
+            assert files[name] == content, (folder, name)
     for folder in ("theirs", *copies):
-        extended = program("train", f"{folder}/config.toml", "--out", folder, "--resume", "--generations", "16", "--json", "--backend", "cpu")
-        extended = json.loads(extended)
-        # Nothing that was trained before is trained again.
+        arguments = ("--resume", "--generations", "16", "--json", "--backend", "cpu")
+        extended = json.loads(program("train", f"{folder}/config.toml", "--out", folder, *arguments))
+        # Only the ten new generations are trained.
         assert (extended["digest"], extended["trained_generations"]) == (longer, 10), folder
 
 
 @pytest.mark.parametrize("out", [None, "run"])
-def test_a_config_that_is_likely_a_mistake_is_warned_of(config, out):
+def test_implausible_configs_warn(config, out):
     with pytest.warns(RuntimeWarning, match="degrees"):
         train(config.replace(world={"heading": 90.0}), out=out)
     with pytest.warns(RuntimeWarning, match="cannot be reached"):
         train(config.replace(world={"steps": 2}), out=out, force=out is not None)
 
 
-def test_a_folder_is_gone_on_with_or_written_over(config):
+def test_an_existing_run_is_resumed_or_overwritten_only_on_request(config):
     first = train(config, out="run")
     with pytest.raises(FileExistsError, match="run"):
         train(config, out="run")
@@ -149,39 +149,40 @@ def test_a_folder_is_gone_on_with_or_written_over(config):
         train(config, resume=True)
 
 
-def test_a_run_is_whole_without_its_picture(config):
+def test_a_failed_picture_does_not_lose_the_run(config):
     os.makedirs("run/curves.svg/full")
     with pytest.raises(flotilla.Error, match="curves.svg"):
         train(config, out="run")
     assert os.listdir("run") == ["curves.svg"]
-    # A run that resumes is not held up by a picture.
+    # A resumed run only warns about its picture.
     with pytest.warns(RuntimeWarning, match="curves.svg"):
         run = train(config, out="run", resume=True)
     assert Run.open("run").digest == run.digest
 
 
-def test_a_training_starts_from_what_another_came_to(config, program):
+def test_init_starts_from_the_policies_of_another_run(config, program):
     first = train(config, out="first")
     second = config.replace(learning={"fitness": "G", "population": 30, "seed": 9})
     warm = train(second, out="warm", init=first)
-    program("train", "warm/config.toml", "--init", "first/policies.safetensors", "--out", "theirs", "--backend", "cpu", "--quiet")
+    arguments = ("--init", "first/policies.safetensors", "--out", "theirs", "--backend", "cpu", "--quiet")
+    program("train", "warm/config.toml", *arguments)
     assert warm.digest == Run.open("theirs").digest != train(second).digest
     assert train(second, out="again", init="first/policies.safetensors").digest == warm.digest
     assert train(second, out="from memory", init=train(config)).digest == warm.digest
-    # Its generation 0 is kept, so that it is gone on with and replayed without what it started from.
+    # The run stores its generation 0, so it can be resumed and replayed without the initial policies.
     assert train(second, out="warm", resume=True).digest == warm.digest
     assert [episode.generation for episode in warm.replay(compare=0).episodes] == [0, 6]
-    # A copy says what it started from, which it has not.
+    # A copy does not contain its initial policies, so it cannot be replayed.
     warm.save("copy")
     assert Run.open("copy").digest == warm.digest
-    # With the times of the one that it was read from.
+    # It has the times of the original.
     assert filecmp.cmp("copy/metrics.csv", "warm/metrics.csv", shallow=False)
     with pytest.raises(flotilla.Error, match="started from given policies"):
         Run.open("copy").replay()
-    # It keeps the last checkpoint, so that it is extended without what it started from.
+    # It has the last checkpoint, so it can be extended without the initial policies.
     longer = second.replace(learning={"generations": 9})
     assert train(longer, out="copy", resume=True).digest == train(longer, init=first).digest
-    # Without the checkpoint it would start over.
+    # Without the checkpoint, it would have to start again from the initial policies.
     warm.save("bare")
     shutil.rmtree("bare/checkpoints")
     with pytest.raises(flotilla.Error, match="can only start again from these"):
@@ -204,7 +205,8 @@ def test_a_callback_sees_every_generation_and_may_stop(config, out):
     seen = []
 
     def stop_at_three(generation):
-        seen.append((generation.generation, generation.last, generation.best_g, generation.mean_g, generation.champion_g))
+        numbers = generation.generation, generation.last
+        seen.append((*numbers, generation.best_g, generation.mean_g, generation.champion_g))
         return generation.generation == 3
 
     config = config.replace(stages=[{"from": number, "set": {"world.coupling": 2}} for number in (1, 6)])
@@ -223,7 +225,7 @@ def test_a_callback_sees_every_generation_and_may_stop(config, out):
 
 
 @pytest.mark.parametrize("out", [None, "run"])
-def test_a_callback_s_error_comes_through(config, out):
+def test_errors_of_callbacks_are_raised(config, out):
     def fail(generation):
         if generation.generation == 2:
             raise LookupError("mine")
@@ -236,26 +238,26 @@ def test_a_callback_s_error_comes_through(config, out):
         assert train(config, out=out, resume=True).digest == train(config).digest
 
 
-def test_a_callback_costs_less_than_a_fiftieth():
-    """Of a run of 50 teams: what calls take is told by a tiny world's many generations, where it would be seen."""
+def test_a_callback_costs_less_than_two_percent_of_the_paper_s_generations():
+    # The cost of a call is measured with 3001 generations of a tiny world. In a large world, it would be lost in noise.
 
-    def least(config, callback=None):
-        took = []
+    def fastest(config, callback=None):
+        seconds = []
         for _ in range(5):
             start = time.process_time()
             train(config, backend="cpu", callback=callback, progress=False)
-            took.append(time.process_time() - start)
-        return min(took)
+            seconds.append(time.process_time() - start)
+        return min(seconds)
 
     paper = Config.paper()
-    place = {"leaders": [[5, 5]], "followers": [], "pois": [[9, 9]], "coupling": 1, "steps": 1}
-    tiny = paper.replace(world=place, learning={"population": 2, "generations": 3000})
-    call = (least(tiny, lambda generation: None) - least(tiny)) / 3001
-    assert call < 0.02 * least(paper) / 101
+    world = {"leaders": [[5, 5]], "followers": [], "pois": [[9, 9]], "coupling": 1, "steps": 1}
+    tiny = paper.replace(world=world, learning={"population": 2, "generations": 3000})
+    per_call = (fastest(tiny, lambda generation: None) - fastest(tiny)) / 3001
+    assert per_call < 0.02 * fastest(paper) / 101
 
 
-@pytest.mark.skipif(os.name == "nt", reason="signals are another thing there")
-def test_ctrl_c_saves_everything(config, tmp_path):
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for one process")
+def test_ctrl_c_saves_a_run_that_can_resume(config, tmp_path):
     long = config.replace(learning={"generations": 100_000, "population": 50})
     (tmp_path / "config.toml").write_text(long.to_toml())
     script = (
@@ -272,25 +274,29 @@ def test_ctrl_c_saves_everything(config, tmp_path):
             time.sleep(0.05)
         running.send_signal(signal.SIGINT)
         assert running.communicate(timeout=60)[0] == "interrupted\n"
-    told = json.loads((tmp_path / "run/run.json").read_text())
-    assert told["state"] == "stopped" and os.listdir("run/checkpoints")
-    reached = told["generations"]
+    record = json.loads((tmp_path / "run/run.json").read_text())
+    assert record["state"] == "stopped" and os.listdir("run/checkpoints")
+    reached = record["generations"]
     with pytest.raises(flotilla.Error, match="run"):
         Run.open("run")
-    short = []
+    seen = []
 
-    def soon(generation):
-        short.append(generation.generation)
+    def stop_at_once(generation):
+        seen.append(generation.generation)
         return True
 
-    run = train(long, out="run", resume=True, callback=soon)
-    assert short[0] >= reached - 1 > 10
+    run = train(long, out="run", resume=True, callback=stop_at_once)
+    assert seen[0] >= reached - 1 > 10
     assert run.digest == train(run.config, backend="cpu").digest
 
 
-def test_two_threads_train_at_once(config):
+def test_threads_can_train_at_the_same_time(config):
     runs, configs = {}, [config.replace(learning={"seed": seed}) for seed in range(4)]
-    threads = [threading.Thread(target=lambda own=own: runs.update({own["learning.seed"]: train(own)})) for own in configs]
+
+    def run(own):
+        runs[own["learning.seed"]] = train(own)
+
+    threads = [threading.Thread(target=run, args=(own,)) for own in configs]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -299,8 +305,7 @@ def test_two_threads_train_at_once(config):
         assert runs[own["learning.seed"]].digest == train(own).digest
 
 
-def test_other_threads_run_meanwhile(config):
-    """The interpreter is free while teams are trained."""
+def test_training_releases_the_interpreter_lock(config):
     ticks, done = [], threading.Event()
 
     def tick():
@@ -312,13 +317,14 @@ def test_other_threads_run_meanwhile(config):
     thread.start()
     start = time.perf_counter()
     train(config.replace(learning={"generations": 400, "population": 50}), backend="cpu")
-    took = time.perf_counter() - start
+    seconds = time.perf_counter() - start
     done.set()
     thread.join()
-    assert took > 0.05 and len(ticks) > took / 0.05
+    # With the lock free, the thread ticks almost every millisecond. One tick per 50 ms is enough on a busy machine.
+    assert seconds > 0.05 and len(ticks) > seconds / 0.05
 
 
-def test_what_is_no_run_is_told(tmp_path):
+def test_missing_runs_and_invalid_arguments_raise(tmp_path):
     with pytest.raises(flotilla.Error, match="nowhere: no such folder"):
         Run.open("nowhere")
     (tmp_path / "empty").mkdir()
@@ -330,14 +336,14 @@ def test_what_is_no_run_is_told(tmp_path):
         train(Config.paper(), backend="no-such-gpu")
 
 
-def test_metrics_as_a_table(config):
+def test_metrics_convert_to_a_pandas_table(config):
     pandas = pytest.importorskip("pandas", reason="pandas is not installed")
     run = train(config, out="run")
     table, file = run.to_pandas(), pandas.read_csv("run/metrics.csv")
     pandas.testing.assert_frame_equal(table, file.drop(columns="seconds"), check_dtype=False)
 
 
-def test_a_bar_is_drawn(config, monkeypatch):
+def test_progress_uses_a_tqdm_bar(config, monkeypatch):
     auto = pytest.importorskip("tqdm.auto", reason="tqdm is not installed")
     bars = []
 
@@ -354,7 +360,7 @@ def test_a_bar_is_drawn(config, monkeypatch):
     assert len(bars) == 1
 
 
-def test_results_cannot_be_changed_by_accident(config, tmp_path):
+def test_result_arrays_are_read_only_and_save_ignores_replaced_ones(config, tmp_path):
     run = pickle.loads(pickle.dumps(flotilla.train(config)))
     for array in (run.policies[0], run.metrics["best_g"]):
         with pytest.raises(ValueError, match="read-only"):
@@ -365,14 +371,14 @@ def test_results_cannot_be_changed_by_accident(config, tmp_path):
     assert flotilla.Run.open(tmp_path / "run").digest == run.digest
 
 
-def test_the_recorded_command_is_one_that_a_shell_reads(tmp_path):
+def test_the_recorded_command_is_quoted_for_a_shell(tmp_path):
     script = tmp_path / "my script.py"
     script.write_text(
         "import flotilla\n"
         "config = flotilla.Config.paper().replace(learning={'generations': 0, 'trials': 1})\n"
         "flotilla.train(config, out='kept', backend='cpu')\n"
     )
-    words = [str(script), "it's", "$HOME; ls"]
-    subprocess.run([sys.executable, *words], check=True, cwd=tmp_path)
+    arguments = [str(script), "it's", "$HOME; ls"]
+    subprocess.run([sys.executable, *arguments], check=True, cwd=tmp_path)
     command = json.loads((tmp_path / "kept/run.json").read_text())["command"]
-    assert shlex.split(command)[1:] == words
+    assert shlex.split(command)[1:] == arguments
