@@ -1,9 +1,9 @@
-"""Times the Python package against an earlier version, by turns, and prints tables in Markdown.
+"""Compares the speed of two versions of the Python package, and prints tables in Markdown.
 
     python benches/python.py OLD_PYTHON NEW_PYTHON [ROUNDS]
 
 The arguments are interpreters of two environments, each with one version of the package. Both processes stay alive and
-measure each case in turn. Times are of the processor, of all threads, so that other programs disturb less.
+measure each case in alternating rounds. Times are processor times of all threads, so that other programs disturb less.
 """
 
 import statistics
@@ -12,12 +12,15 @@ import sys
 import time
 
 TEAMS = (1, 64, 4096, 65_536)
-# Seconds that one measurement takes at least.
-LEAST = 0.2
+# Minimum seconds per measurement.
+MIN_SECONDS = 0.2
 
 
 def case(name: str):
-    """Returns a function to time, and how many steps or generations one call has, or None if the version lacks it."""
+    """Returns a function to time, and how many steps or generations one call has.
+
+    Returns None if the version does not have the feature.
+    """
     import numpy as np
 
     import flotilla
@@ -56,7 +59,7 @@ def case(name: str):
 
         return coevolve, 51
     policies = rng.normal(size=(4, teams, config.parameters)).astype(np.float32)
-    words = {
+    arguments = {
         "rollout": {},
         "trace": {"trace": True},
         "positions": {"record": ("positions",)},
@@ -64,30 +67,31 @@ def case(name: str):
     }
     call = flotilla.rollout
     if kind == "collect":
-        call, words["collect"] = getattr(flotilla, "collect", None), {}
+        call, arguments["collect"] = getattr(flotilla, "collect", None), {}
     else:
-        words[kind]["backend"] = "cpu"
+        arguments[kind]["backend"] = "cpu"
     try:
-        call(config, policies[:, :1], **{**words[kind], "out": None} if kind == "written" else words[kind])
+        call(config, policies[:, :1], **{**arguments[kind], "out": None} if kind == "written" else arguments[kind])
     except TypeError:
         return None
-    return lambda: call(config, policies, **words[kind]), 1
+    return lambda: call(config, policies, **arguments[kind]), 1
 
 
 def work() -> None:
-    """Measures the cases that come in, one per line. Prints microseconds, or nan for what this version lacks."""
-    made = {}
+    """Reads names of cases, one per line, and prints the microseconds of each. Prints nan if a version lacks one."""
+    cases = {}
     for line in sys.stdin:
         name = line.strip()
-        if name not in made:
-            made[name] = case(name)
-            if made[name]:
-                made[name][0]()
+        if name not in cases:
+            cases[name] = case(name)
+            if cases[name]:
+                # Warm up.
+                cases[name][0]()
         spent = float("nan")
-        if made[name]:
-            call, parts = made[name]
+        if cases[name]:
+            call, parts = cases[name]
             calls, start, began = 0, time.process_time(), time.perf_counter()
-            while not calls or time.perf_counter() - began < LEAST:
+            while not calls or time.perf_counter() - began < MIN_SECONDS:
                 call()
                 calls += 1
             spent = (time.process_time() - start) / calls / parts * 1e6
@@ -95,9 +99,9 @@ def work() -> None:
 
 
 def main(old: str, new: str, rounds: int = 7) -> None:
-    words = [sys.executable, __file__, "--work"]
     workers = [
-        subprocess.Popen([python, *words[1:]], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) for python in (old, new)
+        subprocess.Popen([python, __file__, "--work"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        for python in (old, new)
     ]
 
     def ask(worker: subprocess.Popen, name: str) -> float:
@@ -106,8 +110,9 @@ def main(old: str, new: str, rounds: int = 7) -> None:
         return float(worker.stdout.readline())
 
     def ratio(a: list[float], b: list[float]) -> str:
-        found = [one / other for one, other in zip(a, b)]
-        return "" if found[0] != found[0] else f"{statistics.median(found):.2f}"
+        ratios = [x / y for x, y in zip(a, b)]
+        # nan is not equal to itself.
+        return "" if ratios[0] != ratios[0] else f"{statistics.median(ratios):.2f}"
 
     def number(values: list[float]) -> str:
         return "" if values[0] != values[0] else f"{statistics.median(values):,.1f}"
@@ -118,15 +123,17 @@ def main(old: str, new: str, rounds: int = 7) -> None:
         kinds = [(0, name), (1, name), *([(1, f"{name} reused")] if name.startswith("step") else [])]
         turns = [[ask(workers[which], kind) for which, kind in kinds] for _ in range(rounds)]
         before, now, *reused = map(list, zip(*turns))
-        print(f"| {name} | {number(before)} | {number(now)} | {ratio(now, before)} | {ratio(*reused, before) if reused else ''} |")
+        reused_ratio = ratio(*reused, before) if reused else ""
+        print(f"| {name} | {number(before)} | {number(now)} | {ratio(now, before)} | {reused_ratio} |")
     print("\n| | before | now |\n|---|---|---|")
-    pairs = [(f"{kind} {teams}", f"rollout {teams}") for teams in (64, 4096) for kind in ("trace", "positions", "written", "collect")]
+    kinds = ("trace", "positions", "written", "collect")
+    pairs = [(f"{kind} {teams}", f"rollout {teams}") for teams in (64, 4096) for kind in kinds]
     for kind, base in [*pairs, ("own 50", "train 50"), ("asked 50", "train 50")]:
-        found = []
+        cells = []
         for worker in workers:
             turns = [[ask(worker, name) for name in (kind, base)] for _ in range(rounds)]
-            found.append(ratio(*map(list, zip(*turns))))
-        print(f"| {kind} / {base} | {' | '.join(found)} |", flush=True)
+            cells.append(ratio(*map(list, zip(*turns))))
+        print(f"| {kind} / {base} | {' | '.join(cells)} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
-//! What stepping takes of a rollout: the same steps of the same teams as whole episodes, as whole episodes with the smallest
-//! network there is, and by [`Stepper`], by turns.
+//! Compares the speed of stepping with that of rollouts. The same teams play the same steps as rollouts, as rollouts
+//! with the smallest possible network, and with [`Stepper`], in alternating rounds.
 //!
 //! ```text
 //! cargo bench --bench stepping [-- CONFIG [TEAMS [ROUNDS]]]
 //! ```
 //!
-//! Leaders answer the same at every step, each by its own draw, so that a network of any size plays the very same episodes;
-//! what a network takes does not depend on its weights.
+//! The output of each leader is constant, and drawn per leader. Networks of any size therefore play the same episodes.
+//! The time that a network takes does not depend on its weights.
 
 use std::error::Error;
 use std::path::Path;
@@ -20,14 +20,14 @@ use flotilla::evolve::{Key, Purpose, random_policy};
 use flotilla::stepping::Stepper;
 use flotilla::world::{OUTPUTS, World};
 
-/// Least time that one measurement takes.
-const LEAST: Duration = Duration::from_millis(150);
+/// Minimum time per measurement.
+const MIN_TIME: Duration = Duration::from_millis(150);
 
 fn main() -> Result<(), Box<dyn Error>> {
-    let words: Vec<String> = std::env::args().skip(1).filter(|word| word != "--bench").collect();
-    let config = Config::load(Path::new(words.first().map_or("configs/generally_forward.toml", |word| word)))?;
-    let teams: usize = words.get(1).map_or(Ok(4096), |word| word.parse())?;
-    let rounds: usize = words.get(2).map_or(Ok(9), |word| word.parse())?;
+    let arguments: Vec<String> = std::env::args().skip(1).filter(|argument| argument != "--bench").collect();
+    let config = Config::load(Path::new(arguments.first().map_or("configs/generally_forward.toml", |path| path)))?;
+    let teams: usize = arguments.get(1).map_or(Ok(4096), |number| number.parse())?;
+    let rounds: usize = arguments.get(2).map_or(Ok(9), |number| number.parse())?;
     for level in Cpu::levels().into_iter().filter(|level| ["AVX2", "AVX-512", "NEON"].contains(&level_name(*level))) {
         measure(&config, level, teams, rounds)?;
     }
@@ -39,8 +39,7 @@ fn measure(config: &Config, level: Level, teams: usize, rounds: usize) -> Result
     small.policy.hidden.clear();
     let (world, small) = (World::new(config), World::new(&small));
     let leaders = world.leaders();
-    let of = |world: &World| constant(world, teams, config.learning.seed);
-    let weights = [of(&world), of(&small)];
+    let weights = [&world, &small].map(|world| constant(world, teams, config.learning.seed));
     let order: Vec<u32> = (0..teams as u32).flat_map(|team| vec![team; leaders]).collect();
     let group = |world, weights| Group {
         world,
@@ -55,9 +54,10 @@ fn measure(config: &Config, level: Level, teams: usize, rounds: usize) -> Result
     let mut cpu = Cpu::at_level(level);
     let mut rollout = |group| cpu.play(&[group]).map(|scores| _ = std::hint::black_box(scores));
 
-    let mut first = world.clone();
-    first.constants.steps = 1;
-    let trace = Cpu::default().trace(&Group { world: &first, starts: &world.starts, ..groups[0] })?;
+    // A trace of one step gives the constant outputs, which the stepper gets as actions.
+    let mut one_step = world.clone();
+    one_step.constants.steps = 1;
+    let trace = Cpu::default().trace(&Group { world: &one_step, starts: &world.starts, ..groups[0] })?;
     let actions: Vec<f32> = (0..teams)
         .flat_map(|team| (0..leaders).map(move |leader| (team, leader)))
         .flat_map(|(team, leader)| trace.moment(1, team, leader).outputs)
@@ -83,16 +83,17 @@ fn measure(config: &Config, level: Level, teams: usize, rounds: usize) -> Result
         rows[2].push(time(|| steps(false))?);
         rows[3].push(time(|| steps(true))?);
     }
-    println!("{}, {teams} teams, {rounds} rounds: ns an agent-step, share of the first", level_name(level));
-    let names = ["rollout", "rollout without hidden units", "stepping", "stepping, and everyone's states"];
+    println!("{}, {teams} teams, {rounds} rounds: ns per agent-step, relative to the first", level_name(level));
+    let names = ["rollout", "rollout without hidden units", "stepping", "stepping, and reading all states"];
     for (name, row) in names.into_iter().zip(&rows) {
-        let shares = row.iter().zip(&rows[0]).map(|(time, whole)| time / whole);
+        let shares = row.iter().zip(&rows[0]).map(|(time, rollout)| time / rollout);
         println!("  {name:<34}{:>6.2}{:>7.2}", median(row.clone()) / agent_steps * 1e9, median(shares.collect()));
     }
     Ok(())
 }
 
-/// Policies that answer the same whatever they sense, `[leaders][teams][parameters]`: all weights 0 but the outputs' biases.
+/// Returns policies with constant outputs, `[leaders][teams][parameters]`. All weights are 0 except the biases of the
+/// outputs.
 fn constant(world: &World, teams: usize, seed: u64) -> Vec<f32> {
     let (key, parameters) = (Key::new(seed, 0, Purpose::Weights), world.parameters());
     let inputs = world.constants.policy.widths[world.constants.policy.layers as usize - 1] as usize;
@@ -107,10 +108,10 @@ fn constant(world: &World, teams: usize, seed: u64) -> Vec<f32> {
     weights
 }
 
-/// Seconds of one call.
+/// Returns the seconds per call.
 fn time(mut call: impl FnMut() -> Result<(), Box<dyn Error>>) -> Result<f64, Box<dyn Error>> {
     let (start, mut calls) = (Instant::now(), 0);
-    while calls == 0 || start.elapsed() < LEAST {
+    while calls == 0 || start.elapsed() < MIN_TIME {
         call()?;
         calls += 1;
     }

@@ -1,9 +1,10 @@
-// Plays flotilla's episode in a plain C++ loop: one team at a time, teams shared out among OpenMP threads.
+// Plays flotilla's episode in a plain C++ loop: one team at a time per OpenMP thread.
 //
 //   g++ -O3 -march=native -ffast-math -fopenmp -o episode episode.cpp
 //   ./episode LAYOUT TEAMS REPEATS [SEED]
 //
-// Prints one JSON line. Drawing the weights is not timed; the episode and the scores G, D and Df of every leader are.
+// Prints one JSON line. The time includes the episode and the scores G, D and Df of every leader, but not drawing the
+// weights.
 
 #include <algorithm>
 #include <bit>
@@ -16,12 +17,12 @@
 
 #include "world.h"
 
-// One team's state and what credit needs of its episode. Made once per thread, used for one team after the other.
+// A team's state, and the records of an episode for its credits. Each thread has one, and reuses it for all its teams.
 struct Team {
     std::vector<float> x, y, hx, hy, speed;         // state: position, heading (a unit vector), speed
-    std::vector<float> turn, wanted_speed;          // what each agent decided in this step
-    std::vector<int> seen;                          // [followers][leaders]: steps at which the follower saw the leader
-    std::vector<uint32_t> sets;                     // [steps][pois]: who was near, a bit an agent
+    std::vector<float> turn, wanted_speed;          // the decisions of this step
+    std::vector<int> seen;                          // [followers][leaders]: steps in which the follower saw the leader
+    std::vector<uint32_t> sets;                     // [steps][pois]: the agents near each POI, one bit per agent
 
     explicit Team(const World& w)
         : x(w.agents), y(w.agents), hx(w.agents), hy(w.agents), speed(w.agents), turn(w.agents), wanted_speed(w.agents),
@@ -37,8 +38,8 @@ struct Team {
     }
 };
 
-// Adds an entity at (rx, ry) from a leader with heading (hx, hy) to the quadrant it lies in:
-// back-right, front-right, front-left, back-left.
+// Adds an entity at offset (rx, ry) to the density of its quadrant, for a leader with heading (hx, hy). The quadrants
+// are back right, front right, front left, and back left.
 inline void sense(float rx, float ry, float hx, float hy, float range, float* quadrants) {
     float d = std::sqrt(rx * rx + ry * ry);
     if (d > range) return;
@@ -77,7 +78,7 @@ void lead(const World& w, Team& team, int i, const float* weights) {
     team.wanted_speed[i] = (outputs[1] + 1) / 2 * MAX_SPEED;
 }
 
-// The push of the two walls of one axis on an agent at that coordinate.
+// Returns the push of the two walls of one axis on an agent at this coordinate.
 inline float wall_push(float at, bool& near) {
     float push = 0;
     if (at <= REPULSION_RADIUS) {
@@ -161,7 +162,7 @@ void couple(const World& w, Team& team, int step) {
     }
 }
 
-// Observed POIs / P with the agents of `removed` taken out of every set.
+// Returns the share of observed POIs without the agents of `removed`.
 float score(const World& w, const Team& team, uint32_t removed) {
     int observed = 0;
     for (int p = 0; p < w.pois; ++p)
@@ -173,7 +174,8 @@ float score(const World& w, const Team& team, uint32_t removed) {
     return float(observed) / w.pois;
 }
 
-// Each leader together with its followers, a bit an agent: a follower belongs to the leader it saw most often.
+// Sets the group of each leader: itself and its followers, one bit per agent. A follower belongs to the leader that it
+// saw most often.
 void assign(const World& w, const Team& team, uint32_t* groups) {
     for (int i = 0; i < w.leaders; ++i) groups[i] = 1u << i;
     for (int f = 0; f < w.followers; ++f) {

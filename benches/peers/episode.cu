@@ -1,15 +1,15 @@
-// Plays flotilla's episode in one hand-written persistent CUDA kernel: the ceiling for an NVIDIA GPU.
+// Plays flotilla's episode in one hand-written persistent CUDA kernel, as an upper bound of the speed of an NVIDIA GPU.
 //
 //   nvcc -std=c++17 -O3 -arch=native --use_fast_math -o episode_cuda episode.cu
 //   ./episode_cuda LAYOUT TEAMS REPEATS [SEED]
 //
-// NOT RUN ON A GPU: the machine it was written on has none. It compiles for sm_90 without spills (nvcc 13, 43 to 64
-// registers a thread), and played with a CPU thread for every GPU thread it gave the C++ peer's mean scores.
+// NEVER RUN ON A GPU, because none was available. It compiles for sm_90 without spills (nvcc 13, 43 to 64 registers per
+// thread). Emulated with one CPU thread per GPU thread, it gave the C++ peer's mean scores.
 //
-// A block plays 32 teams. A warp is one agent's part in all 32, so leaders and followers never share a warp, and lane l
-// of every warp is the same team. Headings and speeds live in registers; positions, weights and the sets of agents near
-// each POI live in shared memory for the whole episode. Global memory sees weights in and scores out, once.
-// As in the C++ peer, drawing the weights is not timed, and neither is their upload.
+// A block plays 32 teams. Each warp is one agent in all 32 teams, so leaders and followers never share a warp, and lane
+// l of every warp is the same team. Headings and speeds are in registers. Positions, weights and the sets of agents
+// near each POI stay in shared memory for the whole episode. Weights are read from global memory once, and scores are
+// written once. Drawing and uploading the weights is not timed.
 
 #include <algorithm>
 #include <cstdio>
@@ -19,17 +19,17 @@
 #include "world.h"
 
 constexpr int LANES = 32;
-constexpr int PITCH = LANES + 1;  // keeps both the transposing store and the loads free of bank conflicts
+constexpr int PITCH = LANES + 1;  // avoids bank conflicts in the transposing store and in the loads
 
 __constant__ float start_x[32], start_y[32], poi_x[4], poi_y[4];
 
-// Most of a block's shared memory: `weights[(leader * WEIGHTS + weight) * PITCH + lane]`.
+// A block's shared memory. `weights` has the index `(leader * WEIGHTS + weight) * PITCH + lane`.
 template <int L, int F, int P, int T>
 struct Shared {
     float weights[L * WEIGHTS * PITCH];
     float x[L + F][LANES], y[L + F][LANES];
     unsigned sets[T][P][LANES];
-    unsigned groups[L][LANES];  // each leader and the followers assigned to it, a bit an agent
+    unsigned groups[L][LANES];  // each leader and its followers, one bit per agent
 };
 
 __device__ inline void sense(float rx, float ry, float d, float hx, float hy, float* quadrants) {
@@ -106,7 +106,7 @@ __device__ void follow(const Shared<L, F, P, T>& team, int i, int lane, float hx
     wanted = alone ? speed : along > 0 || size == 0 ? size : MIN_SPEED;
 }
 
-// G of this lane's team with the agents of `removed` taken out of every set.
+// Returns G of this lane's team without the agents of `removed`.
 template <int C, int L, int F, int P, int T>
 __device__ float score(const Shared<L, F, P, T>& team, int lane, unsigned removed) {
     int observed = 0;
@@ -118,7 +118,7 @@ __device__ float score(const Shared<L, F, P, T>& team, int lane, unsigned remove
     return observed * (1.0f / P);
 }
 
-// weights [teams][L][WEIGHTS]; g [teams], d and df [teams][L].
+// Plays all teams. The shapes are weights [teams][L][WEIGHTS], g [teams], and d and df [teams][L].
 template <int L, int F, int P, int T, int C>
 __global__ void __launch_bounds__((L + F) * LANES) play(int teams, const float* weights, float* g, float* d, float* df) {
     extern __shared__ float memory[];
@@ -145,7 +145,7 @@ __global__ void __launch_bounds__((L + F) * LANES) play(int teams, const float* 
         } else {
             follow(team, i, lane, hx, hy, speed, seen, turn, wanted);
         }
-        __syncthreads();  // all have read the state before the step
+        __syncthreads();  // all threads have read the state before the step
 
         float s, c;
         sincosf(fminf(fmaxf(turn, -MAX_TURN), MAX_TURN), &s, &c);
@@ -218,7 +218,7 @@ void run(const char* layout, const World& world, int teams, int repeats, int see
     check(cudaEventCreate(&begin));
     check(cudaEventCreate(&end));
     std::vector<double> rates;
-    for (int repeat = 0; repeat <= repeats; ++repeat) {  // the first warms up
+    for (int repeat = 0; repeat <= repeats; ++repeat) {  // the first repeat warms up
         check(cudaEventRecord(begin));
         kernel<<<(teams + LANES - 1) / LANES, (L + F) * LANES, shared>>>(teams, policies, g, d, df);
         check(cudaGetLastError());

@@ -1,9 +1,9 @@
-"""Plays flotilla's episode, or whole generations of its learning, in jitted JAX: vmap over teams, scan over steps.
+"""Plays flotilla's episode, or whole generations of its training, in jitted JAX: vmap over teams, scan over steps.
 
     python episode_jax.py LAYOUT TEAMS REPEATS [SEED] [--generation] [--platform cpu|gpu]
 
-Prints one JSON line. Compilation and drawing the first weights are not timed. JAX takes the fastest device that it
-finds unless --platform names another.
+Prints one JSON line. Compiling and drawing the first weights are not timed. JAX uses its default device unless
+--platform names another.
 """
 
 import argparse
@@ -52,7 +52,7 @@ def cross(a, b):
 
 
 def sense(offsets, heading, included):
-    """Summed value [L, 4] of the included entities at `offsets` [L, entities, 2] in the four quadrants."""
+    """Returns the density [L, 4] in four quadrants of the included entities at `offsets` [L, entities, 2]."""
     fx, fy = dot(heading[:, None], offsets), cross(heading[:, None], offsets)
     left = (fy > 0) | ((fy == 0) & (fx >= 0))
     front = (fx > 0) | ((fx == 0) & (fy <= 0))
@@ -62,7 +62,7 @@ def sense(offsets, heading, included):
 
 
 def policy(weights, inputs):
-    """Outputs [L, 2] of the nets with `weights` [L, WEIGHTS]."""
+    """Returns the outputs [L, 2] of the networks with `weights` [L, WEIGHTS]."""
     first = weights[:, : (INPUTS + 1) * HIDDEN].reshape(L, INPUTS + 1, HIDDEN)
     second = weights[:, (INPUTS + 1) * HIDDEN :].reshape(L, HIDDEN + 1, OUTPUTS)
     hidden = jnp.tanh(jnp.einsum("li,lih->lh", inputs, first[:, :-1]) + first[:, -1])
@@ -70,6 +70,7 @@ def policy(weights, inputs):
 
 
 def lead(weights, position, heading, offsets):
+    """Returns the wanted turns and speeds of leaders."""
     to_pois = world.pois - position[:L, None]
     in_range = others[:L] & (norm(offsets[:L]) <= AGENT_RANGE)
     inputs = jnp.concatenate(
@@ -80,6 +81,7 @@ def lead(weights, position, heading, offsets):
 
 
 def follow(position, heading, speed, offsets):
+    """Returns the wanted turns and speeds of followers, and which leaders they see."""
     distance = norm(offsets[L:])
     near = others[L:] & (distance <= REPULSION_RADIUS)
     far = others[L:] & (distance > REPULSION_RADIUS) & (distance <= ATTRACTION_RADIUS)
@@ -104,6 +106,7 @@ def follow(position, heading, speed, offsets):
 
 
 def step(weights, state, _):
+    """Moves a team by one step. Returns its state, and which agents are near each POI."""
     position, heading, speed, seen = state
     offsets = position[None] - position[:, None]
     leader_turn, leader_speed = lead(weights, position, heading, offsets)
@@ -120,7 +123,7 @@ def step(weights, state, _):
 
 
 def episode(weights):
-    """G, D [L] and Df [L] of the team with `weights` [L, WEIGHTS]."""
+    """Returns G, D [L] and Df [L] of the team with `weights` [L, WEIGHTS]."""
     start = (
         jnp.asarray(world.starts),
         jnp.tile(jnp.array([0.0, 1.0]), (N, 1)),
@@ -146,7 +149,7 @@ rollout = jax.jit(jax.vmap(episode))
 
 @jax.jit
 def generation(key, populations):
-    """One generation of `populations` [L, teams, WEIGHTS] under D; returns the next and every team's G."""
+    """Plays `populations` [L, teams, WEIGHTS] and selects with D. Returns the next populations and every team's G."""
     teams = populations.shape[1]
     keys = jax.random.split(key, 4)
     order = jax.vmap(lambda k: jax.random.permutation(k, teams))(jax.random.split(keys[0], L))  # [L, teams]

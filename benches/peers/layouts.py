@@ -1,4 +1,4 @@
-"""The paper's layouts and the episode's constants, for the Python peers."""
+"""The paper's layouts and the constants of an episode, for the peers in Python."""
 
 import math
 from dataclasses import dataclass

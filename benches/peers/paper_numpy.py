@@ -1,13 +1,12 @@
-"""The complete paper in vectorised NumPy: both paradigms, three layouts, fitness G, D and Df, trials, generations.
+"""Reproduces the paper's 18 experiments in vectorised NumPy: three layouts, both paradigms, and fitness G, D and Df.
 
     python paper_numpy.py [--batch all|run] [--trials 5] [--generations 100] [--fraction 0.1] [--seed 0] [--json]
     python paper_numpy.py --rollout LAYOUT --teams N [--repeats R] [--seed 0]
 
-One process. The teams of a generation play side by side: the team is the last axis of every array. With --batch all
-those of all trials of an arm (one layout, paradigm and fitness), 250 of the paper's, about what a core's cache holds;
-with --batch run those of one training run at a time, 50. Only the credit that the fitness needs is worked out.
---fraction runs that part of the generations and scales the measured time up to all of them. --rollout times and scores
-random teams only, as the other peers do.
+One process plays many teams at once: the team is the last axis of every array. With --batch all, a batch has the 250
+teams of all trials of an experiment (a layout, paradigm and fitness), which about fill a core's cache. With --batch
+run, it has the 50 teams of one training run. Only the credit that the fitness needs is computed. --fraction runs a part
+of the generations and scales the measured time up. --rollout only times and scores random teams, like the other peers.
 """
 
 import argparse
@@ -27,7 +26,7 @@ FITNESSES = ["G", "D", "Df"]
 
 
 def sense(offsets, heading, pois):
-    """Summed value [8, L, B] by kind and quadrant of the entities at offsets [2, L, pois + agents, B]."""
+    """Returns the densities [8, L, B] of POIs and agents by quadrant, for offsets [2, L, pois + agents, B]."""
     rx, ry = offsets
     hx, hy = heading[:, :, None]
     d2 = rx * rx
@@ -56,7 +55,7 @@ def sense(offsets, heading, pois):
 
 
 def policy(first, second, inputs):
-    """Outputs [L, 2, B] of the nets with weights first [L, 9, 10, B] and second [L, 11, 2, B] on inputs [8, L, B]."""
+    """Returns the outputs [L, 2, B] of networks with the layers first [L, 9, 10, B] and second [L, 11, 2, B]."""
     hidden = np.einsum("klb,lkhb->lhb", inputs, first[:, :-1])
     hidden += first[:, -1]
     np.tanh(hidden, out=hidden)
@@ -66,7 +65,7 @@ def policy(first, second, inputs):
 
 
 def rollout(world, weights, wanted_scores):
-    """Of teams with weights [L, WEIGHTS, B]: G [B], D [L, B] and Df [L, B], the latter two where they are wanted."""
+    """Plays teams with weights [L, WEIGHTS, B]. Returns G [B], D [L, B] and Df [L, B]; D and Df if wanted, or None."""
     L, N, F, P, B = world.leaders, world.agents, world.followers, len(world.pois), weights.shape[-1]
     first = weights[:, : (INPUTS + 1) * HIDDEN].reshape(L, INPUTS + 1, HIDDEN, B)
     second = weights[:, (INPUTS + 1) * HIDDEN :].reshape(L, HIDDEN + 1, OUTPUTS, B)
@@ -77,7 +76,7 @@ def rollout(world, weights, wanted_scores):
     sensed, followed = np.empty((2, L, P + N, B), np.float32), np.empty((2, F, N, B), np.float32)
     turn, wanted = np.empty_like(speed), np.empty_like(speed)
 
-    # Without followers, leaving out a leader and its followers is leaving out a leader.
+    # Without followers, Df equals D.
     want_df = bool(F) and "Df" in wanted_scores
     want_d = "D" in wanted_scores or "Df" in wanted_scores and not want_df
     observed = np.zeros((P, B), bool)
@@ -99,7 +98,7 @@ def rollout(world, weights, wanted_scores):
             if want_df:
                 seen += attracted[:, :L]
             far = attracted ^ near
-            # Everyone is near oneself, at an offset of 0.
+            # Do not count the agent itself, at offset 0.
             near_count = near.view(np.uint8).sum(1, dtype=np.uint8) - np.uint8(1)
             far_count = far.view(np.uint8).sum(1, dtype=np.uint8)
             near_scale = np.float32(REPULSION_GAIN / REPULSION_RADIUS) / np.maximum(near_count, 1).astype(np.float32)
@@ -150,12 +149,12 @@ def rollout(world, weights, wanted_scores):
 
 
 def evolve(random, weights, fitness):
-    """The next policies [runs, L, k, WEIGHTS]: each population's best, and mutated winners of binary tournaments."""
+    """Returns the next policies [runs, L, k, WEIGHTS]: each population's best, and mutated tournament winners."""
     runs, leaders, k = fitness.shape
-    one = random.integers(k, size=(runs, leaders, k - 1))
-    other = random.integers(k - 1, size=one.shape)
-    other += other >= one  # two distinct policies
-    low, high = np.minimum(one, other), np.maximum(one, other)
+    a = random.integers(k, size=(runs, leaders, k - 1))
+    b = random.integers(k - 1, size=a.shape)
+    b += b >= a  # two distinct policies
+    low, high = np.minimum(a, b), np.maximum(a, b)
     first = np.take_along_axis(fitness, low, 2) >= np.take_along_axis(fitness, high, 2)
     parents = np.concatenate([fitness.argmax(2)[..., None], np.where(first, low, high)], axis=2)
     children = chosen(weights, parents)
@@ -166,13 +165,13 @@ def evolve(random, weights, fitness):
 
 
 def chosen(weights, policies):
-    """Policies [runs, L, k, WEIGHTS] by their index in each population."""
+    """Returns the policies [runs, L, k, WEIGHTS] with the given indices in their populations."""
     runs, leaders = policies.shape[:2]
     return weights[np.arange(runs)[:, None, None], np.arange(leaders)[:, None], policies]
 
 
 def train(world, fitness, trials, generations, policies, random):
-    """Best team's G in POIs [trials, generations + 1] of trials side by side; generation 0 is the random start."""
+    """Trains several trials at once. Returns the best team's POIs [trials, generations + 1]; generation 0 is random."""
     L = world.leaders
     populations = random.standard_normal((trials, L, policies, WEIGHTS), np.float32)
     best = np.empty((trials, generations + 1), np.float32)
@@ -191,7 +190,7 @@ def train(world, fitness, trials, generations, policies, random):
 
 
 def curves_of(world, fitness, arguments, generations):
-    """Best team's G in POIs [trials, generations + 1] of all trials, side by side or one after another."""
+    """Trains all trials, at once or one after the other. Returns the best team's POIs [trials, generations + 1]."""
     parts = arguments.trials if arguments.batch == "run" else 1
     seeds = np.random.SeedSequence((arguments.seed, FITNESSES.index(fitness))).spawn(parts)
     randoms = [np.random.default_rng(seed) for seed in seeds]
@@ -200,6 +199,7 @@ def curves_of(world, fitness, arguments, generations):
 
 
 def paper(arguments):
+    """Runs all experiments, and prints the curves and the time."""
     generations = max(1, round(arguments.generations * arguments.fraction))
     rows, seconds = [], 0.0
     for layout in arguments.layouts:
@@ -223,7 +223,7 @@ def paper(arguments):
                     )
             if not arguments.json:
                 print(f"{layout:18} {paradigm:15} {elapsed:.2f} s", flush=True)
-    # Generation 0 only plays, every later one also selects first: generations + 1 episodes.
+    # Generation 0 is played, too, so the number of episodes is generations + 1.
     estimate = seconds * (arguments.generations + 1) / (generations + 1)
     summary = {
         "peer": "numpy",
@@ -237,6 +237,7 @@ def paper(arguments):
 
 
 def random_teams(arguments):
+    """Times and scores random teams."""
     world = make_world(arguments.rollout)
     random, chunk = np.random.default_rng(arguments.seed), 512
     rates = []
@@ -265,11 +266,13 @@ def main():
     parser.add_argument("--trials", type=int, default=5)
     parser.add_argument("--generations", type=int, default=100)
     parser.add_argument("--population", type=int, default=50)
-    parser.add_argument("--fraction", type=float, default=1.0, help="part of the generations to run and time")
-    parser.add_argument("--batch", choices=["run", "all"], default="all", help="what plays side by side: one training run, or all trials")
+    parser.add_argument("--fraction", type=float, default=1.0, help="share of the generations to run and time")
+    parser.add_argument(
+        "--batch", choices=["run", "all"], default="all", help="what is played at once: a training run, or all trials"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--layouts", nargs="+", choices=NAMES, default=NAMES)
-    parser.add_argument("--json", action="store_true", help="one JSON object with every curve")
+    parser.add_argument("--json", action="store_true", help="print one JSON object with all curves")
     parser.add_argument("--rollout", choices=NAMES, metavar="LAYOUT", help="only play random teams of this layout")
     parser.add_argument("--teams", type=int, default=4096)
     parser.add_argument("--repeats", type=int, default=1)

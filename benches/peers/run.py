@@ -1,11 +1,12 @@
-"""Builds the peers that this machine can run, runs them in turns with flotilla, and prints a Markdown table.
+"""Compares the speed of flotilla and the peers that this machine can run, and prints a Markdown table.
 
     python3 benches/peers/run.py [--layouts generally_forward,chaotic] [--teams 4096] [--rounds 5] [--backend cpu]
                                  [--flotilla target/release/flotilla] [--python PATH] [--paper] [--json FILE]
 
-Needs nothing but the standard library. --python names an interpreter that has JAX and NumPy, if this one has not. A peer
-that cannot run here is left out, and the reason is told on standard error. Rounds go A B C A B C, so that a slow spell
-of the machine meets everyone; a ratio is the median over the rounds of flotilla's rate by the peer's of the same round.
+This script needs only the standard library. --python names an interpreter with JAX and NumPy, if this one has none. A
+peer that cannot run here is left out, and the reason is printed to standard error. Rounds have the order A B C A B C,
+so that slow phases of the machine affect all programs alike. Each ratio is the median over rounds of flotilla's rate
+divided by the peer's rate in the same round.
 """
 
 import argparse
@@ -26,28 +27,28 @@ ROLLOUT, GENERATION = "team_steps_per_s", "generation_team_steps_per_s"
 
 
 class Unavailable(Exception):
-    """A peer that cannot be run here, with the reason."""
+    """The reason why a peer cannot run here."""
 
 
-def tell(message):
+def report(message):
     print(message, file=sys.stderr, flush=True)
 
 
 def call(command):
-    """Standard output of `command`."""
+    """Runs a command and returns its standard output."""
     command = [str(word) for word in command]
     try:
-        done = subprocess.run(command, capture_output=True, text=True)
+        finished = subprocess.run(command, capture_output=True, text=True)
     except OSError as error:
         raise Unavailable(f"{command[0]}: {error.strerror}") from error
-    if done.returncode != 0:
-        said = done.stderr.strip().splitlines() or ["no message"]
-        raise Unavailable(f"`{' '.join(command)}` ended with {done.returncode}: {said[-1]}")
-    return done.stdout
+    if finished.returncode != 0:
+        message = finished.stderr.strip().splitlines() or ["no message"]
+        raise Unavailable(f"`{' '.join(command)}` failed with exit code {finished.returncode}: {message[-1]}")
+    return finished.stdout
 
 
 def measure(command):
-    """The JSON object that `command` prints as its last line, or as all of its output."""
+    """Runs a command and returns the JSON object that is its last line, or its whole output."""
     output = call(command).strip()
     for text in (output, output.splitlines()[-1] if output else ""):
         try:
@@ -59,13 +60,13 @@ def measure(command):
 
 def build(compiler, flags, source, binary):
     if shutil.which(compiler) is None:
-        raise Unavailable(f"no {compiler} here")
+        raise Unavailable(f"no {compiler} on this machine")
     call([compiler, *flags, "-o", binary, HERE / source])
     return binary
 
 
 def contenders(options, folder):
-    """Name and command of everything to run; a command is a function of layout and round."""
+    """Returns names and commands of the programs to run. A command is a function of the layout and the round."""
 
     def flotilla():
         if not options.flotilla.exists():
@@ -84,7 +85,7 @@ def contenders(options, folder):
 
     def cuda():
         if shutil.which("nvidia-smi") is None:
-            raise Unavailable("no NVIDIA GPU here")
+            raise Unavailable("no NVIDIA GPU on this machine")
         binary = build(
             "nvcc", ["-std=c++17", "-O3", "-arch=native", "--use_fast_math"], "episode.cu", folder / "episode_cuda"
         )
@@ -98,16 +99,16 @@ def contenders(options, folder):
         ]  # fmt: skip
 
     def jax(platform, *flags):
-        def ready():
+        def prepare():
             call([options.python, "-c", f"import jax; jax.devices({platform!r})"])
             program = [options.python, HERE / "episode_jax.py"]
             return lambda layout, seed: [
                 *program, layout, options.teams, options.repeats, seed, "--platform", platform, *flags
             ]  # fmt: skip
 
-        return ready
+        return prepare
 
-    offered = {
+    programs = {
         "flotilla": flotilla,
         "C++ loop": cpp,
         "JAX on the CPU": jax("cpu"),
@@ -117,25 +118,25 @@ def contenders(options, folder):
         "JAX on the GPU, generation": jax("cuda", "--generation"),
         "CUDA kernel": cuda,
     }
-    able = {}
-    for name, ready in offered.items():
+    commands = {}
+    for name, prepare in programs.items():
         try:
-            able[name] = ready()
+            commands[name] = prepare()
         except Unavailable as reason:
-            tell(f"skipped {name}: {reason}")
-    return able
+            report(f"skipped {name}: {reason}")
+    return commands
 
 
-def rounds(options, layout, able):
-    """Every contender's JSON objects, round by round; one that fails is dropped from all later rounds."""
-    results = {name: [] for name in able}
+def rounds(options, layout, commands):
+    """Returns the JSON objects of every program, by round. A program that fails is left out of all later rounds."""
+    results = {name: [] for name in commands}
     for number in range(options.rounds):
-        for name in [name for name in able if name in results]:
+        for name in [name for name in commands if name in results]:
             try:
-                results[name].append(measure(able[name](layout, number)))
-                tell(f"{layout}, round {number + 1} of {options.rounds}: {name}")
+                results[name].append(measure(commands[name](layout, number)))
+                report(f"{layout}, round {number + 1} of {options.rounds}: {name}")
             except Unavailable as reason:
-                tell(f"dropped {name}: {reason}")
+                report(f"dropped {name}: {reason}")
                 del results[name]
     return results
 
@@ -151,7 +152,7 @@ def ratio(ours, theirs, key):
 
 
 def mean_g(lines):
-    """Mean G of random teams over the rounds, each with its own seed, and the standard error of that mean."""
+    """Returns the mean G of random teams over the rounds, each with its own seed, and the standard error."""
     lines = [line for line in lines if "sd_g" in line]
     if not lines:
         return ""
@@ -163,27 +164,30 @@ def mean_g(lines):
 def table(layout, results, options):
     ours = results.get("flotilla", [])
     if ours:
-        where = ours[0].get("adapter") or options.instructions or "its widest instructions"
-        print(f"\n{layout}, {options.teams} teams; flotilla on {ours[0].get('backend')} ({where})\n")
+        device = ours[0].get("adapter") or options.instructions or "its widest instructions"
+        print(f"\n{layout}, {options.teams} teams; flotilla on {ours[0].get('backend')} ({device})\n")
     else:
         print(f"\n{layout}, {options.teams} teams; without flotilla\n")
     print(
-        "| | rollout, team-steps/s | flotilla is × | generation, team-steps/s | flotilla is × | mean G of random teams |"
+        "| | rollout, team-steps/s | flotilla / peer | generation, team-steps/s | flotilla / peer "
+        "| mean G of random teams |"
     )
     print("|---|---|---|---|---|---|")
     for name, lines in results.items():
         times = ["", ""] if name == "flotilla" else [ratio(ours, lines, key) for key in (ROLLOUT, GENERATION)]
-        print(
-            f"| {name} | {rate(lines, ROLLOUT)} | {times[0]} | {rate(lines, GENERATION)} | {times[1]} | {mean_g(lines)} |"
-        )
+        rollout, generation = rate(lines, ROLLOUT), rate(lines, GENERATION)
+        print(f"| {name} | {rollout} | {times[0]} | {generation} | {times[1]} | {mean_g(lines)} |")
     sys.stdout.flush()
 
 
 def paper(options):
-    """The paper's 18 experiments: flotilla's whole commands, a sweep a layout, by the clock, against the NumPy program
-    scaled up from a tenth."""
+    """Compares the time of the paper's 18 experiments.
+
+    flotilla's time is that of whole commands, one sweep per layout. The NumPy program runs a part of the generations,
+    and scales its time up.
+    """
     grid = '\n[grid]\n"learning.paradigm" = ["leader-follower", "all-leaders"]\n"learning.fitness" = ["G", "D", "Df"]\n'
-    batches = {"all": "all trials of an arm side by side", "run": "one training run at a time"}
+    batches = {"all": "all trials of an experiment at once", "run": "one training run at a time"}
     ours, theirs = [], {batch: [] for batch in batches}
     for number in range(options.rounds):
         with tempfile.TemporaryDirectory() as out:
@@ -198,8 +202,8 @@ def paper(options):
             command = [options.python, HERE / "paper_numpy.py", "--trials", 5, "--fraction", options.fraction]
             seconds.append(measure([*command, "--batch", batch, "--seed", number, "--json"])["paper_seconds"])
         numpy = ", ".join(f"{seconds[-1]:.1f} s ({batch})" for batch, seconds in theirs.items())
-        tell(f"paper, round {number + 1} of {options.rounds}: flotilla {ours[-1]:.2f} s, NumPy {numpy}")
-    print("\n| the paper's 18 experiments | seconds | flotilla is × |\n|---|---|---|")
+        report(f"paper, round {number + 1} of {options.rounds}: flotilla {ours[-1]:.2f} s, NumPy {numpy}")
+    print("\n| the paper's 18 experiments | seconds | peer / flotilla |\n|---|---|---|")
     print(f"| flotilla sweep for each layout, start-up and pictures included | {statistics.median(ours):.2f} | |")
     for batch, seconds in theirs.items():
         times = statistics.median(b / a for a, b in zip(ours, seconds))
@@ -209,18 +213,18 @@ def paper(options):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--layouts", default="generally_forward,chaotic", help="names with commas between them")
+    parser.add_argument("--layouts", default="generally_forward,chaotic", help="comma-separated names")
     parser.add_argument("--teams", type=int, default=4096)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument(
-        "--repeats", type=int, default=3, help="rollouts a peer times in one round; their median counts"
+        "--repeats", type=int, default=3, help="rollouts per peer and round, of which the median counts"
     )
     parser.add_argument("--backend", default="auto", help="flotilla's backend: auto, cpu or gpu")
-    parser.add_argument("--instructions", help="instruction set of flotilla's CPU backend, as SSE2, AVX2 or AVX-512")
+    parser.add_argument("--instructions", help="instruction set of flotilla's CPU backend: SSE2, AVX2 or AVX-512")
     parser.add_argument("--flotilla", type=Path, default=ROOT / "target" / "release" / "flotilla")
     parser.add_argument("--python", default=sys.executable, help="an interpreter with JAX and NumPy")
-    parser.add_argument("--paper", action="store_true", help="time the complete paper instead")
-    parser.add_argument("--fraction", type=float, default=0.1, help="part of the paper that NumPy runs")
+    parser.add_argument("--paper", action="store_true", help="time the paper's experiments instead")
+    parser.add_argument("--fraction", type=float, default=0.1, help="share of the generations that NumPy runs")
     parser.add_argument("--json", type=Path, help="also write every measurement to this file")
     options = parser.parse_args()
     layouts = options.layouts.split(",")
@@ -233,13 +237,13 @@ def main():
         except Unavailable as reason:
             sys.exit(f"error: {reason}")
     with tempfile.TemporaryDirectory() as folder:
-        able = contenders(options, Path(folder))
-        everything = {}
+        commands = contenders(options, Path(folder))
+        results = {}
         for layout in layouts:
-            everything[layout] = rounds(options, layout, able)
-            table(layout, everything[layout], options)
+            results[layout] = rounds(options, layout, commands)
+            table(layout, results[layout], options)
     if options.json:
-        options.json.write_text(json.dumps(everything, indent=1))
+        options.json.write_text(json.dumps(results, indent=1))
 
 
 main()

@@ -1,9 +1,10 @@
-"""The paper's training by evosax on `episode_jax.py`'s episode, beside `flotilla.train`, by turns.
+"""Compares the speed of `flotilla.train` and of training with evosax on the episode of `episode_jax.py`.
 
     python train_evosax.py LAYOUT TEAMS ROUNDS [SEED] [--platform cpu]
 
-Five trials of 100 generations by Df, all of a training jitted as one: a genetic algorithm of evosax a leader and trial, as
-many policies each as there are teams. Compiling is not timed. Needs `evosax` and `flotilla`.
+Trains five trials of 100 generations with Df, in alternating rounds. evosax has one genetic algorithm per leader and
+trial, each with as many policies as there are teams. A whole training is jitted, and compiling is not timed. Needs
+`evosax` and `flotilla`.
 """
 
 import json
@@ -21,8 +22,8 @@ TRIALS, GENERATIONS = 5, 100
 teams = arguments.teams
 strategy = SimpleGA(teams, jnp.zeros(WEIGHTS))
 params = strategy.default_params
-each = jax.vmap(jax.vmap(strategy.ask, (0, 0, None)), (0, 0, None))
-told = jax.vmap(jax.vmap(strategy.tell, (0, 0, 0, 0, None)), (0, 0, 0, 0, None))
+ask_all = jax.vmap(jax.vmap(strategy.ask, (0, 0, None)), (0, 0, None))
+tell_all = jax.vmap(jax.vmap(strategy.tell, (0, 0, 0, 0, None)), (0, 0, 0, 0, None))
 
 
 def keys(key):
@@ -30,22 +31,22 @@ def keys(key):
 
 
 def credits(populations):
-    """G [TRIALS, teams] and Df [TRIALS, L, teams] of populations [TRIALS, L, teams, WEIGHTS]."""
+    """Returns G [TRIALS, teams] and Df [TRIALS, L, teams] of populations [TRIALS, L, teams, WEIGHTS]."""
     g, _, df = rollout(populations.swapaxes(1, 2).reshape(TRIALS * teams, L, WEIGHTS))
     return g.reshape(TRIALS, teams), df.reshape(TRIALS, teams, L).swapaxes(1, 2)
 
 
 def generation(state, key):
     ask, tell = jax.random.split(key)
-    populations, state = each(keys(ask), state, params)
+    populations, state = ask_all(keys(ask), state, params)
     g, df = credits(populations)
-    state, _ = told(keys(tell), populations, -df, state, params)
+    state, _ = tell_all(keys(tell), populations, -df, state, params)
     return state, g.max(axis=1)
 
 
 @jax.jit
 def training(key):
-    """The best team's G of every generation and trial."""
+    """Returns the best team's G, [GENERATIONS, TRIALS]."""
     first, begin, rest = jax.random.split(key, 3)
     populations = jax.random.normal(first, (TRIALS, L, teams, WEIGHTS))
     start = jax.vmap(jax.vmap(strategy.init, (0, 0, 0, None)), (0, 0, 0, None))
@@ -53,10 +54,11 @@ def training(key):
     return jax.lax.scan(generation, state, jax.random.split(rest, GENERATIONS))[1]
 
 
-def timed(act):
-    begin, spent = time.perf_counter(), time.process_time()
-    found = act()
-    return time.perf_counter() - begin, time.process_time() - spent, found
+def timed(call):
+    """Calls a function. Returns the seconds, the seconds of processor time, and its result."""
+    begin, begin_processor = time.perf_counter(), time.process_time()
+    result = call()
+    return time.perf_counter() - begin, time.process_time() - begin_processor, result
 
 
 def main():
@@ -73,11 +75,11 @@ def main():
     for name, rounds in (("flotilla", ours), ("evosax", theirs)):
         line[name] = {
             "seconds": statistics.median(wall for wall, _, _ in rounds),
-            "processor_seconds": statistics.median(spent for _, spent, _ in rounds),
+            "processor_seconds": statistics.median(processor for _, processor, _ in rounds),
             "pois_of_best_team": statistics.mean(float(best.mean()) * P for _, _, best in rounds),
         }
-    for what in ("seconds", "processor_seconds"):
-        line[f"times_{what}"] = statistics.median(b[at] / a[at] for a, b in zip(ours, theirs) for at in [what != "seconds"])
+    for index, name in enumerate(("seconds", "processor_seconds")):
+        line[f"times_{name}"] = statistics.median(b[index] / a[index] for a, b in zip(ours, theirs))
     print(json.dumps(line))
 
 

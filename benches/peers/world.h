@@ -1,4 +1,4 @@
-// The world of the paper's layouts, leader-follower paradigm, for the C++ and the CUDA peer.
+// The worlds of the paper's layouts, in the leader-follower paradigm, for the C++ and the CUDA peer.
 #pragma once
 
 #include <cmath>
@@ -14,7 +14,7 @@ constexpr float OBSERVATION_RADIUS = 5, AGENT_RANGE = 5;  // POIs are sensed at 
 constexpr float ATTRACTION_RADIUS = 5, REPULSION_RADIUS = 1;
 constexpr float ATTRACTION_GAIN = 5, REPULSION_GAIN = 1, WALL_GAIN = 1;
 
-// The policy: 8 inputs, 10 hidden units, 2 outputs, the bias as the last row of each layer.
+// The policy has 8 inputs, 10 hidden units and 2 outputs. The biases are the last row of each layer.
 constexpr int INPUTS = 8, HIDDEN = 10, OUTPUTS = 2;
 constexpr int WEIGHTS = (INPUTS + 1) * HIDDEN + (HIDDEN + 1) * OUTPUTS;
 
@@ -25,7 +25,7 @@ struct World {
     std::vector<float> poi_x, poi_y;
 };
 
-// Builds the layout of that name; false if there is none.
+// Builds the layout with this name. Returns false if there is none.
 inline bool make_world(const std::string& layout, World& world) {
     std::vector<float> groups = {10, 20, 30, 40};
     std::vector<std::vector<float>> offsets = {{2, -3}, {-2, -3}};
