@@ -1,9 +1,9 @@
-// Trains in Node what the page trains, by its own worker, and compares the digests with the program's and with those of
-// tests/golden.txt.
+// Compares the page's digests with those of the program and of tests/golden.txt.
 //
 //     node web/golden.mjs PAGE FLOTILLA
 //
-// PAGE is the index.html that web/build makes.
+// PAGE is the index.html that web/build writes, and FLOTILLA the program. The page's own worker trains, in Node. Also
+// tests the page's opening episode, teammates in drive mode, and that the program can resume the page's runs.
 
 import assert from "node:assert/strict";
 import { execFileSync } from "node:child_process";
@@ -18,13 +18,14 @@ const [page, flotilla] = process.argv.slice(2);
 const text = contents(page);
 const source = name => readFileSync(new URL(name, import.meta.url), "utf8");
 
-const player = await Player.of(text);
+const player = await Player.start(text);
 const { words: machine } = await player.ask({ ask: "open", gpu: false, pass: null });
 assert.equal(machine.description, "cpu (SIMD128, 1 thread)");
 
 const SMALL = [["learning.trials", "2"], ["learning.generations", "8"], ["learning.population", "20"]];
-async function digest(layout, changes) {
-  const { words } = await player.ask({ ask: "resolve", text: text(`layout-${layout}`), name: layout, changes: [...SMALL, ...changes] });
+async function train_in_page(layout, changes) {
+  const question = { ask: "resolve", text: text(`layout-${layout}`), name: layout, changes: [...SMALL, ...changes] };
+  const { words } = await player.ask(question);
   const training = new Training([{ ...words, name: "web", label: layout, command: "" }], machine);
   await training.start([player]);
   await training.play(() => Infinity, () => {});
@@ -32,21 +33,26 @@ async function digest(layout, changes) {
   return { toml: words.toml, digest: training.arms[0].digest, zip: training.arms[0].zip };
 }
 
-const golden = Object.fromEntries(source("../tests/golden.txt").split("\n").map(line => line.split(/\s+/)).map(words => [words[0], words[2]]));
+const rows = source("../tests/golden.txt").split("\n").map(line => line.split(/\s+/));
+const golden = Object.fromEntries(rows.map(([name, , digest]) => [name, digest]));
 for (const [name, layout, changes] of [
   ["generally-forward", "generally_forward", []],
   ["strictly-forward", "strictly_forward", [["learning.fitness", "'D++'"]]],
   ["chaotic", "chaotic", [["learning.fitness", "'G'"]]],
 ]) {
-  assert.equal((await digest(layout, changes)).digest, golden[name], `golden digest ${name}`);
+  assert.equal((await train_in_page(layout, changes)).digest, golden[name], `golden digest ${name}`);
   console.log(`${name}: the golden digest`);
 }
 
-// Not `equal`, which would print both episodes whole.
-assert.ok(await opening(player, text) === source("page/opening.json"), "the opening is another episode: node web/opening.mjs web/dist/index.html, then web/build");
-console.log("the opening is what training gives");
+// `equal` would print both episodes if they differ.
+assert.ok(
+  await opening(player, text) === source("page/opening.json"),
+  "web/page/opening.json is out of date: run node web/opening.mjs web/dist/index.html, then web/build",
+);
+console.log("web/page/opening.json is current");
 
-// Whoever takes a leader plays with teammates that do what they learned.
+// If the user drives one leader, the other leaders follow their trained policies. Compare their headings after one
+// step.
 const { words: resolved } = await player.ask({ ask: "resolve", text: text("layout-generally_forward"), name: "", changes: SMALL });
 const trained = new Training([{ ...resolved, label: "", command: "" }], machine);
 await trained.start([player]);
@@ -58,35 +64,40 @@ const { agents, headings } = whole.episodes[0], after = numbers(headings).slice(
 await player.ask({ ask: "drive", text: resolved.toml, leader: 0, policies: 1 }, weights);
 const { words: driven } = await player.ask({ ask: "step", turn: 0, speed: 0 });
 for (const leader of [1, 2, 3])
-  for (const axis of [0, 1]) assert.ok(Math.abs(driven.headings[2 * leader + axis] - after[2 * leader + axis]) < 1e-3, `leader ${leader} does not do what it learned`);
-console.log("teammates do what they learned");
+  for (const axis of [0, 1]) {
+    const difference = driven.headings[2 * leader + axis] - after[2 * leader + axis];
+    assert.ok(Math.abs(difference) < 1e-3, `leader ${leader} does not follow its policy`);
+  }
+console.log("teammates follow their policies");
 
 const folder = mkdtempSync(join(tmpdir(), "flotilla-web-"));
 try {
   for (const layout of ["generally_forward", "strictly_forward", "chaotic"]) {
     for (const paradigm of ["leader-follower", "all-leaders"]) {
-      const { toml, digest: found } = await digest(layout, [["learning.paradigm", `'${paradigm}'`], ["learning.seed", "7"]]);
+      const changes = [["learning.paradigm", `'${paradigm}'`], ["learning.seed", "7"]];
+      const { toml, digest } = await train_in_page(layout, changes);
       const config = join(folder, "config.toml"), out = join(folder, `${layout}-${paradigm}`);
       writeFileSync(config, toml);
-      execFileSync(flotilla, ["train", config, "--out", out, "--quiet", "--backend", "cpu"], { stdio: ["ignore", "ignore", "inherit"] });
-      assert.equal(found, JSON.parse(readFileSync(join(out, "run.json"), "utf8")).digest, `${layout}, ${paradigm}`);
+      const stdio = ["ignore", "ignore", "inherit"];
+      execFileSync(flotilla, ["train", config, "--out", out, "--quiet", "--backend", "cpu"], { stdio });
+      assert.equal(digest, JSON.parse(readFileSync(join(out, "run.json"), "utf8")).digest, `${layout}, ${paradigm}`);
       console.log(`${layout}, ${paradigm}: the program's digest`);
     }
   }
   for (const method of ["tournament", "openai-es"]) {
-    const { toml, digest: found, zip } = await digest("chaotic", [["learning.method", `'${method}'`]]);
+    const { toml, digest, zip } = await train_in_page("chaotic", [["learning.method", `'${method}'`]]);
     const [config, archive, run] = ["config.toml", "run.zip", "web-chaotic"].map(name => join(folder, name));
     rmSync(run, { recursive: true, force: true });
     writeFileSync(config, toml);
     writeFileSync(archive, zip);
     execFileSync("python3", ["-m", "zipfile", "-e", archive, folder]);
-    assert.equal(JSON.parse(readFileSync(join(run, "run.json"), "utf8")).digest, found);
-    const train = (config, out, ...flags) => JSON.parse(execFileSync(
-      flotilla, ["train", config, "--out", join(folder, out), "--generations", "18", "--json", "--quiet", "--backend", "cpu", ...flags],
-    ));
+    assert.equal(JSON.parse(readFileSync(join(run, "run.json"), "utf8")).digest, digest);
+    const more = ["--generations", "18", "--json", "--quiet", "--backend", "cpu"];
+    const train = (config, out, ...flags) =>
+      JSON.parse(execFileSync(flotilla, ["train", config, "--out", join(folder, out), ...more, ...flags]));
     const extended = train(join(run, "config.toml"), "web-chaotic", "--resume");
-    assert.equal(extended.digest, train(config, `straight-${method}`).digest, method);
-    assert.equal(extended.trained_generations, 10, `${method}: generations are trained again`);
+    assert.equal(extended.digest, train(config, `uninterrupted-${method}`).digest, method);
+    assert.equal(extended.trained_generations, 10, `${method}: generations were trained again`);
     console.log(`${method}: the program extends the page's run without training again`);
   }
 } finally {

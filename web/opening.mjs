@@ -1,8 +1,9 @@
-// Writes web/page/opening.json: the episode with which the page opens, of the best team of the gallery's first experiment.
+// Writes web/page/opening.json: the episode that the page shows first, played by the best team of the gallery's first
+// experiment.
 //
 //     node web/opening.mjs PAGE
 //
-// PAGE is an index.html that web/build makes. web/golden.mjs tests that the file is what training gives.
+// PAGE is the index.html that web/build writes. web/golden.mjs tests that the file is current.
 
 import { writeFileSync } from "node:fs";
 import { Player, contents } from "./player.mjs";
@@ -10,16 +11,18 @@ import { Player, contents } from "./player.mjs";
 const TRIAL = 0;
 
 export async function opening(player, text) {
-  const { words } = await player.ask({ ask: "resolve", text: text("gallery-two_groups"), name: "two_groups.toml", changes: [] });
+  const question = { ask: "resolve", text: text("gallery-two_groups"), name: "two_groups.toml", changes: [] };
+  const { words } = await player.ask(question);
   const generation = words.config.learning.generations;
   await player.ask({ ask: "train", runs: [{ text: words.toml, trials: [TRIAL] }] });
-  for (let done = false; !done;) done = (await player.ask({ ask: "advance", generations: 1000, milliseconds: 1e6 })).words.done;
+  const advance = { ask: "advance", generations: 1000, milliseconds: 1e6 };
+  for (let done = false; !done;) done = (await player.ask(advance)).words.done;
   const { words: data } = await player.ask({ ask: "best", run: 0, trial: TRIAL, generation });
   return JSON.stringify({ trial: TRIAL, generation, config: words.config, data }) + "\n";
 }
 
 if (process.argv[1] === new URL(import.meta.url).pathname) {
-  const text = contents(process.argv[2]), player = await Player.of(text);
+  const text = contents(process.argv[2]), player = await Player.start(text);
   await player.ask({ ask: "open", gpu: false, pass: null });
   const written = await opening(player, text);
   writeFileSync(new URL("page/opening.json", import.meta.url), written);
