@@ -1,11 +1,12 @@
-/* Fails or kills a program at one of its file-system calls. Loaded with LD_PRELOAD on Linux.
+/* Makes a file-system call of a program fail, or kills the program at this call. Loaded with LD_PRELOAD on Linux.
  *
- * A seccomp filter turns every such call into a SIGSYS, so calls are seen however they are made, also those that bypass
- * the C library. The handler counts a call and then either makes it, fails it or ends the process.
+ * A seccomp filter turns every such call into a SIGSYS. It also catches calls that bypass the C library. The handler
+ * counts the call, and then makes it, fails it or kills the process.
  *
- * FAULT_AT     the call that fails, from 1; 0 counts only
- * FAULT_KIND   ENOSPC, EIO, EROFS or KILL; a later call is not touched unless FAULT_ALL is set
- * FAULT_COUNT  a file that takes the number of calls as the process ends
+ * FAULT_AT     the number of the call that fails, from 1; with 0, calls are only counted
+ * FAULT_KIND   ENOSPC, EIO, EROFS or KILL
+ * FAULT_ALL    if it is set, all later calls fail, too
+ * FAULT_COUNT  a file to which the number of calls is written when the process ends
  */
 #define _GNU_SOURCE
 #include <errno.h>
@@ -23,7 +24,7 @@
 #include <ucontext.h>
 #include <unistd.h>
 
-/* The sixth argument of calls that the handler makes itself; no call below has six. */
+/* Marks calls that the handler makes itself, as their sixth argument. No call below has six arguments. */
 #define OURS 0x666c6f74u
 
 #if defined(__x86_64__)
@@ -39,10 +40,10 @@
     {(c)->uc_mcontext.regs[0], (c)->uc_mcontext.regs[1], (c)->uc_mcontext.regs[2], (c)->uc_mcontext.regs[3],           \
      (c)->uc_mcontext.regs[4]}
 #else
-#error "the fault shim knows x86-64 and AArch64 only"
+#error "the fault shim supports only x86-64 and AArch64"
 #endif
 
-/* Calls that change a disk. Opening is one of them where it may create or truncate. */
+/* Calls that can change files. `changes_disk` decides about each call. */
 static const int WATCHED[] = {
 #ifdef SYS_open
     SYS_open, SYS_creat, SYS_rename, SYS_unlink, SYS_mkdir, SYS_rmdir, SYS_link, SYS_symlink,
@@ -58,7 +59,7 @@ enum { COUNT = sizeof WATCHED / sizeof *WATCHED };
 static long at, all, result, calls;
 static const char *counted;
 
-/* Reading a file, and talking to a terminal or a pipe, changes no disk. */
+/* Reports whether a call changes a disk: not if it opens a file for reading, or writes to standard output or error. */
 static int changes_disk(long number, const long *arguments) {
     switch (number) {
     case SYS_openat: return (arguments[2] & (O_CREAT | O_TRUNC | O_WRONLY | O_RDWR)) != 0;
@@ -92,7 +93,7 @@ static void on_call(int signal, siginfo_t *info, void *context) {
     errno = saved;
 }
 
-__attribute__((destructor)) static void tell(void) {
+__attribute__((destructor)) static void write_count(void) {
     if (!counted) {
         return;
     }
@@ -110,7 +111,11 @@ __attribute__((constructor)) static void begin(void) {
     at = atol(where);
     all = getenv("FAULT_ALL") != NULL;
     counted = getenv("FAULT_COUNT");
-    result = !kind || !strcmp(kind, "ENOSPC") ? -ENOSPC : !strcmp(kind, "EIO") ? -EIO : !strcmp(kind, "EROFS") ? -EROFS : 0;
+    /* 0 stands for KILL. */
+    result = !kind || !strcmp(kind, "ENOSPC") ? -ENOSPC
+        : !strcmp(kind, "EIO")                ? -EIO
+        : !strcmp(kind, "EROFS")              ? -EROFS
+                                              : 0;
 
     struct sigaction action = {.sa_sigaction = on_call, .sa_flags = SA_SIGINFO | SA_NODEFER | SA_ONSTACK | SA_RESTART};
     struct sock_filter filter[COUNT + 9];
@@ -133,7 +138,7 @@ __attribute__((constructor)) static void begin(void) {
     struct sock_fprog program = {.len = length, .filter = filter};
     if (sigaction(SIGSYS, &action, NULL) || prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) ||
         prctl(PR_SET_SECCOMP, SECCOMP_MODE_FILTER, &program)) {
-        perror("no system calls can be watched");
+        perror("the fault shim cannot install its filter");
         _exit(77);
     }
 }

@@ -1,5 +1,7 @@
-//! A process that is killed while it trains goes on to the same bytes: with what keeps runs and nothing of the program,
-//! for machines where building that takes long. What else is to be known of kills, `tests/recovery.rs` asks.
+//! Tests that a killed training process resumes to the same bytes.
+//!
+//! This uses only the core and the recording of runs, not the program, which takes long to build for some machines.
+//! `tests/recovery.rs` has the other tests of kills.
 
 use std::path::Path;
 use std::process::{Child, Command, ExitStatus};
@@ -14,12 +16,12 @@ use flotilla::record::disk::Disk;
 use flotilla::record::folder::{METRICS, POLICIES, Start};
 use flotilla::run::{Ended, Options, Session};
 
-const TEST: &str = "a_killed_process_goes_on_to_the_same_bytes";
-/// Names the folder to train in, to the processes that are killed.
+const TEST: &str = "a_killed_process_resumes_to_the_same_bytes";
+/// The environment variable with the directory to train in. If it is set, this process is one that will be killed.
 const FOLDER: &str = "FLOTILLA_PORTS_FOLDER";
 const KILLS: usize = 6;
 
-/// Runs that take seconds under an emulator, most of which go into checkpoints.
+/// Returns a config that trains in seconds under an emulator. Most of the time goes into checkpoints.
 fn config() -> Config {
     let text = "
 [world]
@@ -52,21 +54,22 @@ fn train(folder: &Path) {
         save: &save,
         instead: &mut |_| None,
         setback: &mut |_| {},
-        // Time to be killed in.
+        // Slow down, so that there is time for a kill.
         watch: &mut |_| std::thread::sleep(Duration::from_millis(10)),
     };
     assert_eq!(session.train(&mut player, &mut options).unwrap(), Ended::Done);
 }
 
-/// The policies, and the metrics without the seconds.
-fn what_came_out(folder: &Path) -> (Vec<u8>, Vec<String>) {
+/// Returns the bytes of the policies, and the metrics without the seconds.
+fn results(folder: &Path) -> (Vec<u8>, Vec<String>) {
     let metrics = fs::read_to_string(folder.join(METRICS)).unwrap();
     let without_seconds = |line: &str| line.split(',').take(5).collect::<Vec<_>>().join(",");
     (fs::read(folder.join(POLICIES)).unwrap(), metrics.lines().map(without_seconds).collect())
 }
 
-/// Kills a process once the run has two rows more, or waits for its end where none are to come.
-fn killed_or_done(child: &mut Child, metrics: &Path, kill: bool) -> Option<ExitStatus> {
+/// Kills a process when the run has two more rows of metrics, and returns `None`. Without `kill`, or if the process
+/// ends before, returns its exit status.
+fn kill_or_wait(child: &mut Child, metrics: &Path, kill: bool) -> Option<ExitStatus> {
     let rows = || fs::read(metrics).map_or(0, |text| text.iter().filter(|&&byte| byte == b'\n').count());
     let before = rows();
     loop {
@@ -83,23 +86,23 @@ fn killed_or_done(child: &mut Child, metrics: &Path, kill: bool) -> Option<ExitS
 }
 
 #[test]
-fn a_killed_process_goes_on_to_the_same_bytes() {
+fn a_killed_process_resumes_to_the_same_bytes() {
     if let Some(folder) = env::var_os(FOLDER) {
         return train(Path::new(&folder));
     }
     let scratch = tempfile::tempdir().unwrap();
-    let [whole, killed] = ["whole", "killed"].map(|name| scratch.path().join(name));
-    train(&whole);
+    let [uninterrupted, killed] = ["uninterrupted", "killed"].map(|name| scratch.path().join(name));
+    train(&uninterrupted);
     let mut kills = 0;
     let status = loop {
         let mut command = Command::new(env::current_exe().unwrap());
         let mut child = command.args(["--exact", TEST]).env(FOLDER, &killed).spawn().unwrap();
-        match killed_or_done(&mut child, &killed.join(METRICS), kills < KILLS) {
+        match kill_or_wait(&mut child, &killed.join(METRICS), kills < KILLS) {
             None => kills += 1,
             Some(status) => break status,
         }
     };
     assert!(status.success(), "{status}");
     assert_eq!(kills, KILLS);
-    assert!(what_came_out(&killed) == what_came_out(&whole), "{} differs", killed.display());
+    assert!(results(&killed) == results(&uninterrupted), "{} differs", killed.display());
 }

@@ -1,4 +1,7 @@
-// Runs the digests of tests/ports in Node: node run.mjs FILE.wasm TOOLCHAIN VERSION [REPORT]
+// Runs the WebAssembly of tests/ports in Node, and writes a row of evidence if REPORT is given.
+//
+//     node run.mjs FILE.wasm TOOLCHAIN VERSION [REPORT]
+
 import { readFileSync, writeFileSync } from "node:fs";
 import { cpus } from "node:os";
 
@@ -16,7 +19,7 @@ const { instance } = await WebAssembly.instantiate(readFileSync(file), {
 instance.exports.run();
 
 const [backend, ...trained] = lines;
-if (trained.length !== 6) throw new Error(`six trainings should have been told: ${lines}`);
+if (trained.length !== 6) throw new Error(`expected six short trainings: ${lines}`);
 if (report) {
   const evidence = {
     schema: 1,

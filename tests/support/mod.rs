@@ -1,5 +1,5 @@
-//! Shared by tests: a folder to run commands in, GPU adapters, and small helpers.
-#![allow(dead_code, unused_imports, reason = "no test needs all of it")]
+//! Helpers for tests: small configs, a temporary directory in which commands run, and GPU adapters.
+#![allow(dead_code, unused_imports, reason = "no test uses all helpers")]
 
 #[cfg(feature = "gpu")]
 use std::io::Write;
@@ -11,7 +11,7 @@ use flotilla::backend::gpu::device::{self, AdapterInfo, Request, Wanted};
 use flotilla::config::{Config, Paradigm};
 use flotilla::world::World;
 
-/// A config that is small and played at once.
+/// A small config that trains in milliseconds.
 pub const SMALL: &str = "
 [world]
 leaders = [[10, 5], [20, 5]]
@@ -43,27 +43,27 @@ generations = 4
 trials = 2
 ";
 
-/// Returns [`TINY`] with another number of generations, and with these keys of `[checkpoint]`.
+/// Returns [`TINY`] with the given number of generations, and with the given lines in a section `[checkpoint]`.
 pub fn tiny(generations: usize, checkpoint: &str) -> String {
     format!("{}[checkpoint]\n{checkpoint}\n", TINY.replace("generations = 4", &format!("generations = {generations}")))
 }
 
-/// One of the project's own configs, by its name.
+/// Loads a config of the directory `configs/` by its name.
 pub fn layout(name: &str) -> Config {
     let path = format!("{}/configs/{name}.toml", env!("CARGO_MANIFEST_DIR"));
     Config::load(path.as_ref()).unwrap_or_else(|error| panic!("{error}"))
 }
 
-/// The worlds of the paper's layouts, led and where everyone leads, by name.
+/// Returns the worlds of the paper's layouts in both paradigms, with their names.
 pub fn papers_worlds() -> Vec<(String, World)> {
     let layouts = ["generally_forward", "strictly_forward", "chaotic"];
     let paradigms = [(Paradigm::LeaderFollower, ""), (Paradigm::AllLeaders, ", all leaders")];
     let pairs = layouts.into_iter().flat_map(|name| paradigms.map(|paradigm| (name, paradigm)));
     pairs
-        .map(|(name, (paradigm, leads))| {
+        .map(|(name, (paradigm, suffix))| {
             let mut config = layout(name);
             config.learning.paradigm = paradigm;
-            (format!("{}{leads}", name.replace('_', " ")), World::new(&config))
+            (format!("{}{suffix}", name.replace('_', " ")), World::new(&config))
         })
         .collect()
 }
@@ -79,21 +79,22 @@ mod commands {
     use assert_cmd::cargo::cargo_bin;
     use tempfile::TempDir;
 
-    /// The program, as no part of a cluster's job.
+    /// Returns a command that runs the program. It does not run as a task of a cluster's job, even if this test does.
     pub fn flotilla() -> Command {
-        alone(cargo_bin!("flotilla").as_os_str())
+        outside_jobs(cargo_bin!("flotilla").as_os_str())
     }
 
-    /// A shell that is to run a script with the program on its path.
+    /// Returns a command that runs a script with a shell. `flotilla` is on its path.
     pub fn shell(name: &str, script: &str) -> Command {
         let program = cargo_bin!("flotilla");
         let path = format!("{}:{}", program.parent().unwrap().display(), std::env::var("PATH").unwrap_or_default());
-        let mut shell = alone(name.as_ref());
+        let mut shell = outside_jobs(name.as_ref());
         shell.args(["-c", script]).env("PATH", path);
         shell
     }
 
-    fn alone(program: &OsStr) -> Command {
+    /// Removes the variables from which the program would take a shard.
+    fn outside_jobs(program: &OsStr) -> Command {
         let mut command = Command::new(program);
         for name in ["SLURM_ARRAY_TASK_ID", "JOB_COMPLETION_INDEX", "FLOTILLA_SHARDS"] {
             command.env_remove(name);
@@ -101,7 +102,7 @@ mod commands {
         command
     }
 
-    /// The words of a command: a line that is split at spaces, or each by itself.
+    /// Arguments of a command: a line to be split at spaces, or a list.
     pub trait Words {
         fn words(self) -> Vec<OsString>;
     }
@@ -136,21 +137,21 @@ mod commands {
         }
     }
 
-    /// A folder where commands run.
+    /// A temporary directory in which commands run.
     pub struct Place {
         folder: TempDir,
         on_cpu: bool,
     }
 
     impl Place {
-        /// With these files in it, by name and text.
+        /// Makes a directory with files, given as names and texts.
         pub fn new(files: &[(&str, &str)]) -> Place {
             let place = Place { folder: tempfile::tempdir().unwrap(), on_cpu: false };
             files.iter().for_each(|(name, text)| place.write(name, text));
             place
         }
 
-        /// Commands run on the CPU unless they say otherwise; all but `plot` must have `--backend`.
+        /// Makes all commands use the CPU: adds `--backend cpu` unless a command has `--backend` or is `plot`.
         pub fn on_cpu(self) -> Place {
             Place { on_cpu: true, ..self }
         }
@@ -171,7 +172,7 @@ mod commands {
             fs::write(self.path(name), text).unwrap();
         }
 
-        /// Everything in it.
+        /// Returns the sorted names of the directory's entries.
         pub fn names(&self) -> Vec<String> {
             let names = fs::read_dir(self.root()).unwrap().map(|entry| entry.unwrap().file_name());
             let mut names: Vec<_> = names.map(|name| name.to_string_lossy().into_owned()).collect();
@@ -179,11 +180,12 @@ mod commands {
             names
         }
 
-        /// The program in this folder, with nothing to read unless it is given; it is ended if it waits for something.
+        /// Returns a command that runs the program here. Its standard input is empty. It is killed after a minute.
         pub fn command(&self) -> assert_cmd::Command {
-            self.alone(flotilla())
+            self.here(flotilla())
         }
 
+        /// Runs the program with the given arguments.
         pub fn run(&self, words: impl Words) -> Output {
             let mut words = words.words();
             let plays = words.first().is_some_and(|command| command != "plot");
@@ -195,47 +197,47 @@ mod commands {
 
         /// Runs a script with `bash`.
         pub fn shell(&self, script: &str) -> Output {
-            self.alone(shell("bash", script)).output().unwrap()
+            self.here(shell("bash", script)).output().unwrap()
         }
 
-        fn alone(&self, mut command: Command) -> assert_cmd::Command {
+        fn here(&self, mut command: Command) -> assert_cmd::Command {
             command.current_dir(self.root());
             let mut command = assert_cmd::Command::from_std(command);
             command.timeout(Duration::from_secs(60));
             command
         }
 
-        /// Standard output and standard error of a command that must succeed.
+        /// Runs a command that must succeed. Returns its standard output and standard error.
         pub fn good(&self, words: impl Words) -> (String, String) {
             let words = words.words();
             let output = self.run(&words[..]);
-            let told = String::from_utf8(output.stderr).unwrap();
-            assert_eq!(output.status.code(), Some(0), "{words:?}: {told}");
-            (String::from_utf8(output.stdout).unwrap(), told)
+            let stderr = String::from_utf8(output.stderr).unwrap();
+            assert_eq!(output.status.code(), Some(0), "{words:?}: {stderr}");
+            (String::from_utf8(output.stdout).unwrap(), stderr)
         }
 
-        /// Runs a command that must fail with this code and print nothing, or with `--json` its error as an object. Returns
-        /// its error message.
+        /// Runs a command that must fail with this exit code. Its standard output must be empty, or with `--json` have
+        /// the error as an object. Returns its error message.
         pub fn refused(&self, code: i32, words: impl Words) -> String {
             let words = words.words();
             let output = self.run(&words[..]);
-            let told = String::from_utf8(output.stderr).unwrap();
-            assert_eq!(output.status.code(), Some(code), "{words:?}: {told}");
+            let stderr = String::from_utf8(output.stderr).unwrap();
+            assert_eq!(output.status.code(), Some(code), "{words:?}: {stderr}");
             if words.iter().any(|word| *word == "--json") {
                 let object: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
                 assert!(object["code"].is_string() && object["message"].is_string(), "{words:?}: {object}");
             } else {
                 assert!(output.stdout.is_empty(), "{words:?}");
             }
-            assert!(told.contains("error: ") && !told.contains("panicked"), "{words:?}: {told}");
-            told
+            assert!(stderr.contains("error: ") && !stderr.contains("panicked"), "{words:?}: {stderr}");
+            stderr
         }
     }
 }
 
-/// Every adapter, each with the request that opens it.
+/// Returns every adapter, each with the request that opens it.
 ///
-/// Without any, the test is skipped in plain sight, or fails where `FLOTILLA_REQUIRE_GPU=1` says that a GPU is needed.
+/// If there is none, prints that the test was skipped. With `FLOTILLA_REQUIRE_GPU=1`, panics instead.
 #[cfg(feature = "gpu")]
 pub fn adapters(test: &str) -> Vec<(Request, AdapterInfo)> {
     let found = device::adapters();
@@ -244,8 +246,8 @@ pub fn adapters(test: &str) -> Vec<(Request, AdapterInfo)> {
         let reason = ["VK_DRIVER_FILES", "VK_ICD_FILENAMES", "WGPU_BACKEND"].map(set).join(", ");
         let message = format!("{test}: skipped: no GPU adapter found ({reason})");
         assert!(std::env::var("FLOTILLA_REQUIRE_GPU").as_deref() != Ok("1"), "{message}, but one is required");
-        // Straight to the stream: what a passing test prints by macro is not shown.
-        writeln!(std::io::stderr(), "\n{message}").expect("standard error takes a line");
+        // Write to the stream, because the output of `eprintln!` is not shown for a passing test.
+        writeln!(std::io::stderr(), "\n{message}").expect("standard error is writable");
     }
     let request = |index: usize| Request::from(Wanted::Named(index.to_string()));
     found.into_iter().enumerate().map(|(index, info)| (request(index), info)).collect()
