@@ -1,25 +1,27 @@
-//! What the lines of RADV's assembly mean, for as many of AMD's instructions as the kernels take: whatever else turns up is a
+//! Parses RADV's assembly. Only those of AMD's instructions are known that the kernels use. Any other instruction is a
 //! panic that names it.
 
 use std::collections::HashMap;
 use std::ops::Range;
 
-/// Where an operand is.
+/// The location of an operand.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Place {
-    /// A number of consecutive vector registers.
+    /// The first of several consecutive vector registers, and their number.
     Vector(usize, usize),
+    /// The same for scalar registers.
     Scalar(usize, usize),
-    /// As 32 bits and as 64.
+    /// The value as 32 and as 64 bits.
     Constant(u32, u64),
+    /// The scalar condition code (SCC).
     Condition,
 }
 
-/// Registers in one row: the vector ones, the scalar ones from here on, and the condition.
+/// Numbers of all registers: vector registers from 0, scalar registers from `SCALAR`, and the condition code.
 pub const SCALAR: usize = 256;
 pub const CONDITION: usize = SCALAR + 128;
 
-/// Scalar registers with a name: the one of masks that comparisons leave, and the one of the lanes that take part.
+/// Scalar registers with names: VCC has the result mask of comparisons, and EXEC the mask of active lanes.
 const VCC: usize = 106;
 pub const EXEC: usize = 126;
 const NAMED: [(&str, Place); 9] = [
@@ -34,7 +36,7 @@ const NAMED: [(&str, Place); 9] = [
     ("src_scc", Place::Condition),
 ];
 
-/// An operand; a float may be made positive, then turned around.
+/// An operand. For floats, `absolute` is applied before `negative`.
 #[derive(Clone, Copy, Debug)]
 pub struct Operand {
     pub place: Place,
@@ -53,7 +55,7 @@ impl Operand {
         Some(Operand { place: named.or_else(|| registers(bare))?, negative, absolute: bare != rest })
     }
 
-    /// The registers in order.
+    /// Returns the numbers of its registers.
     pub fn registers(&self) -> Range<usize> {
         match self.place {
             Place::Vector(first, count) => first..first + count,
@@ -63,31 +65,32 @@ impl Operand {
         }
     }
 
-    /// The register of a kind that it starts at.
+    /// Returns its first vector register.
     pub fn vector(&self) -> usize {
-        let Place::Vector(first, _) = self.place else { panic!("{self:?} is no vector register") };
+        let Place::Vector(first, _) = self.place else { panic!("{self:?} is not a vector register") };
         first
     }
 
+    /// Returns its first scalar register.
     pub fn scalar(&self) -> usize {
-        let Place::Scalar(first, _) = self.place else { panic!("{self:?} is no scalar register") };
+        let Place::Scalar(first, _) = self.place else { panic!("{self:?} is not a scalar register") };
         first
     }
 }
 
-/// `7`, `-7`, `0x7f` and `0.5`; a 64-bit operand has the sign's bits, or is a double.
+/// Parses `7`, `-7`, `0x7f` and `0.5`. As 64 bits, integers are sign-extended, and floats are doubles.
 fn constant(text: &str) -> Option<Place> {
     if let Some(hex) = text.strip_prefix("0x") {
         return u32::from_str_radix(hex, 16).ok().map(|bits| Place::Constant(bits, bits.into()));
     }
-    if let Ok(whole) = text.parse::<i64>() {
-        return Some(Place::Constant(whole as u32, whole as u64));
+    if let Ok(integer) = text.parse::<i64>() {
+        return Some(Place::Constant(integer as u32, integer as u64));
     }
     let float: f64 = text.contains('.').then(|| text.parse().ok())??;
     Some(Place::Constant((float as f32).to_bits(), float.to_bits()))
 }
 
-/// `s7` and `v[4:7]`.
+/// Parses `s7` and `v[4:7]`.
 fn registers(text: &str) -> Option<Place> {
     let kind = text.get(..1)?;
     let (first, last) = match text[1..].strip_prefix('[') {
@@ -102,32 +105,34 @@ fn registers(text: &str) -> Option<Place> {
     }
 }
 
-/// The operation of an instruction, and the places of its operands.
+/// The operation of an instruction. The comments give the order of its operands.
 #[derive(Clone, Copy)]
 pub enum Action {
-    /// To, from up to three, lane by lane; whether it rounds.
+    /// A result and up to three inputs, per lane. The flag says whether the operation rounds.
     Lanes(fn([u32; 3]) -> u32, bool),
-    /// The same that takes what is there as its third.
+    /// A result and two inputs, per lane. The result register is the third input.
     Accumulates(fn([u32; 3]) -> u32),
-    /// A mask, or on RDNA none, of lanes for which it holds; whether the others are left out from then on.
+    /// A result mask, which RDNA's `cmpx` does not have, and two inputs. The flag says whether only lanes for which the
+    /// comparison holds stay active.
     Compare(fn(u32, u32) -> bool, bool),
     Select,
-    /// To, the carries, two numbers, the carries before.
+    /// The sum, the carries out, two inputs, and the carries in.
     AddWithCarry,
     ShiftWide,
     Swap,
     FirstLane,
-    /// To, from two; by 64 bits if told; what the condition becomes.
+    /// A result and two inputs. The flag says whether they have 64 bits. The last field is the new condition code.
     Scalar(fn(u64, u64) -> u64, bool, Change),
     ScalarCompare(fn(u32, u32) -> bool),
     ScalarSelect(bool),
-    /// To what the lanes were; those of a mask are left.
+    /// A register for the old mask of active lanes, and the mask of lanes that stay active.
     SaveLanes,
     LoadDescriptor,
     LoadScalars,
     Load,
     Store,
-    /// A number of words; from two addresses if the instruction has both offsets.
+    /// The number of words per address. If the instruction has two addresses, the second field is the unit of their
+    /// offsets, in words.
     LocalLoad(usize, Option<usize>),
     LocalStore(usize),
     Branch(When),
@@ -137,23 +142,24 @@ pub enum Action {
     End,
 }
 
-/// When a branch is taken.
+/// The condition of a branch.
 #[derive(Clone, Copy)]
 pub enum When {
     Always,
     Condition(bool),
-    /// When no lane takes part.
+    /// No lane is active.
     Empty,
 }
 
-/// The condition that a scalar instruction sets.
+/// How a scalar instruction sets the condition code.
 #[derive(Clone, Copy)]
 pub enum Change {
     Kept,
     NotZero,
     Carry,
-    /// For a sum or a difference of signed numbers.
+    /// Set if a signed sum overflows.
     Overflow,
+    /// Set if a signed difference overflows.
     OverflowDown,
 }
 
@@ -161,19 +167,20 @@ pub struct Instruction {
     pub text: String,
     pub action: Action,
     pub operands: Vec<Operand>,
-    /// An offset in memory; for a workgroup's memory, in elements.
+    /// An offset in memory, in bytes.
     pub offset: u32,
+    /// The offsets of an instruction with two addresses, in the unit of its [`Action::LocalLoad`].
     pub offsets: [u32; 2],
-    /// Whether each lane has an address of its own.
+    /// Whether each lane has its own address.
     pub addressed: bool,
-    /// Doubles or halves a float at the end.
+    /// A factor by which a float result is multiplied: 2, 4 or 1/2.
     pub scale: Option<f32>,
-    /// Where a branch goes.
+    /// The index of the instruction to which it branches.
     pub target: usize,
-    /// Vector instructions that it takes the time of.
+    /// How many times as long it takes as other vector instructions.
     pub issues: u64,
     pub is_vector: bool,
-    /// The registers in their row that it waits for, and those that wait for it.
+    /// The numbers of the registers that it reads and writes.
     pub reads: Vec<usize>,
     pub writes: Vec<usize>,
 }
@@ -181,6 +188,7 @@ pub struct Instruction {
 pub struct Program(pub Vec<Instruction>);
 
 impl Program {
+    /// Parses the assembly of a shader.
     pub fn parse(assembly: &str, family: &str) -> Program {
         let (mut labels, mut last) = (HashMap::new(), "");
         let mut instructions: Vec<(Instruction, Option<String>)> = Vec::new();
@@ -192,7 +200,7 @@ impl Program {
             if let Some(label) = text.strip_suffix(':') {
                 labels.insert(label.to_string(), instructions.len());
             } else if text.starts_with("(then repeated") {
-                let times: usize = text.split(' ').find_map(|word| word.parse().ok()).expect("how often");
+                let times: usize = text.split(' ').find_map(|word| word.parse().ok()).expect("a number of repetitions");
                 instructions.extend((0..times).map(|_| instruction(last, family)));
             } else {
                 instructions.push(instruction(text, family));
@@ -209,11 +217,11 @@ impl Program {
     }
 }
 
-/// One line; with the label that it names.
+/// Parses one line. Returns the instruction, and the label to which it branches.
 fn instruction(text: &str, family: &str) -> (Instruction, Option<String>) {
     let (name, rest) = text.split_once(' ').unwrap_or((text, ""));
-    let action = action(name, rest).unwrap_or_else(|| panic!("{family}: nobody knows `{text}`"));
-    let mut made = Instruction {
+    let action = action(name, rest).unwrap_or_else(|| panic!("{family}: unknown instruction `{text}`"));
+    let mut parsed = Instruction {
         text: text.to_string(),
         action,
         operands: Vec::new(),
@@ -228,62 +236,64 @@ fn instruction(text: &str, family: &str) -> (Instruction, Option<String>) {
         writes: Vec::new(),
     };
     if matches!(action, Action::Wait(..) | Action::Nothing | Action::Barrier | Action::End) {
-        return (made, None);
+        return (parsed, None);
     }
     if let Action::Branch(when) = action {
-        made.reads = match when {
+        parsed.reads = match when {
             When::Always => Vec::new(),
             When::Condition(_) => vec![CONDITION],
             When::Empty => vec![SCALAR + EXEC, SCALAR + EXEC + 1],
         };
-        return (made, Some(rest.trim().to_string()));
+        return (parsed, Some(rest.trim().to_string()));
     }
     for word in rest.split([',', ' ']).filter(|word| !word.is_empty()) {
         let number = |text: &str| match constant(text) {
             Some(Place::Constant(bits, _)) => bits,
-            _ => panic!("{text} of `{}` is no number", made.text),
+            _ => panic!("{text} in `{}` is not a number", parsed.text),
         };
         match word.split_once(':') {
-            Some(("offset", offset)) => made.offset = number(offset),
-            Some(("offset0", offset)) => made.offsets[0] = number(offset),
-            Some(("offset1", offset)) => made.offsets[1] = number(offset),
-            Some(("mul", by)) => made.scale = Some(number(by) as f32),
-            Some(("div", by)) => made.scale = Some(1.0 / number(by) as f32),
-            None if word == "offen" => made.addressed = true,
+            Some(("offset", offset)) => parsed.offset = number(offset),
+            Some(("offset0", offset)) => parsed.offsets[0] = number(offset),
+            Some(("offset1", offset)) => parsed.offsets[1] = number(offset),
+            Some(("mul", by)) => parsed.scale = Some(number(by) as f32),
+            Some(("div", by)) => parsed.scale = Some(1.0 / number(by) as f32),
+            None if word == "offen" => parsed.addressed = true,
             None if ["glc", "slc", "dlc"].contains(&word) => (),
-            _ => made.operands.push(Operand::parse(word).unwrap_or_else(|| panic!("{word} of `{text}` is unknown"))),
+            _ => parsed
+                .operands
+                .push(Operand::parse(word).unwrap_or_else(|| panic!("unknown operand {word} in `{text}`"))),
         }
     }
-    // Of 16 bits, with a sign.
+    // The constants of s_movk and s_mulk have 16 bits and a sign.
     if let ["s", kind, ..] = name.split('_').collect::<Vec<_>>()[..]
         && ["movk", "mulk"].contains(&kind)
-        && let Some(Operand { place: Place::Constant(bits, wide), .. }) = made.operands.last_mut()
+        && let Some(Operand { place: Place::Constant(bits, wide), .. }) = parsed.operands.last_mut()
     {
         (*bits, *wide) = (*bits as i16 as u32, *bits as i16 as u64);
         if kind == "mulk" {
-            made.operands.insert(1, made.operands[0]);
+            parsed.operands.insert(1, parsed.operands[0]);
         }
     }
-    made.depends();
-    (made, None)
+    parsed.find_dependencies();
+    (parsed, None)
 }
 
 impl Instruction {
-    /// Notes what it reads and writes.
-    fn depends(&mut self) {
+    /// Fills `reads` and `writes`.
+    fn find_dependencies(&mut self) {
         use Action::*;
-        let of = |operands: &[Operand]| -> Vec<usize> { operands.iter().flat_map(Operand::registers).collect() };
-        let all = &self.operands[..];
+        let registers = |operands: &[Operand]| -> Vec<usize> { operands.iter().flat_map(Operand::registers).collect() };
+        let operands = &self.operands[..];
         let written = match self.action {
             Store | LocalStore(_) | ScalarCompare(_) => 0,
-            Compare(..) if all.len() == 2 => 0,
+            Compare(..) if operands.len() == 2 => 0,
             AddWithCarry | Swap => 2,
             _ => 1,
         };
-        (self.writes, self.reads) = (of(&all[..written]), of(&all[written..]));
+        (self.writes, self.reads) = (registers(&operands[..written]), registers(&operands[written..]));
         let lanes = [SCALAR + EXEC, SCALAR + EXEC + 1];
         match self.action {
-            Swap | Accumulates(_) => self.reads.extend(of(&all[..written])),
+            Swap | Accumulates(_) => self.reads.extend(registers(&operands[..written])),
             Scalar(.., Change::Kept) => (),
             Scalar(..) | ScalarCompare(_) => self.writes.push(CONDITION),
             ScalarSelect(_) => self.reads.push(CONDITION),
@@ -301,6 +311,7 @@ impl Instruction {
     }
 }
 
+/// Returns the float with these bits.
 pub fn f(bits: u32) -> f32 {
     f32::from_bits(bits)
 }
@@ -318,7 +329,7 @@ fn action(name: &str, rest: &str) -> Option<Action> {
         let words = words(name)?;
         return match name.rsplit_once('_')?.0 {
             "load" | "read" => Some(Action::LocalLoad(words, None)),
-            // Two addresses are told apart in elements, or in 64 of them.
+            // The offsets of two addresses count elements, or 64 elements.
             "load_2addr" | "read2" => Some(Action::LocalLoad(words, Some(words))),
             "load_2addr_stride64" | "read2st64" => Some(Action::LocalLoad(words, Some(64 * words))),
             "store" | "write" => Some(Action::LocalStore(words)),
@@ -347,7 +358,7 @@ fn action(name: &str, rest: &str) -> Option<Action> {
     }
 }
 
-/// Words that a load or a store takes at one address, by the end of its name.
+/// Returns the words that a load or store transfers per address, according to the end of its name.
 fn words(name: &str) -> Option<usize> {
     match name.rsplit('_').next()? {
         "dword" | "b32" => Some(1),
@@ -357,8 +368,8 @@ fn words(name: &str) -> Option<usize> {
     }
 }
 
-/// How two whole numbers, with a sign or without, are compared.
-fn whole_comparison(kind: &str, relation: &str) -> Option<fn(u32, u32) -> bool> {
+/// Returns the comparison of two signed or unsigned integers.
+fn integer_comparison(kind: &str, relation: &str) -> Option<fn(u32, u32) -> bool> {
     Some(match (kind, relation) {
         ("i32", "lt") => |a, b| (a as i32) < b as i32,
         ("i32", "ge") => |a, b| a as i32 >= b as i32,
@@ -375,7 +386,7 @@ fn whole_comparison(kind: &str, relation: &str) -> Option<fn(u32, u32) -> bool> 
 fn vector_action(name: &str) -> Option<Action> {
     use Action::{Accumulates, Compare, Lanes};
     let float = |work| Some(Lanes(work, true));
-    let whole = |work| Some(Lanes(work, false));
+    let integer = |work| Some(Lanes(work, false));
     if let Some(comparison) = name.strip_prefix("cmp") {
         let (narrows, comparison) = comparison.strip_prefix('x').map_or((false, comparison), |rest| (true, rest));
         let (relation, kind) = comparison.strip_prefix('_')?.split_once('_')?;
@@ -384,7 +395,7 @@ fn vector_action(name: &str) -> Option<Action> {
             ("f32", "le") => |a, b| f(a) <= f(b),
             ("f32", "gt") => |a, b| f(a) > f(b),
             ("f32", "ge") => |a, b| f(a) >= f(b),
-            _ => whole_comparison(kind, relation)?,
+            _ => integer_comparison(kind, relation)?,
         };
         return Some(Compare(holds, narrows));
     }
@@ -392,38 +403,39 @@ fn vector_action(name: &str) -> Option<Action> {
         "mul_f32" => float(|[a, b, _]| (f(a) * f(b)).to_bits()),
         "add_f32" => float(|[a, b, _]| (f(a) + f(b)).to_bits()),
         "sub_f32" => float(|[a, b, _]| (f(a) - f(b)).to_bits()),
-        // Product and sum are rounded each.
+        // These round the product and the sum.
         "mad_f32" | "madak_f32" => float(|[a, b, c]| (f(a) * f(b) + f(c)).to_bits()),
         "mac_f32" => Some(Accumulates(|[a, b, c]| (f(a) * f(b) + f(c)).to_bits())),
         "fma_f32" | "fmaak_f32" => float(|[a, b, c]| f(a).mul_add(f(b), f(c)).to_bits()),
         "fmac_f32" => Some(Accumulates(|[a, b, c]| f(a).mul_add(f(b), f(c)).to_bits())),
         "floor_f32" => float(|[a, ..]| f(a).floor().to_bits()),
-        // Chips are off by a unit in the last place: it is for dividing whole numbers, which makes up for that.
+        // Chips may err by a unit in the last place. The compiler uses this for integer division, and corrects the
+        // result.
         "rcp_f32" | "rcp_iflag_f32" => float(|[a, ..]| (1.0 / f(a)).to_bits()),
         "cvt_f32_u32" => float(|[a, ..]| (a as f32).to_bits()),
-        // To whole numbers, towards zero and within what they hold, as `as` does.
-        "cvt_u32_f32" => whole(|[a, ..]| f(a) as u32),
-        "mov_b32" => whole(|[a, ..]| a),
-        "not_b32" => whole(|[a, ..]| !a),
-        "and_b32" => whole(|[a, b, _]| a & b),
-        "or_b32" => whole(|[a, b, _]| a | b),
-        "or3_b32" => whole(|[a, b, c]| a | b | c),
-        "add_u32" | "add_nc_u32" => whole(|[a, b, _]| a.wrapping_add(b)),
-        "sub_u32" | "sub_nc_u32" => whole(|[a, b, _]| a.wrapping_sub(b)),
-        "subrev_u32" | "subrev_nc_u32" => whole(|[a, b, _]| b.wrapping_sub(a)),
-        "add3_u32" => whole(|[a, b, c]| a.wrapping_add(b).wrapping_add(c)),
-        "add_lshl_u32" => whole(|[a, b, c]| a.wrapping_add(b) << (c & 31)),
-        "lshl_add_u32" => whole(|[a, b, c]| (a << (b & 31)).wrapping_add(c)),
-        "lshlrev_b32" => whole(|[a, b, _]| b << (a & 31)),
-        "lshrrev_b32" => whole(|[a, b, _]| b >> (a & 31)),
-        "bfe_u32" => whole(|[a, b, c]| a >> (b & 31) & ((1u32 << (c & 31)) - 1)),
-        "max_u32" => whole(|[a, b, _]| a.max(b)),
-        "min_u32" => whole(|[a, b, _]| a.min(b)),
-        "mul_lo_u32" => whole(|[a, b, _]| a.wrapping_mul(b)),
-        "mul_hi_u32" => whole(|[a, b, _]| ((u64::from(a) * u64::from(b)) >> 32) as u32),
-        "mad_u32_u24" => whole(|[a, b, c]| (a & 0xff_ffff).wrapping_mul(b & 0xff_ffff).wrapping_add(c)),
-        // The place of the lowest bit, or all ones.
-        "ffbl_b32" | "ctz_i32_b32" => whole(|[a, ..]| if a == 0 { u32::MAX } else { a.trailing_zeros() }),
+        // Rounds towards zero and saturates, like `as`.
+        "cvt_u32_f32" => integer(|[a, ..]| f(a) as u32),
+        "mov_b32" => integer(|[a, ..]| a),
+        "not_b32" => integer(|[a, ..]| !a),
+        "and_b32" => integer(|[a, b, _]| a & b),
+        "or_b32" => integer(|[a, b, _]| a | b),
+        "or3_b32" => integer(|[a, b, c]| a | b | c),
+        "add_u32" | "add_nc_u32" => integer(|[a, b, _]| a.wrapping_add(b)),
+        "sub_u32" | "sub_nc_u32" => integer(|[a, b, _]| a.wrapping_sub(b)),
+        "subrev_u32" | "subrev_nc_u32" => integer(|[a, b, _]| b.wrapping_sub(a)),
+        "add3_u32" => integer(|[a, b, c]| a.wrapping_add(b).wrapping_add(c)),
+        "add_lshl_u32" => integer(|[a, b, c]| a.wrapping_add(b) << (c & 31)),
+        "lshl_add_u32" => integer(|[a, b, c]| (a << (b & 31)).wrapping_add(c)),
+        "lshlrev_b32" => integer(|[a, b, _]| b << (a & 31)),
+        "lshrrev_b32" => integer(|[a, b, _]| b >> (a & 31)),
+        "bfe_u32" => integer(|[a, b, c]| a >> (b & 31) & ((1u32 << (c & 31)) - 1)),
+        "max_u32" => integer(|[a, b, _]| a.max(b)),
+        "min_u32" => integer(|[a, b, _]| a.min(b)),
+        "mul_lo_u32" => integer(|[a, b, _]| a.wrapping_mul(b)),
+        "mul_hi_u32" => integer(|[a, b, _]| ((u64::from(a) * u64::from(b)) >> 32) as u32),
+        "mad_u32_u24" => integer(|[a, b, c]| (a & 0xff_ffff).wrapping_mul(b & 0xff_ffff).wrapping_add(c)),
+        // The index of the lowest set bit, or all ones.
+        "ffbl_b32" | "ctz_i32_b32" => integer(|[a, ..]| if a == 0 { u32::MAX } else { a.trailing_zeros() }),
         "cndmask_b32" => Some(Action::Select),
         "addc_co_u32" | "add_co_ci_u32" => Some(Action::AddWithCarry),
         "lshrrev_b64" => Some(Action::ShiftWide),
@@ -438,7 +450,7 @@ fn scalar_action(name: &str) -> Option<Action> {
     let wide = name.ends_with("64");
     let (stem, kind) = name.rsplit_once('_')?;
     if let Some(relation) = stem.strip_prefix("cmp_") {
-        return whole_comparison(kind, relation).map(Action::ScalarCompare);
+        return integer_comparison(kind, relation).map(Action::ScalarCompare);
     }
     let scalar = |work, condition| Some(Action::Scalar(work, wide, condition));
     match (stem, kind) {

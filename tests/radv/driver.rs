@@ -1,40 +1,41 @@
-//! Asks a Vulkan driver to compile a compute shader and reads its statistics. Unlike wgpu, this opens devices that are absent.
+//! Compiles a compute shader with a Vulkan driver, and reads its statistics and assembly. Unlike wgpu, this can open
+//! devices that the machine does not have.
 
 use std::collections::BTreeMap;
 use std::ffi::{CStr, c_char};
 
 use ash::{Device, Entry, Instance, khr, vk};
 
-/// Bindings of every shader's group 0: a uniform, and storage buffers.
+/// Number of bindings in group 0 of every shader: a uniform buffer, and then storage buffers.
 const BINDINGS: u32 = 8;
 
-/// A shader as the driver compiled it.
+/// A compiled shader.
 #[derive(Debug)]
 pub struct Compiled {
-    /// Registers, scratch, spills, instructions, …, by the driver's own names.
+    /// Registers, scratch, spills, instructions and so on, with the driver's names.
     pub statistics: BTreeMap<String, u64>,
     pub assembly: String,
 }
 
-/// The first device of the driver that the environment names.
+/// The first device of the driver that the environment selects.
 pub struct Driver {
     instance: Instance,
     device: Device,
     layout: vk::PipelineLayout,
-    /// The driver and its version.
+    /// The name and version of the driver.
     pub version: String,
     _entry: Entry,
 }
 
 fn text(chars: &[c_char]) -> String {
-    // SAFETY: Vulkan's names end with a zero.
+    // SAFETY: Vulkan's names are zero-terminated.
     unsafe { CStr::from_ptr(chars.as_ptr()) }.to_string_lossy().into_owned()
 }
 
 impl Driver {
-    /// Opens it, as wgpu would: with robust access to buffers.
+    /// Opens the device with robust buffer access, like wgpu.
     pub fn open() -> Result<Driver, Box<dyn std::error::Error>> {
-        // SAFETY: calls follow the specification, handles outlive their use, and all is given back when the process ends.
+        // SAFETY: the calls follow the specification, and the handles are valid until the process ends.
         unsafe {
             let entry = Entry::load()?;
             let app = vk::ApplicationInfo::default().api_version(vk::API_VERSION_1_2);
@@ -79,7 +80,8 @@ impl Driver {
 
     /// Compiles an entry point of a SPIR-V module.
     pub fn compile(&self, words: &[u32], entry: &CStr) -> Result<Compiled, vk::Result> {
-        // SAFETY: as above; naga wrote the module, and the lists are as long as the driver was told.
+        // SAFETY: as above. The module is valid because naga wrote it, and the lists have the lengths given to the
+        // driver.
         unsafe {
             let module = self.device.create_shader_module(&vk::ShaderModuleCreateInfo::default().code(words), None)?;
             let stage = vk::PipelineShaderStageCreateInfo::default()
@@ -93,23 +95,23 @@ impl Driver {
                 )
                 .stage(stage)
                 .layout(self.layout);
-            let made = self.device.create_compute_pipelines(vk::PipelineCache::null(), &[info], None);
-            let pipeline = made.map_err(|(_, error)| error)?[0];
+            let pipelines = self.device.create_compute_pipelines(vk::PipelineCache::null(), &[info], None);
+            let pipeline = pipelines.map_err(|(_, error)| error)?[0];
             let api = khr::pipeline_executable_properties::Device::new(&self.instance, &self.device);
             let executable = vk::PipelineExecutableInfoKHR::default().pipeline(pipeline);
             let statistics = api.get_pipeline_executable_statistics(&executable)?;
-            let statistics = statistics.iter().map(|one| (text(&one.name), one.value.u64)).collect();
+            let statistics = statistics.iter().map(|entry| (text(&entry.name), entry.value.u64)).collect();
             let list = api.fp().get_pipeline_executable_internal_representations_khr;
             let mut count = 0;
             list(self.device.handle(), &executable, &mut count, std::ptr::null_mut()).result()?;
-            let mut found = vec![vk::PipelineExecutableInternalRepresentationKHR::default(); count as usize];
-            list(self.device.handle(), &executable, &mut count, found.as_mut_ptr()).result()?;
-            let mut texts: Vec<Vec<u8>> = found.iter().map(|one| vec![0; one.data_size]).collect();
-            for (one, text) in found.iter_mut().zip(&mut texts) {
-                one.p_data = text.as_mut_ptr().cast();
+            let mut parts = vec![vk::PipelineExecutableInternalRepresentationKHR::default(); count as usize];
+            list(self.device.handle(), &executable, &mut count, parts.as_mut_ptr()).result()?;
+            let mut texts: Vec<Vec<u8>> = parts.iter().map(|part| vec![0; part.data_size]).collect();
+            for (part, text) in parts.iter_mut().zip(&mut texts) {
+                part.p_data = text.as_mut_ptr().cast();
             }
-            list(self.device.handle(), &executable, &mut count, found.as_mut_ptr()).result()?;
-            let assembly = found.iter().zip(&texts).find(|(one, _)| text(&one.name) == "Assembly");
+            list(self.device.handle(), &executable, &mut count, parts.as_mut_ptr()).result()?;
+            let assembly = parts.iter().zip(&texts).find(|(part, _)| text(&part.name) == "Assembly");
             let assembly = assembly.map(|(_, text)| String::from_utf8_lossy(text).trim_end_matches('\0').to_string());
             Ok(Compiled { statistics, assembly: assembly.unwrap_or_default() })
         }

@@ -1,43 +1,44 @@
-//! Runs what RADV wrote for one workgroup of a chip that is not there, and counts what that costs.
+//! Emulates a workgroup that runs RADV's machine code, and estimates its time.
 //!
-//! After AMD's instruction sets of Vega, RDNA 2 and RDNA 3; that it is right shows in what it comes to. Floats round to nearest; a result that the chip would flush to zero
-//! is counted, since then nothing of it can be said here.
+//! The emulator follows AMD's instruction sets of Vega, RDNA 2 and RDNA 3. That it is correct shows in its results,
+//! which equal the CPU's. Floats round to nearest. Results that the chip may flush to zero are counted, because the
+//! emulator does not flush them.
 //!
-//! Time is a model, and what it leaves out is much: caches, bandwidth, conflicts of banks, clocks, and waves that hinder
-//! each other but for the vector unit that they share. See [`Chip::share`].
+//! The time is a model. It leaves out caches, bandwidth, bank conflicts and clock rates. Waves compete only for the
+//! vector unit. See [`Chip::share`].
 
 use std::collections::VecDeque;
 use std::fmt;
 
 use crate::assembly::{Action, CONDITION, Change, EXEC, Instruction, Operand, Place, Program, SCALAR, When, f};
 
-/// Cycles until memory answers a vector load and a scalar one, and until a workgroup's own memory does.
+/// Latency in cycles of vector loads, scalar loads, and accesses to a workgroup's memory.
 const MEMORY: u64 = 320;
 const SCALAR_MEMORY: u64 = 200;
 const LOCAL_MEMORY: u64 = 64;
-/// Bytes of a workgroup's own memory.
+/// Bytes of a workgroup's memory.
 const LOCAL_BYTES: usize = 64 << 10;
-/// The content of registers and memory that were never written: as a float it is NaN.
+/// The initial content of registers and memory. As a float, it is NaN.
 pub const GARBAGE: u32 = 0xffff_dead;
 
-/// How a chip runs waves.
+/// The properties of a chip.
 #[derive(Clone, Copy, Debug)]
 pub struct Chip {
-    /// As RADV calls it.
+    /// RADV's name of the family.
     pub family: &'static str,
-    /// Threads of a wave.
+    /// Threads per wave.
     pub wave: usize,
-    /// Lanes of one vector unit, and how many of these a compute unit has.
+    /// Lanes per vector unit, and vector units per compute unit.
     pub lanes: usize,
     pub units: usize,
-    /// Vector registers of a wave's thread that one unit has for all its waves, how many are given out at once, and how
-    /// many waves it takes at most.
+    /// Vector registers per lane of a vector unit, shared by its waves; the granule in which they are allocated; and
+    /// the maximum number of waves.
     pub registers: usize,
     pub granule: usize,
     pub waves: usize,
-    /// Cycles from a vector instruction's start to where the next may use its result.
+    /// Cycles from the start of a vector instruction until another can use its result.
     pub latency: u64,
-    /// Whether the workgroup's place and its grid's size come as on GCN.
+    /// Whether it is a GCN chip. These have unfused multiply-adds, and pass the size of the grid in another way.
     pub gcn: bool,
 }
 
@@ -50,37 +51,38 @@ impl fmt::Display for Chip {
 /// The result of running a kernel.
 #[derive(Clone, Copy, Debug)]
 pub struct Cost {
-    /// Vector instructions of all waves of the workgroup.
+    /// Number of vector instructions, in all waves of the workgroup.
     pub vector: u64,
-    /// Cycles of the slowest wave with the machine for itself.
-    pub alone: u64,
-    /// Float results that are too small for a normal number.
+    /// Cycles of the slowest wave, if each has the machine for itself.
+    pub slowest_wave: u64,
+    /// Number of float results that are denormal.
     pub denormal: u64,
 }
 
 impl Chip {
-    /// Workgroups of so many threads and registers that a compute unit runs side by side.
-    fn side_by_side(&self, threads: usize, registers: usize) -> usize {
-        let waves_a_unit = (self.registers / registers.next_multiple_of(self.granule)).min(self.waves);
-        (waves_a_unit * self.units / threads.div_ceil(self.wave)).max(1)
+    /// Returns how many workgroups a compute unit runs at the same time.
+    fn concurrent_workgroups(&self, threads: usize, registers: usize) -> usize {
+        let waves_per_unit = (self.registers / registers.next_multiple_of(self.granule)).min(self.waves);
+        (waves_per_unit * self.units / threads.div_ceil(self.wave)).max(1)
     }
 
-    /// The part of a compute unit's f32 operations, one a lane and cycle, that so many operations of a workgroup are:
-    /// what takes longer counts, its vector instructions or its slowest wave, with as many workgroups side by side as fit.
+    /// Returns the operations of a workgroup as a share of a compute unit's f32 rate, which is one per lane and cycle.
+    /// The time of a workgroup is the larger of two times: that of its vector instructions, and that of its slowest
+    /// wave divided by the number of concurrent workgroups.
     pub fn share(&self, operations: f64, threads: usize, registers: usize, cost: Cost) -> f64 {
         let lanes = (self.lanes * self.units) as f64;
         let issued = (cost.vector * self.wave as u64) as f64 / lanes;
-        let waited = cost.alone as f64 / self.side_by_side(threads, registers) as f64;
+        let waited = cost.slowest_wave as f64 / self.concurrent_workgroups(threads, registers) as f64;
         operations / (issued.max(waited) * lanes)
     }
 
-    /// Runs a workgroup of so many threads, the grid's only one, on buffers by their binding.
+    /// Runs a grid of one workgroup. `buffers` has the buffer of each binding.
     pub fn run(&self, assembly: &str, threads: usize, buffers: &mut [Vec<u32>]) -> Cost {
         let program = Program::parse(assembly, self.family);
         let mut local = vec![GARBAGE; LOCAL_BYTES / 4];
         let mut waves: Vec<Wave> =
             (0..threads).step_by(self.wave).map(|first| Wave::new(self, first, threads)).collect();
-        // From barrier to barrier, one wave after the other.
+        // Waves run one after the other, each up to the next barrier.
         while waves.iter().any(|wave| !wave.ended) {
             for wave in waves.iter_mut().filter(|wave| !wave.ended) {
                 wave.run(&program, buffers, &mut local);
@@ -88,24 +90,25 @@ impl Chip {
         }
         Cost {
             vector: waves.iter().map(|wave| wave.vector).sum(),
-            alone: waves.iter().map(|wave| wave.clock.now).max().expect("a workgroup has a wave"),
+            slowest_wave: waves.iter().map(|wave| wave.clock.now).max().expect("a workgroup has a wave"),
             denormal: waves.iter().map(|wave| wave.denormal).sum(),
         }
     }
 }
 
-/// When what is on its way has come, for one wave that has the machine for itself and goes in order.
+/// The time of one in-order wave that has the machine for itself.
 struct Clock {
     now: u64,
-    /// When each register can be read.
+    /// The time from which each register can be read.
     ready: [u64; CONDITION + 1],
-    /// Answers outstanding, of vector memory and of the others.
+    /// Completion times of outstanding accesses: to memory by vector instructions, and all others.
     memory: VecDeque<u64>,
     others: VecDeque<u64>,
 }
 
 impl Clock {
-    fn pass(&mut self, chip: &Chip, instruction: &Instruction) {
+    /// Advances by one instruction.
+    fn advance(&mut self, chip: &Chip, instruction: &Instruction) {
         use Action::*;
         let start = instruction.reads.iter().map(|&place| self.ready[place]).max().unwrap_or(0).max(self.now);
         let (takes, until) = match instruction.action {
@@ -114,7 +117,7 @@ impl Clock {
                 let mut now = self.now;
                 for (queue, left) in [(&mut self.memory, memory), (&mut self.others, others)] {
                     while left.is_some_and(|left| queue.len() > left) {
-                        now = now.max(queue.pop_front().expect("longer than that"));
+                        now = now.max(queue.pop_front().expect("the queue is not empty"));
                     }
                 }
                 self.now = now + 1;
@@ -133,7 +136,7 @@ impl Clock {
         }
         match instruction.action {
             Load => self.memory.push_back(self.now + MEMORY),
-            // GCN counts them together.
+            // GCN counts loads and stores together.
             Store if chip.gcn => self.memory.push_back(self.now + MEMORY),
             LoadDescriptor | LoadScalars => self.others.push_back(self.now + SCALAR_MEMORY),
             LocalLoad(..) | LocalStore(_) => self.others.push_back(self.now + LOCAL_MEMORY),
@@ -148,17 +151,17 @@ struct Wave {
     vector_registers: Vec<[u32; 64]>,
     scalar_registers: [u32; 128],
     condition: bool,
-    /// The next instruction.
+    /// The index of the next instruction.
     at: usize,
     ended: bool,
-    /// Vector instructions so far, each as often as it takes the time of one.
+    /// Number of vector instructions, weighted with [`Instruction::issues`].
     vector: u64,
     denormal: u64,
     clock: Clock,
 }
 
 impl Wave {
-    /// One that begins with thread `first` of its workgroup.
+    /// Makes a wave that starts with thread `first` of its workgroup.
     fn new(chip: &Chip, first: usize, threads: usize) -> Wave {
         let clock = Clock { now: 0, ready: [0; CONDITION + 1], memory: VecDeque::new(), others: VecDeque::new() };
         let mut wave = Wave {
@@ -175,7 +178,8 @@ impl Wave {
         wave.vector_registers[0] = std::array::from_fn(|lane| (first + lane) as u32);
         let alive = chip.wave.min(threads - first);
         wave.set_mask(EXEC, u64::MAX >> (64 - alive));
-        // Descriptors lie at 0, and there is one workgroup: its place is 0 along every axis.
+        // Descriptors are at address 0. The position of the only workgroup is 0 on every axis. Chips after GCN get the
+        // size of the grid, 1, in registers.
         if !chip.gcn {
             wave.scalar_registers[3..6].fill(1);
         }
@@ -199,7 +203,7 @@ impl Wave {
         (0..self.chip.wave).filter(move |lane| lanes >> lane & 1 == 1)
     }
 
-    /// 32 bits of an operand for a lane, signs applied.
+    /// Returns 32 bits of an operand for a lane, with its modifiers applied.
     fn read(&self, operand: &Operand, lane: usize) -> u32 {
         let bits = match operand.place {
             Place::Vector(first, _) => self.vector_registers[first][lane],
@@ -211,7 +215,7 @@ impl Wave {
         if operand.negative { bits ^ 0x8000_0000 } else { bits }
     }
 
-    /// 64 bits of an operand for a lane.
+    /// Returns 64 bits of an operand for a lane.
     fn read_wide(&self, operand: &Operand, lane: usize) -> u64 {
         let [low, high] = match operand.place {
             Place::Vector(first, _) => [0, 1].map(|next| self.vector_registers[first + next][lane]),
@@ -234,12 +238,12 @@ impl Wave {
         }
     }
 
-    /// Goes on up to a barrier or the end.
+    /// Runs up to the next barrier or the end.
     fn run(&mut self, program: &Program, buffers: &mut [Vec<u32>], local: &mut [u32]) {
         loop {
             let instruction = &program.0[self.at];
             let chip = self.chip;
-            self.clock.pass(&chip, instruction);
+            self.clock.advance(&chip, instruction);
             self.at += 1;
             if instruction.is_vector {
                 self.vector += instruction.issues;
@@ -274,7 +278,7 @@ impl Wave {
                 Action::LoadDescriptor => {
                     let [to, from, offset] = &instruction.operands[..] else { panic!("{}", instruction.text) };
                     let offset = self.read(offset, 0) / 16;
-                    // A descriptor, of which there need only be the binding; or the grid's size, one workgroup.
+                    // This loads a descriptor, for which the emulator uses the binding, or the grid's size, 1.
                     let is_descriptor = from.scalar() == 2;
                     for (word, register) in to.registers().enumerate() {
                         let descriptor = if word % 4 == 0 { offset + word as u32 / 4 } else { 0 };
@@ -395,7 +399,7 @@ impl Wave {
         }
     }
 
-    /// A float's result, scaled where it is told, and counted if it is too small.
+    /// Returns a result, scaled if the instruction says so. Counts it if it is denormal.
     fn rounded(&mut self, result: u32, instruction: &Instruction, rounds: bool) -> u32 {
         let scaled = instruction.scale.map_or(result, |scale| (f(result) * scale).to_bits());
         self.denormal += u64::from(rounds && f(scaled).is_subnormal());
@@ -408,7 +412,7 @@ impl Wave {
         }
     }
 
-    /// Loads from a buffer, or stores; outside of it there are zeros, and what is stored there is lost.
+    /// Loads from a buffer or stores to it. Loads out of bounds give 0, and stores out of bounds do nothing.
     fn exchange(&mut self, instruction: &Instruction, buffers: &mut [Vec<u32>]) {
         let [data, address, descriptor, offset] = &instruction.operands[..] else { panic!("{}", instruction.text) };
         let Place::Vector(first, count) = data.place else { panic!("{}", instruction.text) };
@@ -428,16 +432,16 @@ impl Wave {
         }
     }
 
-    /// The same with the workgroup's memory, at one address or two.
+    /// Loads from the workgroup's memory or stores to it, at one or two addresses.
     fn exchange_locally(&mut self, instruction: &Instruction, local: &mut [u32]) {
         let [a, b] = &instruction.operands[..] else { panic!("{}", instruction.text) };
-        let (loads, words, apart, data, address) = match instruction.action {
-            Action::LocalLoad(words, apart) => (true, words, apart, a.vector(), b),
+        let (loads, words, unit, data, address) = match instruction.action {
+            Action::LocalLoad(words, unit) => (true, words, unit, a.vector(), b),
             Action::LocalStore(words) => (false, words, None, b.vector(), a),
             _ => unreachable!("{}", instruction.text),
         };
-        let offsets = match apart {
-            Some(apart) => instruction.offsets.map(|offset| offset * apart as u32 * 4).to_vec(),
+        let offsets = match unit {
+            Some(unit) => instruction.offsets.map(|offset| offset * unit as u32 * 4).to_vec(),
             None => vec![instruction.offset],
         };
         for lane in self.lanes() {

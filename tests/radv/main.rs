@@ -1,20 +1,22 @@
-//! What AMD's own compiler makes of every shader, for chips that are not there: no fused multiply-add, no scratch, no
-//! spills, registers and instructions under a ceiling. The kernels of the paper's layouts are run by an emulator, too: to
-//! the CPU's bits, and at no less than a share of the chip's f32 rate.
+//! Tests the machine code that AMD's compiler makes of every shader, without an AMD GPU.
 //!
-//! Mesa's RADV compiles for whatever chip `RADV_FORCE_FAMILY` names. It reads that as it starts, so each chip takes a
-//! process of its own: this program once more, as the test `compile`. Without RADV all is skipped in plain sight, or
-//! fails where `FLOTILLA_REQUIRE_RADV=1` says that it is needed.
+//! The code must have no fused multiply-adds, no scratch and no spills. Registers and instructions are limited. The
+//! kernels of the paper's layouts also run in an emulator. There they must give the CPU's bits, and reach a share of
+//! the chip's f32 rate.
 //!
-//! With `FLOTILLA_EVIDENCE=FOLDER` what was read is noted there, as a row of `docs/develop/evidence.md`.
+//! Mesa's RADV compiles for the chip that `RADV_FORCE_FAMILY` names. RADV reads this variable when it starts, so each
+//! chip needs a new process. The process is this program again, with the ignored test `compile`. If RADV is not
+//! installed, tests print that they are skipped. With `FLOTILLA_REQUIRE_RADV=1`, they fail instead.
 //!
-//! `cargo test --test radv -- table --ignored --nocapture` makes the tables of `benches/static-figures.md`.
+//! With `FLOTILLA_EVIDENCE=FOLDER`, the results are written there as a row of `docs/develop/evidence.md`.
+//!
+//! `cargo test --test radv -- table --ignored --nocapture` prints the tables of `benches/static-figures.md`.
 
 #![cfg(feature = "cli")]
 
 mod assembly;
 mod case;
-#[expect(unsafe_code, reason = "a Vulkan driver is called directly")]
+#[expect(unsafe_code, reason = "it calls a Vulkan driver")]
 mod driver;
 mod machine;
 #[path = "../support/mod.rs"]
@@ -36,7 +38,7 @@ use naga::valid::{Capabilities, ValidationFlags, Validator};
 use naga::{BinaryOperator, Expression, Module};
 use rayon::prelude::*;
 
-/// Three generations; the later two in waves of 32, as games have them, the second in waves of 64 too.
+/// The tested chips: three generations. The later two run waves of 32, like games do. The second also runs waves of 64.
 const CHIPS: [Chip; 4] = [
     Chip {
         family: "VEGA20",
@@ -50,7 +52,7 @@ const CHIPS: [Chip; 4] = [
         gcn: true,
     },
     NAVI21,
-    // As RADV would have it if it were not asked.
+    // RADV's default for compute shaders.
     Chip { wave: 64, registers: 512, granule: 8, ..NAVI21 },
     Chip { family: "GFX1100", registers: 1536, granule: 24, ..NAVI21 },
 ];
@@ -67,65 +69,67 @@ const NAVI21: Chip = Chip {
 };
 const PASSES: [Pass; 2] = [Pass::NoContraction, Pass::Guarded];
 
-/// Vector registers, and instructions under each pass, that an episode's kernel takes at most at the paper's layouts.
-/// Ceilings, not measurements: with more registers fewer waves hide each other's waiting.
-const REGISTERS: u64 = 64;
-const INSTRUCTIONS: [u64; 2] = [2600, 3500];
+/// Maximum vector registers of an episode's kernel in the paper's layouts. With more registers, fewer waves run at the
+/// same time and hide each other's latency.
+const MAX_REGISTERS: u64 = 64;
+/// Maximum instructions of such a kernel, for each of [`PASSES`].
+const MAX_INSTRUCTIONS: [u64; 2] = [2600, 3500];
 
-/// The version that these are of, and that the emulator knows.
-const KNOWN: &str = "radv Mesa 22.3";
+/// The version of RADV to which these limits apply, and whose instructions the emulator knows.
+const KNOWN_VERSION: &str = "radv Mesa 22.3";
 
-/// Where the loader looks for drivers' manifests.
+/// The directories in which Vulkan looks for drivers.
 const MANIFESTS: [&str; 3] = ["/usr/share/vulkan/icd.d", "/usr/local/share/vulkan/icd.d", "/etc/vulkan/icd.d"];
 
-/// RADV's manifest, if it is installed.
+/// Returns RADV's manifest. Skips the test if RADV is not installed.
 fn radv(test: &str) -> Option<PathBuf> {
     let entries = MANIFESTS.iter().filter_map(|folder| fs::read_dir(folder).ok()).flatten().flatten();
     let named = |path: &PathBuf| {
         let name = path.file_name().unwrap_or_default().to_string_lossy();
         name.starts_with("radeon_icd") && name.ends_with(".json")
     };
-    let found = entries.map(|entry| entry.path()).find(named);
-    if found.is_none() {
+    let manifest = entries.map(|entry| entry.path()).find(named);
+    if manifest.is_none() {
         skip(test, &format!("no radeon_icd*.json in {}", MANIFESTS.join(", ")));
     }
-    found
+    manifest
 }
 
-fn skip(test: &str, why: &str) {
-    let message = format!("{test}: skipped: {why}");
+/// Prints that a test is skipped, or panics if RADV is required.
+fn skip(test: &str, reason: &str) {
+    let message = format!("{test}: skipped: {reason}");
     assert!(!is_required(), "{message}, but it is required");
-    writeln!(std::io::stderr(), "\n{message}").expect("standard error takes a line");
+    writeln!(std::io::stderr(), "\n{message}").expect("standard error is writable");
 }
 
 fn is_required() -> bool {
     std::env::var("FLOTILLA_REQUIRE_RADV").as_deref() == Ok("1")
 }
 
-/// Whether what this version writes is to be run and as small and fast as is asked: another may write what the emulator
-/// has never met.
+/// Reports whether to emulate the code of this version of RADV and to check its size and speed. Another version may use
+/// instructions that the emulator does not know.
 fn is_known(test: &str, version: &str) -> bool {
-    let known = version.starts_with(KNOWN) || is_required();
+    let known = version.starts_with(KNOWN_VERSION) || is_required();
     if !known {
-        skip(test, &format!("running what {version} writes, and its size and speed; this is for {KNOWN}"));
+        skip(test, &format!("emulation, size and speed are tested only with {KNOWN_VERSION}, not with {version}"));
     }
     known
 }
 
-/// A shader on its way to the compiler: its name, its entry point and its SPIR-V.
+/// A shader to compile: name, entry point and SPIR-V.
 type Job = (String, &'static str, Vec<u32>);
 
-/// Every shader of a job's name, and what came of it.
+/// The compiled shaders by name.
 type Results = BTreeMap<String, Compiled>;
 
-/// Compiles all jobs for a chip.
-fn compiled(manifest: &Path, chip: Chip, jobs: &[Job]) -> (String, Results) {
-    let folder = tempfile::tempdir().expect("a folder for the shaders");
+/// Compiles shaders for a chip, in a new process. Returns the version of the driver and the results.
+fn compile_for(manifest: &Path, chip: Chip, jobs: &[Job]) -> (String, Results) {
+    let folder = tempfile::tempdir().expect("a temporary directory");
     for (name, entry, words) in jobs {
         let path = folder.path().join(format!("{name}@{entry}.spv"));
-        fs::write(path, bytemuck::cast_slice(words)).expect("the folder takes a file");
+        fs::write(path, bytemuck::cast_slice(words)).expect("the file is writable");
     }
-    let program = std::env::current_exe().expect("a program knows where it is");
+    let program = std::env::current_exe().expect("the path of this program");
     let output = Command::new(program)
         .args(["compile", "--exact", "--ignored", "--nocapture"])
         .env("FLOTILLA_RADV_FOLDER", folder.path())
@@ -134,78 +138,81 @@ fn compiled(manifest: &Path, chip: Chip, jobs: &[Job]) -> (String, Results) {
         .envs([("RADV_FORCE_FAMILY", chip.family), ("RADV_DEBUG", "nocache")])
         .env("RADV_PERFTEST", if chip.wave == 32 { "cswave32" } else { "" })
         .output()
-        .expect("this program can be run");
+        .expect("this program starts");
     assert!(output.status.success(), "{}: {}", chip.family, String::from_utf8_lossy(&output.stdout));
-    let read = |name: &str, what: &str| {
-        let path = folder.path().join(format!("{name}.{what}"));
+    let read = |name: &str, extension: &str| {
+        let path = folder.path().join(format!("{name}.{extension}"));
         fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
     };
     let results = jobs.iter().map(|(name, ..)| {
         let statistics = read(name, "statistics")
             .lines()
             .filter_map(|line| line.split_once('='))
-            .map(|(what, count)| (what.to_string(), count.parse().expect("a number")))
+            .map(|(name, count)| (name.to_string(), count.parse().expect("a number")))
             .collect();
         (name.clone(), Compiled { statistics, assembly: read(name, "assembly") })
     });
     (read("driver", "txt"), results.collect())
 }
 
-/// The other side of `compiled`: compiles what lies in a folder, for the chip that the environment names.
+/// Runs in the process that [`compile_for`] starts. Compiles all shaders of a directory for the chip that the
+/// environment names.
 #[test]
-#[ignore = "runs as a process of its own, for one chip"]
+#[ignore = "other tests start it as a process, once per chip"]
 fn compile() {
     let Ok(folder) = std::env::var("FLOTILLA_RADV_FOLDER") else { return };
     let folder = Path::new(&folder);
     let driver = Driver::open().unwrap_or_else(|error| panic!("RADV cannot be opened: {error}"));
-    fs::write(folder.join("driver.txt"), &driver.version).expect("the folder takes a file");
-    for entry in fs::read_dir(folder).expect("the folder can be listed") {
-        let path = entry.expect("and its entries too").path();
+    fs::write(folder.join("driver.txt"), &driver.version).expect("the file is writable");
+    for entry in fs::read_dir(folder).expect("the directory is readable") {
+        let path = entry.expect("the directory is readable").path();
         let file = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let Some((name, point)) = file.strip_suffix(".spv").and_then(|name| name.split_once('@')) else { continue };
-        let bytes = fs::read(&path).expect("a shader can be read");
-        let point = CString::new(point).expect("no zero in a name");
+        let bytes = fs::read(&path).expect("the shader is readable");
+        let point = CString::new(point).expect("a name without a zero byte");
         let words = bytemuck::pod_collect_to_vec::<u8, u32>(&bytes);
-        let Compiled { statistics, assembly } = driver.compile(&words, &point).expect("the driver takes it");
-        let lines: Vec<_> = statistics.iter().map(|(what, count)| format!("{what}={count}")).collect();
-        fs::write(folder.join(format!("{name}.statistics")), lines.join("\n")).expect("the folder takes a file");
-        fs::write(folder.join(format!("{name}.assembly")), assembly).expect("the folder takes a file");
+        let Compiled { statistics, assembly } = driver.compile(&words, &point).expect("the driver compiles the shader");
+        let lines: Vec<_> = statistics.iter().map(|(name, count)| format!("{name}={count}")).collect();
+        fs::write(folder.join(format!("{name}.statistics")), lines.join("\n")).expect("the file is writable");
+        fs::write(folder.join(format!("{name}.assembly")), assembly).expect("the file is writable");
     }
 }
 
-fn emitted(module: &Module) -> Vec<u32> {
+/// Returns a module as SPIR-V.
+fn emit(module: &Module) -> Vec<u32> {
     let info = Validator::new(ValidationFlags::all(), Capabilities::empty()).validate(module);
-    exact::emit(module, &info.expect("a valid shader"), false).expect("it has SPIR-V")
+    exact::emit(module, &info.expect("a valid shader"), false).expect("valid SPIR-V")
 }
 
-fn under(pass: Pass, wgsl: &str) -> Vec<u32> {
+/// Compiles WGSL to SPIR-V with an exactness pass.
+fn spirv(pass: Pass, wgsl: &str) -> Vec<u32> {
     let (module, _) = exact::parse(wgsl).unwrap_or_else(|error| panic!("{error}"));
     match pass {
-        Pass::NoContraction => exact::decorate(&emitted(&module)),
-        Pass::Guarded => emitted(&exact::guarded(&module).unwrap_or_else(|error| panic!("{error}"))),
-        Pass::Plain => emitted(&module),
+        Pass::NoContraction => exact::decorate(&emit(&module)),
+        Pass::Guarded => emit(&exact::guarded(&module).unwrap_or_else(|error| panic!("{error}"))),
+        Pass::Plain => emit(&module),
     }
 }
 
-/// The kernels that play the cases.
+/// Returns the kernels that play the cases.
 fn episodes(pass: Pass, cases: &[Case]) -> impl Iterator<Item = Job> {
-    cases.iter().map(move |case| (case.name.clone(), "episode", under(pass, &case.workgroup.shader)))
+    cases.iter().map(move |case| (case.name.clone(), "episode", spirv(pass, &case.workgroup.shader)))
 }
 
-/// These, and every other shader.
+/// Returns the kernels of the cases, and all other shaders.
 fn jobs(pass: Pass, cases: &[Case]) -> Vec<Job> {
     let others = shaders().into_iter().flat_map(|(name, text)| {
         let (module, _) = exact::parse(&text).expect("shaders are valid");
         let entries: Vec<_> = module.entry_points.iter().map(|entry| entry.name.clone()).collect();
-        let words = under(pass, &text);
+        let words = spirv(pass, &text);
         entries.into_iter().map(move |entry| (format!("{name}, {entry}"), &*entry.leak(), words.clone()))
     });
     episodes(pass, cases).chain(others).collect()
 }
 
-/// Instructions that round a product and a sum at once.
+/// Returns the instructions that round a product and a sum only once.
 ///
-/// Not those whose product is exact: `v_fma_f32` by a literal power of two of at least 1, which only scales.
+/// Leaves out `v_fma_f32` with a literal power of two of at least 1 as a factor, because its product is exact.
 fn fused(assembly: &str) -> Vec<&str> {
     let scales = |operand: &str| {
         let bits = operand.strip_prefix("0x").and_then(|hex| u32::from_str_radix(hex, 16).ok());
@@ -213,20 +220,20 @@ fn fused(assembly: &str) -> Vec<&str> {
     };
     let is_fused = |line: &&str| {
         let (instruction, operands) = line.trim().split_once(' ').unwrap_or((line.trim(), ""));
-        // To, factor, factor, term.
+        // The operands are a result, two factors, and a term.
         let mut factors = operands.split([',', ' ']).filter(|operand| !operand.is_empty()).skip(1).take(2);
         instruction.contains("fma") && !(instruction.starts_with("v_fma_f32") && factors.any(scales))
     };
     assembly.lines().filter(is_fused).collect()
 }
 
-/// Whether the text is what it should be: no shader does without a sum or a product.
+/// Reports whether the text is assembly at all: every shader has a sum or a product.
 fn has_arithmetic(assembly: &str) -> bool {
     assembly.contains("v_mul_f32") || assembly.contains("v_mul_lo_u32") || assembly.contains("v_add")
 }
 
 #[test]
-fn the_reader_of_assembly_knows_what_is_fused() {
+fn fused_instructions_are_recognised() {
     for fused_line in [
         "\tv_fma_f32 v1, v2, v3, v4 ; d5cb0001",
         "v_fmac_f32_e32 v1, v2, v3",
@@ -251,93 +258,98 @@ fn the_reader_of_assembly_knows_what_is_fused() {
 }
 
 #[test]
-fn what_the_compiler_writes_is_exact_small_and_fast() {
-    let test = "what_the_compiler_writes_is_exact_small_and_fast";
+fn compiled_shaders_are_exact_small_and_fast() {
+    let test = "compiled_shaders_are_exact_small_and_fast";
     let Some(manifest) = radv(test) else { return };
-    let (cases, mut read) = (Case::all(), Vec::new());
-    for (pass, most_instructions) in PASSES.into_iter().zip(INSTRUCTIONS) {
+    let (cases, mut findings) = (Case::all(), Vec::new());
+    for (pass, max_instructions) in PASSES.into_iter().zip(MAX_INSTRUCTIONS) {
         let jobs = jobs(pass, &cases);
         for chip in CHIPS {
-            let (version, results) = compiled(&manifest, chip, &jobs);
+            let (version, results) = compile_for(&manifest, chip, &jobs);
             println!("{chip}: {version}, {} shaders, {pass} pass", results.len());
             let is_known = is_known(test, &version);
             for (name, Compiled { statistics, assembly }) in &results {
-                let what = format!("{chip} under the {pass} pass, {name} ({version})");
+                let context = format!("{chip} under the {pass} pass, {name} ({version})");
                 if !has_arithmetic(assembly) {
-                    return skip(test, &format!("{what}: this is no assembly: {assembly}"));
+                    return skip(test, &format!("{context}: not assembly: {assembly}"));
                 }
-                assert_eq!(fused(assembly), Vec::<&str>::new(), "{what}: fused");
-                // GCN has an unfused multiply-add: product and sum are rounded.
+                assert_eq!(fused(assembly), Vec::<&str>::new(), "{context}: fused");
+                // The multiply-adds v_mad_f32 and v_mac_f32 round the product and the sum. Only GCN has them.
                 if !chip.gcn {
-                    assert!(!assembly.contains("v_mad_f32") && !assembly.contains("v_mac_f32"), "{what}");
+                    assert!(!assembly.contains("v_mad_f32") && !assembly.contains("v_mac_f32"), "{context}");
                 }
-                let count = |named: &str| {
-                    *statistics.get(named).unwrap_or_else(|| panic!("{what}: no \"{named}\" in {statistics:?}"))
+                let count = |name: &str| {
+                    *statistics.get(name).unwrap_or_else(|| panic!("{context}: no \"{name}\" in {statistics:?}"))
                 };
-                // Several agents a thread and networks wider than the paper's are indexed, and nobody traces for speed.
+                // The limits do not apply to the other episode shaders. They index arrays, for several agents per
+                // thread or wide networks, or they trace, which need not be fast.
                 if name.starts_with("episode, ") || !is_known {
                     continue;
                 }
-                for none in ["Scratch size", "Spilled SGPRs", "Spilled VGPRs"] {
-                    assert_eq!(count(none), 0, "{what}: {none}");
+                for name in ["Scratch size", "Spilled SGPRs", "Spilled VGPRs"] {
+                    assert_eq!(count(name), 0, "{context}: {name}");
                 }
-                assert!(count("VGPRs") <= REGISTERS, "{what}: {} registers", count("VGPRs"));
-                assert!(count("Instructions") <= most_instructions, "{what}: {} instructions", count("Instructions"));
+                assert!(count("VGPRs") <= MAX_REGISTERS, "{context}: {} registers", count("VGPRs"));
+                assert!(count("Instructions") <= max_instructions, "{context}: {} instructions", count("Instructions"));
             }
             let mut finding = format!("{chip}, {pass} pass: {} shaders, none fused", results.len());
             if is_known {
                 let steps: u64 = cases.par_iter().map(|case| run(case, chip, pass, &results[&case.name])).sum();
                 let kernels = cases.len();
-                finding += &format!("; {kernels} run by an emulator for {steps} agent-steps, to the CPU's bits");
+                finding += &format!("; {kernels} run in an emulator for {steps} agent-steps, with the CPU's bits");
             }
-            read.push((version, finding));
+            findings.push((version, finding));
         }
     }
-    note(read);
+    write_evidence(findings);
 }
 
-/// Runs what was compiled of a case: to the CPU's bits, and as fast as is asked. How many agent-steps that was.
+/// Emulates the compiled kernel of a case, and checks its results and its speed. Returns the number of agent-steps.
 fn run(case: &Case, chip: Chip, pass: Pass, compiled: &Compiled) -> u64 {
-    let what = format!("{chip} under the {pass} pass, {}", case.name);
-    let Run { differ, cost, share } = case.run(&chip, compiled);
-    assert_eq!(differ, 0, "{what}: words of the record and of where agents stand");
-    assert_eq!(cost.denormal, 0, "{what}: results that the chip may flush");
-    let least = case.least(&chip, pass);
-    assert!(share >= least, "{what}: {:.1} % of the f32 rate, not {:.0}", 100.0 * share, 100.0 * least);
+    let context = format!("{chip} under the {pass} pass, {}", case.name);
+    let Run { differences, cost, share } = case.run(&chip, compiled);
+    assert_eq!(differences, 0, "{context}: words of the record and the final states that differ from the CPU's");
+    assert_eq!(cost.denormal, 0, "{context}: results that the chip may flush to zero");
+    let min = case.min_share(&chip, pass);
+    assert!(share >= min, "{context}: {:.1} % of the f32 rate, not {:.0}", 100.0 * share, 100.0 * min);
     case.agent_steps
 }
 
-/// Notes what was read where `FLOTILLA_EVIDENCE` says, each with the driver that compiled it.
-fn note(read: Vec<(String, String)>) {
+/// Writes the findings to the directory that `FLOTILLA_EVIDENCE` names. Each has the version of the driver.
+fn write_evidence(findings: Vec<(String, String)>) {
     use flotilla::record::evidence::{MachineReport, Tier};
     let Some(folder) = std::env::var_os("FLOTILLA_EVIDENCE") else { return };
-    let note = read.first().map(|(version, _)| format!("Mesa's RADV, {version}, for chips that were not there"));
-    let findings = read.into_iter().map(|(_, finding)| finding).collect();
-    let sighting = MachineReport { note, findings, ..MachineReport::new(Tier::MachineCodeRead) };
-    fs::write(Path::new(&folder).join("radv.json"), sighting.to_json()).expect("the folder takes a file");
+    let note = findings.first().map(|(version, _)| format!("Mesa's RADV, {version}, for chips that are not installed"));
+    let findings = findings.into_iter().map(|(_, finding)| finding).collect();
+    let report = MachineReport { note, findings, ..MachineReport::new(Tier::MachineCodeRead) };
+    fs::write(Path::new(&folder).join("radv.json"), report.to_json()).expect("the file is writable");
 }
 
-/// The canary: without a pass the compiler fuses, and it shows, in its code and in what that does.
+/// A canary: without a pass, the compiler fuses. Both the search for instructions and the emulator must detect this.
 #[test]
 fn without_a_pass_the_compiler_fuses() {
     let Some(manifest) = radv("without_a_pass_the_compiler_fuses") else { return };
     let cases = Case::all();
     let jobs: Vec<_> = jobs(Pass::Plain, &cases).into_iter().filter(|(_, entry, _)| *entry == "episode").collect();
     for chip in CHIPS.into_iter().filter(|chip| !chip.gcn) {
-        let (version, results) = compiled(&manifest, chip, &jobs);
+        let (version, results) = compile_for(&manifest, chip, &jobs);
         for (name, Compiled { assembly, .. }) in &results {
-            let found = fused(assembly).len();
-            assert!(found >= 20, "{chip}, {name}: only {found} of its instructions are fused");
+            let count = fused(assembly).len();
+            assert!(count >= 20, "{chip}, {name}: only {count} instructions are fused");
         }
         let is_known = is_known("without_a_pass_the_compiler_fuses", &version);
         for case in cases.iter().filter(|_| is_known) {
-            assert!(case.run(&chip, &results[&case.name]).differ > 0, "{chip}, {}: nothing shows", case.name);
+            assert!(
+                case.run(&chip, &results[&case.name]).differences > 0,
+                "{chip}, {}: the emulator's results are equal",
+                case.name
+            );
         }
     }
 }
 
-/// Guards by `^` leaked: the first sum of an unrolled loop adds to 0, which falls away, and the two guards around it
-/// cancelled. Guards by `|` do not.
+/// Guards that use `^` do not work. The first sum of an unrolled loop adds to 0 and is removed. The guards before and
+/// after it then cancel each other. Guards that use `|` do not cancel.
 #[test]
 fn guards_are_not_cancelled() {
     let Some(manifest) = radv("guards_are_not_cancelled") else { return };
@@ -363,35 +375,39 @@ fn guards_are_not_cancelled() {
             }
         }
     }
-    let jobs: [Job; 2] = [("or".into(), "sum", emitted(&by_or)), ("xor".into(), "sum", emitted(&by_xor))];
+    let jobs: [Job; 2] = [("or".into(), "sum", emit(&by_or)), ("xor".into(), "sum", emit(&by_xor))];
     for chip in CHIPS.into_iter().filter(|chip| !chip.gcn) {
-        let (_, results) = compiled(&manifest, chip, &jobs);
+        let (_, results) = compile_for(&manifest, chip, &jobs);
         assert_eq!(fused(&results["or"].assembly), Vec::<&str>::new(), "{}", chip.family);
-        assert!(!fused(&results["xor"].assembly).is_empty(), "{}: the test shows nothing", chip.family);
+        assert!(
+            !fused(&results["xor"].assembly).is_empty(),
+            "{}: guards with ^ were not cancelled, so this test is useless",
+            chip.family
+        );
     }
 }
 
-/// Prints the table by chip of `benches/static-figures.md`.
+/// Prints the tables by chip of `benches/static-figures.md`.
 #[test]
 #[ignore = "prints a table"]
 fn table() {
     let Some(manifest) = radv("table") else { return };
     let cases = Case::all();
     let mut rows: BTreeMap<(usize, usize), Vec<String>> = BTreeMap::new();
-    let mut heads = Vec::new();
+    let mut columns = Vec::new();
     let mut versions = Vec::new();
     for pass in PASSES {
         let jobs: Vec<Job> = episodes(pass, &cases).collect();
         for chip in CHIPS {
-            let (version, results) = compiled(&manifest, chip, &jobs);
+            let (version, results) = compile_for(&manifest, chip, &jobs);
             versions.push(version);
-            heads.push(format!("{chip}, {pass}"));
+            columns.push(format!("{chip}, {pass}"));
             let runs: Vec<Run> = cases.par_iter().map(|case| case.run(&chip, &results[&case.name])).collect();
             for (index, (case, Run { cost, share, .. })) in cases.iter().zip(runs).enumerate() {
-                let count = |what: &str| results[&case.name].statistics[what];
+                let count = |name: &str| results[&case.name].statistics[name];
                 let cells = [
                     format!("{:.0}", 100.0 * share),
-                    format!("{:.0}, {:.0}", case.slots(&chip, cost), case.alone(cost)),
+                    format!("{:.0}, {:.0}", case.slots(&chip, cost), case.cycles(cost)),
                     format!("{}, {}", count("VGPRs"), count("Instructions")),
                 ];
                 for (table, cell) in cells.into_iter().enumerate() {
@@ -408,8 +424,8 @@ fn table() {
     ];
     for (table, title) in tables.into_iter().enumerate() {
         println!("\n{title}, {}:\n", versions.join(", "));
-        println!("| layout, kernel, threads | {} |", heads.join(" | "));
-        println!("|---|{}", "---|".repeat(heads.len()));
+        println!("| layout, kernel, threads | {} |", columns.join(" | "));
+        println!("|---|{}", "---|".repeat(columns.len()));
         for (index, case) in cases.iter().enumerate() {
             println!("| {} | {} |", case.name, rows[&(table, index)].join(" | "));
         }
@@ -419,8 +435,8 @@ fn table() {
 mod emulator {
     use super::*;
 
-    /// A wave that adds its threads' numbers to what memory has, one by one, and leaves the sums there.
-    const SUMS: &str = "BB0:
+    /// A program in which three threads add their number to a word of memory, double the sum, and store it.
+    const PROGRAM: &str = "BB0:
 \ts_load_dwordx4 s[8:11], s[2:3], 0x20 ; a comment
 \tv_lshlrev_b32_e32 v1, 2, v0
 \tv_cvt_f32_u32_e32 v2, v0
@@ -438,26 +454,28 @@ BB2:
 ";
 
     #[test]
-    fn a_wave_is_run_and_timed() {
+    fn the_emulator_runs_and_times_a_wave() {
         let chip = CHIPS[1];
         let floats = |values: &[f32]| values.iter().map(|value| value.to_bits()).collect::<Vec<_>>();
         let mut buffers = [vec![], vec![], floats(&[0.0, 1.0, 2.0, 3.0, 4.0])];
-        let cost = chip.run(SUMS, 32, &mut buffers);
+        let cost = chip.run(PROGRAM, 32, &mut buffers);
         assert_eq!(buffers[2], floats(&[2.0, 6.0, 10.0, 3.0, 4.0]));
         assert_eq!((cost.vector, cost.denormal), (4, 0));
-        // The descriptor 1 + 200 and its wait 1, the load 1 + 320 and its wait 1, the sum 1 and 4 until it can be stored, 1.
-        assert_eq!(cost.alone, 530);
-        // One instruction a cycle and unit; two workgroups of 16 waves side by side halve what is waited for.
-        let cost = machine::Cost { vector: 6400, alone: 100, denormal: 0 };
+        // The descriptor takes 1 + 200 and its wait 1, the load 1 + 320 and its wait 1. The sum takes 1. The store
+        // waits 4 for it and takes 1.
+        assert_eq!(cost.slowest_wave, 530);
+        // With few cycles of the slowest wave, the vector instructions decide: one per cycle and unit.
+        let cost = machine::Cost { vector: 6400, slowest_wave: 100, denormal: 0 };
         assert_eq!(chip.share(102_400.0, 512, 64, cost), 0.5);
-        let cost = machine::Cost { alone: 12_800, ..cost };
+        // With many, they decide. Two concurrent workgroups of 16 waves halve them; with 65 registers, only one fits.
+        let cost = machine::Cost { slowest_wave: 12_800, ..cost };
         assert_eq!(chip.share(102_400.0, 512, 64, cost), 0.25);
         assert_eq!(chip.share(102_400.0, 512, 65, cost), 0.125);
     }
 
     #[test]
-    #[should_panic(expected = "nobody knows `v_sin_f32_e32 v1, v0`")]
-    fn what_is_unknown_is_named() {
+    #[should_panic(expected = "unknown instruction `v_sin_f32_e32 v1, v0`")]
+    fn unknown_instructions_are_named() {
         CHIPS[0].run("BB0:\n\tv_sin_f32_e32 v1, v0\n\ts_endpgm\n", 64, &mut []);
     }
 }
