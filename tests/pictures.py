@@ -1,6 +1,8 @@
-"""Draws SVG pictures by resvg, and compares them with the PNG pictures that flotilla draws itself.
+"""Compares flotilla's SVG pictures, as resvg draws them, with the PNG pictures that flotilla draws.
 
-    python3 tests/pictures.py FLOTILLA        (needs the packages resvg-py and pillow)
+    python3 tests/pictures.py FLOTILLA
+
+Needs the packages resvg-py and pillow.
 """
 
 import io
@@ -19,23 +21,24 @@ PICTURES = {
     "comparison": ["plot", "run", "other"],
     "still": ["replay", "run", "--quiet"],
 }
-# Two programs may blend the pixels at an edge differently; what is drawn elsewhere or in another colour differs more.
-EDGE, MOST = 96, 0.001
+# Programs blend the pixels at edges differently. Larger differences come from another place or colour, and are allowed
+# for a small share of the pixels.
+THRESHOLD, MAX_SHARE = 96, 0.001
 
 
-def differing(one, other):
-    """Returns the share of pixels of which a colour differs by more than EDGE."""
-    largest = ImageChops.difference(one, other).split()
-    strong = [band.point(lambda value: 255 * (value > EDGE)) for band in largest]
-    any_band = ImageChops.lighter(ImageChops.lighter(strong[0], strong[1]), strong[2])
-    return any_band.histogram()[255] / (one.width * one.height)
+def differing(a, b):
+    """Returns the share of pixels in which a colour differs by more than THRESHOLD."""
+    bands = ImageChops.difference(a, b).split()
+    large = [band.point(lambda value: 255 * (value > THRESHOLD)) for band in bands]
+    any_band = ImageChops.lighter(ImageChops.lighter(large[0], large[1]), large[2])
+    return any_band.histogram()[255] / (a.width * a.height)
 
 
 def main(flotilla):
     flotilla = pathlib.Path(flotilla).resolve()
     with tempfile.TemporaryDirectory() as folder:
-        def run(*words):
-            subprocess.run([flotilla, *map(str, words)], cwd=folder, check=True, stdout=subprocess.DEVNULL)
+        def run(*arguments):
+            subprocess.run([flotilla, *map(str, arguments)], cwd=folder, check=True, stdout=subprocess.DEVNULL)
 
         for out, fitness in ("run", "Df"), ("other", "G"):
             run("train", CONFIG, "--generations", 8, "--fitness", fitness, "--backend", "cpu", "--quiet", "--out", out)
@@ -45,20 +48,20 @@ def main(flotilla):
                 run(*command, "--out", f"{name}.{kind}")
             png = Image.open(pathlib.Path(folder, f"{name}.png")).convert("RGB")
             source = str(pathlib.Path(folder, f"{name}.svg"))
-            # PNG has 300 dots per inch.
+            # flotilla draws PNG with 300 dots per inch.
             svg = bytes(resvg_py.svg_to_bytes(svg_path=source, dpi=300, width=png.width, height=png.height))
             svg = Image.open(io.BytesIO(svg)).convert("RGBA")
             white = Image.new("RGBA", svg.size, "white")
             svg = Image.alpha_composite(white, svg).convert("RGB").resize(png.size)
             share = differing(png, svg)
             print(f"{name}: {share:.4%} of the pixels differ")
-            assert share < MOST, name
+            assert share < MAX_SHARE, name
             blank = differing(png, Image.new("RGB", png.size, "white"))
-            assert blank > 10 * MOST, f"{name} is blank"
+            assert blank > 10 * MAX_SHARE, f"{name} is blank"
             drawn[name] = svg
-        # The comparison has to notice another picture.
+        # A canary: another picture has to differ.
         other = drawn["curves"].resize(drawn["comparison"].size)
-        assert differing(other, drawn["comparison"]) > 10 * MOST
+        assert differing(other, drawn["comparison"]) > 10 * MAX_SHARE
 
 
 main(sys.argv[1])

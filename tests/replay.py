@@ -1,10 +1,12 @@
-"""Opens replay pages in headless Chromium: they load, play, scrub, show what `flotilla rollout --trace` traces, and can be
-read in light and dark (WCAG AA).
+"""Tests replay pages in headless Chromium.
 
-    python3 tests/replay.py target/release/flotilla [FOLDER for screenshots]
+    python3 tests/replay.py FLOTILLA [FOLDER]
 
-Python's standard library and a Chromium (named by $CHROMIUM, or found by its usual names) are all that is needed:
-the browser is driven by the DevTools protocol over a pipe.
+Pages must load, play and scrub, and show the positions that `flotilla rollout --trace` writes. Their contrasts must
+meet WCAG AA in light and dark mode. Screenshots are written to FOLDER.
+
+Needs Python's standard library and Chromium, which $CHROMIUM may name. The test controls the browser with the DevTools
+protocol over a pipe.
 """
 
 import base64
@@ -37,18 +39,19 @@ STEPS, AGENTS = 25, 6
 
 
 class Browser:
-    """Chromium with one page."""
+    """A headless Chromium with one page."""
 
     def __init__(self, profile, flags=("--disable-gpu",)):
         names = ["chromium", "chromium-browser", "google-chrome"]
         program = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, names)), None)
         if program is None:
-            sys.exit("no Chromium found; install one, or name it by $CHROMIUM")
+            sys.exit("no Chromium found; install one, or name it with $CHROMIUM")
         read_commands, self.commands = os.pipe()
         self.answers, write_answers = os.pipe()
 
         def pipes():
-            # Chromium reads commands from 3 and answers on 4; first out of the way of each other.
+            # Chromium reads commands from file descriptor 3 and answers on 4. If the pipes have one of these numbers,
+            # they are moved first, so that neither overwrites the other.
             low, high = os.dup(read_commands), os.dup(write_answers)
             low, high = (os.dup(low), os.dup(high)) if 3 in (low, high) or 4 in (low, high) else (low, high)
             os.dup2(low, 3)
@@ -93,10 +96,10 @@ class Browser:
         return message["result"]
 
     def open(self, url):
-        # By way of an empty page, since going to another place of the same page loads nothing.
-        for place in ["about:blank", url]:
+        # Open an empty page first, because a change of the fragment alone would not reload the page.
+        for address in ["about:blank", url]:
             self.events.clear()
-            self.call("Page.navigate", url=place)
+            self.call("Page.navigate", url=address)
             while not any(event["method"] == "Page.loadEventFired" for event in self.events):
                 self.events.append(self.message())
 
@@ -107,7 +110,8 @@ class Browser:
 
     def press(self, key, code):
         for kind in ["keyDown", "keyUp"]:
-            self.call("Input.dispatchKeyEvent", type=kind, key=key, code=code, text=" " if key == " " and kind == "keyDown" else "")
+            text = " " if key == " " and kind == "keyDown" else ""
+            self.call("Input.dispatchKeyEvent", type=kind, key=key, code=code, text=text)
 
     def click(self, selector):
         box = f"(() => {{ const b = document.querySelector('{selector}').getBoundingClientRect();"
@@ -118,11 +122,12 @@ class Browser:
     def wait(self, script, seconds=120):
         deadline = time.monotonic() + seconds
         while not self.evaluate(script):
-            assert time.monotonic() < deadline, f"never came true: {script}"
+            assert time.monotonic() < deadline, f"timeout while waiting for: {script}"
             time.sleep(0.02)
 
     def window(self, width, height, dark):
-        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 500)
+        metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 500}
+        self.call("Emulation.setDeviceMetricsOverride", **metrics)
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.call("Emulation.setEmulatedMedia", features=[scheme])
 
@@ -131,7 +136,7 @@ class Browser:
         path.write_bytes(base64.b64decode(content["data"]))
 
     def complaints(self):
-        """What went wrong on the page, and what it asked the network for."""
+        """Yields errors and warnings of the page, and its requests to the network."""
         for event in self.events:
             method, parameters = event.get("method"), event.get("params", {})
             if method == "Runtime.exceptionThrown":
@@ -143,31 +148,31 @@ class Browser:
             elif method == "Network.requestWillBeSent":
                 url = parameters["request"]["url"]
                 if not url.startswith(("file:", "data:", "blob:")):
-                    yield f"asked for {url}"
+                    yield f"request for {url}"
 
     def close(self):
         self.call("Browser.close")
         self.process.wait(20)
 
 
-# Every text's colour with what lies under it, and every border of what can be used; then the canvas's colours.
+# Returns rows of required contrast, description, colour and background: for texts, borders of controls, and the canvas.
 COLOURS = """(() => {
   const parse = text => text.match(/[\\d.]+/g).map(Number);
-  const ground = element => {
+  const background = element => {
     for (let at = element; at; at = at.parentElement) {
       const color = parse(getComputedStyle(at).backgroundColor);
       if (color.length === 3 || color[3] === 1) return color.slice(0, 3);
     }
     return [255, 255, 255];
   };
-  const found = [];
+  const rows = [];
   for (const element of document.querySelectorAll("body *")) {
     if (!element.checkVisibility() || element.closest("script")) continue;
     const style = getComputedStyle(element);
     const text = [...element.childNodes].filter(node => node.nodeType === 3).map(node => node.data.trim()).join("");
-    if (text) found.push([4.5, text.slice(0, 30), parse(style.color).slice(0, 3), ground(element)]);
+    if (text) rows.push([4.5, text.slice(0, 30), parse(style.color).slice(0, 3), background(element)]);
     if (element.matches("button, select")) {
-      found.push([3, "border of " + text, parse(style.borderTopColor).slice(0, 3), ground(element.parentElement)]);
+      rows.push([3, "border of " + text, parse(style.borderTopColor).slice(0, 3), background(element.parentElement)]);
     }
   }
   const root = getComputedStyle(document.documentElement);
@@ -177,26 +182,26 @@ COLOURS = """(() => {
     return hex(text.length === 4 ? "#" + [...text.slice(1)].map(c => c + c).join("") : text);
   };
   const sea = named("--sea");
-  found.push([4.5, "labels on the map", named("--ink"), sea]);
-  for (const name of ["--seen", "--poi", "--ink"]) found.push([3, name, named(name), sea]);
+  rows.push([4.5, "labels on the map", named("--ink"), sea]);
+  for (const name of ["--seen", "--poi", "--ink"]) rows.push([3, name, named(name), sea]);
   const scheme = matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
-  for (const color of replay.data.colors[scheme]) found.push([3, "leader " + color, hex(color), sea]);
-  return found;
+  for (const color of replay.data.colors[scheme]) rows.push([3, "leader " + color, hex(color), sea]);
+  return rows;
 })()"""
 
 
 def contrast(a, b):
-    """WCAG's contrast of two colours of sRGB."""
-    def light(color):
+    """Returns WCAG's contrast ratio of two sRGB colours."""
+    def luminance(color):
         shares = [channel / 255 for channel in color]
         linear = [share / 12.92 if share <= 0.04045 else ((share + 0.055) / 1.055) ** 2.4 for share in shares]
         return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
-    low, high = sorted([light(a), light(b)])
+    low, high = sorted([luminance(a), luminance(b)])
     return (high + 0.05) / (low + 0.05)
 
 
 def every_team(source, target):
-    """A policies file whose teams are all that can be made of the policies of two leaders with two each."""
+    """Writes a file of policies with every team that can be formed from the policies of a run's first trial."""
     content = source.read_bytes()
     (length,) = struct.unpack("<Q", content[:8])
     header, body = json.loads(content[8 : 8 + length]), content[8 + length :]
@@ -215,7 +220,7 @@ def every_team(source, target):
 
 
 def traces(path):
-    """Positions by team: [steps + 1][agents] of (x, y), as f32."""
+    """Returns the positions of each team, [steps + 1][agents] of [x, y], rounded to f32."""
     single = lambda text: struct.unpack("<f", struct.pack("<f", float(text)))[0]
     teams = {}
     for line in path.read_text().splitlines()[1:]:
@@ -248,28 +253,33 @@ def main():
         browser.open((run / "replay.html").as_uri())
         browser.wait("document.readyState === 'complete' && replay.step === 0")
 
-        # Scrubbing through all steps, what is on the screen is the trace of a team, to the bit.
-        scrub = "(() => {{ const s = document.querySelector('#scrub'); s.value = {}; s.dispatchEvent(new Event('input')); }})()"
+        # Scrub through all steps. The positions on the screen must equal the trace of a team bit by bit.
+        scrub = (
+            "(() => {{ const s = document.querySelector('#scrub'); s.value = {};"
+            " s.dispatchEvent(new Event('input')); }})()"
+        )
         shown, counts = [], []
         for step in range(STEPS + 1):
             browser.evaluate(scrub.format(step))
             assert browser.evaluate("replay.step") == step
             shown.append(browser.evaluate("replay.positions[0]"))
-            counts.append(int(browser.evaluate("document.querySelector('.episode header p').textContent").split()[0]))
-        assert shown in traces(folder / "trace.csv"), "no team's trace is what the page shows"
+            header = browser.evaluate("document.querySelector('.episode header p').textContent")
+            counts.append(int(header.split()[0]))
+        assert shown in traces(folder / "trace.csv"), "the page's positions are those of no team"
         assert counts == sorted(counts) and counts[0] == 0, counts
         assert counts[-1] == 2 * browser.evaluate("replay.data.episodes[0].g") > 0, counts
 
-        # The table of POIs says what the map does: who is near now, and when each was observed.
-        near = "[...document.querySelectorAll('table:last-of-type td:nth-child(3)')].map(cell => Number(cell.textContent))"
-        last = STEPS * 2
-        assert browser.evaluate(near) == browser.evaluate(f"[...replay.data.episodes[0].near.slice({last}, {last} + 2)]")
+        # The table of POIs has the number of agents near each POI. Pointing at a POI on the map selects it.
+        cells = "[...document.querySelectorAll('table:last-of-type td:nth-child(3)')]"
+        near, last = f"{cells}.map(cell => Number(cell.textContent))", STEPS * 2
+        expected = f"[...replay.data.episodes[0].near.slice({last}, {last} + 2)]"
+        assert browser.evaluate(near) == browser.evaluate(expected)
         for poi in range(2):
             x, y = browser.evaluate(f"replay.place(0, {poi})")
             browser.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
             browser.wait(f"replay.pointed[0] === {poi}")
 
-        # Keys.
+        # The page has keyboard shortcuts.
         browser.press("Home", "Home")
         assert browser.evaluate("replay.step") == 0
         browser.press("ArrowRight", "ArrowRight")
@@ -282,7 +292,7 @@ def main():
         assert browser.evaluate("replay.playing")
         browser.wait("replay.step > 3")
 
-        # Playing moves, pausing stops, and the end is the end.
+        # A paused replay does not move. A playing one stops at the last step.
         browser.click("#play")
         assert not browser.evaluate("replay.playing")
         step = browser.evaluate("replay.step")
@@ -292,24 +302,26 @@ def main():
         browser.wait(f"replay.step === {STEPS} && !replay.playing")
         assert not list(browser.complaints()), list(browser.complaints())
 
-        # Two generations, in windows of all kinds.
+        # Pages with one and with two generations, in large and small windows, in light and dark mode.
         for page, name in [(run / "replay.html", "one"), (folder / "compare.html", "two")]:
             for (width, height), dark in itertools.product([(1280, 900), (390, 844)], [False, True]):
                 browser.window(width, height, dark)
                 browser.open(page.as_uri() + "#step=18")
                 browser.wait("document.readyState === 'complete' && replay.step === 18")
-                assert browser.evaluate("document.documentElement.scrollWidth") <= width, "the page is wider than the window"
+                scroll_width = browser.evaluate("document.documentElement.scrollWidth")
+                assert scroll_width <= width, "the page is wider than the window"
                 assert browser.evaluate("document.querySelectorAll('canvas').length") == (2 if name == "two" else 1)
                 assert not list(browser.complaints()), list(browser.complaints())
                 colours = browser.evaluate(COLOURS)
                 assert len(colours) > 60, colours
-                for least, what, ink, ground in colours:
-                    assert contrast(ink, ground) >= least, (what, ink, ground, contrast(ink, ground), dark)
-                described = browser.evaluate("document.querySelector('canvas').getAttribute('aria-label')")
-                assert described.startswith("Map of generation ") and "step 18: " in described, described
+                for minimum, name_of_colour, colour, background in colours:
+                    ratio = contrast(colour, background)
+                    assert ratio >= minimum, (name_of_colour, colour, background, ratio, dark)
+                label = browser.evaluate("document.querySelector('canvas').getAttribute('aria-label')")
+                assert label.startswith("Map of generation ") and "step 18: " in label, label
                 browser.screenshot(pictures / f"{name}-{width}-{'dark' if dark else 'light'}.png")
         browser.close()
-        print("pages load without complaint, play, scrub, and show what rollout traces")
+        print("replay pages load without errors, play, scrub, and show the traces of rollout")
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Opens the documentation site in headless Chromium, from disk, as a reader does.
+"""Tests the documentation site, in headless Chromium and from disk.
 
     python3 tests/site.py target/site
 
-Every link to a file or an anchor of the site leads somewhere. Searching for what readers look for finds the right page first.
-The sections that are generated have content. Nothing is loaded from the network. Python's standard library and a Chromium are all
-that is needed.
+All links to files and anchors of the site must exist. Searches for common terms must find the right page first.
+Generated sections must have content. Nothing may be loaded from the network. Needs Python's standard library and
+Chromium.
 """
 
 import html.parser
@@ -18,7 +18,7 @@ import urllib.parse
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from replay import Browser
 
-# What readers type, and the page that should come first.
+# Searches, and the page that must come first.
 SEARCHES = {
     "champion": "explain/glossary.html",
     "leaders that cannot sense": "how-to/blind-leaders.html",
@@ -29,7 +29,7 @@ SEARCHES = {
 
 
 class Page(html.parser.HTMLParser):
-    """The links and anchors of a page."""
+    """Parses the links and anchors of a page."""
 
     def __init__(self, path):
         super().__init__()
@@ -45,33 +45,39 @@ class Page(html.parser.HTMLParser):
 
 
 def broken_links(site):
-    # rustdoc checks its own links.
-    pages = {path: Page(path) for path in site.rglob("*.html") if site / "rust" not in path.parents and site / "page" not in path.parents}
+    """Yields the broken links of all pages except rustdoc's, which rustdoc checks, and the browser page."""
+    excluded = {site / "rust", site / "page"}
+    pages = {path: Page(path) for path in site.rglob("*.html") if excluded.isdisjoint(path.parents)}
     for path, page in pages.items():
         for link in page.links:
             parts = urllib.parse.urlsplit(link)
-            # The page for wrong addresses belongs to a server's root.
+            # The links of 404.html are relative to the root of a server.
             if parts.scheme or parts.netloc or path.name == "404.html":
                 continue
             target = (path.parent / urllib.parse.unquote(parts.path)).resolve() if parts.path else path
             if not target.exists():
                 yield f"{path.relative_to(site)}: {link}"
-            elif parts.fragment and target in pages and urllib.parse.unquote(parts.fragment) not in pages[target].anchors:
+                continue
+            anchor = urllib.parse.unquote(parts.fragment)
+            if anchor and target in pages and anchor not in pages[target].anchors:
                 yield f"{path.relative_to(site)}: {link} (no such anchor)"
-    print(f"links of {len(pages)} pages lead somewhere")
+    print(f"checked the links of {len(pages)} pages")
 
 
-def found_by(browser, site, query):
+def search(browser, site, query):
     """Returns the addresses of the pages that a search finds, best first."""
     browser.open((site / "index.html").as_uri())
     browser.wait("document.querySelector('.md-search__input') !== null")
-    browser.evaluate("document.querySelector('[data-md-toggle=search]').click(); document.querySelector('.md-search__input').focus()")
+    browser.evaluate(
+        "document.querySelector('[data-md-toggle=search]').click(); document.querySelector('.md-search__input').focus()"
+    )
     browser.evaluate(
         f"(() => {{ const e = document.querySelector('.md-search__input'); e.value = {json.dumps(query)};"
         " e.dispatchEvent(new KeyboardEvent('keyup', { key: 'a', bubbles: true })); })()"
     )
-    browser.wait("document.querySelectorAll('.md-search-result__item > .md-search-result__link').length > 0")
-    links = browser.evaluate("[...document.querySelectorAll('.md-search-result__item > .md-search-result__link')].map(link => link.href)")
+    results = "document.querySelectorAll('.md-search-result__item > .md-search-result__link')"
+    browser.wait(f"{results}.length > 0")
+    links = browser.evaluate(f"[...{results}].map(link => link.href)")
     root = (site / "index.html").as_uri().removesuffix("index.html")
     return [link.split("?")[0].split("#")[0].removeprefix(root) for link in links]
 
@@ -79,17 +85,17 @@ def found_by(browser, site, query):
 def main():
     site = pathlib.Path(sys.argv[1]).resolve()
     broken = list(broken_links(site))
-    assert not broken, "links lead nowhere:\n" + "\n".join(broken)
+    assert not broken, "broken links:\n" + "\n".join(broken)
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         browser = Browser(profile)
         browser.window(1280, 900, dark=False)
         wrong = []
         for query, page in SEARCHES.items():
-            found = found_by(browser, site, query)
-            print(f"search for {query!r}: {', '.join(found[:3])}")
-            if found[:1] != [page]:
+            results = search(browser, site, query)
+            print(f"search for {query!r}: {', '.join(results[:3])}")
+            if results[:1] != [page]:
                 wrong.append(query)
-        assert not wrong, f"another page comes first: {wrong}"
+        assert not wrong, f"these searches find another page first: {wrong}"
         for page, selector in {
             "reference/python.html": "[id='flotilla.VectorEnv.step']",
             "reference/rust.html": "a[href='../rust/flotilla/index.html']",
@@ -99,11 +105,13 @@ def main():
             "page/index.html": "#train",
         }.items():
             browser.open((site / page).as_uri())
-            assert browser.evaluate(f"document.querySelector({json.dumps(selector)}) !== null"), f"{page} has no {selector}"
-            asked = [event["params"]["request"]["url"] for event in browser.events if event["method"] == "Network.requestWillBeSent"]
-            outside = [url for url in asked if not url.startswith(("file:", "data:", "blob:", "about:"))]
-            assert not outside, f"{page} asks the network for {outside}"
-        print("generated sections are there, and nothing asks the network")
+            exists = browser.evaluate(f"document.querySelector({json.dumps(selector)}) !== null")
+            assert exists, f"{page} has no {selector}"
+            requests = [event["params"] for event in browser.events if event["method"] == "Network.requestWillBeSent"]
+            urls = [request["request"]["url"] for request in requests]
+            external = [url for url in urls if not url.startswith(("file:", "data:", "blob:", "about:"))]
+            assert not external, f"{page} loads from the network: {external}"
+        print("generated sections have content, and no page loads from the network")
         browser.close()
 
 

@@ -1,6 +1,9 @@
-"""Makes statistics.json, what scipy says of samples like those of trials: python3 statistics.py > statistics.json
+"""Prints statistics.json: scipy's intervals and p-values for samples like the results of trials.
 
-(Holm's correction, which scipy lacks, is that of statsmodels.)"""
+    python3 statistics.py > statistics.json
+
+Holm's correction, which scipy lacks, comes from statsmodels. Tests compare flotilla's statistics with this file.
+"""
 
 import json
 
@@ -34,12 +37,14 @@ def listed(values):
     return [float(x) for x in values]
 
 
-# Few values and many ties, as a G has, with few enough ways to try them all; then such that all differ; then more than are
-# tried one by one.
+# Three kinds of pairs of samples for the rank test. `tied` has few values and many ties, as G has, and is small enough
+# for all permutations. `apart` has no ties. `many` is too large for the exact test.
 tied = [([1, 1, 0.75, 1, 1], [0.5, 0.75, 0.5, 0.5, 0.25]), ([1, 1], [0, 0.5, 1, 0.5]), ([0.5] * 4, [0.5] * 3),
         ([0, 0.25, 0, 0.5, 1, 0.25], [0.25, 0.25, 0.75, 0, 1, 0.5])]
-apart = [(listed(random.normal(0, 1, size=n)), listed(random.normal(0.8, 2, size=m))) for n, m in ((3, 2), (8, 8), (25, 40))]
-many = [(listed(random.integers(0, 5, size=n) / 4), listed(random.integers(0, 4, size=m) / 4)) for n, m in ((60, 60), (30, 150))]
+apart = [(listed(random.normal(0, 1, size=n)), listed(random.normal(0.8, 2, size=m)))
+         for n, m in ((3, 2), (8, 8), (25, 40))]
+many = [(listed(random.integers(0, 5, size=n) / 4), listed(random.integers(0, 4, size=m) / 4))
+        for n, m in ((60, 60), (30, 150))]
 ranks = []
 for cases, method in ((tied, None), (apart, "exact"), (many, "asymptotic")):
     for one, other in cases:
@@ -49,10 +54,11 @@ for cases, method in ((tied, None), (apart, "exact"), (many, "asymptotic")):
             permutation_type="independent", n_resamples=np.inf).pvalue
         ranks.append({"one": one, "other": other, "a": test.statistic / len(one) / len(other), "p": p})
 signs = []
-for size, grain, method in ((5, 1, None), (10, 2, None), (12, 4, None), (20, 0, "exact"), (60, 0, "exact"), (150, 4, "asymptotic")):
+for size, grain, method in ((5, 1, None), (10, 2, None), (12, 4, None), (20, 0, "exact"), (60, 0, "exact"),
+                            (150, 4, "asymptotic")):
     less = random.normal(0.4, 1, size=size)
     less = np.round(less * grain) / grain if grain else less
-    # Pairs without a difference are dropped first: to draw their signs, too, would change nothing.
+    # Pairs without a difference are dropped first, because their signs change nothing.
     p = stats.wilcoxon(less, correction=True, method=method).pvalue if method else stats.permutation_test(
         (less[less != 0],), lambda x: stats.rankdata(np.abs(x))[x > 0].sum(), vectorized=False,
         permutation_type="samples", n_resamples=np.inf).pvalue
@@ -62,10 +68,11 @@ intervals = []
 for samples in ([skewed], [listed(random.normal(3, 1, size=8))],
                 [skewed, listed(random.normal(0, 1, size=9))],
                 [listed(random.exponential(1, size=30)), listed(random.exponential(3, size=12))]):
-    # So many draws that hardly anything is left to chance.
-    found = stats.bootstrap(samples, lambda one, other=np.zeros(1), axis=-1: one.mean(axis=axis) - other.mean(axis=axis),
-                            n_resamples=200_000, batch=10_000, vectorized=True, method="BCa", rng=1).confidence_interval
-    intervals.append({"samples": samples, "low": found.low, "high": found.high})
+    # With this many resamples, the interval hardly depends on the random numbers.
+    interval = stats.bootstrap(
+        samples, lambda one, other=np.zeros(1), axis=-1: one.mean(axis=axis) - other.mean(axis=axis),
+        n_resamples=200_000, batch=10_000, vectorized=True, method="BCa", rng=1).confidence_interval
+    intervals.append({"samples": samples, "low": interval.low, "high": interval.high})
 several = [[0.01, 0.04, 0.03], [0.5, 0.2, 0.9, 0.001, 0.02, 0.02], [0.4]]
 corrected = [{"p": p, "holm": multipletests(p, method="holm")[1].tolist()} for p in several]
 print(json.dumps({"scipy": scipy.__version__, "means": means, "shares": shares, "spreads": spreads, "ranks": ranks,
