@@ -1,14 +1,14 @@
 #!/bin/bash
-# A real Slurm on this machine runs job arrays of sweeps. Their results are compared with those of undisturbed runs.
-# Jobs finish, are cancelled, are preempted, lose their node and reach their time limit.
+# Tests job arrays of sweeps on a real Slurm on this machine. Jobs finish, are cancelled, are preempted, lose their
+# node, or reach their time limit. Their results must equal those of undisturbed runs.
 #
 #   apt-get install slurmctld slurmd slurm-client munge
-#   tests/slurm.sh [path/to/flotilla [PART...]]
+#   tests/slurm.sh [FLOTILLA [PART...]]
 #
-# The parts are page, array, cancelled, preempted, node and limit; without a name all run.
-# Needs root: munged runs as its own user, and slurmd starts jobs. All daemons have their own ports and files in a
-# temporary folder, and are always stopped. Takes five to ten minutes: the shortest time limit of Slurm is a minute, and
-# two jobs have to reach it.
+# The parts are page, array, cancelled, preempted, node and limit. Without PART, all run. Needs root, because munged
+# runs as its own user and slurmd starts jobs. All daemons have their own ports, have their files in a temporary
+# directory, and are always stopped. Takes five to ten minutes: Slurm's shortest time limit is a minute, and two jobs
+# must reach it.
 set -euo pipefail
 
 flotilla=$(realpath "${1:-target/debug/flotilla}")
@@ -16,7 +16,7 @@ page=$(realpath "$(dirname "$0")/../docs/how-to/clusters.md")
 parts=("${@:2}")
 [ ${#parts[@]} != 0 ] || parts=(page array cancelled preempted node limit)
 for program in slurmctld slurmd sbatch munged; do
-    PATH=$PATH:/usr/sbin command -v "$program" > /dev/null || { echo "skipped: there is no $program here"; exit 0; }
+    PATH=$PATH:/usr/sbin command -v "$program" > /dev/null || { echo "skipped: $program is not installed"; exit 0; }
 done
 [ "$(id -u)" = 0 ] || { echo "skipped: this needs root"; exit 0; }
 PATH=$PATH:/usr/sbin
@@ -31,7 +31,7 @@ stop() {
     code=$?
     trap - EXIT INT TERM HUP
     set +e
-    [ "$code" = 0 ] || say "failed; what Slurm and its tasks told:"
+    [ "$code" = 0 ] || say "FAILED; the logs of Slurm and its tasks:"
     [ "$code" = 0 ] || tail -n 25 "$work"/*.log "$work"/*/slurm-*.log 2> /dev/null
     timeout 10 scancel --user=root 2> /dev/null
     for _ in $(seq 20); do
@@ -41,7 +41,7 @@ stop() {
     for daemon in "${daemons[@]}"; do kill "$daemon" 2> /dev/null; done
     sleep 1
     for daemon in "${daemons[@]}"; do kill -KILL "$daemon" 2> /dev/null; done
-    # Whatever else was started by this Slurm carries the name of its configuration.
+    # Kill all other processes that this Slurm started. They have its configuration in their environment.
     for process in /proc/[0-9]*; do
         [ "${process#/proc/}" != $$ ] && grep -qz "^SLURM_CONF=$SLURM_CONF\$" "$process/environ" 2> /dev/null \
             && kill -KILL "${process#/proc/}" 2> /dev/null
@@ -105,7 +105,7 @@ CONF
     start_node
 }
 
-# Starts the node of this machine and waits until it takes jobs.
+# Starts this machine's node and waits until it accepts jobs.
 start_node() {
     slurmd -D -f "$SLURM_CONF" -N "$(hostname -s)" >> "$work/slurmd.log" 2>&1 &
     node_daemon=$!
@@ -114,17 +114,19 @@ start_node() {
         [ "$(timeout 5 sinfo --noheader --partition=all --format=%T 2> /dev/null)" = idle ] && return
         sleep 0.5
     done
-    say "the node did not come up"
+    say "the node did not start"
     exit 1
 }
 
-# Waits for a job, starting requeued tasks without Slurm's pause before them and without their time limit: Slurm takes
-# a job's credential away when its limit stops it a second time within minutes, so once must be enough. A task that starts
-# in the very second in which that was taken away is held by Slurm. That nobody answers does not mean that nothing is left.
+# Waits for a job to end: wait_for JOB SECONDS
+#
+# Starts requeued tasks without Slurm's usual pause and without their time limit. If a time limit stopped a task twice
+# within minutes, Slurm would revoke its credential. Slurm holds a task that starts in the second of a revocation; such
+# a task is released. If squeue fails, the job is still assumed to run.
 wait_for() {
     local job=$1 until=$((SECONDS + $2)) left task why
     while sleep 1; do
-        [ $SECONDS -lt $until ] || { say "job $job takes too long"; squeue --array; scontrol show "job=$job"; exit 1; }
+        [ $SECONDS -lt $until ] || { say "timeout for job $job"; squeue --array; scontrol show "job=$job"; exit 1; }
         left=$(squeue --noheader --jobs="$job" --array --format='%F_%K %T %r' 2> /dev/null) || continue
         [ -n "$left" ] || break
         while read -r task why; do
@@ -136,6 +138,7 @@ wait_for() {
     done
 }
 
+# Collects the results of a sweep and compares them with another sweep's: compare SWEEP FOLDER EXPECTED [FLAG...]
 compare() {
     "$flotilla" sweep "$1" --out "$2" --collect "${@:4}" > /dev/null
     for file in results.csv points.csv final.svg sweep.toml; do
@@ -158,23 +161,23 @@ followers_per_leader = [0, 1, 2, 4]
 "world.coupling" = [1, 2, 3]
 "learning.fitness" = ["G", "Df"]
 SWEEP
-# 200 trials of it take a good while, in chunks small enough to stop at once.
+# The same sweep with more trials and fewer checkpoints, so that it takes long.
 sed -e 's/trials = 2/trials = 20/' -e 's/generations = 5$/generations = 200/' "$work/small.toml" > "$work/long.toml"
 
 say "starting munge and Slurm $(slurmctld -V | cut -d' ' -f2) in $work"
 start_slurm
 
-# What a reader of the page does, command by command.
+# Runs the commands of the documentation's page about clusters.
 part_page() {
     local job command
-    say "the commands of ${page##*/}"
+    say "page: the commands of ${page##*/}"
     mkdir "$work/page" "$work/bin"
     ln -s "$flotilla" "$work/bin/flotilla"
     awk '/^```toml/ { on = 1; next } /^```/ { on = 0 } on' "$page" > "$work/page/sweep.toml"
     while read -r command; do
         case $command in
             sbatch*)
-                # shellcheck disable=SC2086 # the words of the command
+                # shellcheck disable=SC2086 # the arguments have to be split
                 job=$(cd "$work/page" && sbatch --parsable ${command#sbatch})
                 wait_for "$job" 300
                 ;;
@@ -182,33 +185,34 @@ part_page() {
         esac < /dev/null
     done < <(awk '/^## / { slurm = $2 == "Slurm" } /^```/ { on = !on; next } slurm && on' "$page")
     [ "$(tail -n +2 "$work/page/cluster/points.csv" | wc -l)" = 6 ] || { say "points are missing"; exit 1; }
-    say "all points are there"
+    say "all points were trained"
 }
 
 part_array() {
     local job
-    say "an array of 4 tasks"
+    say "array: 4 tasks"
     "$flotilla" sweep "$work/small.toml" --out "$work/whole" --backend cpu --quiet > /dev/null
-    "$flotilla" sweep "$work/small.toml" --out "$work/array" --backend cpu --threads 1 --shards 4 --slurm="$work/array.sh"
+    "$flotilla" sweep "$work/small.toml" --out "$work/array" --backend cpu --threads 1 --shards 4 \
+        --slurm="$work/array.sh"
     job=$(sbatch --parsable --chdir="$work" "$work/array.sh")
     wait_for "$job" 300
     compare "$work/small.toml" "$work/array" "$work/whole"
     [ "$(ls "$work"/array/slurm-*.log | wc -l)" = 4 ]
-    say "same bytes as unsharded"
+    say "same bytes as without shards"
 
-    say "a hand-written array, whose ids start at 7"
+    say "array: a hand-written script whose ids start at 7"
     printf '#!/bin/bash\nexec %q sweep %q --out %q --backend cpu --threads 1 --quiet\n' \
         "$flotilla" "$work/small.toml" "$work/plain" > "$work/plain.sh"
     job=$(sbatch --parsable --chdir="$work" --array=7-9 --output="$work/plain-%a.log" "$work/plain.sh")
     wait_for "$job" 300
     compare "$work/small.toml" "$work/plain" "$work/whole"
-    say "same bytes as unsharded"
+    say "same bytes as without shards"
 }
 
-# Trains the long sweep undisturbed, and writes its batch script for the folder $work/$1, with further flags.
+# Writes the batch script of the long sweep for the directory $work/$1: prepare NAME [FLAG...]
 #
-# A calibration run determines how many generations take one thread about 75 s of processor time here: longer than the
-# shortest time limit, whatever the machine and its load.
+# The first call also starts an undisturbed run of the sweep. A calibration run determines how many generations take one
+# thread about 75 s of processor time. This is longer than the shortest time limit on any machine.
 undisturbed=
 generations=
 prepare() {
@@ -226,7 +230,7 @@ prepare() {
         "${@:2}"
 }
 
-# Compares the folder $work/$1 with the undisturbed sweep.
+# Compares the directory $work/$1 with the undisturbed sweep.
 same_as_undisturbed() {
     [ -z "$undisturbed" ] || wait "$undisturbed"
     undisturbed=
@@ -239,16 +243,16 @@ fail() {
     exit 1
 }
 
-# Waits until the command in the arguments after the first succeeds.
+# Waits until a command succeeds: until_true DESCRIPTION COMMAND...
 until_true() {
     local end=$((SECONDS + 120))
     until "${@:2}"; do
-        [ $SECONDS -lt $end ] || fail "waited too long until $1"
+        [ $SECONDS -lt $end ] || fail "timeout while waiting until $1"
         sleep 0.5
     done
 }
 
-# A property of the only task of a job, from Slurm.
+# Prints a property of the only task of a job.
 property() { scontrol show "job=$1" 2> /dev/null | tr ' ' '\n' | sed -n "s/^$2=//p" | head -n 1; }
 is_in_state() { [ "$(property "$1" JobState)" = "$2" ]; }
 has_sessions() { [ "$(grep -l "\"sessions\": $2" "$work/$1"/points/*/run.json 2> /dev/null | wc -l)" -gt 0 ]; }
@@ -263,28 +267,28 @@ submit() {
 
 saves() { grep -q "everything is saved" "$work/$1"/slurm-*.log; }
 
-# Checks that the ended task in $work/$1 saved, and that no run was cut off.
+# Checks that the ended task in $work/$1 saved its runs before it ended.
 saved() {
-    saves "$1" || fail "it did not save"
-    ! grep -q '"state": "running"' "$work/$1"/points/*/run.json || fail "a run was cut off"
+    saves "$1" || fail "the task did not save"
+    ! grep -q '"state": "running"' "$work/$1"/points/*/run.json || fail "a run was stopped before it was saved"
 }
 
-# Checks that a job has ended in state $2, and does not return.
+# Checks that a job ends in state $2 and is not requeued.
 ended_for_good() {
     until_true "job $1 ends" is_in_state "$1" "$2"
     sleep 5
-    is_in_state "$1" "$2" || fail "it returned to the queue after $2: $(property "$1" JobState)"
-    [ "$(property "$1" Restarts)" = 0 ] || fail "it was restarted after $2"
+    is_in_state "$1" "$2" || fail "the job was requeued after $2: $(property "$1" JobState)"
+    [ "$(property "$1" Restarts)" = 0 ] || fail "the job was restarted after $2"
 }
 
 part_cancelled() {
-    say "a task that is cancelled, and submitted again"
+    say "cancelled: a task is cancelled and submitted again"
     prepare cancelled
     submit cancelled 1
     scancel "$job"
     ended_for_good "$job" CANCELLED
     saved cancelled
-    say "it saved, and did not return"
+    say "the task saved and was not requeued"
     submit cancelled 2
     wait_for "$job" 900
     same_as_undisturbed cancelled
@@ -293,21 +297,21 @@ part_cancelled() {
 part_preempted() {
     local partition
     for partition in all graceful; do
-        say "a task that is preempted in partition $partition"
+        say "preempted: a task in partition $partition is preempted"
         prepare "preempted-$partition"
         submit "preempted-$partition" 1 --partition="$partition"
         sbatch --parsable --chdir="$work" --partition=urgent --exclusive --wrap="sleep 1" --output=/dev/null > /dev/null
         wait_until_restarted "$job"
-        until_true "it saves" saves "preempted-$partition"
+        until_true "the task saves" saves "preempted-$partition"
         wait_for "$job" 900
         same_as_undisturbed "preempted-$partition"
     done
 }
 
 is_restarted() { [ "$(property "$1" Restarts)" -gt 0 ] 2> /dev/null; }
-wait_until_restarted() { until_true "job $1 returns to the queue" is_restarted "$1"; }
+wait_until_restarted() { until_true "job $1 is requeued" is_restarted "$1"; }
 
-# Kills the processes of this Slurm's jobs: the managers of steps ($1 is slurmstepd), or all in a job.
+# Kills processes of this Slurm's jobs: those with the name $1, or all processes inside jobs if $1 is empty.
 kill_processes() {
     local process
     for process in /proc/[0-9]*; do
@@ -322,11 +326,11 @@ kill_processes() {
 }
 
 part_node() {
-    say "a task whose node fails"
+    say "node: the node of a task fails"
     prepare node
     submit node 1
     until_true "there is a checkpoint" has_checkpoint node
-    # All of the node ends at once: its daemon, then the step's manager, which would report the end of the step.
+    # Kill slurmstepd before the processes of the job, because it would report that the step ended.
     kill -KILL "$node_daemon"
     kill_processes slurmstepd
     kill_processes ""
@@ -339,22 +343,23 @@ part_node() {
 }
 
 part_limit() {
-    say "a task with a time limit of a minute"
+    say "limit: a task reaches its limit of a minute"
     prepare limited --time 00:01:00
-    # The warning comes at most 30 s late, and the script asks for it a minute ahead; here that would leave no time.
+    # The script asks for a warning a minute before the limit, which would leave no time here. Slurm's warnings may be
+    # up to 30 s late.
     job=$(sbatch --parsable --chdir="$work" --signal=B:USR1@20 "$work/limited.sh")
     wait_for "$job" 900
-    grep -q "returns to the queue" "$work"/limited/slurm-*.log || fail "it was never requeued"
+    grep -q "returns to the queue" "$work"/limited/slurm-*.log || fail "the task was not requeued"
     same_as_undisturbed limited
 
-    say "a task that reaches its time limit without a warning"
-    # Slurm ends it up to 30 s after the limit, and the machine may have become faster since its speed was probed.
+    say "limit: a task reaches its limit without a warning"
+    # Slurm may end it 30 s after the limit, and the machine may be faster than in the calibration run.
     flags=(--generations $((2 * generations)))
     prepare late --time 00:01:00
     submit late 1 --signal=B:CONT@20
     ended_for_good "$job" TIMEOUT
     saved late
-    say "it saved, and did not return"
+    say "the task saved and was not requeued"
 }
 
 for part in "${parts[@]}"; do "part_$part"; done
