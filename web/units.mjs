@@ -44,7 +44,7 @@ test("curves are written as CSV, with labels quoted if necessary", () => {
 test("the inputs shown are those of the chosen leader and frame, and quadrants are relative to the heading", () => {
   const numbers = Float32Array.from({ length: 2 * 3 * 10 }, (_, index) => index);
   assert.deepEqual(moment(numbers, 3, 1, 2), { pois: [50, 51, 52, 53], agents: [54, 55, 56, 57], turn: 58, speed: 59 });
-  // Front left lies between the heading and 90 degrees counterclockwise.
+  // Front left is between the heading and 90 degrees counterclockwise.
   assert.deepEqual(angles(2), [0, Math.PI / 2]);
   const inputs = { pois: [0, 0, 1, 0], agents: [0, 0, 0, 0], turn: 0.5, speed: 1 };
   assert.match(words(inputs), /front left 1\.00.* 90° to the left, at 100 %/);
