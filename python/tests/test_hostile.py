@@ -3,7 +3,6 @@
 import gc
 import inspect
 import os
-import resource
 
 import numpy as np
 import pytest
@@ -116,7 +115,7 @@ def memory() -> int:
     """Returns the resident memory of this process, in bytes."""
     gc.collect()
     with open("/proc/self/statm") as file:
-        return int(file.read().split()[1]) * resource.getpagesize()
+        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/statm"), reason="only Linux has /proc/self/statm")
