@@ -342,7 +342,7 @@ fn table() {
 fn note(findings: Vec<String>) {
     use flotilla::record::evidence::{MachineReport, Tier};
     let Some(folder) = std::env::var_os("FLOTILLA_EVIDENCE") else { return };
-    let note = format!("NVIDIA's {}, of naga's Metal text made CUDA, for chips that were not there", version());
+    let note = format!("NVIDIA's {}, of naga's Metal text made CUDA, for chips that are not installed", version());
     let report = MachineReport { note: Some(note), findings, ..MachineReport::new(Tier::MachineCodeRead) };
     std::fs::write(Path::new(&folder).join("nvidia.json"), report.to_json()).expect("the directory is writable");
 }
