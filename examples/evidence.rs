@@ -65,9 +65,9 @@ flotilla does not control the following. Each line names the functions in `tests
 |---|---|---|
 | float sums and products are rounded to nearest, ties to even | WGSL leaves the rounding of `+ - *` open | probes whenever a GPU is opened; `devices_are_exact_under_both_passes` |
 | no product is fused with a sum, no sum reordered | WGSL allows both, and drivers do both | the same probes; `the_probes_catch_a_device_without_a_pass`, `compiled_shaders_are_exact_small_and_fast` |
-| a guard `x \\| 0` remains, because the zero is known only at run time | a compiler that knew the zero could remove it | `guards_are_not_cancelled`; `every_product_is_guarded_in_metals_and_directx_text` |
-| a sum has a guard, or only a comparison of its bits as an integer reads it | a compiler might treat that as a float comparison; none is known to | the probes; `only_what_is_compared_by_its_bits_needs_no_guard` |
-| naga writes no option or function that fuses operations for Metal and DirectX | a later version might | `every_product_is_guarded_in_metals_and_directx_text` |
+| a guard `x \\| 0` remains, because the zero is known only at run time | a compiler that knew the zero could remove it | `guards_are_not_cancelled`; `every_sum_and_product_is_guarded_in_metal_and_directx_text` |
+| a sum has a guard, or only a comparison of its bits as an integer reads it | a compiler might treat that as a float comparison; none is known to | the probes; `only_results_compared_as_integers_need_no_guard` |
+| naga writes no option or function that fuses operations for Metal and DirectX | a later version might | `every_sum_and_product_is_guarded_in_metal_and_directx_text` |
 | a driver keeps `NoContraction` | Vulkan requires it of drivers | the probes; `every_float_result_is_decorated` |
 | numbers of normal size are not flushed to zero | they never are; numbers below 2^-126 may be, so none occurs | `flush_makes_small_values_positive_zero`, `no_value_comes_near_the_denormals`, `twins_have_the_same_numbers` |
 | `bitcast` of a NaN is never needed, nor is one ever made | WGSL may change a NaN's bits and may assume that none exists | `a_valid_config_makes_normal_constants`, `kernels_follow_the_model` |

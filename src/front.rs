@@ -484,7 +484,7 @@ pub struct Played {
 /// `b[out]`.
 ///
 /// # Errors
-/// The config, the weights or the starts are invalid, or the backend fails.
+/// The config, the number of teams, the weights or the starts are invalid, memory is insufficient, or the backend fails.
 pub fn play(
     config: &Config,
     backend: &mut dyn Backend,
@@ -652,7 +652,7 @@ pub fn trace(
 /// scored, including Dt if that is the config's fitness.
 ///
 /// # Errors
-/// The config is invalid, or the number of teams is not allowed.
+/// The config is invalid, the number of teams is not allowed, or memory is insufficient.
 pub fn stepper(config: &Config, teams: usize, recording: bool) -> Result<Stepper, Failure> {
     let world = World::new(&*config.validate()?);
     Ok(match (recording, config.learning.fitness) {

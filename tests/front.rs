@@ -203,7 +203,7 @@ fn training_starts_from_given_policies() {
     let [two, four] = [learned.policies[..2].to_vec(), [&learned.policies[..], &learned.policies[..1]].concat()];
     for (count, trials) in [(2, two), (4, four)] {
         let error = train_from(policies, &trials).expect_err("the number of trials differs").to_string();
-        assert!(error.starts_with(&format!("policies of {count} trials, where 3 are trained; ")), "{error}");
+        assert!(error.starts_with(&format!("{count} trials have policies, but the config has 3 trials; ")), "{error}");
     }
     let mut wrong = learned.policies.clone();
     wrong[1][3] = f32::NAN;

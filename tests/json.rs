@@ -100,7 +100,7 @@ fn other_commands_print_json() {
     let verified: Value = serde_json::from_slice(&verify.stdout).unwrap();
     assert_eq!(verified["equal"], true);
     let report: Value = serde_json::from_str(&place.read("r.json")).unwrap();
-    assert!(report["rows"].as_array().is_some_and(|rows| !rows.is_empty()), "{report}");
+    assert!(report["comparisons"].as_array().is_some_and(|rows| !rows.is_empty()), "{report}");
 }
 
 #[test]

@@ -99,7 +99,11 @@ fn errors_in_stages_name_their_line() {
             "stages[0].set.learning.parents: this key cannot change between stages",
         ),
         (stage("0", "'policy.hidden' = [3]"), 3, "stages[0].set.policy.hidden: this key cannot change between stages"),
-        (stage("0", "'checkpoint.seconds' = 3"), 3, "stages[0].set.checkpoint.seconds: this is the same"),
+        (
+            stage("0", "'checkpoint.seconds' = 3"),
+            3,
+            "stages[0].set.checkpoint.seconds: this key cannot change between stages",
+        ),
         (stage("0", "'world.leaders' = [[1, 1]]"), 3, "stages[0].set.world.leaders: 1 leaders learn in this stage, 2"),
         (stage("7", ""), 2, "stages[0].from: found 7, allowed a whole number, 0 to 6 (learning.generations)"),
         (stage("-1", ""), 2, "stages[0].from: found something else"),

@@ -49,6 +49,7 @@ pub(super) fn gather(owner: &[u32], world: &World, groups: &mut Vec<u32>) {
 }
 
 /// Writes which leaders lead each follower at each step, one bit per leader, `[steps][followers][words of leaders]`.
+/// `sights` has the leaders that each follower saw, in the same shape.
 ///
 /// Only the steps that [count](crate::world::Led) matter. The leader that the follower saw at most of them leads it,
 /// ties to the lower index; or with [`LedBy::AnySeen`] every leader that it saw.

@@ -127,7 +127,8 @@ fn count(observed_at: &[u32]) -> u32 {
     observed_at.iter().filter(|&&step| step != NEVER).count() as u32
 }
 
-/// Returns the step, from 1, at which each POI is observed, if any, `[pois]`.
+/// Returns the step, from 1, at which each POI is observed, if any, `[pois]`. `sets` has the agents at each POI,
+/// `[steps][pois][words]`.
 pub fn observed_at(sets: Strided<'_>, world: &World) -> Vec<Option<usize>> {
     let mut observed_at = Vec::new();
     Replay { sets, world }.observe(&mut observed_at);

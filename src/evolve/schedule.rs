@@ -52,7 +52,7 @@ pub fn past_champions(learning: &Learning, trial: usize, generation: usize) -> O
     Some(population + 1 + past % hall_of_fame)
 }
 
-/// Writes one population's policy in each team of a round, see [`form_teams`].
+/// Writes one population's policy in each team of a round, `[teams]`, see [`form_teams`].
 pub fn shuffle(level: Level, key: Key, generation: usize, round: usize, population: usize, order: &mut [u32]) {
     let key = key.at(generation, population, round);
     dispatch!(level, simd => shuffle_lanes(simd, key, order));
@@ -90,14 +90,15 @@ pub fn places(
     }
 }
 
-/// Writes the start positions of one episode: the world's, each moved by a uniform offset in `-jitter..jitter` on both
-/// axes.
+/// Writes the start positions of one episode, `[agents]`: the world's, each moved by a uniform offset in `-jitter..jitter`
+/// units on both axes. `key` is of [`Purpose::Starts`] or [`Purpose::HeldOut`].
 pub fn jitter_starts(key: Key, generation: usize, episode: usize, world: &World, jitter: f64, starts: &mut Vec<Vec2>) {
     starts.clone_from(&world.starts);
     scatter(key.at(generation, episode, 0), world.map(), jitter, starts);
 }
 
-/// Appends the POI positions of one episode, moved the same way. Appends nothing if `jitter` is 0.
+/// Appends the POI positions of one episode, `[pois]`, moved the same way. Appends nothing if `jitter` is 0. `key` is of
+/// [`Purpose::Pois`] or [`Purpose::HeldOutPois`].
 pub fn jitter_pois(key: Key, generation: usize, episode: usize, world: &World, jitter: f64, places: &mut Vec<Vec2>) {
     if jitter > 0.0 {
         let first = places.len();

@@ -42,7 +42,8 @@ impl Strategy {
         Some(Strategy { method: learning.method, utilities, step, rate, sigma })
     }
 
-    /// Returns each policy's utility: that of its rank. Policies with equal scores get the mean over their ranks.
+    /// Returns the utility of each policy's rank, `[policies]`, for scores `[policies]`. Policies with equal scores get the
+    /// mean over their ranks.
     pub fn utilities(&self, scores: &[f32]) -> Vec<f64> {
         let order = best(scores, scores.len());
         let (mut utilities, mut rank) = (vec![0.0; scores.len()], 0);
@@ -55,8 +56,10 @@ impl Strategy {
         utilities
     }
 
-    /// Moves the mean of a population that has played, and adapts the standard deviations. Generation 0 is random: the
-    /// mean starts at its best policy.
+    /// Moves the mean of a population that has played, and adapts the standard deviations.
+    ///
+    /// `scores` is `[policies]`. `population` is `[policies + 2][parameters]`, with the mean and the standard deviations
+    /// last. Generation 0 is random, and the mean starts at its best policy.
     pub fn update(&self, level: Level, generation: usize, scores: &[f32], population: &mut [f32]) {
         let parameters = population.len() / (scores.len() + 2);
         let (policies, search) = population.split_at_mut(scores.len() * parameters);

@@ -25,7 +25,7 @@ pub fn admit(weights: &mut [f32]) -> Option<usize> {
     })
 }
 
-/// Fills a new policy with weights from N(0, 1). `key` is a slot's key of
+/// Fills a new policy, `[parameters]`, with weights from N(0, 1). `key` is a slot's key of
 /// [`Purpose::Weights`](super::Purpose::Weights).
 pub fn random_policy(level: Level, key: Key, weights: &mut [f32]) {
     dispatch!(level, simd => random_lanes(simd, key, weights));

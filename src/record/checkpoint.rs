@@ -303,7 +303,7 @@ pub struct Keeper {
 }
 
 impl Keeper {
-    /// Creates a keeper for an existing folder that already has the checkpoints `kept`.
+    /// Creates a keeper for an existing folder with the checkpoints `kept`. The run resumes before `generation`.
     pub fn new(disk: Disk, folder: PathBuf, config: Config, kept: Vec<usize>, generation: usize) -> Keeper {
         let last = (generation, Instant::now(), Duration::ZERO);
         Keeper { disk, folder, config: Arc::new(config), kept, writing: None, last }
@@ -321,7 +321,8 @@ impl Keeper {
             || seconds > 0.0 && !writing && elapsed.as_secs_f64() >= seconds && elapsed >= cost * SHARE
     }
 
-    /// Starts to write a checkpoint after the previous one is complete. `metrics` is flushed to the disk first.
+    /// Starts to write a checkpoint after the previous one is complete. `metrics` is flushed to the disk first. The cost of
+    /// the checkpoint counts from `since`.
     ///
     /// # Errors
     /// The previous checkpoint could not be written.

@@ -288,10 +288,10 @@ impl Stepper {
         Ok(())
     }
 
-    /// Returns a team's POI positions, `[pois]`.
+    /// Returns a team's POI positions in units, `[pois]`. For a team that does not exist, they are the world's.
     pub fn pois(&self, team: usize) -> &[Vec2] {
         let pois = self.world.pois.len();
-        self.moved.get(team * pois..).filter(|rest| !rest.is_empty()).map_or(&self.world.pois, |rest| &rest[..pois])
+        self.moved.get(team * pois..(team + 1) * pois).unwrap_or(&self.world.pois)
     }
 
     /// Returns what every leader senses, `[teams][leaders][8]`: the density of POIs, then of agents, in four quadrants

@@ -139,6 +139,7 @@ pub enum SnapshotError {
     Backend(#[from] BackendError),
 }
 
+/// Methods panic if an experiment or a trial does not exist.
 impl Trainer {
     /// Creates random populations for every trial of every config.
     pub fn new(configs: impl IntoIterator<Item = ValidConfig>) -> Trainer {
