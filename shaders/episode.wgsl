@@ -11,7 +11,7 @@
 //   TALLY      whether a follower counts the leaders it sees in registers (SIGHTS of them), not in the record
 //   shape      the sizes
 //   variant    the choices between formulas
-//   set_shape      sets both for a task
+//   set_shape  sets both for a task
 //   decide     a leader's policy
 //
 // Neighbouring threads play the same agent of neighbouring teams. They execute the same code, load neighbouring

@@ -154,7 +154,8 @@ fn pack(
     let nobody = select(0xffffu, 0xffu, sizes.leaders < 255u);
     let bits = select(16u, 8u, sizes.leaders < 255u);
     let owners_per_word = 32u / bits;
-    let owner_items = select((sizes.followers + owners_per_word - 1u) / owners_per_word * task.teams, 0u, task.owners == NOWHERE);
+    let owner_words = (sizes.followers + owners_per_word - 1u) / owners_per_word;
+    let owner_items = select(owner_words * task.teams, 0u, task.owners == NOWHERE);
     for (var item = thread; item < owner_items; item += WORKGROUP) {
         let team = item % task.teams;
         let first = item / task.teams * owners_per_word;

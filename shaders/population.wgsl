@@ -2,7 +2,7 @@
 // the weights of a batch's teams for the episode. One buffer holds one leader's policies, `[slots][parameters]`.
 //
 // The host prepends:
-//   WORKGROUP         threads per workgroup, a multiple of TILE
+//   WORKGROUP            threads per workgroup, a multiple of TILE
 //   BreedJob, GatherJob  declared in src/backend/gpu/population.rs
 
 // The range of sizes of a weight other than 0.

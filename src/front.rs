@@ -508,8 +508,8 @@ pub fn play_until(
     starts: &Starts,
     each: &mut dyn FnMut(evaluate::Batch<'_>) -> ControlFlow<()>,
 ) -> Result<Evaluation, Failure> {
-    let cast = CheckedTeams::new(config, teams, weights, starts)?;
-    let group = Group { fitnesses: scores_of(config), ..cast.group(&cast.world.starts) };
+    let checked = CheckedTeams::new(config, teams, weights, starts)?;
+    let group = Group { fitnesses: scores_of(config), ..checked.group(&checked.world.starts) };
     Ok(evaluate::evaluate_until(backend, &group, starts, &mut |_| (), each)?)
 }
 
@@ -560,13 +560,13 @@ pub fn record(
     noise: Option<ActionNoise<'_>>,
     arrays: StepArrays<'_>,
 ) -> Result<Vec<GroupScores>, Failure> {
-    let cast = CheckedTeams::new(config, teams, weights, starts)?;
+    let checked = CheckedTeams::new(config, teams, weights, starts)?;
     if episodes.end > starts.episodes() || episodes.is_empty() {
         return Err(Failure::NoEpisode { episode: episodes.end, episodes: starts.episodes() });
     }
-    let drawn: Vec<Vec<glam::Vec2>> = episodes.clone().map(|episode| starts.of(episode, &cast.world)).collect();
+    let drawn: Vec<Vec<glam::Vec2>> = episodes.clone().map(|episode| starts.of(episode, &checked.world)).collect();
     let fitnesses = scores_of(config);
-    let groups: Vec<Group<'_>> = drawn.iter().map(|starts| Group { fitnesses, ..cast.group(starts) }).collect();
+    let groups: Vec<Group<'_>> = drawn.iter().map(|starts| Group { fitnesses, ..checked.group(starts) }).collect();
     let noise = noise.map(|ActionNoise { seed, deviations }| Noise {
         key: Key::new(seed, 0, Purpose::Exploration),
         deviations,
@@ -607,11 +607,11 @@ pub fn trace(
     starts: &Starts,
     episode: usize,
 ) -> Result<Traced, Failure> {
-    let cast = CheckedTeams::new(config, teams, weights, starts)?;
+    let checked = CheckedTeams::new(config, teams, weights, starts)?;
     if episode >= starts.episodes() {
         return Err(Failure::NoEpisode { episode, episodes: starts.episodes() });
     }
-    let world = &cast.world;
+    let world = &checked.world;
     let (agents, leaders, steps) = (world.agents(), world.leaders(), world.steps());
     let words_per_team = (steps + 1) * agents * 5 + steps * leaders * (INPUTS + OUTPUTS) + world.set_words();
     let bytes = words_per_team as u128 * 4 * teams as u128;
@@ -629,7 +629,7 @@ pub fn trace(
         near: Vec::with_capacity(teams * world.set_words()),
     };
     let starts = starts.of(episode, world);
-    for (_, part) in evaluate::parts(&cast.group(&starts)) {
+    for (_, part) in evaluate::parts(&checked.group(&starts)) {
         let trace = backend.trace(&part)?;
         for (team, step) in (0..trace.teams).flat_map(|team| (0..=steps).map(move |step| (team, step))) {
             for moment in (0..agents).map(|agent| trace.moment(step, team, agent)) {

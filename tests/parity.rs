@@ -86,10 +86,13 @@ fn a_changed_shader_is_reported_with_its_stage() {
         ("influence", |text| replaced(text, "seen = u32(", "seen = 2u * u32(")),
         ("policy", |text| replaced(text, "if wanted[3] > most", "if wanted[3] >= most")),
         ("policy", |text| replaced(text, "if densities.y > most", "if densities.y >= most")),
-        ("breed", |text| replaced(text, "* brood.sigma", "* 1.0000001 * brood.sigma")),
+        ("breed", |text| replaced(text, "* breed_job.sigma", "* 1.0000001 * breed_job.sigma")),
         ("sight", |text| replaced(text, "return within(dx, dy, world.attr", "return within(dx, dy, 0.99 * world.attr")),
         ("sight", |text| replaced(text, "sights + (step * rows + row)", "sights + (step * rows + rows - 1u - row)")),
     ];
+    for (stage, edit) in edits {
+        assert!(support::edits_a_shader(edit), "an edit of stage {stage} changes no shader");
+    }
     for (request, info) in support::adapters("a_changed_shader_is_reported_with_its_stage") {
         for ((stage, edit), kernel) in edits.into_iter().zip(KERNELS.into_iter().cycle()) {
             // SAFETY: the edits change numbers, and an index within its row; loops stay as they are.

@@ -124,14 +124,19 @@ start_node() {
 # within minutes, Slurm would revoke its credential. Slurm holds a task that starts in the second of a revocation; such
 # a task is released. If squeue fails, the job is still assumed to run.
 wait_for() {
-    local job=$1 until=$((SECONDS + $2)) left task why
+    local job=$1 until=$((SECONDS + $2)) left task why since
+    local -A pending=()
     while sleep 1; do
         [ $SECONDS -lt $until ] || { say "timeout for job $job"; squeue --array; scontrol show "job=$job"; exit 1; }
         left=$(squeue --noheader --jobs="$job" --array --format='%F_%K %T %r' 2> /dev/null) || continue
         [ -n "$left" ] || break
         while read -r task why; do
             case $why in
-                "PENDING BeginTime") scontrol update "JobId=$task" StartTime=now TimeLimit=UNLIMITED ;;
+                "PENDING BeginTime")
+                    # A node refuses a job that returns while its last run is still being cleaned up.
+                    since=${pending[$task]:=$SECONDS}
+                    [ $((SECONDS - since)) -lt 5 ] || scontrol update "JobId=$task" StartTime=now TimeLimit=UNLIMITED
+                    ;;
                 *[Hh]eld*) scontrol release "$task" ;;
             esac 2> /dev/null || true
         done <<< "$left"

@@ -135,9 +135,10 @@ fn fetching_an_incomplete_population_reports_a_lost_device() {
     let key = Key::new(0, 0, Purpose::Mutation);
     let breeding = |generation| Breeding { parents: &parents, key, generation, learning: &learning };
     let skip_a_workgroup: fn(String) -> String = |text| {
-        let start = "let counters = (brood.parameters";
+        let start = "let counters = (breed_job.parameters";
         text.replace(start, &format!("if workgroup.x == 2u {{ return; }}\n    {start}"))
     };
+    assert!(support::edits_a_shader(skip_a_workgroup), "the edit changes no shader");
     for (request, info) in support::adapters("fetching_an_incomplete_population_reports_a_lost_device") {
         let gpu = open_gpu(&request);
         let dropping = |what, nth| Arc::new(Dropping { what, left: AtomicUsize::new(nth) });
@@ -283,8 +284,8 @@ fn check_stall() {
     let (rows, policies) = expected();
     for (request, info) in support::adapters("a_stalled_device_is_reported_and_counts_as_lost") {
         let faults = Arc::new(Stalled(AtomicUsize::new(0)));
-        let patience = WaitLimit { wait: Duration::from_millis(20), waits: 3 };
-        let result = train(backend(with_faults(&open_gpu(&request), &faults).waiting(patience), MODES[0]));
+        let wait_limit = WaitLimit { wait: Duration::from_millis(20), waits: 3 };
+        let result = train(backend(with_faults(&open_gpu(&request), &faults).waiting(wait_limit), MODES[0]));
         assert_eq!((result.0, result.1, result.2), (rows.clone(), policies.clone(), 1), "{info}");
         assert_eq!(faults.0.load(SeqCst), 3);
         let reported = REPORTED.lock().unwrap().split_off(0);
@@ -332,9 +333,12 @@ fn opening_detects_an_edit_of_any_kernel() {
         ("pack", |text| text.replace("size >= enough", "size > enough")),
         ("pack", |text| text.replace("if steps > most", "if steps >= most")),
         ("gather", |text| text.replace("vec4(tile[start], tile[start + 1u]", "vec4(tile[start + 1u], tile[start]")),
-        ("breed", |text| text.replace("* brood.sigma", "* 1.0000001 * brood.sigma")),
+        ("breed", |text| text.replace("* breed_job.sigma", "* 1.0000001 * breed_job.sigma")),
         ("generic kernel", |text| text.replace("sum += inputs[row] * weight", "sum -= inputs[row] * weight")),
     ];
+    for (what, edit) in edits {
+        assert!(support::edits_a_shader(edit), "an edit of {what} changes no shader");
+    }
     for (request, info) in support::adapters("opening_detects_an_edit_of_any_kernel") {
         let gpu = open_gpu(&request);
         for (what, edit) in edits {

@@ -83,7 +83,7 @@ commands! {
         Sweep(sweep),
         /// Train the paper's experiments, and check its claims.
         Paper(paper),
-        /// Train a suite of tasks, and check which need learning.
+        /// Train a suite of tasks, and check that no baseline solves them.
         Tasks(tasks),
     }
     "Look at results" {

@@ -1,4 +1,4 @@
-//! `flotilla tasks`: trains the tasks of a suite, and checks which of them need learning and large populations.
+//! `flotilla tasks`: trains the tasks of a suite, and checks that no baseline and no small population solves them.
 
 use std::path::{Path, PathBuf};
 

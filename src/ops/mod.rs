@@ -37,7 +37,7 @@
 //! | [`replay`] | a page, a film or a picture of an episode |
 //! | [`plot`] | learning curves |
 //! | [`baseline`] | teams that do not learn |
-//! | [`tasks`] | which tasks need learning |
+//! | [`tasks`] | which tasks no baseline solves |
 //! | [`sweep`] | training of a grid of runs, and collection of its results |
 //! | [`questions`] | training for the open questions of the paper |
 //! | [`paper`] | training of the paper's experiments, and a check of its claims |

@@ -125,7 +125,7 @@ pub fn write(path: &Path, content: &[u8]) -> Result<(), Error> {
 /// # Errors
 /// Fails if the file cannot be written.
 pub fn write_with(path: &Path, content: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<(), Error> {
-    let opened = tell_of_waiting(path);
+    let opened = report_waiting_later(path);
     let content = |output: &mut dyn Write| {
         drop(opened);
         content(output)
@@ -162,14 +162,14 @@ fn disk(path: &Path) -> io::Result<Disk> {
     Ok(disk)
 }
 
-/// Reports that a pipe has no reader yet, unless the returned sender is dropped within [`PATIENCE`].
-fn tell_of_waiting(path: &Path) -> mpsc::Sender<()> {
+/// Reports that a pipe has no reader yet, unless the returned sender is dropped within [`REPORT_AFTER`].
+fn report_waiting_later(path: &Path) -> mpsc::Sender<()> {
     let (opened, waiting) = mpsc::channel();
     if fs::metadata(path).is_ok_and(|there| !there.is_file() && !there.is_dir()) {
         let path = path.to_path_buf();
         // If no thread can be started, only the message is missing.
         let _ = thread::Builder::new().spawn(move || {
-            let silent = waiting.recv_timeout(PATIENCE) == Err(mpsc::RecvTimeoutError::Timeout);
+            let silent = waiting.recv_timeout(REPORT_AFTER) == Err(mpsc::RecvTimeoutError::Timeout);
             if silent && let Some(report) = REPORT.get() {
                 report(&format!("waiting for somebody to read from {}", path.escaped()));
             }
@@ -187,4 +187,4 @@ pub fn report_waiting(report: fn(&str)) {
 }
 
 /// Time until a pipe without a reader is reported.
-const PATIENCE: Duration = Duration::from_secs(1);
+const REPORT_AFTER: Duration = Duration::from_secs(1);

@@ -295,8 +295,8 @@ pub(crate) fn claim(disk: &Disk, sweep: &Sweep, out: &Path) -> Result<(), Error>
     same_sweep(sweep, out)
 }
 
-/// Enters a sweep's folder. Refuses it if a file to be written there was not made by flotilla.
-fn enter(out: &Path, named: bool) -> Result<Disk, Error> {
+/// Opens a sweep's folder for writing. Refuses it if a file to be written there was not made by flotilla.
+fn open_folder(out: &Path, named: bool) -> Result<Disk, Error> {
     let disk = ownership::open_output_folder(&Disk::default(), out, named)?;
     let products = pictures::names().chain([folder::RESULTS, folder::POINTS].map(String::from));
     ownership::check(&disk, products.map(|name| out.join(name)))?;
@@ -322,7 +322,7 @@ pub fn train(
     check_memory(points.iter().map(|point| &point.config), backend)?;
     warn_of_unreachable(sweep, &points, context);
     claim(&Disk::default(), sweep, out)?;
-    let disk = enter(out, request.named)?;
+    let disk = open_folder(out, request.named)?;
     let memory = request.memory.unwrap_or_else(free_memory);
     let skipped =
         if sweep.skipped > 0 { format!(", {} impossible ones left out", sweep.skipped) } else { String::new() };
@@ -458,7 +458,7 @@ pub fn collect(request: &Request, sweep: &Sweep, axes: &[usize], context: Contex
         return Err(Error::Usage(format!("{} holds no sweep", out.escaped()).into()));
     }
     same_sweep(sweep, out)?;
-    enter(out, request.named)?;
+    open_folder(out, request.named)?;
     let Results { every, reach, unverified, measure, band, .. } = request.results;
     let options = results::Detail { every, reach, verification: Verification::unless(unverified), measure, band };
     let folders: Vec<PathBuf> = sweep.points.iter().map(|point| results::point_folder(out, point)).collect();

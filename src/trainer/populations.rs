@@ -13,7 +13,7 @@ use crate::evolve::{self, Breeding, Key, Purpose, Samples, Selection, Strategy};
 use crate::parallel::*;
 
 /// Slots that one thread fills at a time.
-const BROOD: usize = 64;
+const SLOTS_PER_TASK: usize = 64;
 
 impl Experiment {
     /// Asks a backend once to hold the populations. It takes those of all trials or none.
@@ -162,9 +162,9 @@ impl Experiment {
                 let (mean, sigmas) = search.split_at(parameters);
                 let (children, kept) = children.split_at_mut(policies * parameters);
                 kept.copy_from_slice(search);
-                let broods = children.par_chunks_mut(BROOD * parameters).with_max_len(4);
-                broods.enumerate().for_each(|(index, children)| {
-                    let first = index * BROOD;
+                let tasks = children.par_chunks_mut(SLOTS_PER_TASK * parameters).with_max_len(4);
+                tasks.enumerate().for_each(|(index, children)| {
+                    let first = index * SLOTS_PER_TASK;
                     let samples = Samples { key, generation, population, policies, first, mean, sigmas };
                     NOISE.with_borrow_mut(|noise| strategy.sample(level, samples, children, noise));
                 });
@@ -198,12 +198,12 @@ impl Experiment {
             let populations = weights.par_chunks_exact(stride).zip(children.par_chunks_exact_mut(stride));
             plans.zip(populations).enumerate().for_each(|(leader, ((fitness, parents), (policies, children)))| {
                 plan(level, learning, tournaments, (generation, last), leader, fitness, parents);
-                let broods = children.par_chunks_mut(BROOD * parameters);
+                let tasks = children.par_chunks_mut(SLOTS_PER_TASK * parameters);
                 // Small tasks, so that no thread is left with a long one at the end.
-                broods.with_max_len(4).enumerate().for_each(|(index, children)| {
-                    let first = index * BROOD;
-                    let brood = evolve::Offspring { key, generation, population: leader, first, parents, policies };
-                    SCRATCH.with_borrow_mut(|scratch| evolve::breed(level, learning, brood, children, scratch));
+                tasks.with_max_len(4).enumerate().for_each(|(index, children)| {
+                    let first = index * SLOTS_PER_TASK;
+                    let offspring = evolve::Offspring { key, generation, population: leader, first, parents, policies };
+                    SCRATCH.with_borrow_mut(|scratch| evolve::breed(level, learning, offspring, children, scratch));
                 });
             });
             std::mem::swap(weights, &mut trial.children);

@@ -235,6 +235,12 @@ mod commands {
     }
 }
 
+/// Returns whether an edit changes at least one shader, so that a renamed variable is noticed without a GPU.
+#[cfg(feature = "gpu")]
+pub fn edits_a_shader(edit: fn(String) -> String) -> bool {
+    flotilla::backend::gpu::shaders().into_iter().any(|(_, text)| edit(text.clone()) != text)
+}
+
 /// Returns every adapter, each with the request that opens it.
 ///
 /// If there is none, prints that the test was skipped. With `FLOTILLA_REQUIRE_GPU=1`, panics instead.

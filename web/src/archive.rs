@@ -141,7 +141,8 @@ pub fn read(text: Option<&str>, bytes: &[u8]) -> Result<Answer, Refusal> {
     if run.origin.is_some_and(|origin| origin != Origin::of(&config)) {
         return Err(refuse("config.toml is not the config that this run was trained by"));
     }
-    let expected = run.digest.ok_or_else(|| refuse("run.json tells no digest: the run is not done"))?;
+    let expected =
+        run.digest.ok_or_else(|| refuse("run.json has no digest: the run is not finished: the run is not done"))?;
     let mut numbers: Vec<f64> = Vec::new();
     let mut rows = metrics::Rows::new(&metrics[..]).map_err(|error| refuse(format!("metrics.csv: {error}")))?;
     let mut plain = Vec::new();

@@ -122,7 +122,7 @@ impl Kernels {
         let buffer = |_| gpu.buffer("a population", (size * size_of::<f32>()) as u64, usage);
         let buffers = (0..=leaders).map(buffer).collect::<Result<Vec<_>, _>>()?;
         let input = Usage::STORAGE | Usage::COPY_DST;
-        let breed_jobs = gpu.buffer("breed_jobs", (leaders * BINDING_ALIGNMENT) as u64, input)?;
+        let breed_jobs = gpu.buffer("the breeding jobs", (leaders * BINDING_ALIGNMENT) as u64, input)?;
         let plan = gpu.buffer("the parents", (leaders * slots * size_of::<u32>()) as u64, input)?;
         let pieces = weights.chunks_exact(size).zip(&buffers).flat_map(|(weights, buffer)| {
             weights.chunks(PIECE / size_of::<f32>()).enumerate().map(move |(index, piece)| (buffer, index, piece))

@@ -80,7 +80,7 @@ const FIXED: [&str; 4] = ["learning.paradigm", "learning.fitness", "policy.actio
 /// They are all-leaders, on the layouts of the paper's figures.
 ///
 /// # Errors
-/// An override is invalid, or is of a key in which the experiments differ.
+/// An override is invalid, or sets a key that the experiments fix.
 pub fn arms(overrides: &[Override]) -> Result<Vec<Experiment>, ConfigError> {
     let problems: Vec<_> = overrides
         .iter()

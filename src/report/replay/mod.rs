@@ -376,11 +376,11 @@ fn team(
     let learning = &config.learning;
     let (generation, world) = (trainer.generation(0), trainer.world(0).clone());
     let teams = evolve::teams_of(learning, trial, generation, world.leaders());
-    let cast = Episodes::new(config, &world, trial, generation, trainer.weights(0, 0)?, &teams);
-    let g = cast.play(backend)?;
+    let episodes = Episodes::new(config, &world, trial, generation, trainer.weights(0, 0)?, &teams);
+    let g = episodes.play(backend)?;
     let first_best = (0..g.len()).reduce(|a, b| if g[b] > g[a] { b } else { a }).unwrap_or(0);
     let team = if let Which::Number(team) = which { team } else { first_best };
-    let played = cast.trace(team, backend)?;
+    let played = episodes.trace(team, backend)?;
     Ok((Replayed { trial, generation, which, team, team_g: g[team], ..played }, g[first_best]))
 }
 
@@ -396,9 +396,9 @@ fn champion(
     let (next, world) = (trainer.generation(0), World::new(config));
     let population = config.learning.population;
     let teams = vec![population as u32; world.leaders()];
-    let cast = Episodes::new(config, &world, trial, next, trainer.weights(0, 0)?, &teams);
-    let team_g = cast.play(backend)?[0];
-    let played = cast.trace(0, backend)?;
+    let episodes = Episodes::new(config, &world, trial, next, trainer.weights(0, 0)?, &teams);
+    let team_g = episodes.play(backend)?[0];
+    let played = episodes.trace(0, backend)?;
     Ok(Replayed { trial, generation: next - 1, which: Which::Champion, team: population, team_g, ..played })
 }
 

@@ -235,7 +235,7 @@ pub(super) fn plan(
     for (index, group) in groups.iter().enumerate() {
         let world = group.world;
         let kept = Kept::of(group, trace);
-        let moments_a_team = if trace { (world.steps() + 1) * world.agents() } else { 0 };
+        let moments_per_team = if trace { (world.steps() + 1) * world.agents() } else { 0 };
         let for_it =
             Packing::specialised(world, room).map(|packing| (packing, Shape::specialised(world, packing, kept)));
         let (packing, shape) = for_it.filter(|(_, shape)| specialised.contains(shape)).unwrap_or_else(|| {
@@ -244,13 +244,13 @@ pub(super) fn plan(
         });
         let (steps_per_dispatch, turns_per_step) =
             (steps_per_dispatch(world, packing, kept), turns_per_step(world, packing, kept));
-        let states_a_team = if world.steps() > steps_per_dispatch { world.agents() } else { 0 };
+        let states_per_team = if world.steps() > steps_per_dispatch { world.agents() } else { 0 };
         // Every buffer that grows with the teams is one of these, or smaller than one of them.
         let bytes_per_team = [
             (record_words(world, group.records()) + STATUS) * size_of::<u32>(),
             fours(world) * size_of::<[f32; FOUR]>(),
-            moments_a_team * size_of::<Moment>(),
-            states_a_team * size_of::<State>(),
+            moments_per_team * size_of::<Moment>(),
+            states_per_team * size_of::<State>(),
         ]
         .into_iter()
         .max()
@@ -307,8 +307,8 @@ pub(super) fn plan(
             work.weights += fours(world) * teams;
             work.record += record_words(world, group.records()) * teams + STATUS;
             work.sets += world.set_words() * teams;
-            work.moments += moments_a_team * teams;
-            work.states += states_a_team * teams;
+            work.moments += moments_per_team * teams;
+            work.states += states_per_team * teams;
             let turns_per_step = turns_per_step * packing.workgroup;
             work.shares.push(PlannedTask { group: index, first_team, shape, task, steps_per_dispatch, turns_per_step });
         }
