@@ -1,7 +1,7 @@
 //! Rules for which files flotilla may write, replace, rename and delete. All code that writes in one of flotilla's
 //! folders uses this module.
 //!
-//! - No symbolic link below such a folder is followed ([`enter`], [`Disk::within`]).
+//! - No symbolic link below such a folder is followed ([`open_output_folder`], [`Disk::within`]).
 //! - A folder of another user is written to only if the user named it as the output folder.
 //! - The files of a run (config, metrics, policies, checkpoints, `run.json`) may be replaced if the folder holds a run.
 //!   A valid `run.json` or checkpoint shows that ([`holds_run`]).
