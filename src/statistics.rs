@@ -297,7 +297,7 @@ pub fn rank_sum(one: &[f64], other: &[f64]) -> Option<Tested> {
 }
 
 /// Returns a power by multiplication. The precision of `powi` is not specified, so it could differ between systems.
-fn power_of(base: f64, exponent: usize) -> f64 {
+pub(crate) fn power_of(base: f64, exponent: usize) -> f64 {
     (0..exponent).fold(1.0, |power, _| power * base)
 }
 

@@ -436,6 +436,8 @@ fn a_wrong_value_of_a_flag_exits_with_code_2() {
         &["sweep", "grid.toml", "--axes", "steps"],
         &["paper", "--trials", "0"],
         &["paper", "--set", "learning.fitness=G"],
+        // A stage could change the fitness.
+        &["paper", "--set", "stages=[{ from = 1, set = { 'learning.fitness' = 'G' } }]"],
         &["paper", "--questions=d", "--set", "learning.fitness=G"],
         &["replay", "run", "--trial", "2"],
         &["replay", "run", "--generation", "5"],

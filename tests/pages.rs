@@ -242,7 +242,7 @@ fn copy(from: &Path, to: &Path) {
     }
 }
 
-/// What happened to the commands of a page.
+/// The results of a page's commands.
 #[derive(Default)]
 struct PageResult {
     ran: usize,

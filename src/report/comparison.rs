@@ -10,7 +10,7 @@ use super::runs::{self, ReadError};
 use super::table;
 use crate::escape::{self, PathExt};
 use crate::record::digests::Verification;
-use crate::statistics::{self, Estimate, Tested};
+use crate::statistics::{self, Estimate, Tested, power_of};
 
 /// The trials of one arm of a comparison.
 #[derive(Clone, Debug, PartialEq)]
@@ -406,7 +406,7 @@ impl Comparison {
 pub fn estimate(Estimate { value, low, high }: Estimate, digits: usize, signed: bool) -> String {
     // Adding 0.0 turns -0.0 into 0.0, which prints no sign.
     let [value, low, high] = [value, low, high].map(|x| {
-        let tens = (0..digits).fold(1.0, |power, _| power * 10.0);
+        let tens = power_of(10.0, digits);
         (x * tens).round() / tens + 0.0
     });
     let value = if signed { format!("{value:+.digits$}") } else { format!("{value:.digits$}") };

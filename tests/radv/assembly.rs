@@ -151,7 +151,7 @@ pub enum When {
     Empty,
 }
 
-/// How a scalar instruction sets the condition code.
+/// The way in which a scalar instruction sets the condition code.
 #[derive(Clone, Copy)]
 pub enum Change {
     Kept,
@@ -177,7 +177,7 @@ pub struct Instruction {
     pub scale: Option<f32>,
     /// The index of the instruction to which it branches.
     pub target: usize,
-    /// How many times as long it takes as other vector instructions.
+    /// The factor by which it takes longer than other vector instructions.
     pub issues: u64,
     pub is_vector: bool,
     /// The numbers of the registers that it reads and writes.
