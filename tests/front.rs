@@ -19,7 +19,7 @@ use flotilla::record::digests::Verification;
 use flotilla::record::disk::Disk;
 use flotilla::record::folder::Start;
 use flotilla::record::policies::{self, Init, Policies};
-use flotilla::run::{Ended, Options, Session};
+use flotilla::run::{Options, Session, SessionEnd};
 use flotilla::sample;
 use flotilla::stepping::StepError;
 use flotilla::world::World;
@@ -60,12 +60,12 @@ fn run_digest_from(config: &Config, folder: &Path, init: Option<Init>) -> String
             command: "",
             stop: &unset,
             save: &unset,
-            instead: &mut |_| None,
-            setback: &mut |_| (),
+            fallback: &mut |_| None,
+            on_recovery: &mut |_| (),
             watch: &mut |_| (),
         },
     );
-    assert_eq!(ended.expect("training succeeds"), Ended::Done);
+    assert_eq!(ended.expect("training succeeds"), SessionEnd::Finished);
     session.results(0).expect("the run is finished").digest.clone()
 }
 

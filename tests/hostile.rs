@@ -66,8 +66,8 @@ fn files() -> Files {
         command: "flotilla train",
         stop: &stop,
         save: &save,
-        instead: &mut |_| None,
-        setback: &mut |_| {},
+        fallback: &mut |_| None,
+        on_recovery: &mut |_| {},
         watch: &mut |_| {},
     };
     session.train(&mut (Box::new(Cpu::default()), Machine::default()), &mut options).unwrap();

@@ -18,7 +18,7 @@ use flotilla::config::Config;
 use flotilla::record::disk::Disk;
 use flotilla::record::folder::{METRICS, POLICIES, RUN, Run, Start, Status};
 use flotilla::record::ownership::{self, LIST};
-use flotilla::run::{Ended, Options, Session};
+use flotilla::run::{Options, Session, SessionEnd};
 use support::{Place, SMALL};
 
 const SWEEP: &str = "
@@ -527,13 +527,13 @@ fn train(config: &Config, path: &Path, start: Start, disk: Disk) -> Result<(), S
         command: "",
         stop: &stop,
         save: &save,
-        instead: &mut |_| None,
-        setback: &mut |_| {},
+        fallback: &mut |_| None,
+        on_recovery: &mut |_| {},
         watch: &mut |_| {},
     };
     let mut player: OpenBackend = (Box::new(Cpu::default()), Machine::default());
     let ended = session.train(&mut player, &mut options).map_err(|error| error.to_string())?;
-    assert_eq!(ended, Ended::Done);
+    assert_eq!(ended, SessionEnd::Finished);
     Ok(())
 }
 

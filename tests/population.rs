@@ -23,7 +23,7 @@ use flotilla::config::{
 use flotilla::evolve::{self, Breeding, Key, Purpose, UNCHANGED};
 use flotilla::record::disk::Disk;
 use flotilla::record::folder::{METRICS, Start};
-use flotilla::run::{Ended, Options, Session};
+use flotilla::run::{Options, Session, SessionEnd};
 use flotilla::trainer::{Row, Snapshot, SnapshotError, Trainer};
 
 fn learning() -> Learning {
@@ -318,16 +318,17 @@ fn starts_drawn_in_advance_are_discarded_after_a_restore() {
     assert_eq!(outcome(&mut FakeDevice::failing_at(0, false)), expected);
 }
 
-/// `take_setback` returns an error from which the trainer recovered, once.
+/// `take_recovered_error` returns an error from which the trainer recovered, once.
 #[test]
-fn a_setback_is_reported_once() {
+fn a_recovered_error_is_reported_once() {
     for nth in 1.. {
         let (mut trainer, mut device, mut reported) =
             (Trainer::new(ValidConfig::all(&experiments()).unwrap()), FakeDevice::failing_at(nth, false), 0);
         while !trainer.is_done() {
             trainer.advance(&mut device).unwrap();
-            reported +=
-                usize::from(trainer.take_setback().is_some_and(|error| error.to_string().contains("pulled out")));
+            reported += usize::from(
+                trainer.take_recovered_error().is_some_and(|error| error.to_string().contains("pulled out")),
+            );
         }
         assert_eq!(reported, usize::from(device.failed()), "call {nth}");
         if !device.failed() {
@@ -511,13 +512,13 @@ fn a_run_survives_the_loss_of_its_device() {
             command: "",
             stop: &stop,
             save: &save,
-            instead: &mut |_| fall_back.then(cpu),
-            setback: &mut |_| {},
+            fallback: &mut |_| fall_back.then(cpu),
+            on_recovery: &mut |_| {},
             watch: &mut |_| {},
         };
         let mut player = device.map_or_else(cpu, |device| (Box::new(device), Machine::default()));
         let ended = session.train(&mut player, &mut options).map(|outcome| {
-            assert_eq!(outcome, Ended::Done);
+            assert_eq!(outcome, SessionEnd::Finished);
             session.results(0).cloned().unwrap()
         });
         let metrics = std::fs::read_to_string(path.join(METRICS)).unwrap();

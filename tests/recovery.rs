@@ -26,7 +26,7 @@ use flotilla::record::checkpoint::{self, Checkpoint};
 use flotilla::record::disk::{Disk, Operation};
 use flotilla::record::folder::{CONFIG, Folder, METRICS, Note, POLICIES, RUN, Run, Start, StartFrom, Status};
 use flotilla::record::{RecordError, metrics, policies};
-use flotilla::run::{Ended, Options, Results, RunError, Session};
+use flotilla::run::{Options, Results, RunError, Session, SessionEnd};
 use rand::{RngExt, SeedableRng, rngs::ChaCha8Rng};
 use support::tiny;
 use tempfile::TempDir;
@@ -47,7 +47,7 @@ fn cpu() -> OpenBackend {
 /// Outcome of one session. `notes` are about the folder. `start` and `reached` are the next generations at its start
 /// and at its end.
 struct Outcome {
-    end: Result<Ended, RunError>,
+    end: Result<SessionEnd, RunError>,
     results: Option<Results>,
     notes: Vec<Note>,
     start: usize,
@@ -69,7 +69,7 @@ fn session(
     let notes = notes.into_iter().map(|(_, note)| note).collect();
     if session.is_done() {
         let results = session.results(0).cloned();
-        return Outcome { end: Ok(Ended::Done), results, notes, start: 0, reached: 0 };
+        return Outcome { end: Ok(SessionEnd::Finished), results, notes, start: 0, reached: 0 };
     }
     let start = session.generations()[0];
     let end = train(&mut session, player, &mut |_| None, &mut |next| stop_at.is_some_and(|at| next[0] >= at));
@@ -80,16 +80,16 @@ fn session(
 fn train(
     session: &mut Session,
     mut player: OpenBackend,
-    instead: &mut dyn FnMut(&BackendError) -> Option<OpenBackend>,
+    fallback: &mut dyn FnMut(&BackendError) -> Option<OpenBackend>,
     stops: &mut dyn FnMut(&[usize]) -> bool,
-) -> Result<Ended, RunError> {
+) -> Result<SessionEnd, RunError> {
     let (stop, save) = (AtomicBool::new(false), AtomicBool::new(false));
     let mut options = Options {
         command: "",
         stop: &stop,
         save: &save,
-        instead,
-        setback: &mut |_| {},
+        fallback,
+        on_recovery: &mut |_| {},
         watch: &mut |now| stop.store(stops(now.generations), SeqCst),
     };
     session.train(&mut player, &mut options)
@@ -98,7 +98,7 @@ fn train(
 /// Resumes a run to its end, on a disk without failures.
 fn resume(config: &Config, path: &Path) -> (Results, Outcome) {
     let outcome = session(config, path, Start::Resume, Disk::default(), cpu(), None);
-    assert!(matches!(outcome.end, Ok(Ended::Done)), "{:?}", outcome.end);
+    assert!(matches!(outcome.end, Ok(SessionEnd::Finished)), "{:?}", outcome.end);
     (outcome.results.clone().unwrap(), outcome)
 }
 
@@ -117,7 +117,7 @@ fn reference(config: &Config) -> (Results, (String, Vec<u8>)) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("run");
     let outcome = session(config, &path, Start::Fresh, Disk::default(), cpu(), None);
-    assert!(matches!(outcome.end, Ok(Ended::Done)), "{:?}", outcome.end);
+    assert!(matches!(outcome.end, Ok(SessionEnd::Finished)), "{:?}", outcome.end);
     (outcome.results.unwrap(), result_files(&path))
 }
 
@@ -139,7 +139,7 @@ fn a_run_stopped_before_any_generation_resumes_to_the_same_results() {
         let outcome = session(&config, &path, Start::Fresh, Disk::default(), cpu(), Some(stop_at));
         // The last step completes the run, which leaves nothing to stop.
         let done = stop_at == config.learning.generations + 2;
-        assert_eq!(outcome.end.unwrap(), if done { Ended::Done } else { Ended::Stopped });
+        assert_eq!(outcome.end.unwrap(), if done { SessionEnd::Finished } else { SessionEnd::Stopped });
         assert_eq!(outcome.reached, stop_at);
         let (results, outcome) = resume(&config, &path);
         assert_eq!(outcome.start, if done { 0 } else { stop_at });
@@ -160,7 +160,7 @@ fn a_finished_run_is_not_trained_again() {
         _ => panic!("{operation:?} {}", path.display()),
     });
     let outcome = session(&config, &path, Start::Resume, disk, cpu(), None);
-    assert_eq!((outcome.end.unwrap(), outcome.results), (Ended::Done, Some(expected.0.clone())));
+    assert_eq!((outcome.end.unwrap(), outcome.results), (SessionEnd::Finished, Some(expected.0.clone())));
     assert_eq!(fs::read(path.join(METRICS)).unwrap(), before);
     // If a result file is damaged, the run resumes from its last checkpoint and restores the file.
     for (name, at) in [(POLICIES, 500), (METRICS, 60)] {
@@ -334,11 +334,11 @@ fn runs_trained_together_equal_runs_trained_alone() {
     assert_eq!(session.generations(), [11, 7, 0, 0]);
     assert_eq!(notes.iter().map(|(run, _)| *run).collect::<Vec<_>>(), [0, 2, 3]);
     let stopped = train(&mut session, cpu(), &mut |_| None, &mut |next| next[2] >= 3);
-    assert_eq!((stopped.unwrap(), session.generations()), (Ended::Stopped, &[14, 7, 3, 3][..]));
+    assert_eq!((stopped.unwrap(), session.generations()), (SessionEnd::Stopped, &[14, 7, 3, 3][..]));
     drop(session);
     let (mut session, _) = open();
     let done = train(&mut session, cpu(), &mut |_| None, &mut |_| false);
-    assert_eq!((done.unwrap(), session.generations()), (Ended::Done, &[16, 7, 11, 16][..]));
+    assert_eq!((done.unwrap(), session.generations()), (SessionEnd::Finished, &[16, 7, 11, 16][..]));
     for (run, expected) in expected.iter().enumerate() {
         assert_eq!(
             (session.results(run), result_files(&path(run))),
@@ -379,7 +379,7 @@ fn a_run_survives_every_failing_disk_operation() {
         (folder, path, outcome, count.load(SeqCst), failed)
     };
     let (_, _, outcome, operations, _) = attempt(Box::new(|_| false));
-    assert_eq!((outcome.end.unwrap(), outcome.results), (Ended::Done, Some(expected.0.clone())));
+    assert_eq!((outcome.end.unwrap(), outcome.results), (SessionEnd::Finished, Some(expected.0.clone())));
     assert!(operations > 14 * 5, "{operations}");
     let mut reported = Vec::new();
     for at in 0..operations {
@@ -617,11 +617,11 @@ fn a_lost_device_does_not_change_results() {
         let runs = vec![(config.clone(), path.clone())];
         let (mut session, _) = Session::open(runs, Start::Fresh, &Disk::default()).unwrap();
         let mut requests = 0;
-        let mut instead = |_: &_| {
+        let mut fallback = |_: &_| {
             requests += 1;
             Some(cpu())
         };
-        assert_eq!(train(&mut session, failing(), &mut instead, &mut |_| false).unwrap(), Ended::Done);
+        assert_eq!(train(&mut session, failing(), &mut fallback, &mut |_| false).unwrap(), SessionEnd::Finished);
         assert_eq!(session.results(0), Some(&expected.0));
         assert_eq!((requests, result_files(&path)), (1, expected.1.clone()));
     }
@@ -640,10 +640,10 @@ fn a_run_can_alternate_between_cpu_and_gpu() {
         let path = folder.path().join("run");
         for (stop_at, player) in [(4, cpu()), (9, gpu()), (12, cpu())] {
             let outcome = session(&config, &path, Start::Resume, Disk::default(), player, Some(stop_at));
-            assert_eq!((outcome.end.unwrap(), outcome.reached), (Ended::Stopped, stop_at));
+            assert_eq!((outcome.end.unwrap(), outcome.reached), (SessionEnd::Stopped, stop_at));
         }
         let outcome = session(&config, &path, Start::Resume, Disk::default(), gpu(), None);
-        assert_eq!((outcome.end.unwrap(), outcome.results), (Ended::Done, Some(expected.0.clone())), "{info}");
+        assert_eq!((outcome.end.unwrap(), outcome.results), (SessionEnd::Finished, Some(expected.0.clone())), "{info}");
         assert_eq!(result_files(&path), expected.1, "{info}");
     }
 }

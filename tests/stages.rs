@@ -19,7 +19,7 @@ use flotilla::record::disk::Disk;
 use flotilla::record::folder::{Folder, METRICS, POLICIES, RUN, Run, Start, StartFrom};
 use flotilla::record::policies::{self, Init, read_init};
 use flotilla::report::replay::{Which, replay};
-use flotilla::run::{Ended, Options, Results, RunError, Session};
+use flotilla::run::{Options, Results, RunError, Session, SessionEnd};
 use flotilla::trainer::Trainer;
 use flotilla::verify;
 use support::SMALL;
@@ -126,14 +126,14 @@ fn errors_in_stages_name_their_line() {
 }
 
 /// Trains until `stops` returns true for the next generation, or to the end.
-fn train_until(session: &mut Session, stops: impl Fn(usize) -> bool) -> Result<Ended, RunError> {
+fn train_until(session: &mut Session, stops: impl Fn(usize) -> bool) -> Result<SessionEnd, RunError> {
     let (stop, save) = (AtomicBool::new(stops(0)), AtomicBool::new(false));
     let mut options = Options {
         command: "",
         stop: &stop,
         save: &save,
-        instead: &mut |_| None,
-        setback: &mut |_| {},
+        fallback: &mut |_| None,
+        on_recovery: &mut |_| {},
         watch: &mut |progress| stop.store(stops(progress.generations[0]), Relaxed),
     };
     session.train(&mut (Box::new(Cpu::default()), Machine::default()), &mut options)
@@ -150,7 +150,7 @@ fn train(
     let (mut session, _) =
         Session::open_from(vec![(config.clone(), path.to_path_buf(), init)], start, &Disk::default())?;
     let ended = train_until(&mut session, |next| next >= until)?;
-    Ok((ended == Ended::Done).then(|| session.results(0).cloned().unwrap()))
+    Ok((ended == SessionEnd::Finished).then(|| session.results(0).cloned().unwrap()))
 }
 
 /// Trains up to generation `until` and makes it the last (`Session::end`). Plays it too if `finish` is set. Returns the
@@ -158,10 +158,10 @@ fn train(
 fn train_shorter(config: &Config, path: &Path, init: Option<Init>, until: usize, finish: bool) -> usize {
     let runs = vec![(config.clone(), path.to_path_buf(), init)];
     let (mut session, _) = Session::open_from(runs, Start::Fresh, &Disk::default()).unwrap();
-    assert!(train_until(&mut session, |next| next == until).unwrap() == Ended::Stopped);
+    assert!(train_until(&mut session, |next| next == until).unwrap() == SessionEnd::Stopped);
     let last = session.end().unwrap();
     if finish {
-        assert!(train_until(&mut session, |_| false).unwrap() == Ended::Done);
+        assert!(train_until(&mut session, |_| false).unwrap() == SessionEnd::Finished);
     }
     last
 }
@@ -285,7 +285,7 @@ fn a_run_with_a_hall_of_fame_resumes_to_the_same_results() {
         let (mut session, _) =
             Session::open(vec![(plain.clone(), extended.clone())], Start::Resume, &Disk::default()).unwrap();
         assert_eq!(session.generations(), [generations + 1], "the finished generations are trained again");
-        assert!(train_until(&mut session, |_| false).unwrap() == Ended::Done);
+        assert!(train_until(&mut session, |_| false).unwrap() == SessionEnd::Finished);
         assert_eq!(
             (rows(&extended), policy_bytes(&extended)),
             (rows(&longer), policy_bytes(&longer)),
@@ -331,7 +331,7 @@ fn evolution_strategies_resume_to_the_same_results() {
             let (mut session, _) =
                 Session::open(vec![(plain.clone(), extended.clone())], Start::Resume, &Disk::default()).unwrap();
             assert_eq!(session.generations(), [generations + 1], "the finished generations are trained again");
-            assert!(train_until(&mut session, |_| false).unwrap() == Ended::Done);
+            assert!(train_until(&mut session, |_| false).unwrap() == SessionEnd::Finished);
             assert_eq!(session.results(0), Some(&expected), "from {generations} on");
             assert_eq!(
                 (rows(&extended), policy_bytes(&extended)),

@@ -74,7 +74,9 @@ fn train(mut device: GpuBackend) -> (Vec<Row>, Vec<Vec<f32>>, usize) {
             Err(error) => panic!("{error}"),
         }
         assert!(
-            trainer.take_setback().is_none_or(|error| matches!(error, BackendError::Gpu(DeviceError::Lost { .. })))
+            trainer
+                .take_recovered_error()
+                .is_none_or(|error| matches!(error, BackendError::Gpu(DeviceError::Lost { .. })))
         );
     }
     (rows, trainer.policies(0), lost)

@@ -1,6 +1,7 @@
 //! Training in which the caller decides what policies are worth.
 
-use super::{Failure, Generation, Trained, champions, start_from, trainer_of};
+use super::train::{new_trainer, previous_champions, start_from};
+use super::{Failure, Generation, Trained};
 use crate::backend::Backend;
 use crate::config::Config;
 use crate::trainer::{Candidates, Row, Snapshot, Trainer};
@@ -49,7 +50,7 @@ impl Coevolution {
     pub fn new(config: &Config) -> Result<Coevolution, Failure> {
         let valid = config.validate()?;
         let config = Config::clone(&valid);
-        Ok(Coevolution { config, trainer: trainer_of(valid)?, rows: Vec::new(), played: false })
+        Ok(Coevolution { config, trainer: new_trainer(valid)?, rows: Vec::new(), played: false })
     }
 
     /// Replaces the random populations by given ones, see [`super::train_from`].
@@ -165,7 +166,7 @@ impl Coevolution {
         if self.generation() == 0 {
             return Err(Failure::State);
         }
-        Ok(champions(&mut self.trainer, &self.config)?)
+        Ok(previous_champions(&mut self.trainer, &self.config)?)
     }
 
     /// Returns the state, for [`Coevolution::restore`].

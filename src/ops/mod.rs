@@ -195,7 +195,7 @@ impl Context<'_> {
     }
 
     /// Returns the CPU backend to continue with after another backend failed, if that is allowed.
-    pub fn instead(&self, error: &BackendError) -> Option<OpenBackend> {
+    pub fn fallback(&self, error: &BackendError) -> Option<OpenBackend> {
         self.falls_back.then(|| {
             let (backend, machine) = front::cpu();
             self.warn(format_args!("{error}\ncontinuing on {}, with the same results", backend.describe()));
@@ -204,7 +204,7 @@ impl Context<'_> {
     }
 
     /// Reports that populations moved to the host.
-    pub fn setback(&self, error: &BackendError) {
+    pub fn on_recovery(&self, error: &BackendError) {
         self.warn(format_args!("{error}\nthe populations are kept by the host from here on, to the same results"));
     }
 
@@ -214,8 +214,8 @@ impl Context<'_> {
             command: self.command,
             stop: self.stop,
             save: self.save,
-            instead: &mut |error| self.instead(error),
-            setback: &mut |error| self.setback(error),
+            fallback: &mut |error| self.fallback(error),
+            on_recovery: &mut |error| self.on_recovery(error),
             watch,
         })
     }

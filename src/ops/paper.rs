@@ -21,7 +21,7 @@ use crate::report::paper::claims::Claim;
 use crate::report::paper::{self, Evidence, Experiment, Summary, Trajectory, claims, tables};
 use crate::report::runs;
 use crate::report::scene::Format;
-use crate::run::{self, Ended, RunError, Session, Twin};
+use crate::run::{self, RunError, Session, SessionEnd, Twin};
 use crate::trainer::Row;
 
 /// The results in a paper's folder, for people and for programs.
@@ -180,7 +180,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         };
         let ended = context.train(&mut watch, |options| session.train(backend, options));
         (context.tell)(Event::Pause);
-        if ended? == Ended::Stopped {
+        if ended? == SessionEnd::Stopped {
             return Err(Error::Stopped(
                 format!(
                     "before generation {} of {}, with everything saved",
@@ -208,7 +208,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
             return Err(Error::Stopped("before all that needs no learning was played, with every run done".into()));
         }
         if let Err(error) = baselines.advance(&mut *backend.0) {
-            *backend = context.instead(&error).ok_or(error)?;
+            *backend = context.fallback(&error).ok_or(error)?;
             continue;
         }
         let (generation, last) = (baselines.generation(), learning.generations);

@@ -16,7 +16,7 @@ use crate::record::{RecordError, ownership, policies};
 use crate::report::comparison::{self, Comparison};
 use crate::report::curves::PRINT;
 use crate::report::scene::Format;
-use crate::run::{Ended, Session};
+use crate::run::{Session, SessionEnd};
 use crate::sweep::questions::{self, Answer, OpenQuestion, QUESTIONS, Study};
 use crate::sweep::results::point_folder;
 use crate::sweep::run::SweepProgress;
@@ -133,7 +133,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         };
         let ended =
             super::sweep::train_points(context, sweep, &points, &folder, start, &disk, free_memory(), backend, &share)?;
-        if ended == Ended::Stopped {
+        if ended == SessionEnd::Stopped {
             return Err(stopped());
         }
         before += cost(sweep);
@@ -147,7 +147,8 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         let mut watch = |_: &crate::run::Progress<'_>| {
             (context.tell)(Event::Fraction(before / whole, format!("{}: warm starts", part.name)));
         };
-        if !session.is_done() && context.train(&mut watch, |options| session.train(backend, options))? == Ended::Stopped
+        if !session.is_done()
+            && context.train(&mut watch, |options| session.train(backend, options))? == SessionEnd::Stopped
         {
             return Err(stopped());
         }

@@ -23,7 +23,7 @@ use crate::record::folder::{self, CONFIG, RUN, Run, SWEEP, Start};
 use crate::record::ownership;
 use crate::report::curves::Band;
 use crate::report::runs::TeamKind;
-use crate::run::{self as training, Ended};
+use crate::run::{self as training, SessionEnd};
 use crate::sweep::pictures;
 use crate::sweep::results::{self, Missing};
 use crate::sweep::run::{self, SweepProgress};
@@ -339,8 +339,8 @@ pub fn train(
         (context.tell)(Event::Fraction(played as f64 / total.max(1) as f64, text));
     };
     match train_points(context, sweep, &points, out, request.start, &disk, memory, backend, &share)? {
-        Ended::Done => Ok(()),
-        Ended::Stopped => Err(Error::Stopped("everything is saved".into())),
+        SessionEnd::Finished => Ok(()),
+        SessionEnd::Stopped => Err(Error::Stopped("everything is saved".into())),
     }
 }
 
@@ -356,7 +356,7 @@ pub(super) fn train_points(
     memory: usize,
     backend: &mut OpenBackend,
     share: &dyn Fn(&SweepProgress),
-) -> Result<Ended, Error> {
+) -> Result<SessionEnd, Error> {
     let mut options = run::SweepOptions {
         start,
         disk,
@@ -365,8 +365,8 @@ pub(super) fn train_points(
             command: context.command,
             stop: context.stop,
             save: context.save,
-            instead: &mut |error| context.instead(error),
-            setback: &mut |error| context.setback(error),
+            fallback: &mut |error| context.fallback(error),
+            on_recovery: &mut |error| context.on_recovery(error),
             watch: &mut |_| {},
         },
         watch: &mut |progress| share(progress),

@@ -19,7 +19,7 @@ use crate::record::disk::Disk;
 use crate::record::folder::{POLICIES, Start};
 use crate::record::ownership;
 use crate::report::runs;
-use crate::run::{Ended, Progress, Session};
+use crate::run::{Progress, Session, SessionEnd};
 use crate::sweep::questions::champions;
 
 /// Default folder.
@@ -215,8 +215,8 @@ fn train(
     let ended = context.train(&mut watch, |options| session.train(backend, options));
     context.pause();
     match ended? {
-        Ended::Done => Ok(()),
-        Ended::Stopped => Err(Error::Stopped("with everything saved".into())),
+        SessionEnd::Finished => Ok(()),
+        SessionEnd::Stopped => Err(Error::Stopped("with everything saved".into())),
     }
 }
 

@@ -29,7 +29,7 @@ use crate::report::replay::History;
 use crate::report::runs;
 use crate::report::scene::Scene;
 use crate::report::tensorboard::Events;
-use crate::run::{Ended, Progress, RunError, Session};
+use crate::run::{Progress, RunError, Session, SessionEnd};
 use crate::shell;
 use crate::trainer::Row;
 
@@ -249,7 +249,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         let ended = context.train(&mut watch, |options| session.train(backend, options));
         context.pause();
         events.flush();
-        if ended? == Ended::Done {
+        if ended? == SessionEnd::Finished {
             break;
         }
         if !context.ends() {

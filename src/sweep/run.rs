@@ -9,7 +9,7 @@ use crate::backend::OpenBackend;
 use crate::config::Config;
 use crate::record::disk::Disk;
 use crate::record::folder::{self, Note, Start};
-use crate::run::{self, Ended, RunError, Session};
+use crate::run::{self, RunError, Session, SessionEnd};
 
 /// Maximum number of points per batch. Each keeps two files open, and most systems allow a process at least 1024.
 const MAX_BATCH: usize = 400;
@@ -96,7 +96,7 @@ pub fn run(
     out: &Path,
     player: &mut OpenBackend,
     options: &mut SweepOptions<'_>,
-) -> Result<Ended, RunError> {
+) -> Result<SessionEnd, RunError> {
     let total = points.iter().map(|point| team_steps(&point.config)).sum();
     let mut progress =
         SweepProgress { done: 0, points: points.len(), batch: 0, generation: 0, last: 0, played: 0, total };
@@ -107,7 +107,7 @@ pub fn run(
     folder::check(disk, folders.iter().map(|path| &**path).zip(configs), options.start)?;
     for batch in batches(points, options.memory) {
         if options.runs.stop.load(Relaxed) {
-            return Ok(Ended::Stopped);
+            return Ok(SessionEnd::Stopped);
         }
         let runs = batch.iter().map(|point| (point.config.clone(), point_folder(out, point))).collect();
         let (mut session, notes) = Session::open(runs, options.start, disk)?;
@@ -128,13 +128,13 @@ pub fn run(
         };
         tell(session.generations());
         let mut watch = |now: &run::Progress<'_>| tell(now.generations);
-        let run::Options { command, stop, save, ref mut instead, ref mut setback, .. } = options.runs;
-        let mut runs = run::Options { command, stop, save, instead, setback, watch: &mut watch };
-        if !session.is_done() && session.train(player, &mut runs)? == Ended::Stopped {
-            return Ok(Ended::Stopped);
+        let run::Options { command, stop, save, ref mut fallback, ref mut on_recovery, .. } = options.runs;
+        let mut runs = run::Options { command, stop, save, fallback, on_recovery, watch: &mut watch };
+        if !session.is_done() && session.train(player, &mut runs)? == SessionEnd::Stopped {
+            return Ok(SessionEnd::Stopped);
         }
     }
-    Ok(Ended::Done)
+    Ok(SessionEnd::Finished)
 }
 
 /// Returns the last generation of a point.

@@ -43,7 +43,7 @@ pub struct Trainer {
     experiments: Vec<Experiment>,
     level: Level,
     times: Times,
-    setback: Option<BackendError>,
+    recovered_error: Option<BackendError>,
 }
 
 /// The results of one generation of one trial. Every G is in 0..1.
@@ -146,14 +146,14 @@ impl Trainer {
         let level = Level::new();
         let experiment = |config: ValidConfig| Experiment::new(&config, 0..config.learning.trials, level);
         let experiments = configs.into_iter().map(experiment).collect();
-        Trainer { experiments, level, times: Times::default(), setback: None }
+        Trainer { experiments, level, times: Times::default(), recovered_error: None }
     }
 
     /// Creates random populations for one trial of a config. Its rows are the same as among the other trials.
     pub fn of_trial(config: &ValidConfig, trial: usize) -> Trainer {
         let level = Level::new();
         let experiments = vec![Experiment::new(config, trial..trial + 1, level)];
-        Trainer { experiments, level, times: Times::default(), setback: None }
+        Trainer { experiments, level, times: Times::default(), recovered_error: None }
     }
 
     /// Returns the generation that an experiment plays next: two past its last when it is done.
@@ -172,8 +172,8 @@ impl Trainer {
 
     /// Takes the error of a backend that held populations and failed, if the trainer recovered from it. The host holds
     /// the populations from then on.
-    pub fn take_setback(&mut self) -> Option<BackendError> {
-        self.setback.take()
+    pub fn take_recovered_error(&mut self) -> Option<BackendError> {
+        self.recovered_error.take()
     }
 
     /// Returns and resets the times of generations.
@@ -201,7 +201,7 @@ impl Trainer {
             // A device may have room for the populations or for the episodes, but not for both.
             Err(error) if self.release_all() => {
                 let rows = self.replay_and_play(backend)?;
-                self.setback = Some(error);
+                self.recovered_error = Some(error);
                 Ok(rows)
             }
             played => played,
@@ -264,9 +264,9 @@ impl Trainer {
         let mut rows = playing.par_iter_mut().flat_map_iter(collect).collect::<Vec<_>>();
         let collected = Instant::now();
         playing.retain(|(_, experiment)| !experiment.only_champions_left());
-        let setbacks: Vec<_> =
+        let errors: Vec<_> =
             playing.par_iter_mut().filter_map(|(_, experiment)| experiment.breed(level).err()).collect();
-        self.setback = setbacks.into_iter().next().or(self.setback.take());
+        self.recovered_error = errors.into_iter().next().or(self.recovered_error.take());
         rows.sort_by_key(|row| (row.experiment, row.trial, row.generation));
         self.times.prepare += prepared - start;
         self.times.play += played - prepared;

@@ -14,7 +14,7 @@ use flotilla::backend::{Machine, OpenBackend};
 use flotilla::config::Config;
 use flotilla::record::disk::Disk;
 use flotilla::record::folder::{METRICS, POLICIES, Start};
-use flotilla::run::{Ended, Options, Session};
+use flotilla::run::{SessionEnd, Options, Session};
 
 const TEST: &str = "a_killed_process_resumes_to_the_same_bytes";
 /// The environment variable with the directory to train in. If it is set, this process is one that will be killed.
@@ -52,12 +52,12 @@ fn train(folder: &Path) {
         command: "",
         stop: &stop,
         save: &save,
-        instead: &mut |_| None,
-        setback: &mut |_| {},
+        fallback: &mut |_| None,
+        on_recovery: &mut |_| {},
         // Slow down, so that there is time for a kill.
         watch: &mut |_| std::thread::sleep(Duration::from_millis(10)),
     };
-    assert_eq!(session.train(&mut player, &mut options).unwrap(), Ended::Done);
+    assert_eq!(session.train(&mut player, &mut options).unwrap(), SessionEnd::Finished);
 }
 
 /// Returns the bytes of the policies, and the metrics without the seconds.

@@ -6,7 +6,8 @@
 //!
 //! Mesa's RADV compiles for the chip that `RADV_FORCE_FAMILY` names. RADV reads this variable when it starts, so each
 //! chip needs a new process. The process is this program again, with the ignored test `compile`. If RADV is not
-//! installed, tests print that they are skipped. With `FLOTILLA_REQUIRE_RADV=1`, they fail instead.
+//! installed, tests print that they are skipped. With `FLOTILLA_REQUIRE_RADV=1`, they fail instead. With
+//! `FLOTILLA_REQUIRE_RADV=0`, they are always skipped.
 //!
 //! With `FLOTILLA_EVIDENCE=FOLDER`, the results are written there as a row of `docs/develop/evidence.md`.
 //!
@@ -81,8 +82,12 @@ const KNOWN_VERSION: &str = "radv Mesa 22.3";
 /// The directories in which Vulkan looks for drivers.
 const MANIFESTS: [&str; 3] = ["/usr/share/vulkan/icd.d", "/usr/local/share/vulkan/icd.d", "/etc/vulkan/icd.d"];
 
-/// Returns RADV's manifest. Skips the test if RADV is not installed.
+/// Returns RADV's manifest. Skips the test if RADV is not installed or not wanted.
 fn radv(test: &str) -> Option<PathBuf> {
+    if setting() == "0" {
+        skip(test, "FLOTILLA_REQUIRE_RADV is 0");
+        return None;
+    }
     let entries = MANIFESTS.iter().filter_map(|folder| fs::read_dir(folder).ok()).flatten().flatten();
     let named = |path: &PathBuf| {
         let name = path.file_name().unwrap_or_default().to_string_lossy();
@@ -103,7 +108,12 @@ fn skip(test: &str, reason: &str) {
 }
 
 fn is_required() -> bool {
-    std::env::var("FLOTILLA_REQUIRE_RADV").as_deref() == Ok("1")
+    setting() == "1"
+}
+
+/// Returns the value of `FLOTILLA_REQUIRE_RADV`, or an empty text.
+fn setting() -> String {
+    std::env::var("FLOTILLA_REQUIRE_RADV").unwrap_or_default()
 }
 
 /// Reports whether to emulate the code of this version of RADV and to check its size and speed. Another version may use

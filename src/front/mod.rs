@@ -1,0 +1,29 @@
+//! The functions that most programs need: train with a callback, play and trace given policies, step teams by given
+//! actions, and read runs.
+//!
+//! All functions check their arguments and return flat arrays. The documentation gives their shapes, for example
+//! `[teams][leaders][8]`; the last index changes fastest. The functions build on [`crate::trainer`],
+//! [`crate::evaluate`], [`crate::stepping`] and [`crate::record`]. Training that saves its files as it goes, and can be
+//! resumed, is in [`crate::run`].
+//!
+//! | module | contents |
+//! |---|---|
+//! | `error` | what all functions return if they fail |
+//! | `open` | the processor that plays, and its backend |
+//! | `train` | training with a callback, and its results |
+//! | `coevolution` | training in which the caller decides what policies are worth |
+//! | `play` | playing, tracing and stepping of given policies |
+
+mod coevolution;
+mod error;
+mod open;
+mod play;
+mod train;
+
+pub use coevolution::{Coevolution, Progress};
+pub use error::Failure;
+pub use open::cpu;
+#[cfg(feature = "gpu")]
+pub use open::{Found, Processor, find_gpu, on_gpu, open};
+pub use play::{ActionNoise, Played, Traced, play, play_until, record, stepper, trace};
+pub use train::{Generation, Trained, train, train_from, train_with_champions};

@@ -1,0 +1,90 @@
+//! Opening of backends.
+
+use crate::backend::cpu::Cpu;
+#[cfg(feature = "gpu")]
+use crate::backend::gpu::{
+    self,
+    device::{DeviceError, Wanted},
+    episode::{GpuBackend, ResidencyPolicy},
+};
+use crate::backend::{Machine, OpenBackend};
+
+/// The processor that plays episodes.
+#[cfg(feature = "gpu")]
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Processor {
+    /// A usable GPU if there is one, else the CPU. Software renderers are ignored.
+    #[default]
+    Auto,
+    /// The CPU.
+    Cpu,
+    /// A GPU. Software renderers are ignored.
+    Gpu,
+    /// An adapter, selected by its index in `gpu::device::adapters` or by part of its name. It may be a software
+    /// renderer.
+    Adapter(String),
+}
+
+/// The result of the search for a GPU.
+#[cfg(feature = "gpu")]
+#[non_exhaustive]
+pub struct Found {
+    /// The opened GPU, if one is used.
+    pub gpu: Option<GpuBackend>,
+    /// The reason why an existing GPU is not used.
+    pub passed_over: Option<DeviceError>,
+}
+
+/// Opens the GPU that the processor asks for, if any. `holding` selects the populations that the GPU keeps between
+/// generations; without it, the backend's default applies.
+///
+/// With [`Processor::Auto`], a missing or unusable GPU is an error only if `holding` is [`ResidencyPolicy::Always`].
+///
+/// # Errors
+/// The requested GPU does not exist or cannot be used.
+#[cfg(feature = "gpu")]
+pub fn find_gpu(processor: &Processor, holding: Option<ResidencyPolicy>) -> Result<Found, DeviceError> {
+    let choice = match processor {
+        Processor::Cpu => return Ok(Found { gpu: None, passed_over: None }),
+        Processor::Auto | Processor::Gpu => Wanted::Real,
+        Processor::Adapter(name) => Wanted::Named(name.clone()),
+    };
+    let optional = *processor == Processor::Auto && holding != Some(ResidencyPolicy::Always);
+    match gpu::open(choice).and_then(GpuBackend::new) {
+        Ok(gpu) => {
+            let gpu = match holding {
+                Some(holding) => gpu.holding(holding),
+                None => gpu,
+            };
+            Ok(Found { gpu: Some(gpu), passed_over: None })
+        }
+        Err(DeviceError::NoAdapter | DeviceError::NoRealAdapter { .. }) if optional => {
+            Ok(Found { gpu: None, passed_over: None })
+        }
+        Err(error) if optional => Ok(Found { gpu: None, passed_over: Some(error) }),
+        Err(error) => Err(error),
+    }
+}
+
+/// Opens the backend for a processor. Also returns why an existing GPU is not used, if so.
+///
+/// # Errors
+/// The requested GPU does not exist or cannot be used.
+#[cfg(feature = "gpu")]
+pub fn open(processor: &Processor) -> Result<(OpenBackend, Option<DeviceError>), DeviceError> {
+    let Found { gpu, passed_over } = find_gpu(processor, None)?;
+    Ok((gpu.map_or_else(cpu, on_gpu), passed_over))
+}
+
+/// Returns the CPU backend, which is always available.
+pub fn cpu() -> OpenBackend {
+    (Box::new(Cpu::default()), Machine::of_cpu())
+}
+
+/// Returns an opened GPU as a backend, with its description.
+#[cfg(feature = "gpu")]
+pub fn on_gpu(backend: GpuBackend) -> OpenBackend {
+    let machine = Machine::of_gpu(&backend);
+    (Box::new(backend), machine)
+}

@@ -1,0 +1,266 @@
+//! Playing, tracing and stepping of given policies.
+
+use std::borrow::Cow;
+use std::ops::{ControlFlow, Range};
+
+use super::Failure;
+use crate::backend::cpu::{Cpu, Noise, StepArrays};
+use crate::backend::{Backend, Group, GroupScores};
+use crate::config::{Config, Fitness, MAX_POPULATION, Sharing};
+use crate::evaluate::{self, Evaluation, MAX_EPISODES, Starts};
+use crate::evolve::{self, Key, Purpose};
+use crate::stepping::Stepper;
+use crate::world::{INPUTS, OUTPUTS, World};
+
+/// The scores of teams, averaged over episodes.
+#[derive(Clone, Debug, PartialEq)]
+#[non_exhaustive]
+pub struct Played {
+    /// Number of POIs observed, `[teams]`.
+    pub observed: Vec<f64>,
+    /// G, the share of POIs observed, in 0..1, `[teams]`.
+    pub g: Vec<f32>,
+    /// D, `[teams][leaders]`.
+    pub d: Vec<f32>,
+    /// Df, `[teams][leaders]`.
+    pub df: Vec<f32>,
+    /// D++, `[teams][leaders]`.
+    pub dpp: Vec<f32>,
+    /// Dt, `[teams][leaders]`. Empty unless Dt is the config's fitness, because Dt needs a record of who was seen at
+    /// every step.
+    pub dt: Vec<f32>,
+}
+
+/// Plays teams of given policies, `[leaders][teams][parameters]`. Team `t` consists of every leader's policy `t`. If
+/// the leaders of a team share one policy, `[1][teams][parameters]` is enough.
+///
+/// A policy's parameters are its layers in order. Each layer has its weights row-major, `W[in, out]`, then its biases
+/// `b[out]`.
+///
+/// # Errors
+/// The config, the number of teams, the weights or the starts are invalid, memory is insufficient, or the backend fails.
+pub fn play(
+    config: &Config,
+    backend: &mut dyn Backend,
+    teams: usize,
+    weights: &[f32],
+    starts: &Starts,
+) -> Result<Played, Failure> {
+    let each = &mut |_: evaluate::Batch<'_>| ControlFlow::Continue(());
+    Ok(Played::from(&play_until(config, backend, teams, weights, starts, each)?))
+}
+
+/// Plays teams as [`play`] does, and calls `each` several times per second, see [`evaluate::evaluate_until`].
+///
+/// # Errors
+/// As for [`play`].
+pub fn play_until(
+    config: &Config,
+    backend: &mut dyn Backend,
+    teams: usize,
+    weights: &[f32],
+    starts: &Starts,
+    each: &mut dyn FnMut(evaluate::Batch<'_>) -> ControlFlow<()>,
+) -> Result<Evaluation, Failure> {
+    let checked = CheckedTeams::new(config, teams, weights, starts)?;
+    let group = Group { fitnesses: scores_of(config), ..checked.group(&checked.world.starts) };
+    Ok(evaluate::evaluate_until(backend, &group, starts, &mut |_| (), each)?)
+}
+
+/// Returns the fitnesses that teams of a config are scored by: Dt only if it is the config's fitness.
+fn scores_of(config: &Config) -> &'static [Fitness] {
+    evaluate::scores_beside(config.learning.fitness)
+}
+
+impl From<&Evaluation> for Played {
+    fn from(evaluation: &Evaluation) -> Played {
+        let (teams, leaders) = (evaluation.observed.len(), evaluation.leaders);
+        let places = || (0..teams * leaders).map(|place| (place / leaders, place % leaders));
+        let scores: Vec<[f32; 4]> = places().map(|(team, leader)| evaluation.scores(team, leader)).collect();
+        Played {
+            observed: evaluation.observed.iter().map(evaluate::Tally::mean).collect(),
+            g: scores.iter().step_by(leaders).map(|&[g, ..]| g).collect(),
+            d: scores.iter().map(|&[_, d, ..]| d).collect(),
+            df: scores.iter().map(|&[_, _, df, _]| df).collect(),
+            dpp: scores.iter().map(|&[.., dpp]| dpp).collect(),
+            dt: places().filter_map(|(team, leader)| evaluation.dt(team, leader)).collect(),
+        }
+    }
+}
+
+/// Noise on the actions of leaders: its seed, and the standard deviation of each leader's turn and speed, `[leaders]`.
+#[derive(Clone, Copy, Debug)]
+pub struct ActionNoise<'a> {
+    /// Random seed.
+    pub seed: u64,
+    /// `[leaders]`, each from 0 on.
+    pub deviations: &'a [[f32; OUTPUTS]],
+}
+
+/// Plays some episodes of given policies on the CPU, writes the steps of all teams, and returns the scores of each
+/// episode, by the fitnesses of [`evaluate::scores_beside`]. In the arrays, the teams of an episode follow those of the
+/// one before. See [`play`] for the other arguments.
+///
+/// Without noise, the states and scores are those of [`trace`] and [`play`].
+///
+/// # Errors
+/// The config, the weights or the starts are invalid, an array has the wrong length, or there is no such episode.
+pub fn record(
+    config: &Config,
+    teams: usize,
+    weights: &[f32],
+    starts: &Starts,
+    episodes: Range<usize>,
+    noise: Option<ActionNoise<'_>>,
+    arrays: StepArrays<'_>,
+) -> Result<Vec<GroupScores>, Failure> {
+    let checked = CheckedTeams::new(config, teams, weights, starts)?;
+    if episodes.end > starts.episodes() || episodes.is_empty() {
+        return Err(Failure::NoEpisode { episode: episodes.end, episodes: starts.episodes() });
+    }
+    let drawn: Vec<Vec<glam::Vec2>> = episodes.clone().map(|episode| starts.of(episode, &checked.world)).collect();
+    let fitnesses = scores_of(config);
+    let groups: Vec<Group<'_>> = drawn.iter().map(|starts| Group { fitnesses, ..checked.group(starts) }).collect();
+    let noise = noise.map(|ActionNoise { seed, deviations }| Noise {
+        key: Key::new(seed, 0, Purpose::Exploration),
+        deviations,
+        first: (episodes.start * teams) as u32,
+    });
+    Ok(Cpu::default().record(&groups, noise, arrays)?)
+}
+
+/// The states, inputs, outputs and observations of every step of one episode.
+#[derive(Clone, Debug, PartialEq)]
+#[non_exhaustive]
+pub struct Traced {
+    /// Positions in units, `[teams][steps + 1][agents][2]`. Step 0 is the start. Leaders come first.
+    pub positions: Vec<f32>,
+    /// Headings as unit vectors, `[teams][steps + 1][agents][2]`.
+    pub headings: Vec<f32>,
+    /// Speeds in units per second, `[teams][steps + 1][agents]`.
+    pub speeds: Vec<f32>,
+    /// The leaders' inputs, `[teams][steps][leaders][8]`. Index 0 is sensed at the start.
+    pub inputs: Vec<f32>,
+    /// The outputs of the leaders' policies for these inputs, `[teams][steps][leaders][2]`. They lead to the next
+    /// step's state.
+    pub outputs: Vec<f32>,
+    /// The agents within the observation radius of each POI after each step, `[teams][steps][pois][words]`. Each agent
+    /// is one bit.
+    pub near: Vec<u32>,
+}
+
+/// Plays one episode of given policies and records every step. See [`play`] for the arguments.
+///
+/// # Errors
+/// The config, the weights or the starts are invalid, the memory is insufficient, or the backend fails.
+pub fn trace(
+    config: &Config,
+    backend: &mut dyn Backend,
+    teams: usize,
+    weights: &[f32],
+    starts: &Starts,
+    episode: usize,
+) -> Result<Traced, Failure> {
+    let checked = CheckedTeams::new(config, teams, weights, starts)?;
+    if episode >= starts.episodes() {
+        return Err(Failure::NoEpisode { episode, episodes: starts.episodes() });
+    }
+    let world = &checked.world;
+    let (agents, leaders, steps) = (world.agents(), world.leaders(), world.steps());
+    let words_per_team = (steps + 1) * agents * 5 + steps * leaders * (INPUTS + OUTPUTS) + world.set_words();
+    let bytes = words_per_team as u128 * 4 * teams as u128;
+    let fits = usize::try_from(bytes).is_ok_and(|bytes| Vec::<u8>::new().try_reserve_exact(bytes).is_ok());
+    if !fits {
+        return Err(Failure::Memory { what: "all steps of all teams", bytes });
+    }
+    let states = teams * (steps + 1) * agents;
+    let mut traced = Traced {
+        positions: Vec::with_capacity(states * 2),
+        headings: Vec::with_capacity(states * 2),
+        speeds: Vec::with_capacity(states),
+        inputs: Vec::with_capacity(teams * steps * leaders * INPUTS),
+        outputs: Vec::with_capacity(teams * steps * leaders * OUTPUTS),
+        near: Vec::with_capacity(teams * world.set_words()),
+    };
+    let starts = starts.of(episode, world);
+    for (_, part) in evaluate::parts(&checked.group(&starts)) {
+        let trace = backend.trace(&part)?;
+        for (team, step) in (0..trace.teams).flat_map(|team| (0..=steps).map(move |step| (team, step))) {
+            for moment in (0..agents).map(|agent| trace.moment(step, team, agent)) {
+                traced.positions.extend(moment.position);
+                traced.headings.extend(moment.heading);
+                traced.speeds.push(moment.speed);
+            }
+            // A trace stores inputs and outputs with the state that they lead to.
+            for moment in (0..leaders).filter(|_| step > 0).map(|leader| trace.moment(step, team, leader)) {
+                traced.inputs.extend(moment.inputs);
+                traced.outputs.extend(moment.outputs);
+            }
+        }
+        traced.near.extend(trace.sets);
+    }
+    Ok(traced)
+}
+
+/// Creates teams that are stepped by given actions, all at the world's start. With `recording`, the teams can be
+/// scored, including Dt if that is the config's fitness.
+///
+/// # Errors
+/// The config is invalid, the number of teams is not allowed, or memory is insufficient.
+pub fn stepper(config: &Config, teams: usize, recording: bool) -> Result<Stepper, Failure> {
+    let world = World::new(&*config.validate()?);
+    Ok(match (recording, config.learning.fitness) {
+        (false, _) => Stepper::new(world, teams)?,
+        (true, Fitness::Dt) => Stepper::recording(world, teams)?.with_sights()?,
+        (true, _) => Stepper::recording(world, teams)?,
+    })
+}
+
+/// Teams of given policies after all checks.
+struct CheckedTeams<'a> {
+    world: World,
+    weights: Cow<'a, [f32]>,
+    policies: usize,
+    sharing: Sharing,
+    teams: Vec<u32>,
+}
+
+impl<'a> CheckedTeams<'a> {
+    fn new(config: &Config, teams: usize, weights: &'a [f32], starts: &Starts) -> Result<CheckedTeams<'a>, Failure> {
+        let world = World::new(&*config.validate()?);
+        if !(1..=MAX_POPULATION).contains(&teams) {
+            return Err(Failure::Teams(teams));
+        }
+        if let &Starts::Drawn { episodes, jitter, poi_jitter, .. } = starts {
+            let wrong = [jitter, poi_jitter].into_iter().find(|jitter| !jitter.is_finite() || *jitter < 0.0);
+            if wrong.is_some() || !(1..=MAX_EPISODES).contains(&episodes) {
+                return Err(Failure::Starts { episodes, jitter: wrong.unwrap_or(jitter) });
+            }
+        }
+        let (leaders, parameters) = (world.leaders(), world.parameters());
+        let shared = weights.len() / teams == parameters;
+        if !weights.len().is_multiple_of(teams) || !(shared || weights.len() / teams == leaders * parameters) {
+            return Err(Failure::Weights { found: weights.len(), leaders, teams, parameters });
+        }
+        // Each leader of a team needs an entry of `teams` and several scores.
+        let bytes = teams as u128 * leaders as u128 * 28;
+        if !usize::try_from(bytes).is_ok_and(|bytes| Vec::<u8>::new().try_reserve_exact(bytes).is_ok()) {
+            return Err(Failure::Memory { what: "all teams", bytes });
+        }
+        let mut weights = Cow::Borrowed(weights);
+        if !weights.iter().all(|&weight| evolve::is_weight(weight))
+            && let Some(place) = evolve::admit(weights.to_mut())
+        {
+            let (policy, parameter, value) = (place / parameters, place % parameters, weights[place]);
+            return Err(Failure::Weight { leader: policy / teams, team: policy % teams, parameter, value });
+        }
+        let order = evaluate::aligned_teams(teams, leaders);
+        let sharing = if shared { Sharing::Shared } else { Sharing::PerLeader };
+        Ok(CheckedTeams { world, weights, policies: teams, sharing, teams: order })
+    }
+
+    fn group<'b>(&'b self, starts: &'b [glam::Vec2]) -> Group<'b> {
+        let &CheckedTeams { ref world, ref weights, policies, sharing, ref teams } = self;
+        Group { world, starts, weights: weights[..].into(), policies, sharing, teams, fitnesses: &[] }
+    }
+}
