@@ -363,7 +363,7 @@ impl Faults for FasterWith {
 }
 
 #[test]
-fn the_faster_packing_is_kept_and_results_do_not_change() {
+fn the_faster_workgroup_size_is_kept_and_results_do_not_change() {
     const TEAMS: usize = 1024;
     let world = World::new(&config());
     let weights = sample::weights(&world, 9, 0);
@@ -379,14 +379,14 @@ fn the_faster_packing_is_kept_and_results_do_not_change() {
     };
     let few = Group { teams: &teams[..100 * world.leaders()], ..group };
     let (scores, trace) = (Cpu::default().play(&[group]).unwrap(), Cpu::default().trace(&few).unwrap());
-    for (request, info) in support::adapters("the_faster_packing_is_kept_and_results_do_not_change") {
+    for (request, info) in support::adapters("the_faster_workgroup_size_is_kept_and_results_do_not_change") {
         let gpu = open_gpu(&request);
         for (faster, records) in
             [(32, Records::Whole), (16, Records::Whole), (32, Records::Packed), (16, Records::Packed)]
         {
             let case = format!("{info}, {faster} teams per workgroup, {records:?}");
             let device = GpuBackend::new(with_faults(&gpu, &Arc::new(FasterWith(faster)))).unwrap();
-            let mut device = device.playing(Kernel::Specialised).with_records(records).packing(None);
+            let mut device = device.playing(Kernel::Specialised).with_records(records).with_teams_per_workgroup(None);
             // These teams are too few to compare speeds.
             assert_eq!(device.trace(&few).unwrap(), trace, "{case}");
             assert_eq!(device.packed(), None, "{case}");

@@ -52,7 +52,7 @@ pub struct Args {
     instructions: Option<String>,
     /// Teams per workgroup of a GPU's specialised kernels: 32, 16 or 8 [default: the faster one of 32 and 16, measured]
     #[arg(long, value_name = "N", value_parser = ["32", "16", "8"])]
-    packing: Option<String>,
+    teams_per_workgroup: Option<String>,
     /// Print JSON objects, one per line
     #[arg(long)]
     json: bool,
@@ -159,15 +159,15 @@ fn open(args: &Args) -> Result<(Subject, Machine), Error> {
     };
     Ok(match backend::open_gpu(&args.run, None)?.0 {
         Some(gpu) => {
-            let gpu = match args.packing.as_deref().and_then(|teams| teams.parse().ok()) {
-                Some(teams) => gpu.packing(Some(teams)),
+            let gpu = match args.teams_per_workgroup.as_deref().and_then(|teams| teams.parse().ok()) {
+                Some(teams) => gpu.with_teams_per_workgroup(Some(teams)),
                 None => gpu,
             };
             let machine = Machine::of_gpu(&gpu);
             (Subject::Gpu(Box::new(gpu)), machine)
         }
-        None if args.packing.is_some() => {
-            let message = "--packing is for specialised kernels of a GPU, and none is used";
+        None if args.teams_per_workgroup.is_some() => {
+            let message = "--teams-per-workgroup is for specialised kernels of a GPU, and none is used";
             return Err(Error::Usage(said(message, "leave it out, or name a GPU with --adapter")));
         }
         None => (Subject::Cpu(Cpu::at_level(level), level), front::cpu().1),

@@ -1,7 +1,7 @@
 //! Test cases: a layout of the paper, the teams that one workgroup plays, and the results that the CPU expects.
 
 use flotilla::backend::cpu::Cpu;
-use flotilla::backend::gpu::episode::{Kernel, Workgroup, workgroup_of};
+use flotilla::backend::gpu::episode::{Kernel, WorkgroupBuffers, workgroup_of};
 use flotilla::backend::gpu::exact::Pass;
 use flotilla::backend::{Backend, Group};
 use flotilla::bench::operations::{self, Reach};
@@ -22,7 +22,7 @@ pub struct Case {
     kernel: Kernel,
     /// Whether the size of workgroups is limited to less than the kernel would choose.
     is_limited: bool,
-    pub workgroup: Workgroup,
+    pub workgroup: WorkgroupBuffers,
     /// The results of the CPU.
     record: Vec<u32>,
     states: Vec<u32>,

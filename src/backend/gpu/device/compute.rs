@@ -148,15 +148,15 @@ impl Gpu {
         self.scoped(label, || self.device.create_compute_pipeline(&descriptor))
     }
 
-    /// Submits commands. `turns` is their estimated work.
+    /// Submits commands. `iterations` is their estimated work.
     pub(in crate::backend::gpu) fn submit_commands(
         &self,
         what: &str,
-        turns: u64,
+        iterations: u64,
         encoder: wgpu::CommandEncoder,
     ) -> wgpu::SubmissionIndex {
         let commands = encoder.finish();
-        match self.drops(what, turns) {
+        match self.drops(what, iterations) {
             true => self.queue.submit([]),
             false => self.queue.submit([commands]),
         }
@@ -172,8 +172,8 @@ impl Gpu {
     }
 
     /// Reports whether a submission is dropped under injected faults.
-    fn drops(&self, what: &str, turns: u64) -> bool {
-        self.faults.as_ref().is_some_and(|faults| faults.drops(what, turns))
+    fn drops(&self, what: &str, iterations: u64) -> bool {
+        self.faults.as_ref().is_some_and(|faults| faults.drops(what, iterations))
     }
 
     /// Submits one dispatch, without waiting for it.

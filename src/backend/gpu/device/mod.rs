@@ -181,8 +181,8 @@ impl Gpu {
     }
 
     /// Returns how long work took, or seems to take under injected faults.
-    pub(super) fn taken(&self, turns: u64, elapsed: Duration) -> Duration {
-        self.faults.as_ref().and_then(|faults| faults.takes(turns)).unwrap_or(elapsed)
+    pub(super) fn taken(&self, iterations: u64, elapsed: Duration) -> Duration {
+        self.faults.as_ref().and_then(|faults| faults.takes(iterations)).unwrap_or(elapsed)
     }
 
     /// Returns how long a rollout took, or seems to take under injected faults.

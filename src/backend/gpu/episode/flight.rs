@@ -16,9 +16,9 @@ use crate::parallel::*;
 const TASK_ALIGNMENT: usize = BINDING_ALIGNMENT / size_of::<Task>();
 const _: () = assert!(BINDING_ALIGNMENT.is_multiple_of(size_of::<Task>()));
 /// Initial share of all sets that a packed record has room for.
-pub(super) const KEPT: f64 = 1.0 / 16.0;
+pub(super) const KEPT_SHARE: f64 = 1.0 / 16.0;
 /// Words of a packed record beyond that share.
-const KEPT_AT_LEAST: usize = 256;
+const MIN_KEPT_SETS: usize = 256;
 
 /// Jobs to gather from populations on the device, and the policies of the teams, one slice `[teams][leaders]` per group. The
 /// slices are adjacent on the device.
@@ -49,7 +49,7 @@ pub(super) struct Buffers {
     /// The number of submissions, the time before the first, unless some were waited for, and their work.
     pub(super) submissions: usize,
     pub(super) started: Option<Instant>,
-    pub(super) turns: u64,
+    pub(super) iterations: u64,
     /// The last submission.
     pub(super) submitted: Option<wgpu::SubmissionIndex>,
     /// The nonce of the batch.
@@ -109,7 +109,7 @@ struct Run {
     round: usize,
     tasks: Range<usize>,
     /// The estimated work of a task.
-    turns: u64,
+    iterations: u64,
 }
 
 /// The dispatches of a batch on their way to the device, in submissions that no watchdog ends.
@@ -123,13 +123,13 @@ struct Submission<'a> {
     /// Dispatches of the next submission, their estimated time in seconds and their estimated work.
     dispatches: Vec<Dispatch<'a>>,
     load: f64,
-    turns: u64,
+    iterations: u64,
 }
 
 impl Submission<'_> {
     /// Submits the dispatches, and whatever `copy` adds.
     fn submit(&mut self, copy: impl FnOnce(&mut wgpu::CommandEncoder)) -> Result<wgpu::SubmissionIndex, DeviceError> {
-        let Submission { gpu, clock, watches, count, dispatches, turns, .. } = self;
+        let Submission { gpu, clock, watches, count, dispatches, iterations, .. } = self;
         if *clock && watches.len() == *count {
             watches.extend(gpu.stopwatch()?);
         }
@@ -145,10 +145,10 @@ impl Submission<'_> {
             drop(pass);
             watch.inspect(|watch| watch.stop(&mut encoder));
             copy(&mut encoder);
-            gpu.submit_commands("episodes", *turns, encoder)
+            gpu.submit_commands("episodes", *iterations, encoder)
         })?;
         dispatches.clear();
-        (self.count, self.load, self.turns) = (self.count + 1, 0.0, 0);
+        (self.count, self.load, self.iterations) = (self.count + 1, 0.0, 0);
         Ok(submitted)
     }
 }
@@ -177,15 +177,15 @@ impl GpuBackend {
         self.prepare_pipelines(shapes)?;
         for (round, &shape) in (0..rounds).flat_map(|round| shapes.iter().map(move |shape| (round, shape))) {
             tasks.resize(tasks.len().next_multiple_of(TASK_ALIGNMENT), Task::default());
-            let (first, mut turns) = (tasks.len(), 1);
+            let (first, mut iterations) = (tasks.len(), 1);
             for share in work.shares.iter().filter(|share| share.shape == shape) {
                 if let Some(task) = share.round(round, nonce) {
-                    turns = turns.max(share.turns(&task));
+                    iterations = iterations.max(share.iterations(&task));
                     tasks.push(task);
                 }
             }
             if tasks.len() > first {
-                runs.push(Run { shape, round, tasks: first..tasks.len(), turns });
+                runs.push(Run { shape, round, tasks: first..tasks.len(), iterations });
             }
         }
         if work.head.is_some() {
@@ -195,7 +195,7 @@ impl GpuBackend {
             let most = work.record - PACKED_HEAD - 1;
             let room = match self.records {
                 Records::Packed => most,
-                _ => head + (work.sets as f64 * self.kept) as usize + KEPT_AT_LEAST,
+                _ => head + (work.sets as f64 * self.kept_share) as usize + MIN_KEPT_SETS,
             };
             // If nearly all sets are kept, packing only measures when that changes.
             match room <= most {
@@ -284,19 +284,20 @@ impl GpuBackend {
 
         let most = gpu.limits.max_compute_workgroups_per_dimension as usize / TASK_ALIGNMENT * TASK_ALIGNMENT;
         let (clock, watches) = (self.clock, &mut buffers.watches);
-        let mut submission = Submission { gpu, clock, watches, count: 0, dispatches: gathers, load: 0.0, turns: 0 };
-        let (mut packs, mut started, mut turns_in_all) = (Vec::new(), Some(Instant::now()), 0);
-        for Run { shape, round, mut tasks, turns } in runs {
+        let mut submission =
+            Submission { gpu, clock, watches, count: 0, dispatches: gathers, load: 0.0, iterations: 0 };
+        let (mut packs, mut started, mut total_iterations) = (Vec::new(), Some(Instant::now()), 0);
+        for Run { shape, round, mut tasks, iterations } in runs {
             while !tasks.is_empty() {
                 let pace = self.paces.entry(shape).or_default();
-                let allowed = pace.tasks(turns, submission.load) / TASK_ALIGNMENT * TASK_ALIGNMENT;
-                if allowed == 0 && submission.turns > 0 {
+                let allowed = pace.tasks(iterations, submission.load) / TASK_ALIGNMENT * TASK_ALIGNMENT;
+                if allowed == 0 && submission.iterations > 0 {
                     submission.submit(|_| ())?;
                     continue;
                 }
                 let part = tasks.start..tasks.end.min(tasks.start + allowed.clamp(TASK_ALIGNMENT, most));
                 tasks.start = part.end;
-                let (grid, part_turns) = ([part.len() as u32, 1, 1], part.len() as u64 * turns);
+                let (grid, part_iterations) = ([part.len() as u32, 1, 1], part.len() as u64 * iterations);
                 let bound_tasks = wgpu::BufferBinding {
                     buffer: &all_tasks,
                     offset: (part.start * size_of::<Task>()) as u64,
@@ -313,16 +314,16 @@ impl GpuBackend {
                 let inputs = [worlds, bound_tasks, places, weights, record, moments, states];
                 let group = gpu.bind("episode", &self.layout, &inputs)?;
                 submission.dispatches.push((&self.pipelines[&shape].pipeline, group, grid));
-                turns_in_all += part_turns;
-                submission.turns += part_turns;
-                submission.load += pace.seconds(part_turns);
+                total_iterations += part_iterations;
+                submission.iterations += part_iterations;
+                submission.load += pace.seconds(part_iterations);
                 if !tasks.is_empty() && !pace.is_known() {
                     // The rest is cut by how long this part takes.
                     gpu.wait()?;
                     let start = Instant::now();
                     gpu.wait_for(Some(submission.submit(|_| ())?))?;
-                    let elapsed = gpu.taken(part_turns, start.elapsed());
-                    pace.try_out(part_turns, elapsed);
+                    let elapsed = gpu.taken(part_iterations, start.elapsed());
+                    pace.try_out(part_iterations, elapsed);
                     self.stages.longest = self.stages.longest.max(elapsed);
                     started = None;
                 }
@@ -354,7 +355,7 @@ impl GpuBackend {
         buffers.submissions = submission.count;
         buffers.submitted = Some(submitted);
         (buffers.sent, buffers.whole, buffers.nonce) = (sent, whole, nonce);
-        (buffers.started, buffers.turns) = (started, turns_in_all);
+        (buffers.started, buffers.iterations) = (started, total_iterations);
         self.stages.upload += gathered.elapsed();
         Ok(())
     }

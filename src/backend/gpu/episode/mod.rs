@@ -5,7 +5,7 @@
 //! | `shape` | kernels: what they are compiled for, and how teams fill their workgroups |
 //! | `planner` | teams cut into tasks, and tasks into batches |
 //! | `source` | the text of the shaders |
-//! | `packing` | which packing is faster on a device |
+//! | `workgroups` | how many teams per workgroup are faster on a device |
 //! | `pipelines` | compiled kernels |
 //! | `pace` | how long submissions take, so that none is too long |
 //! | `flight` | buffers, and submitting a batch |
@@ -36,19 +36,19 @@ use crate::host::Instant;
 
 mod flight;
 mod pace;
-mod packing;
 mod pipelines;
 mod planner;
 mod readback;
 mod shape;
 mod source;
+mod workgroups;
 
 pub(crate) use planner::state_bytes;
 pub use planner::{State, Task};
 pub use shape::Kernel;
-pub use source::{Workgroup, shader_of, shaders, workgroup_of};
+pub use source::{WorkgroupBuffers, shader_of, shaders, workgroup_of};
 
-use flight::{Buffers, KEPT};
+use flight::{Buffers, KEPT_SHARE};
 use pace::Pace;
 use pipelines::{Compiled, IDLE_PLAYS, KEPT_KERNELS};
 use planner::{NOWHERE, owner_words, plan};
@@ -95,7 +95,7 @@ pub struct GpuBackend {
     layout: Bindings,
     kernel: Kernel,
     /// Maximum teams per workgroup of a specialised kernel. `None` until it is measured.
-    packing: Option<usize>,
+    teams_per_workgroup: Option<usize>,
     pipelines: HashMap<Shape, Compiled>,
     /// How fast the device plays each shape.
     paces: HashMap<Shape, Pace>,
@@ -110,7 +110,7 @@ pub struct GpuBackend {
     /// Compiled when first needed.
     pack: Option<(wgpu::ComputePipeline, Bindings)>,
     /// The share of all sets that packed records have room for.
-    kept: f64,
+    kept_share: f64,
     /// Compiled when populations are first held.
     kernels: Option<Arc<Kernels>>,
     /// Two sets of buffers, so that one batch plays while the other is read.
@@ -159,7 +159,7 @@ impl GpuBackend {
             layout,
             kernel: if software { Kernel::Generic } else { Kernel::Best },
             // Software renderers have no warps to fill.
-            packing: software.then_some(TEAMS[0]),
+            teams_per_workgroup: software.then_some(TEAMS[0]),
             pipelines: HashMap::new(),
             paces: HashMap::new(),
             done_at: None,
@@ -168,7 +168,7 @@ impl GpuBackend {
             holding: if software { ResidencyPolicy::Never } else { ResidencyPolicy::From(HELD_FROM) },
             records: if software { Records::Whole } else { Records::PackedFrom(PACKED_FROM) },
             pack: None,
-            kept: KEPT,
+            kept_share: KEPT_SHARE,
             kernels: None,
             flights: Default::default(),
             staging: Vec::new(),
@@ -193,13 +193,13 @@ impl GpuBackend {
     /// Sets the maximum teams per workgroup of specialised kernels: 32, 16 or 8. With `None`, the faster one of 32 and 16
     /// is measured on the first large rollout. This is the default, except on software renderers. Results do not depend
     /// on it.
-    pub fn packing(self, teams: Option<usize>) -> GpuBackend {
-        GpuBackend { packing: teams, ..self }
+    pub fn with_teams_per_workgroup(self, teams: Option<usize>) -> GpuBackend {
+        GpuBackend { teams_per_workgroup: teams, ..self }
     }
 
     /// Returns the maximum teams per workgroup of specialised kernels, or `None` if it is yet to be measured.
     pub fn packed(&self) -> Option<usize> {
-        self.packing
+        self.teams_per_workgroup
     }
 
     /// Sets the maximum number of kernels per batch and kept between batches, at least one, and the number of rollouts
@@ -321,7 +321,7 @@ impl GpuBackend {
 impl Backend for GpuBackend {
     fn play(&mut self, groups: &[Group<'_>]) -> Result<Vec<GroupScores>, BackendError> {
         groups.iter().try_for_each(Group::check)?;
-        self.measure_packing(groups)?;
+        self.measure_workgroups(groups)?;
         let scores = ScoreTable::new(groups);
         self.visit(groups, &|group, team, episode| scores.score(group, team, episode))?;
         Ok(scores.finish())

@@ -5,25 +5,25 @@ use std::time::Duration;
 
 /// Target time of a submission, in seconds.
 const TARGET: f64 = 0.1;
-/// Work of the first submission of a kernel, in turns. It takes milliseconds on the slowest GPUs.
-const FIRST_TURNS: u64 = 1 << 24;
+/// Work of the first submission of a kernel, in iterations. It takes milliseconds on the slowest GPUs.
+const FIRST_ITERATIONS: u64 = 1 << 24;
 /// Minimum time of a trial whose duration says something about the device's speed.
 const TELLING: Duration = Duration::from_millis(5);
 
-/// The speed at which a device plays a kernel, as far as it is known. Work is counted in turns: loop iterations over all
+/// The speed at which a device plays a kernel, as far as it is known. Work is counted in loop iterations over all
 /// threads, as the planner estimates them.
 pub(super) struct Pace {
-    /// Turns of the next trial.
+    /// Iterations of the next trial.
     trial: u64,
-    /// Turns per second of the last trial. Some drivers compile in the first dispatch, so two trials are timed.
+    /// Iterations per second of the last trial. Some drivers compile in the first dispatch, so two trials are timed.
     tried: Option<f64>,
-    /// Turns per second.
+    /// Iterations per second.
     rate: Option<f64>,
 }
 
 impl Default for Pace {
     fn default() -> Pace {
-        Pace { trial: FIRST_TURNS, tried: None, rate: None }
+        Pace { trial: FIRST_ITERATIONS, tried: None, rate: None }
     }
 }
 
@@ -33,23 +33,23 @@ impl Pace {
         self.rate.is_some()
     }
 
-    /// Returns how many tasks of so many turns may join a submission that takes `load` seconds without them.
-    pub(super) fn tasks(&self, turns: u64, load: f64) -> usize {
+    /// Returns how many tasks of so many iterations may join a submission that takes `load` seconds without them.
+    pub(super) fn tasks(&self, iterations: u64, load: f64) -> usize {
         match self.rate {
-            Some(rate) => ((TARGET - load).max(0.0) * rate / turns as f64) as usize,
+            Some(rate) => ((TARGET - load).max(0.0) * rate / iterations as f64) as usize,
             None if load > 0.0 => 0,
-            None => (self.trial / turns) as usize,
+            None => (self.trial / iterations) as usize,
         }
     }
 
     /// Returns the estimated time of some work, in seconds.
-    pub(super) fn seconds(&self, turns: u64) -> f64 {
-        self.rate.map_or(0.0, |rate| turns as f64 / rate)
+    pub(super) fn seconds(&self, iterations: u64) -> f64 {
+        self.rate.map_or(0.0, |rate| iterations as f64 / rate)
     }
 
     /// Notes how long a trial took. The device had nothing else to do.
-    pub(super) fn try_out(&mut self, turns: u64, elapsed: Duration) {
-        let rate = turns as f64 / elapsed.as_secs_f64().max(1e-9);
+    pub(super) fn try_out(&mut self, iterations: u64, elapsed: Duration) {
+        let rate = iterations as f64 / elapsed.as_secs_f64().max(1e-9);
         if elapsed < TELLING {
             // The overhead of a submission hides the speed.
             self.trial = self.trial.saturating_mul(8);
@@ -60,9 +60,9 @@ impl Pace {
 
     /// Notes how long a whole batch took, if the speed is known and the batch is long enough to tell. Unless `exact`, the
     /// device may have been done earlier.
-    pub(super) fn observe(&mut self, turns: u64, elapsed: Duration, exact: bool) {
+    pub(super) fn observe(&mut self, iterations: u64, elapsed: Duration, exact: bool) {
         let Some(known) = &mut self.rate else { return };
-        let rate = turns as f64 / elapsed.as_secs_f64().max(1e-9);
+        let rate = iterations as f64 / elapsed.as_secs_f64().max(1e-9);
         if elapsed >= TELLING && (exact || rate > *known) {
             *known = rate;
         }

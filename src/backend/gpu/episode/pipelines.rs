@@ -4,7 +4,7 @@ use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet, HashSet};
 
 use super::GpuBackend;
-use super::shape::{Capacity, Kept, Kernel, MAX_OFFSET, Packing, Shape, TEAMS};
+use super::shape::{Capacity, Kernel, MAX_OFFSET, Recorded, Shape, TEAMS, Workgroup};
 use super::source::{packing, source};
 use crate::backend::Group;
 use crate::backend::gpu::device::{Binding, DeviceError};
@@ -41,7 +41,7 @@ impl GpuBackend {
         Capacity {
             batch: self.batch_bytes,
             kernels: self.kept_kernels,
-            teams: self.packing.unwrap_or(TEAMS[0]),
+            teams: self.teams_per_workgroup.unwrap_or(TEAMS[0]),
             buffer: limits.max_buffer_size.min(limits.max_storage_buffer_binding_size).min(MAX_OFFSET),
             workgroup: limits.max_compute_invocations_per_workgroup.min(limits.max_compute_workgroup_size_x) as usize,
             workgroup_bytes: limits.max_compute_workgroup_storage_size as usize,
@@ -52,9 +52,9 @@ impl GpuBackend {
     pub(super) fn specialised(&self, groups: &[Group<'_>], trace: bool) -> HashSet<Shape> {
         let mut work: BTreeMap<Shape, u64> = BTreeMap::new();
         for group in groups {
-            if let Some(packing) = Packing::specialised(group.world, self.room()) {
+            if let Some(workgroup) = Workgroup::specialised(group.world, self.room()) {
                 let agent_steps = group.team_count() * group.world.agents() * group.world.steps();
-                let shape = Shape::specialised(group.world, packing, Kept::of(group, trace));
+                let shape = Shape::specialised(group.world, workgroup, Recorded::of(group, trace));
                 *work.entry(shape).or_default() += agent_steps as u64;
             }
         }

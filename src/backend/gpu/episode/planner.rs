@@ -5,7 +5,7 @@ use std::collections::{BTreeSet, HashSet};
 use glam::Vec2;
 
 use super::Records;
-use super::shape::{Capacity, Kept, MAX_THREADS, Packing, Shape, WORKGROUPS};
+use super::shape::{Capacity, MAX_THREADS, Recorded, Shape, WORKGROUPS, Workgroup};
 use crate::backend::{BackendError, FOUR, Group, Moment, fours, record_words};
 use crate::credit::{RecordRequest, owner_bits};
 use crate::gpu_struct::gpu_struct;
@@ -15,7 +15,7 @@ use crate::world::World;
 
 /// Maximum loop iterations per thread and dispatch, over all loops. Longer episodes take several dispatches: Mesa's
 /// llvmpipe 22.3 abandons every loop after 65 535 iterations, and drivers stop a dispatch that runs for seconds.
-const TURNS: usize = 60_000;
+const MAX_ITERATIONS: usize = 60_000;
 /// Threads per workgroup of the kernel that packs records.
 pub(super) const PACK_WORKGROUP: usize = 64;
 /// Words before the others in a packed record (`struct Packed` in the shader): words used, and words available.
@@ -79,30 +79,30 @@ gpu_struct! {
 }
 
 /// Returns the estimated loop iterations per thread and step, over all loops.
-fn turns_per_step(world: &World, packing: Packing, records: Kept) -> usize {
+fn iterations_per_step(world: &World, workgroup: Workgroup, records: Recorded) -> usize {
     let Constants { words, policy: PolicyConstants { widths, .. }, .. } = world.constants;
     let network: u32 = widths.windows(2).map(|w| (w[0] + 2) * w[1]).sum();
     // A leader iterates over all agents, and again over those in reach.
     let agent = world.pois.len() + 2 * world.agents() + words as usize + network as usize + 20;
     let sights = if records.sights { world.followers() * world.leader_words() } else { 0 };
-    let items = |rows: usize| (rows * packing.teams).div_ceil(packing.workgroup);
+    let items = |rows: usize| (rows * workgroup.teams).div_ceil(workgroup.threads);
     let items = items(world.pois.len() * words as usize) + items(sights);
-    packing.slots * agent + items * 33
+    workgroup.slots * agent + items * 33
 }
 
-/// Returns the maximum steps per dispatch, see [`TURNS`].
-fn steps_per_dispatch(world: &World, packing: Packing, records: Kept) -> usize {
-    (TURNS / turns_per_step(world, packing, records)).max(1)
+/// Returns the maximum steps per dispatch, see [`MAX_ITERATIONS`].
+fn steps_per_dispatch(world: &World, workgroup: Workgroup, records: Recorded) -> usize {
+    (MAX_ITERATIONS / iterations_per_step(world, workgroup, records)).max(1)
 }
 
 /// Returns the bytes of a team's states between two dispatches, 0 if one dispatch plays the whole episode. This is an
 /// upper bound: adapters with larger workgroups may need none.
 pub(crate) fn state_bytes(world: &World, request: RecordRequest<'_>) -> u64 {
-    let kept = Kept { trace: false, sights: request.sights() && world.followers() > 0 };
-    let generic = Packing::generic(world, WORKGROUPS[2]);
-    let specialised = Packing::specialised(world, Capacity::of_workgroups(MAX_THREADS));
-    let packings = [generic].into_iter().chain(specialised);
-    let parted = packings.into_iter().any(|packing| world.steps() > steps_per_dispatch(world, packing, kept));
+    let recorded = Recorded { trace: false, sights: request.sights() && world.followers() > 0 };
+    let generic = Workgroup::generic(world, WORKGROUPS[2]);
+    let specialised = Workgroup::specialised(world, Capacity::of_workgroups(MAX_THREADS));
+    let workgroups = [generic].into_iter().chain(specialised);
+    let parted = workgroups.into_iter().any(|workgroup| world.steps() > steps_per_dispatch(world, workgroup, recorded));
     if parted { (world.agents() * size_of::<State>()) as u64 } else { 0 }
 }
 
@@ -115,13 +115,13 @@ pub(super) struct PlannedTask {
     pub(super) task: Task,
     pub(super) steps_per_dispatch: usize,
     /// The estimated work of a step: loop iterations over all threads.
-    pub(super) turns_per_step: usize,
+    pub(super) iterations_per_step: usize,
 }
 
 impl PlannedTask {
     /// Returns the estimated work of a round: loop iterations over all threads.
-    pub(super) fn turns(&self, round: &Task) -> u64 {
-        u64::from(round.end - round.first) * self.turns_per_step as u64
+    pub(super) fn iterations(&self, round: &Task) -> u64 {
+        u64::from(round.end - round.first) * self.iterations_per_step as u64
     }
 
     /// Returns the number of weights of its teams, in fours.
@@ -178,7 +178,7 @@ impl BatchPlan {
     fn pack(&mut self, groups: &[Group<'_>], records: Records) {
         let packs = |share: &PlannedTask| {
             let (world, need) = (groups[share.group].world, groups[share.group].records());
-            need.least(1).is_some() && !world.rule.is_timed() && pack_turns(groups, share) <= TURNS
+            need.least(1).is_some() && !world.rule.is_timed() && pack_iterations(groups, share) <= MAX_ITERATIONS
         };
         // The first task of a group is the largest.
         let all_pack = self.shares.chunk_by(|a, b| a.group == b.group).all(|shares| packs(&shares[0]));
@@ -210,7 +210,7 @@ pub(super) fn owner_words(world: &World) -> usize {
 }
 
 /// Returns the maximum loop iterations per thread to pack a task.
-fn pack_turns(groups: &[Group<'_>], share: &PlannedTask) -> usize {
+fn pack_iterations(groups: &[Group<'_>], share: &PlannedTask) -> usize {
     let (world, teams) = (groups[share.group].world, share.task.teams as usize);
     let sets = (world.pois.len() * teams).div_ceil(PACK_WORKGROUP);
     let owners = (owner_words(world) * teams).div_ceil(PACK_WORKGROUP) * 4 * (world.leaders() + 2);
@@ -234,16 +234,16 @@ pub(super) fn plan(
     let mut batches = vec![BatchPlan::default()];
     for (index, group) in groups.iter().enumerate() {
         let world = group.world;
-        let kept = Kept::of(group, trace);
+        let recorded = Recorded::of(group, trace);
         let moments_per_team = if trace { (world.steps() + 1) * world.agents() } else { 0 };
-        let for_it =
-            Packing::specialised(world, room).map(|packing| (packing, Shape::specialised(world, packing, kept)));
-        let (packing, shape) = for_it.filter(|(_, shape)| specialised.contains(shape)).unwrap_or_else(|| {
-            let packing = Packing::generic(world, room.workgroup);
-            (packing, Shape::generic(world, packing, kept))
+        let for_it = Workgroup::specialised(world, room)
+            .map(|workgroup| (workgroup, Shape::specialised(world, workgroup, recorded)));
+        let (workgroup, shape) = for_it.filter(|(_, shape)| specialised.contains(shape)).unwrap_or_else(|| {
+            let workgroup = Workgroup::generic(world, room.workgroup);
+            (workgroup, Shape::generic(world, workgroup, recorded))
         });
-        let (steps_per_dispatch, turns_per_step) =
-            (steps_per_dispatch(world, packing, kept), turns_per_step(world, packing, kept));
+        let (steps_per_dispatch, iterations_per_step) =
+            (steps_per_dispatch(world, workgroup, recorded), iterations_per_step(world, workgroup, recorded));
         let states_per_team = if world.steps() > steps_per_dispatch { world.agents() } else { 0 };
         // Every buffer that grows with the teams is one of these, or smaller than one of them.
         let bytes_per_team = [
@@ -262,7 +262,7 @@ pub(super) fn plan(
                 room.buffer
             )));
         }
-        let teams_per_task = packing.teams.min((target / bytes_per_team.max(1)).max(1) as usize);
+        let teams_per_task = workgroup.teams.min((target / bytes_per_team.max(1)).max(1) as usize);
         // A group's world, starts and POIs are stored once per batch.
         let mut stored: Option<(usize, Task)> = None;
         for first_team in (0..group.team_count()).step_by(teams_per_task) {
@@ -309,8 +309,15 @@ pub(super) fn plan(
             work.sets += world.set_words() * teams;
             work.moments += moments_per_team * teams;
             work.states += states_per_team * teams;
-            let turns_per_step = turns_per_step * packing.workgroup;
-            work.shares.push(PlannedTask { group: index, first_team, shape, task, steps_per_dispatch, turns_per_step });
+            let iterations_per_step = iterations_per_step * workgroup.threads;
+            work.shares.push(PlannedTask {
+                group: index,
+                first_team,
+                shape,
+                task,
+                steps_per_dispatch,
+                iterations_per_step,
+            });
         }
     }
     batches.retain(|work| !work.shares.is_empty());

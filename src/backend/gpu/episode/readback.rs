@@ -81,7 +81,7 @@ impl GpuBackend {
             })??;
             // The next generation may keep more, so there is room for half as much again. The room shrinks slowly.
             let kept = 1.5 * used.saturating_sub(head) as f64 / work.sets as f64;
-            self.kept = kept.max(0.9 * self.kept);
+            self.kept_share = kept.max(0.9 * self.kept_share);
         }
         if !fits {
             if !buffers.whole {
@@ -112,16 +112,16 @@ impl GpuBackend {
 
     /// Notes how long a batch took that is `done`, after the host has waited for it.
     fn note_pace(&mut self, flight: usize, work: &BatchPlan, done: Instant, waited: Duration) {
-        let Buffers { started, turns, submissions, .. } = self.flights[flight];
+        let Buffers { started, iterations, submissions, .. } = self.flights[flight];
         // The device plays one batch after the other.
         let before = self.done_at.replace(done);
         let Some(started) = started.map(|started| before.map_or(started, |before| started.max(before))) else { return };
-        let elapsed = self.gpu.taken(turns, done - started);
+        let elapsed = self.gpu.taken(iterations, done - started);
         if !self.clock {
             self.stages.longest = self.stages.longest.max(elapsed / submissions.max(1) as u32);
         }
         if let (1, Some(pace)) = (work.shapes.len(), work.shapes.first().and_then(|shape| self.paces.get_mut(shape))) {
-            pace.observe(turns, elapsed, waited > WAITED);
+            pace.observe(iterations, elapsed, waited > WAITED);
         }
     }
 }

@@ -53,22 +53,22 @@ pub(super) struct Shape {
     pub(super) workgroup: usize,
     /// Agents that a thread plays, one after another.
     pub(super) slots: usize,
-    pub(super) records: Kept,
+    pub(super) records: Recorded,
     pub(super) sizes: Sizes,
 }
 
 /// Additional records of a kernel, besides sets and counts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub(super) struct Kept {
+pub(super) struct Recorded {
     /// Whether it records every stage of every step.
     pub(super) trace: bool,
     /// Whether it records which leaders each follower sees at each step.
     pub(super) sights: bool,
 }
 
-impl Kept {
-    pub(super) fn of(group: &Group<'_>, trace: bool) -> Kept {
-        Kept { trace, sights: group.records().sights() && group.world.followers() > 0 }
+impl Recorded {
+    pub(super) fn of(group: &Group<'_>, trace: bool) -> Recorded {
+        Recorded { trace, sights: group.records().sights() && group.world.followers() > 0 }
     }
 }
 
@@ -89,31 +89,33 @@ impl Shape {
         matches!(self.sizes, Sizes::Fixed { .. })
     }
 
-    pub(super) fn generic(world: &World, packing: Packing, records: Kept) -> Shape {
+    pub(super) fn generic(world: &World, workgroup: Workgroup, records: Recorded) -> Shape {
         let policy = &world.constants.policy;
         let chooses = policy.actions() == Some(Actions::Behaviours);
         let sizes = Sizes::Any { widest: policy.widest().next_power_of_two(), chooses };
-        Shape { workgroup: packing.workgroup, slots: packing.slots, records, sizes }
+        Shape { workgroup: workgroup.threads, slots: workgroup.slots, records, sizes }
     }
 
     /// Returns the specialised shape, if it is asked for and possible.
-    pub(super) fn asked_for(world: &World, kernel: Kernel, room: Capacity, records: Kept) -> Option<Shape> {
-        let packing = Packing::specialised(world, room).filter(|_| kernel != Kernel::Generic);
-        packing.map(|packing| Shape::specialised(world, packing, records))
+    pub(super) fn asked_for(world: &World, kernel: Kernel, room: Capacity, records: Recorded) -> Option<Shape> {
+        let workgroup = Workgroup::specialised(world, room).filter(|_| kernel != Kernel::Generic);
+        workgroup.map(|workgroup| Shape::specialised(world, workgroup, records))
     }
 
-    pub(super) fn specialised(world: &World, packing: Packing, records: Kept) -> Shape {
+    pub(super) fn specialised(world: &World, workgroup: Workgroup, records: Recorded) -> Shape {
         let Constants { leaders, followers, pois, variant, policy: PolicyConstants { widths, .. }, .. } =
             world.constants;
-        let sizes = Sizes::Fixed { teams: packing.teams, leaders, agents: leaders + followers, pois, widths, variant };
-        Shape { workgroup: packing.workgroup, slots: packing.slots, records, sizes }
+        let sizes =
+            Sizes::Fixed { teams: workgroup.teams, leaders, agents: leaders + followers, pois, widths, variant };
+        Shape { workgroup: workgroup.threads, slots: workgroup.slots, records, sizes }
     }
 }
 
-/// How teams fill the workgroups of one world's kernel.
+/// A workgroup of one world's kernel.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Packing {
-    pub(super) workgroup: usize,
+pub(super) struct Workgroup {
+    pub(super) threads: usize,
+    /// Agents per thread.
     pub(super) slots: usize,
     /// Teams per workgroup.
     pub(super) teams: usize,
@@ -124,10 +126,10 @@ fn seats(world: &World, teams: usize) -> usize {
     (teams * world.leaders()).next_multiple_of(ROLE) + teams * world.followers()
 }
 
-impl Packing {
-    /// Returns the packing for a specialised kernel: as many teams as a warp has threads, or as many as fit. `None` if
+impl Workgroup {
+    /// Returns the workgroup of a specialised kernel: as many teams as a warp has threads, or as many as fit. `None` if
     /// there are too many agents or the policy is too large.
-    pub(super) fn specialised(world: &World, room: Capacity) -> Option<Packing> {
+    pub(super) fn specialised(world: &World, room: Capacity) -> Option<Workgroup> {
         let threads = |teams: usize| seats(world, teams).next_multiple_of(ROLE);
         let bytes = |teams: usize| 2 * teams * world.agents() * size_of::<Vec2>();
         let fits = |&teams: &usize| {
@@ -136,20 +138,20 @@ impl Packing {
                 && bytes(teams) <= room.workgroup_bytes
         };
         let teams = TEAMS.into_iter().find(fits).filter(|_| world.parameters() <= MAX_STRAIGHT_WEIGHTS)?;
-        Some(Packing { workgroup: threads(teams), slots: 1, teams })
+        Some(Workgroup { threads: threads(teams), slots: 1, teams })
     }
 
-    /// Returns the packing for the generic kernel that leaves the fewest threads idle.
-    pub(super) fn generic(world: &World, largest: usize) -> Packing {
+    /// Returns the workgroup of the generic kernel that leaves the fewest threads idle.
+    pub(super) fn generic(world: &World, largest: usize) -> Workgroup {
         let sizes = WORKGROUPS.into_iter().filter(|&size| size <= largest);
-        let packed = sizes.clone().filter_map(|workgroup| {
-            let teams = (1..=workgroup).take_while(|&teams| seats(world, teams) <= workgroup).last()?;
-            Some(Packing { workgroup, slots: 1, teams })
+        let one_each = sizes.clone().filter_map(|threads| {
+            let teams = (1..=threads).take_while(|&teams| seats(world, teams) <= threads).last()?;
+            Some(Workgroup { threads, slots: 1, teams })
         });
         // Compares the shares of busy threads by cross-multiplication. The smaller workgroup wins ties.
-        packed.reduce(|a, b| if b.teams * a.workgroup > a.teams * b.workgroup { b } else { a }).unwrap_or_else(|| {
-            let workgroup = sizes.max().unwrap_or(WORKGROUPS[0]);
-            Packing { workgroup, slots: seats(world, 1).div_ceil(workgroup), teams: 1 }
+        one_each.reduce(|a, b| if b.teams * a.threads > a.teams * b.threads { b } else { a }).unwrap_or_else(|| {
+            let threads = sizes.max().unwrap_or(WORKGROUPS[0]);
+            Workgroup { threads, slots: seats(world, 1).div_ceil(threads), teams: 1 }
         })
     }
 }

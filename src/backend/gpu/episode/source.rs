@@ -13,7 +13,7 @@ use crate::world::{INPUTS, OUTPUTS, World};
 
 use super::Records;
 use super::planner::{NOWHERE, PACK_WORKGROUP, PlannedTask, State, Task, gather, plan};
-use super::shape::{Capacity, Kept, Kernel, Packing, Shape, Sizes, TEAMS, WIDTHS, WORKGROUPS};
+use super::shape::{Capacity, Kernel, Recorded, Shape, Sizes, TEAMS, WIDTHS, WORKGROUPS, Workgroup};
 
 /// Maximum leaders whose sightings a follower counts in registers.
 const SIGHTS: usize = 8;
@@ -34,7 +34,7 @@ pub(super) fn packing() -> String {
 
 /// Returns the episode's shader for a shape.
 pub(super) fn source(shape: Shape) -> String {
-    let Shape { workgroup, slots, records: Kept { trace, sights: sighted }, sizes } = shape;
+    let Shape { workgroup, slots, records: Recorded { trace, sights: sighted }, sizes } = shape;
     let (shared, tally, sights) = match sizes {
         // The agents of one large team, or of several small ones.
         Sizes::Any { .. } => ((workgroup * slots).min(MAX_AGENTS), false, 1),
@@ -116,7 +116,7 @@ const AXES: [&str; FOUR] = ["x", "y", "z", "w"];
 /// Returns some variants of the episode's shader, generic and specialised for the paper's first layout, each with a
 /// name.
 pub fn shaders() -> Vec<(&'static str, String)> {
-    let generic = |workgroup, slots, widest, records: Kept| {
+    let generic = |workgroup, slots, widest, records: Recorded| {
         source(Shape { workgroup, slots, records, sizes: Sizes::Any { widest, chooses: records.trace } })
     };
     let specialised = |records, actions: Actions| {
@@ -126,7 +126,7 @@ pub fn shaders() -> Vec<(&'static str, String)> {
         source(Shape { workgroup: 384, slots: 1, records, sizes })
     };
     let [little, sights, trace] =
-        [(false, false), (false, true), (true, true)].map(|(trace, sights)| Kept { trace, sights });
+        [(false, false), (false, true), (true, true)].map(|(trace, sights)| Recorded { trace, sights });
     vec![
         ("episode", generic(64, 1, 16, little)),
         ("episode, traced", generic(128, 1, 64, trace)),
@@ -144,14 +144,14 @@ pub fn shaders() -> Vec<(&'static str, String)> {
 #[doc(hidden)]
 pub fn shader_of(world: &World, kernel: Kernel, threads: usize) -> String {
     let room = Capacity::of_workgroups(threads);
-    let little = Kept { trace: false, sights: false };
+    let little = Recorded { trace: false, sights: false };
     let made = Shape::asked_for(world, kernel, room, little);
-    source(made.unwrap_or_else(|| Shape::generic(world, Packing::generic(world, threads), little)))
+    source(made.unwrap_or_else(|| Shape::generic(world, Workgroup::generic(world, threads), little)))
 }
 
 /// The inputs and outputs of one workgroup that plays a group's first teams, to run what compilers make of its shader.
 #[doc(hidden)]
-pub struct Workgroup {
+pub struct WorkgroupBuffers {
     /// The text of the shader.
     pub shader: String,
     /// Threads of the workgroup.
@@ -169,9 +169,9 @@ pub struct Workgroup {
 /// # Errors
 /// A team exceeds the limits of any device.
 #[doc(hidden)]
-pub fn workgroup_of(group: &Group<'_>, kernel: Kernel, threads: usize) -> Result<Workgroup, BackendError> {
+pub fn workgroup_of(group: &Group<'_>, kernel: Kernel, threads: usize) -> Result<WorkgroupBuffers, BackendError> {
     let room = Capacity::of_workgroups(threads);
-    let made = Shape::asked_for(group.world, kernel, room, Kept::of(group, false));
+    let made = Shape::asked_for(group.world, kernel, room, Recorded::of(group, false));
     let batches = plan(&[*group], false, Records::Whole, room, &made.into_iter().collect())?;
     let work = &batches[0];
     let PlannedTask { task, first_team, shape, .. } = work.shares[0];
@@ -182,7 +182,7 @@ pub fn workgroup_of(group: &Group<'_>, kernel: Kernel, threads: usize) -> Result
     let words = |bytes: &[u8]| bytemuck::pod_collect_to_vec(bytes);
     let world = Constants { steps: task.end + 1, ..work.worlds[0] };
     let agents = group.world.agents() * task.teams as usize;
-    Ok(Workgroup {
+    Ok(WorkgroupBuffers {
         shader: source(shape),
         threads: shape.workgroup,
         teams: task.teams as usize,

@@ -1,39 +1,40 @@
-//! Measures which packing of teams into workgroups is faster on a device. Large workgroups share more work, and more of
-//! the small ones fit into a compute unit at once. The winner depends on the registers that the driver's compiler needs.
+//! Measures how many teams per workgroup are faster on a device. Large workgroups share more work, and more of the
+//! small ones fit into a compute unit at once. The winner depends on the registers that the driver's compiler needs.
 
 use std::time::Duration;
 
 use super::GpuBackend;
-use super::shape::{Kernel, Packing, TEAMS};
+use super::shape::{Kernel, TEAMS, Workgroup};
 use crate::backend::{BackendError, Group};
 use crate::host::Instant;
 
 /// Teams per workgroup that are compared.
 const CANDIDATES: [usize; 2] = [TEAMS[0], TEAMS[1]];
-/// Minimum teams of a group whose time tells, as enough workgroups to occupy a GPU.
-const TELLING: usize = 1024;
+/// Minimum teams of a group that is timed. They are enough workgroups to occupy a GPU.
+const MIN_TEAMS: usize = 1024;
 /// Timed rollouts of each candidate, after one that compiles.
 const REPEATS: usize = 2;
 
 impl GpuBackend {
-    /// Plays groups by both packings and keeps the faster one, once, when the first large group comes.
-    pub(super) fn measure_packing(&mut self, groups: &[Group<'_>]) -> Result<(), BackendError> {
-        let tells = |group: &Group<'_>| {
-            let packing = Packing::specialised(group.world, self.room());
-            group.team_count() >= TELLING && packing.is_some_and(|packing| packing.teams == CANDIDATES[0])
+    /// Plays groups with each number of teams per workgroup and keeps the faster one. Does so once, when the first
+    /// large group comes.
+    pub(super) fn measure_workgroups(&mut self, groups: &[Group<'_>]) -> Result<(), BackendError> {
+        let is_timed = |group: &Group<'_>| {
+            let workgroup = Workgroup::specialised(group.world, self.room());
+            group.team_count() >= MIN_TEAMS && workgroup.is_some_and(|workgroup| workgroup.teams == CANDIDATES[0])
         };
-        if self.packing.is_some() || self.kernel == Kernel::Generic || !groups.iter().any(tells) {
+        if self.teams_per_workgroup.is_some() || self.kernel == Kernel::Generic || !groups.iter().any(is_timed) {
             return Ok(());
         }
         let stages = self.stages;
         let measured = fastest(CANDIDATES, |teams| {
-            self.packing = Some(teams);
+            self.teams_per_workgroup = Some(teams);
             let start = Instant::now();
             self.play_tasks(groups, false, &|_, _, _| ())?;
             Ok(self.gpu.rollout_taken(teams, start.elapsed()))
         });
         // After an error, the next rollout measures again.
-        self.packing = measured.as_ref().ok().copied();
+        self.teams_per_workgroup = measured.as_ref().ok().copied();
         self.stages = stages;
         measured.map(drop)
     }
