@@ -46,8 +46,8 @@ impl Display for EscapedPath<'_> {
     }
 }
 
-/// Returns a text as a cell of a CSV file. Spreadsheets run a text that starts with `=`, `+`, `-` or `@` as a formula, so
-/// an apostrophe precedes it. Numbers stay numbers.
+/// Returns a text as a cell of a CSV file. Spreadsheets run a text that starts with `=`, `+`, `-` or `@` as a formula,
+/// so an apostrophe precedes it. Numbers stay numbers.
 pub(crate) fn csv_cell(text: &str) -> Cow<'_, str> {
     match text.starts_with(['=', '+', '-', '@', '\t', '\r']) && text.parse::<f64>().is_err() {
         true => format!("'{text}").into(),

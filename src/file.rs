@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 
 use crate::escape::PathExt;
 
-/// Opens a regular file for reading. Opening a pipe without a writer would block, so other kinds are refused, except files
-/// that the parent process opened: `/dev/stdin`, or `<(…)` in a shell.
+/// Opens a regular file for reading. Opening a pipe without a writer would block, so other kinds are refused, except
+/// files that the parent process opened: `/dev/stdin`, or `<(…)` in a shell.
 ///
 /// # Errors
 /// The file is missing, cannot be opened, or is not a regular file.

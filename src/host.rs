@@ -3,7 +3,8 @@
 //! Native programs use the system's. WebAssembly has neither, so its embedder provides them with `install`. Without a
 //! clock, time stands still there. Without a way to park, waiting polls in a loop.
 
-/// Asks the processor to load numbers into its cache, and does not wait for them. A no-op on processors other than x86-64.
+/// Asks the processor to load numbers into its cache, and does not wait for them. A no-op on processors other than
+/// x86-64.
 #[inline(always)]
 pub(crate) fn prefetch(numbers: &[f32]) {
     #[cfg(target_arch = "x86_64")]
@@ -160,11 +161,11 @@ mod threads {
         }
     }
 
-    /// Starts the threads of this process: so many, or one per core (or what `RAYON_NUM_THREADS` says). Only the first call
-    /// does anything; later calls return what it returned.
+    /// Starts the threads of this process: so many, or one per core (or what `RAYON_NUM_THREADS` says). Only the first
+    /// call does anything; later calls return what it returned.
     ///
-    /// rayon cannot be asked again after a thread could not be started. So the threads are started first, and rayon gets
-    /// those that there are.
+    /// rayon cannot be asked again after a thread could not be started. So the threads are started first, and rayon
+    /// gets those that there are.
     pub fn start(threads: Option<usize>) -> Threads {
         static STARTED: OnceLock<Threads> = OnceLock::new();
         *STARTED.get_or_init(|| start_now(threads.unwrap_or_else(usual)))

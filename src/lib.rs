@@ -109,8 +109,8 @@
 //!
 //! # Stability
 //!
-//! Programs build on [`front`], [`ops`], [`Config`] and the types that these use. A minor version may change them, and the
-//! changelog says so. The other modules are public for this crate's tests and tools, and may change in any version.
+//! Programs build on [`front`], [`ops`], [`Config`] and the types that these use. A minor version may change them, and
+//! the changelog says so. The other modules are public for this crate's tests and tools, and may change in any version.
 //!
 //! # Features
 //!

@@ -1,7 +1,7 @@
 //! Verification that a backend agrees with the CPU bit for bit.
 //!
-//! Verification compares random worlds stage by stage, then the scores of all of them as one batch, and by each fitness. It
-//! also compares breeding on the device and short training runs.
+//! Verification compares random worlds stage by stage, then the scores of all of them as one batch, and by each
+//! fitness. It also compares breeding on the device and short training runs.
 
 use std::ops::Range;
 
@@ -195,8 +195,8 @@ fn compare_scores(
     Ok(expected.iter().zip(&found).enumerate().find_map(differs))
 }
 
-/// Plays all groups in three batches. Each group is scored by one of [`KINDS`], which changes with each turn. Returns the
-/// first group that differs, and how.
+/// Plays all groups in three batches. Each group is scored by one of [`KINDS`], which changes with each turn. Returns
+/// the first group that differs, and how.
 fn compare_kinds(
     groups: &[Group<'_>],
     turn: usize,

@@ -117,8 +117,8 @@ pub fn rollout<'py>(
     Ok(((PyArray1::from_vec(py, observed), rows(d)?, rows(df)?, rows(dpp)?, dt), spreads.transpose()?))
 }
 
-/// Plays some episodes on the CPU, and writes every step of all teams to the arrays that are given. Returns the scores of
-/// each episode's teams.
+/// Plays some episodes on the CPU, and writes every step of all teams to the arrays that are given. Returns the scores
+/// of each episode's teams.
 ///
 /// The arrays are positions and headings `[teams, steps + 1, agents, 2]`, speeds `[teams, steps + 1, agents]`, inputs
 /// `[teams, steps, leaders, 8]`, outputs and actions `[teams, steps, leaders, 2]`, all float32, and near
@@ -253,8 +253,8 @@ pub fn forward(
     Ok(())
 }
 
-/// Draws start positions, `[count, agents, 2]`, moved by at most `jitter` on each axis, in map units. If `poi_jitter` is
-/// above 0, the POIs follow, `[count, agents + pois, 2]`, moved by at most that.
+/// Draws start positions, `[count, agents, 2]`, moved by at most `jitter` on each axis, in map units. If `poi_jitter`
+/// is above 0, the POIs follow, `[count, agents + pois, 2]`, moved by at most that.
 ///
 /// Team `i` uses draw number `first + i`.
 #[pyfunction]

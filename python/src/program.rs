@@ -42,8 +42,8 @@ pub fn answer(py: Python<'_>, request: &str, backend: &str, command: &str) -> Py
         .map(|outcome| outcome.to_string())
 }
 
-/// Receives the rows of a generation, the number of the last one, and champions if they were asked for. Returns whether to end the
-/// training there.
+/// Receives the rows of a generation, the number of the last one, and champions if they were asked for. Returns whether
+/// to end the training there.
 type Watch<'a> = &'a (dyn Fn(&[Row], usize, Option<&[f32]>) -> PyResult<bool> + Sync);
 
 /// Runs a use case, shows its warnings, and checks for Ctrl-C.

@@ -75,7 +75,8 @@ mod kernel {
     pub(crate) const SQRT: u32 = 12;
     /// [`recip`](crate::kernels::math::recip).
     pub(crate) const RECIP: u32 = 8;
-    /// A clamp, a square, 5 and 3 for numerator and denominator; their squares' sum, its rough reciprocal (4) and 6 more.
+    /// A clamp, a square, 5 and 3 for numerator and denominator; their squares' sum, its rough reciprocal (4) and 6
+    /// more.
     pub(crate) const TANH: u32 = CLAMP + 1 + 5 + 3 + 3 + 4 + 6;
     /// [`sin_cos`](crate::kernels::math::sin_cos).
     pub(crate) const SIN_COS: u32 = 26;
@@ -94,35 +95,36 @@ use kernel::*;
 const WEIGHT_INPUTS: u32 = INPUTS as u32;
 /// A leader turns: clamp, sine and cosine, rotation.
 const TURN: u32 = CLAMP + SIN_COS + ROTATE;
-/// An agent moves: the heading is renormalized (its square 3, a scale 2, 2 products, 2 flushes), the speed changed within 2
-/// clamps, and on each axis a step (after one common product) rounded to the grid (4) and clamped to the map.
+/// An agent moves: the heading is renormalized (its square 3, a scale 2, 2 products, 2 flushes), the speed changed
+/// within 2 clamps, and on each axis a step (after one common product) rounded to the grid (4) and clamped to the map.
 const MOVE: u32 = 3 + 2 + 2 + 2 * FLUSH + (2 + 2 * CLAMP) + 1 + 2 * (2 + 4 + CLAMP);
-/// A leader chooses a behaviour: 4 comparisons with 2 selections each; per kind of entity 3 such, the opposite quadrant (a
-/// comparison, a selection, a sum) and whether there is any (2); then kind, direction and the two actions.
+/// A leader chooses a behaviour: 4 comparisons with 2 selections each; per kind of entity 3 such, the opposite quadrant
+/// (a comparison, a selection, a sum) and whether there is any (2); then kind, direction and the two actions.
 const CHOOSE: u32 = 4 * 3 + 2 * (3 * 3 + 3 + 2) + 8;
-/// A follower meets an agent within the attraction radius: 2 tests and their difference, 4 selections, 4 sums, 2 counts.
+/// A follower meets an agent within the attraction radius: 2 tests and their difference, 4 selections, 4 sums, 2
+/// counts.
 const INFLUENCE: u32 = SQUARED_DISTANCE + 3 + 4 + 4 + 2;
 /// A follower counts a leader that it sees.
 const SEE: u32 = 1;
 /// A follower steers, whoever it met.
 const FOLLOW: u32 = FORCE + INFLUENCED + STEER;
-/// The force: 2 means (a reciprocal of a count of at least 1, scaled), and on each axis the two weighted sums (4), the walls
-/// (3 differences, 2 maxima, a difference, a gain) and a flush.
+/// The force: 2 means (a reciprocal of a count of at least 1, scaled), and on each axis the two weighted sums (4), the
+/// walls (3 differences, 2 maxima, a difference, a gain) and a flush.
 const FORCE: u32 = 2 * (RECIP + 3) + 2 * (4 + 7 + FLUSH);
 /// Whether anything is near: the counts' sum and test, the nearest of 4 walls and its test, and their union.
 const INFLUENCED: u32 = 2 + 3 + 1 + 1;
-/// Steering: the force's square and direction (3, an inverse root, 2), along and across (6), the maximum turn to its side (2
-/// and a rotation), whether the force is within it, 4 selections of the heading, the speed ahead (2) and 3 selections of the
-/// speed, 2 tests of the force.
+/// Steering: the force's square and direction (3, an inverse root, 2), along and across (6), the maximum turn to its
+/// side (2 and a rotation), whether the force is within it, 4 selections of the heading, the speed ahead (2) and 3
+/// selections of the speed, 2 tests of the force.
 const STEER: u32 = 3 + RSQRT + 2 + 6 + 2 + ROTATE + WITHIN + 4 + 2 + 3 + 2;
 /// A test of the sine and its size, combined with one that is counted already.
 const WITHIN: u32 = 3;
 /// An agent is tested for a POI and added to its set: a test, a selection, a union.
 const OBSERVE: u32 = SQUARED_DISTANCE + 3;
 
-/// Returns the operations of a leader that senses one entity: the test of the range and a selection, the quadrant's 4 tests
-/// and their combination (4), 2 selections by side and 4 by front, 4 sums; and the density: a root, scaled and subtracted
-/// from 1, or an inverse root of at least 1.
+/// Returns the operations of a leader that senses one entity: the test of the range and a selection, the quadrant's 4
+/// tests and their combination (4), 2 selections by side and 4 by front, 4 sums; and the density: a root, scaled and
+/// subtracted from 1, or an inverse root of at least 1.
 fn sense(density: Density) -> u32 {
     let density = match density {
         Density::Linear => SQRT + 2,

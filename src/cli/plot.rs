@@ -18,8 +18,8 @@ pub struct Args {
     /// several]
     #[arg(long, short, value_name = "FILE")]
     out: Option<PathBuf>,
-    /// Team whose G to show: the best, the champion, or the mean over all teams [default: all three of one run, the best
-    /// of several]
+    /// Team whose G to show: the best, the champion, or the mean over all teams [default: all three of one run, the
+    /// best of several]
     #[arg(long, value_name = "best|champion|mean")]
     measure: Option<TeamKind>,
     /// Band around a mean: its 95 % interval, its standard error, or none

@@ -34,8 +34,8 @@ pub struct Args {
     /// Only this kernel, instead of both
     #[arg(long, value_name = "KERNEL", value_parser = ["generic", "specialised"])]
     kernel: Option<String>,
-    /// Write comparisons, hardware and the digests of short trainings as a row of docs/develop/evidence.md; compares the
-    /// processor's instruction sets, too, and needs no adapter
+    /// Write comparisons, hardware and the digests of short trainings as a row of docs/develop/evidence.md; compares
+    /// the processor's instruction sets, too, and needs no adapter
     #[arg(long, value_name = "FILE")]
     report: Option<PathBuf>,
     /// A remark about the machine, for the report

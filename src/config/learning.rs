@@ -33,25 +33,27 @@ section! {
         fitness: Fitness = "", "3.2, Eq. 1; 4.2, Eq. 5; 2.2",
         /// k: policies of each learner; a generation has k·m teams
         population: usize = "policies", "4.3",
-        /// m: teams that each policy plays in per generation, each with other random partners; 1 if leaders share a policy
+        /// m: teams that each policy plays in per generation, each with other random partners; 1 if leaders share a
+        /// policy
         partners: usize = "teams", "",
         /// what a policy's fitness is: the mean score of its teams, or the largest, which is lenient with bad partners
         leniency: Leniency = "", "",
-        /// h: last generations whose champions are kept; from generation 1 on, each policy also plays in a team with the
-        /// champions of one of them, drawn at random; 0 means none
+        /// h: last generations whose champions are kept; from generation 1 on, each policy also plays in a team with
+        /// the champions of one of them, drawn at random; 0 means none
         hall_of_fame: usize = "generations", "",
         /// number of generations after the random start
         generations: usize = "generations", "4.3, Alg. 1",
         /// independent repetitions
         trials: usize = "trials", "5",
-        /// n: the best of a population, which survive unchanged; a share is rounded to the nearest whole number, and is at
-        /// least 1
+        /// n: the best of a population, which survive unchanged; a share is rounded to the nearest whole number, and is
+        /// at least 1
         elites: Elites = "policies", "4.3, Alg. 1",
         /// which policies the parents of a generation are drawn from: by binary tournaments of the whole population, or
         /// uniformly from its elites (truncation selection)
         parents: Parents = "", "4.3, Alg. 1",
-        /// how a generation follows from the one before: by elites, tournaments and mutation, or by an evolution strategy,
-        /// which samples policies around a mean policy: that of OpenAI, or separable natural evolution strategies
+        /// how a generation follows from the one before: by elites, tournaments and mutation, or by an evolution
+        /// strategy, which samples policies around a mean policy: that of OpenAI, or separable natural evolution
+        /// strategies
         method: Method = "", "4.3, Alg. 1",
         /// for evolution strategies: standard deviation of the samples around the mean; "snes" adapts it from there
         search_sigma: f64 = "", "",
@@ -214,8 +216,8 @@ impl Paradigm {
 impl Learning {
     /// Returns the number of slots for policies in a population's memory.
     ///
-    /// The policies come first, then the champion of the previous generation, then the champions of the hall of fame. An
-    /// evolution strategy has its mean in place of the champion, and its standard deviations after that.
+    /// The policies come first, then the champion of the previous generation, then the champions of the hall of fame.
+    /// An evolution strategy has its mean in place of the champion, and its standard deviations after that.
     pub fn slots(&self) -> usize {
         self.population + 1 + usize::from(self.method != Method::Tournament) + self.hall_of_fame
     }

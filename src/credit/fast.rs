@@ -53,8 +53,8 @@ impl Credit {
         });
     }
 
-    /// Finds what [`Credit::lose_leaders`] finds, and the size of the largest set with each leader at every POI that was
-    /// not observed.
+    /// Finds what [`Credit::lose_leaders`] finds, and the size of the largest set with each leader at every POI that
+    /// was not observed.
     pub(super) fn add_copies(&mut self, episode: &Episode<'_>, world: &World) {
         self.all_critical(world);
         let leaders = world.leaders();

@@ -5,8 +5,8 @@ use crate::config::Fitness;
 /// The record of one team's episode. Credit is computed from it.
 #[derive(Clone, Copy, Debug)]
 pub struct Episode<'a> {
-    /// The agents at each POI after each step, one bit per agent, `[steps][pois][words]`. There may be fewer steps, down
-    /// to none, whose sets give the same scores; see [`RecordRequest`].
+    /// The agents at each POI after each step, one bit per agent, `[steps][pois][words]`. There may be fewer steps,
+    /// down to none, whose sets give the same scores; see [`RecordRequest`].
     pub sets: Strided<'a>,
     /// The leaders that the followers saw.
     pub seen: Seen<'a>,
@@ -56,8 +56,8 @@ impl RecordRequest<'_> {
 pub enum Seen<'a> {
     /// The number of steps at which each follower saw each leader, `[followers][leaders]`.
     Counts(Strided<'a>),
-    /// The leader that each follower saw at most steps, see [`assign`](super::assign): [`owner_bits`] bits per follower,
-    /// from the lowest of a word, all ones for nobody. Empty unless [needed](RecordRequest::owners).
+    /// The leader that each follower saw at most steps, see [`assign`](super::assign): [`owner_bits`] bits per
+    /// follower, from the lowest of a word, all ones for nobody. Empty unless [needed](RecordRequest::owners).
     Owners(Strided<'a>),
 }
 

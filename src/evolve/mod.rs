@@ -1,5 +1,5 @@
-//! Cooperative coevolution with an n-elites binary tournament (paper, Algorithm 1): team schedules, selection, mutation.
-//! Instead of selection and mutation, [`strategy`] has evolution strategies.
+//! Cooperative coevolution with an n-elites binary tournament (paper, Algorithm 1): team schedules, selection,
+//! mutation. Instead of selection and mutation, [`strategy`] has evolution strategies.
 //!
 //! Every random number is a pure function of counters ([`random`]). Results therefore do not depend on threads, batch
 //! size, backend, or on interruptions.

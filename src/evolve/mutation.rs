@@ -11,8 +11,8 @@ use crate::config::{Learning, Mutation};
 use crate::host::prefetch;
 use crate::kernels::math;
 
-/// Mutates a policy `[parameters]`. With the configured probability, each weight w gains noise: N(0, σ), or w · N(0, σ) for
-/// [`Mutation::Scaled`].
+/// Mutates a policy `[parameters]`. With the configured probability, each weight w gains noise: N(0, σ), or w · N(0, σ)
+/// for [`Mutation::Scaled`].
 ///
 /// `key` is a slot's key of [`Purpose::Mutation`](super::Purpose::Mutation). `scratch` may hold anything.
 pub fn mutate(level: Level, key: Key, learning: &Learning, weights: &mut [f32], scratch: &mut Vec<u32>) {

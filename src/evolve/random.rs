@@ -88,8 +88,8 @@ impl Key {
     }
 }
 
-/// Returns the noise on one leader's turn and speed at one step: two standard normal deviates, one team per lane. `key` is
-/// of [`Purpose::Exploration`].
+/// Returns the noise on one leader's turn and speed at one step: two standard normal deviates, one team per lane. `key`
+/// is of [`Purpose::Exploration`].
 #[inline(always)]
 pub fn noise<S: Simd>(key: Key, step: usize, leader: usize, team: S::u32s) -> [S::f32s; 2] {
     let [a, b, c, d] = key.at_lanes::<S>(step, leader, team);

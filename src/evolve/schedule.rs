@@ -90,15 +90,15 @@ pub fn places(
     }
 }
 
-/// Writes the start positions of one episode, `[agents]`: the world's, each moved by a uniform offset in `-jitter..jitter`
-/// units on both axes. `key` is of [`Purpose::Starts`] or [`Purpose::HeldOut`].
+/// Writes the start positions of one episode, `[agents]`: the world's, each moved by a uniform offset in
+/// `-jitter..jitter` units on both axes. `key` is of [`Purpose::Starts`] or [`Purpose::HeldOut`].
 pub fn jitter_starts(key: Key, generation: usize, episode: usize, world: &World, jitter: f64, starts: &mut Vec<Vec2>) {
     starts.clone_from(&world.starts);
     scatter(key.at(generation, episode, 0), world.map(), jitter, starts);
 }
 
-/// Appends the POI positions of one episode, `[pois]`, moved the same way. Appends nothing if `jitter` is 0. `key` is of
-/// [`Purpose::Pois`] or [`Purpose::HeldOutPois`].
+/// Appends the POI positions of one episode, `[pois]`, moved the same way. Appends nothing if `jitter` is 0. `key` is
+/// of [`Purpose::Pois`] or [`Purpose::HeldOutPois`].
 pub fn jitter_pois(key: Key, generation: usize, episode: usize, world: &World, jitter: f64, places: &mut Vec<Vec2>) {
     if jitter > 0.0 {
         let first = places.len();

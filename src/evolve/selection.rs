@@ -74,12 +74,12 @@ impl Selection {
     }
 }
 
-/// Plans one population's next generation: the policy that each slot is copied from, `[slots]`, with [`UNCHANGED`] if it
-/// does not mutate.
+/// Plans one population's next generation: the policy that each slot is copied from, `[slots]`, with [`UNCHANGED`] if
+/// it does not mutate.
 ///
 /// The first slots are the elites', best first. The others' parents win [`tournament`]s, or with [`Parents::Elites`]
-/// are elites, each with the same probability. The slot after the policies gets the best of all, the champion. Any slots
-/// after it are the hall of fame, in which the champion replaces the oldest. `key` is of
+/// are elites, each with the same probability. The slot after the policies gets the best of all, the champion. Any
+/// slots after it are the hall of fame, in which the champion replaces the oldest. `key` is of
 /// [`Purpose::Tournament`](super::Purpose::Tournament), `scores` are `[policies]`.
 pub fn draw_parents(
     level: Level,

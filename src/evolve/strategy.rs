@@ -42,8 +42,8 @@ impl Strategy {
         Some(Strategy { method: learning.method, utilities, step, rate, sigma })
     }
 
-    /// Returns the utility of each policy's rank, `[policies]`, for scores `[policies]`. Policies with equal scores get the
-    /// mean over their ranks.
+    /// Returns the utility of each policy's rank, `[policies]`, for scores `[policies]`. Policies with equal scores get
+    /// the mean over their ranks.
     pub fn utilities(&self, scores: &[f32]) -> Vec<f64> {
         let order = best(scores, scores.len());
         let (mut utilities, mut rank) = (vec![0.0; scores.len()], 0);
@@ -90,8 +90,8 @@ impl Strategy {
 
     /// Fills slots of the next generation, `[slots][parameters]`. `scratch` may hold anything.
     ///
-    /// With mirrored sampling, slots 2i and 2i + 1 are the mean plus and minus the same noise. If the number of policies
-    /// is odd, the last one is the mean.
+    /// With mirrored sampling, slots 2i and 2i + 1 are the mean plus and minus the same noise. If the number of
+    /// policies is odd, the last one is the mean.
     pub fn sample(&self, level: Level, samples: Samples<'_>, children: &mut [f32], scratch: &mut Vec<f32>) {
         let mirrored = self.method == Method::OpenAiEs;
         dispatch!(level, simd => sample_lanes(simd, mirrored, samples, children, scratch));

@@ -113,15 +113,15 @@ impl Coevolution {
         Ok(self.trainer.played(0))
     }
 
-    /// Breeds the next generation from what each leader of each team was worth, `[trials][teams][leaders]`, or `None` for
-    /// the config's fitness. Plays the generation unless [`Coevolution::play`] did, because its rows need G. After the
-    /// last generation its champions play, too.
+    /// Breeds the next generation from what each leader of each team was worth, `[trials][teams][leaders]`, or `None`
+    /// for the config's fitness. Plays the generation unless [`Coevolution::play`] did, because its rows need G. After
+    /// the last generation its champions play, too.
     ///
     /// Returns the rows that became complete.
     ///
     /// # Errors
-    /// The fitness has the wrong length or is not finite, the backend failed, or all generations were played. Nothing has
-    /// changed then.
+    /// The fitness has the wrong length or is not finite, the backend failed, or all generations were played. Nothing
+    /// has changed then.
     pub fn tell(&mut self, backend: &mut dyn Backend, fitness: Option<&[f32]>) -> Result<Generation<'_>, Failure> {
         if self.is_done() {
             return Err(Failure::Done);

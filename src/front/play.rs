@@ -38,7 +38,8 @@ pub struct Played {
 /// `b[out]`.
 ///
 /// # Errors
-/// The config, the number of teams, the weights or the starts are invalid, memory is insufficient, or the backend fails.
+/// The config, the number of teams, the weights or the starts are invalid, memory is insufficient, or the backend
+/// fails.
 pub fn play(
     config: &Config,
     backend: &mut dyn Backend,

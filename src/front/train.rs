@@ -165,8 +165,8 @@ pub fn train_from(
     train_any(config, backend, (policies, first), false, watch)
 }
 
-/// Trains as [`train`] does, and gives `watch` the champions of every generation. A device that holds populations returns
-/// them after every generation.
+/// Trains as [`train`] does, and gives `watch` the champions of every generation. A device that holds populations
+/// returns them after every generation.
 ///
 /// # Errors
 /// As for [`train`].

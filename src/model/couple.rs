@@ -1,4 +1,5 @@
-//! Coupling: whether an agent is close enough to a POI to observe it (paper, Equations 3 and 4). Its key is in `[world]`.
+//! Coupling: whether an agent is close enough to a POI to observe it (paper, Equations 3 and 4). Its key is in
+//! `[world]`.
 
 use fearless_simd::Simd;
 

@@ -21,7 +21,8 @@ const MAX_GAIN: f64 = 1e3;
 section! {
     /// `[follow]`: the followers' preset behaviour.
     Follow = "follow" {
-        /// a follower sees other agents within this distance: they attract it, and the leaders among them count for Df and Dt
+        /// a follower sees other agents within this distance: they attract it, and the leaders among them count for Df
+        /// and Dt
         attraction_radius: f64 = "units", "4.1, 4.2",
         /// agents and walls within this distance repel a follower
         repulsion_radius: f64 = "units", "4.1",
@@ -225,9 +226,9 @@ mod tests {
     use crate::config::Config;
     use crate::world::World;
 
-    /// Each component of a force is at most the two gains, as each mean offset is within its radius, and the push of the
-    /// walls, which is at most the gain times the radius or the side. So the square is in the range of [`rsqrt`], whose
-    /// error holds up to 2^48.
+    /// Each component of a force is at most the two gains, as each mean offset is within its radius, and the push of
+    /// the walls, which is at most the gain times the radius or the side. So the square is in the range of [`rsqrt`],
+    /// whose error holds up to 2^48.
     #[test]
     fn the_largest_force_of_any_config_is_in_the_range_of_rsqrt() {
         const RANGE: f64 = (1u64 << 48) as f64;

@@ -51,7 +51,8 @@ impl Motion {
 }
 
 impl Motion {
-    /// Returns what is wrong with steps of this time on this map, if they are so short that rounding of positions shows.
+    /// Returns what is wrong with steps of this time on this map, if they are so short that rounding of positions
+    /// shows.
     pub(crate) fn too_short(&self, dt: f64, map: [f64; 2]) -> Option<String> {
         let (step, resolution) = (self.max_speed * dt, resolution(map));
         (step > 0.0 && step < SHORTEST * resolution).then(|| {
@@ -65,8 +66,8 @@ impl Motion {
     }
 }
 
-/// The shortest step that rounding does not change noticeably, in distances between neighbouring positions. A step is off
-/// by at most one and a half of these distances on each axis, 0.6 % of so long a step.
+/// The shortest step that rounding does not change noticeably, in distances between neighbouring positions. A step is
+/// off by at most one and a half of these distances on each axis, 0.6 % of so long a step.
 const SHORTEST: f64 = 256.0;
 
 /// Returns the largest distance between neighbouring positions on a map: the grid's, or where f32 is coarser, f32's.

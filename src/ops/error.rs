@@ -179,8 +179,8 @@ impl Error {
         (!advice.is_empty()).then(|| advice.to_string())
     }
 
-    /// Adds what to do about a result that does not exist yet, a refused request or a stop, if nothing is said about that
-    /// yet. The caller knows how it was called.
+    /// Adds what to do about a result that does not exist yet, a refused request or a stop, if nothing is said about
+    /// that yet. The caller knows how it was called.
     pub fn or_advise(mut self, remedy: impl FnOnce() -> String) -> Error {
         if let Error::Usage(said) | Error::Refused(said) | Error::Missing(said) | Error::Stopped(said) = &mut self {
             said.remedy.get_or_insert_with(remedy);

@@ -1,7 +1,7 @@
 //! The use cases of the program, below the command line, Python and the page.
 //!
-//! Each takes a request that can be serialised, tells a [`Context`] what happens on the way, and returns an outcome that
-//! can be serialised, or an [`Error`] with a stable code. [`answer`] takes any request as data.
+//! Each takes a request that can be serialised, tells a [`Context`] what happens on the way, and returns an outcome
+//! that can be serialised, or an [`Error`] with a stable code. [`answer`] takes any request as data.
 //!
 //! # Example
 //!
@@ -100,7 +100,8 @@ pub enum Event<'a> {
         next: usize,
         /// The rows that became complete.
         rows: &'a [Row],
-        /// The best policy of each population of that generation, `[trials][populations][parameters]`, if they were asked for.
+        /// The best policy of each population of that generation, `[trials][populations][parameters]`, if they were
+        /// asked for.
         champions: Option<&'a [f32]>,
     },
     /// The fraction of the work that is done, 0 to 1, and what is done now.

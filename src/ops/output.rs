@@ -119,8 +119,8 @@ pub fn write(path: &Path, content: &[u8]) -> Result<(), Error> {
     write_with(path, |output| output.write_all(content))
 }
 
-/// Writes a file completely or not at all. A pipe blocks until a reader opens it. In the folder of a run, sweep or paper
-/// no link is followed, because other users may write there.
+/// Writes a file completely or not at all. A pipe blocks until a reader opens it. In the folder of a run, sweep or
+/// paper no link is followed, because other users may write there.
 ///
 /// # Errors
 /// Fails if the file cannot be written.

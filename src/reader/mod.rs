@@ -1,5 +1,5 @@
-//! A reader of TOML texts, key by key. Each request for a key states its allowed values, and one pass finds all problems
-//! of the text with their lines.
+//! A reader of TOML texts, key by key. Each request for a key states its allowed values, and one pass finds all
+//! problems of the text with their lines.
 //!
 //! The requests also define the table of keys, see [`keys`]. The keys themselves are defined elsewhere.
 //!
@@ -70,7 +70,8 @@ impl Override {
 pub struct Problem {
     /// The line in the file, from 1, or none for an [`Override`].
     pub line: Option<usize>,
-    /// The dotted key with its index in a list, `world.leaders[3][1]`, or the override's name. Empty for a syntax error.
+    /// The dotted key with its index in a list, `world.leaders[3][1]`, or the override's name. Empty for a syntax
+    /// error.
     pub key: String,
     /// The value found and the values allowed.
     pub message: String,

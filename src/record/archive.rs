@@ -64,7 +64,8 @@ fn zip_file(path: &Path) -> Result<Option<File>, RecordError> {
     Ok(Some(file))
 }
 
-/// Returns the folder of the run within a zip file, empty at the top. Returns `None` unless the path is a zip file with a run.
+/// Returns the folder of the run within a zip file, empty at the top. Returns `None` unless the path is a zip file with
+/// a run.
 pub(crate) fn run_prefix(path: &Path) -> Option<String> {
     let archive = ZipArchive::new(zip_file(path).ok()??).ok()?;
     let names: Vec<String> = archive.file_names().flatten().map(Into::into).collect();

@@ -321,8 +321,8 @@ impl Keeper {
             || seconds > 0.0 && !writing && elapsed.as_secs_f64() >= seconds && elapsed >= cost * SHARE
     }
 
-    /// Starts to write a checkpoint after the previous one is complete. `metrics` is flushed to the disk first. The cost of
-    /// the checkpoint counts from `since`.
+    /// Starts to write a checkpoint after the previous one is complete. `metrics` is flushed to the disk first. The
+    /// cost of the checkpoint counts from `since`.
     ///
     /// # Errors
     /// The previous checkpoint could not be written.

@@ -105,8 +105,8 @@ impl Finished<'_> {
     }
 }
 
-/// Reads the state of a finished run after its last generation. Returns `None` if its last checkpoint is missing or cannot be
-/// used.
+/// Reads the state of a finished run after its last generation. Returns `None` if its last checkpoint is missing or
+/// cannot be used.
 pub(crate) fn read_ending(folder: &Path, config: &Config) -> Option<Ending> {
     let path = checkpoint::path(&folder.join(CHECKPOINTS), config.learning.generations + 1);
     let found = Checkpoint::read(crate::file::open(&path).ok()?, config).ok()?;

@@ -1,7 +1,7 @@
 //! Stepping: the caller decides the leaders' actions, step by step, on the CPU.
 //!
-//! A [`Stepper`] plays the episodes of [`crate::backend`] with the same kernels, but takes actions from the caller. Given a
-//! policy's own outputs, it returns the bits of [`Backend::trace`](crate::backend::Backend::trace).
+//! A [`Stepper`] plays the episodes of [`crate::backend`] with the same kernels, but takes actions from the caller.
+//! Given a policy's own outputs, it returns the bits of [`Backend::trace`](crate::backend::Backend::trace).
 //!
 //! ```
 //! use flotilla::{config::Config, stepping::Stepper, world::World};
@@ -225,9 +225,9 @@ impl Stepper {
         self.vectors.reset(&self.world, None, None, &self.moved, &mut self.observations);
     }
 
-    /// Resets all teams to given start positions, `[teams][agents][2]`, or `[teams][agents + pois][2]` with POI positions
-    /// that replace the world's. Each is rounded to the kernels' grid (within 2^-19). [`crate::evaluate::Starts`] draws
-    /// such positions.
+    /// Resets all teams to given start positions, `[teams][agents][2]`, or `[teams][agents + pois][2]` with POI
+    /// positions that replace the world's. Each is rounded to the kernels' grid (within 2^-19).
+    /// [`crate::evaluate::Starts`] draws such positions.
     ///
     /// # Errors
     /// The length is wrong, or a position is off the map.
@@ -378,8 +378,8 @@ impl Stepper {
         if found == expected { Ok(()) } else { Err(StepError::Length { what, shape, expected, found }) }
     }
 
-    /// Returns the start positions of the chosen teams, `[teams][agents]`, and their POI positions, `[teams][pois]`, which
-    /// are empty unless given; all rounded to the grid.
+    /// Returns the start positions of the chosen teams, `[teams][agents]`, and their POI positions, `[teams][pois]`,
+    /// which are empty unless given; all rounded to the grid.
     fn checked(&self, starts: &[f32], chosen: Option<&[bool]>) -> Result<(Vec<Vec2>, Vec<Vec2>), StepError> {
         let (teams, agents, pois) = (self.teams(), self.world.agents(), self.world.pois.len());
         let each = if starts.len() == teams * (agents + pois) * 2 { agents + pois } else { agents };

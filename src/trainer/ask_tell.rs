@@ -54,8 +54,8 @@ impl Trainer {
         })
     }
 
-    /// Returns the world of the next generation and its number of teams, without the champions' team. The number is 0 if
-    /// only the champions still have to play.
+    /// Returns the world of the next generation and its number of teams, without the champions' team. The number is 0
+    /// if only the champions still have to play.
     pub fn candidates_world(&self, experiment: usize) -> (&World, usize) {
         let experiment = &self.experiments[experiment];
         let stage = experiment.stage();

@@ -29,8 +29,8 @@ pub(super) struct Experiment {
 
 /// One trial's populations, and scratch memory for its generations.
 ///
-/// A population has more slots than policies, see [`Learning::slots`]. The one after the policies is that of the champion,
-/// which plays along as one more team.
+/// A population has more slots than policies, see [`Learning::slots`]. The one after the policies is that of the
+/// champion, which plays along as one more team.
 pub(super) struct TrialState {
     /// The trial's number within its config.
     pub index: usize,

@@ -210,8 +210,8 @@ impl Experiment {
         });
     }
 
-    /// Copies policies, without the champions' slots, best first in each population. With an evolution strategy the mean
-    /// comes first, in place of the worst policy.
+    /// Copies policies, without the champions' slots, best first in each population. With an evolution strategy the
+    /// mean comes first, in place of the worst policy.
     pub fn sort(&self, weights: &[f32], fitness: &[f32], policies: &mut [f32]) {
         let Stage { config, world, .. } = self.stage();
         let (population, parameters) = (config.learning.population, world.parameters());

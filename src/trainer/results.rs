@@ -64,8 +64,8 @@ pub(super) fn keep(scores: Vec<GroupScores>, experiments: &mut [(usize, &mut Exp
 }
 
 impl Experiment {
-    /// Returns the range of teams to play. The last is the champions' team: it does not play in the first generation, and
-    /// plays alone after the last one.
+    /// Returns the range of teams to play. The last is the champions' team: it does not play in the first generation,
+    /// and plays alone after the last one.
     fn playing(&self) -> Range<usize> {
         let teams = self.teams();
         let first = if self.only_champions_left() { teams } else { 0 };
@@ -145,8 +145,8 @@ fn team_g(episodes: &[GroupScores], pois: usize, teams: usize) -> [f64; 2] {
     [best as f64 / whole, total as f64 / (whole * teams as f64)]
 }
 
-/// Assigns each policy its leader's score in its team, or the mean or the largest of its scores in several teams. `hall`
-/// means that the last of these has past champions. `score` takes a place of `[teams][leaders]`, `fitness` is
+/// Assigns each policy its leader's score in its team, or the mean or the largest of its scores in several teams.
+/// `hall` means that the last of these has past champions. `score` takes a place of `[teams][leaders]`, `fitness` is
 /// `[leaders][policies]`.
 ///
 /// The mean adds scores in 64 bits, in the order of the teams, and rounds to 32 bits once.

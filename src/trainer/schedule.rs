@@ -20,7 +20,8 @@ pub(super) fn min_populations_per_task(population: usize) -> usize {
 
 /// Who plays with whom in one generation of one trial, and from where.
 pub(super) struct TeamSchedule {
-    /// The generation and the index of its stage. `None` before the first draw. Ending a run early can change the stage.
+    /// The generation and the index of its stage. `None` before the first draw. Ending a run early can change the
+    /// stage.
     drawn_for: Option<(usize, usize)>,
     /// Scratch memory: each population's policies in the order of their teams, `[rounds][populations][policies]`.
     orders: Vec<u32>,

@@ -34,7 +34,8 @@ impl Stages {
         &self.stages[self.index(generation.min(self.last_generation))]
     }
 
-    /// Returns the stage that ends just before a generation, if one does: its last champions play beside that generation.
+    /// Returns the stage that ends just before a generation, if one does: its last champions play beside that
+    /// generation.
     pub fn ending_before(&self, generation: usize) -> Option<&Stage> {
         let (before, now) = (self.index(generation.checked_sub(1)?), self.index(generation.min(self.last_generation)));
         (before != now).then(|| &self.stages[before])

@@ -32,7 +32,8 @@ enum Ask {
     Edit { text: String, changes: Vec<(String, String)> },
     /// Returns G of the best constant action.
     Constant { text: String },
-    /// Returns learning curves with their intervals, and the comparison of arms. The numbers are G, see [`arms::compare`].
+    /// Returns learning curves with their intervals, and the comparison of arms. The numbers are G, see
+    /// [`arms::compare`].
     Compare { arms: Vec<arms::Arm> },
     /// Names runs by what differs between their configs, or by their files.
     Labels { texts: Vec<String>, names: Vec<String> },
@@ -40,7 +41,8 @@ enum Ask {
     Random { text: String },
     /// Plays generations of that baseline, and returns G of the best network so far.
     MoreRandom { milliseconds: f64 },
-    /// Joins pictures to a GIF. The numbers are RGBA `[pictures][height][width][4]`. `delay` is in hundredths of a second.
+    /// Joins pictures to a GIF. The numbers are RGBA `[pictures][height][width][4]`. `delay` is in hundredths of a
+    /// second.
     Gif { width: u16, height: u16, delay: u16 },
     /// Returns the version.
     About,

@@ -51,8 +51,8 @@ mod page {
     }
 
     impl Script {
-        /// Joins a module, without its imports and exports. Names are unique among modules; the browser reports any that
-        /// are not.
+        /// Joins a module, without its imports and exports. Names are unique among modules; the browser reports any
+        /// that are not.
         fn join(&mut self, module: &str) -> Result<(), Box<dyn Error>> {
             if self.joined.iter().any(|joined| joined == module) {
                 return Ok(());

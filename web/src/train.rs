@@ -166,7 +166,8 @@ impl Training {
 
     /// Returns the results of a run's trials that this worker has finished.
     ///
-    /// The numbers are, per trial, the policies, the fitness, and the weights after the last generation if they are needed, as f32.
+    /// The numbers are, per trial, the policies, the fitness, and the weights after the last generation if they are
+    /// needed, as f32.
     pub fn ends(&mut self, run: usize) -> Result<Answer, Refusal> {
         let (mut words, mut numbers) = (Vec::new(), Vec::<u8>::new());
         for Batch { trainer, arms } in self.batches.iter_mut().filter(|batch| batch.trainer.is_done()) {

@@ -47,8 +47,8 @@ impl<'a> WorldBatch<'a> {
         &weights[group.place(leader, policy)..][..self.world.parameters()]
     }
 
-    /// Prefetches a share of the policies of some teams. The calls of all steps of an episode prefetch all of them: a few at
-    /// a time, because the processor has room for few requests.
+    /// Prefetches a share of the policies of some teams. The calls of all steps of an episode prefetch all of them: a
+    /// few at a time, because the processor has room for few requests.
     #[inline(always)]
     pub(super) fn prefetch(&self, teams: Range<usize>, step: usize) {
         let (steps, policies) = (self.world.steps(), teams.len() * self.world.leaders());

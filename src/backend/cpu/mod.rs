@@ -126,8 +126,8 @@ impl Backend for Cpu {
 /// one. Policies of fewer teams fit into the cache, and threads that take vectors early finish less evenly.
 const PREFETCH_FROM: usize = 32;
 
-/// Plays all groups. Threads take one vector of teams after another from a common counter, so that none waits for a lock
-/// and none is left with much to do at the end.
+/// Plays all groups. Threads take one vector of teams after another from a common counter, so that none waits for a
+/// lock and none is left with much to do at the end.
 fn play<S: Simd>(simd: S, groups: &[Group<'_>], workspaces: &mut Option<Box<dyn Any + Send>>, scores: &ScoreTable<'_>) {
     let width = S::f32s::LEN;
     let batches = world_batches(groups);

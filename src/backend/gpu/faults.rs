@@ -5,7 +5,8 @@ use std::time::Duration;
 /// The faults of a device. By default nothing fails.
 #[doc(hidden)]
 pub trait Faults: Send + Sync {
-    /// Reports whether a submission is dropped although the driver reports it as done. `iterations` is its estimated work.
+    /// Reports whether a submission is dropped although the driver reports it as done. `iterations` is its estimated
+    /// work.
     fn drops(&self, _what: &str, _turns: u64) -> bool {
         false
     }

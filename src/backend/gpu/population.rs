@@ -193,7 +193,8 @@ pub(super) struct Population {
     buffers: Vec<wgpu::Buffer>,
     breed_jobs: wgpu::Buffer,
     plan: wgpu::Buffer,
-    /// Per leader the number of workgroups that have bred, then the nonces of the pieces that were copied to the device.
+    /// Per leader the number of workgroups that have bred, then the nonces of the pieces that were copied to the
+    /// device.
     status: wgpu::Buffer,
     /// The content of `status` if everything was done that was submitted.
     done: Vec<u32>,

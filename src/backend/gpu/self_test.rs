@@ -245,7 +245,8 @@ fn training(gpu: &Gpu) -> Result<Option<Deviation>, DeviceError> {
     let weights = sample::weights(&world, TEAMS, 1);
     let place = |place: usize| ((place / leaders * (2 * (place % leaders) + 1) + place % leaders) % TEAMS) as u32;
     let teams: Vec<u32> = (0..TEAMS * leaders).map(place).collect();
-    // Leaders start at POIs, alone, and followers out of sight, so that small sets and followers without a leader matter.
+    // Leaders start at POIs, alone, and followers out of sight, so that small sets and followers without a leader
+    // matter.
     let start = |agent: usize| match agent.checked_sub(leaders) {
         None => world.pois[agent % world.pois.len()],
         Some(follower) => world.pois[follower % world.pois.len()] + Vec2::new(0.0, 11.0 + 3.5 * follower as f32 / 2.0),

@@ -1,7 +1,7 @@
 //! The open questions of the paper, as sweeps in `configs/questions/`, and their results.
 //!
-//! [`QUESTIONS`] lists them. A [`Study`] is one sweep. Its arms are compared along one axis, as in [`comparison`]. Each combination of the other
-//! axes is a row of its results.
+//! [`QUESTIONS`] lists them. A [`Study`] is one sweep. Its arms are compared along one axis, as in [`comparison`]. Each
+//! combination of the other axes is a row of its results.
 //!
 //! This module adds two experiments that a sweep cannot express. Some runs start from the policies of other runs, and
 //! some champions play where they did not learn.

@@ -71,8 +71,8 @@ impl Gpu {
         Ok(buffer)
     }
 
-    /// Writes to a buffer (usage `COPY_DST`) before everything that is submitted from now on. `offset` is in bytes; it and
-    /// the length are multiples of 4. Errors appear in the next [`Gpu::scoped`] or [`Gpu::check`].
+    /// Writes to a buffer (usage `COPY_DST`) before everything that is submitted from now on. `offset` is in bytes; it
+    /// and the length are multiples of 4. Errors appear in the next [`Gpu::scoped`] or [`Gpu::check`].
     pub fn write(&self, buffer: &wgpu::Buffer, offset: u64, bytes: &[u8]) {
         self.traffic[0].fetch_add(bytes.len() as u64, Relaxed);
         self.queue.write_buffer(buffer, offset, bytes);

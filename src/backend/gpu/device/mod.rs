@@ -150,8 +150,8 @@ impl Gpu {
     /// Injects faults, so that tests can show that each is noticed.
     ///
     /// # Safety
-    /// Shaders are compiled without bounds checks. An edited shader must keep its indices in bounds and its loops finite,
-    /// see [`Gpu::pipeline`].
+    /// Shaders are compiled without bounds checks. An edited shader must keep its indices in bounds and its loops
+    /// finite, see [`Gpu::pipeline`].
     #[doc(hidden)]
     #[expect(unsafe_code, reason = "edited shaders are compiled without bounds checks")]
     pub unsafe fn failing(self, faults: Arc<dyn Faults>) -> Gpu {

@@ -18,7 +18,8 @@ pub struct WaitLimit {
 }
 
 impl WaitLimit {
-    /// The limit for GPUs: a message after 10 s, and an error after 2 minutes. No submission takes longer than a second.
+    /// The limit for GPUs: a message after 10 s, and an error after 2 minutes. No submission takes longer than a
+    /// second.
     pub const WITH_GPUS: WaitLimit = WaitLimit { wait: Duration::from_secs(10), waits: 12 };
     /// The limit for software renderers: an hour, because they wait for the processor like other programs.
     pub const WITH_SOFTWARE: WaitLimit = WaitLimit { wait: Duration::from_secs(10), waits: 360 };

@@ -20,8 +20,8 @@ pub(super) const KEPT_SHARE: f64 = 1.0 / 16.0;
 /// Words of a packed record beyond that share.
 const MIN_KEPT_SETS: usize = 256;
 
-/// Jobs to gather from populations on the device, and the policies of the teams, one slice `[teams][leaders]` per group. The
-/// slices are adjacent on the device.
+/// Jobs to gather from populations on the device, and the policies of the teams, one slice `[teams][leaders]` per
+/// group. The slices are adjacent on the device.
 type Gathering<'a> = (Vec<(GatherJob, &'a Population)>, Vec<&'a [u32]>);
 
 /// The device's buffers of one batch. They only grow.

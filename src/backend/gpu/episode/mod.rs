@@ -190,9 +190,9 @@ impl GpuBackend {
         GpuBackend { kernel, ..self }
     }
 
-    /// Sets the maximum teams per workgroup of specialised kernels: 32, 16 or 8. With `None`, the faster one of 32 and 16
-    /// is measured on the first large rollout. This is the default, except on software renderers. Results do not depend
-    /// on it.
+    /// Sets the maximum teams per workgroup of specialised kernels: 32, 16 or 8. With `None`, the faster one of 32 and
+    /// 16 is measured on the first large rollout. This is the default, except on software renderers. Results do not
+    /// depend on it.
     pub fn with_teams_per_workgroup(self, teams: Option<usize>) -> GpuBackend {
         GpuBackend { teams_per_workgroup: teams, ..self }
     }
@@ -227,8 +227,8 @@ impl GpuBackend {
     /// Changes the text of shaders, so that tests can show that a change is detected.
     ///
     /// # Safety
-    /// Shaders are compiled without bounds checks. An edited shader must keep its indices in bounds and its loops finite,
-    /// see [`Gpu::pipeline`].
+    /// Shaders are compiled without bounds checks. An edited shader must keep its indices in bounds and its loops
+    /// finite, see [`Gpu::pipeline`].
     #[doc(hidden)]
     #[expect(unsafe_code, reason = "edited shaders are compiled without bounds checks")]
     pub unsafe fn edited(self, edit: fn(String) -> String) -> GpuBackend {
@@ -277,7 +277,8 @@ impl GpuBackend {
         Ok(())
     }
 
-    /// Plays all groups, and calls `visit` with each team's group, its index there, and its record, from several threads.
+    /// Plays all groups, and calls `visit` with each team's group, its index there, and its record, from several
+    /// threads.
     pub(crate) fn visit(
         &mut self,
         groups: &[Group<'_>],

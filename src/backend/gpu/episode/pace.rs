@@ -58,8 +58,8 @@ impl Pace {
         }
     }
 
-    /// Notes how long a whole batch took, if the speed is known and the batch is long enough to tell. Unless `exact`, the
-    /// device may have been done earlier.
+    /// Notes how long a whole batch took, if the speed is known and the batch is long enough to tell. Unless `exact`,
+    /// the device may have been done earlier.
     pub(super) fn observe(&mut self, iterations: u64, elapsed: Duration, exact: bool) {
         let Some(known) = &mut self.rate else { return };
         let rate = iterations as f64 / elapsed.as_secs_f64().max(1e-9);

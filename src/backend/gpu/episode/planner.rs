@@ -57,7 +57,8 @@ gpu_struct! {
         pub table: u32,
         /// The offset of the leaders that followers saw most, which packing writes, or all ones for nowhere.
         pub owners: u32,
-        /// The offset of the status word in the record. The first dispatch writes the nonce there; each later one adds 1.
+        /// The offset of the status word in the record. The first dispatch writes the nonce there; each later one adds
+        /// 1.
         pub status: u32,
         /// A number that no earlier work of the device had.
         pub nonce: u32,

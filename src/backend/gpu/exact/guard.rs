@@ -6,7 +6,8 @@
 //!
 //! # Why no compiler can remove a guard
 //!
-//! To fuse or reorder `x` with the next operation, a compiler needs `x` itself. If a bit of the guard is set, that bit of
+//! To fuse or reorder `x` with the next operation, a compiler needs `x` itself. If a bit of the guard is set, that bit
+//! of
 //! `x | guard` is 1 for all `x`. So `x` cannot be computed from `x | guard` and the guard, and the pass gives float
 //! operations nothing else of `x`.
 //!
@@ -120,7 +121,8 @@ fn guard_function(function: &mut Function, info: &FunctionInfo, module: &Module,
     function.body.splice(0..0, Block::from_vec(vec![load]));
 }
 
-/// Returns for each expression whether it needs a guard: whether anything reads it except guards and integer comparisons.
+/// Returns for each expression whether it needs a guard: whether anything reads it except guards and integer
+/// comparisons.
 fn exposed(
     function: &Function,
     info: &FunctionInfo,

@@ -47,8 +47,8 @@ pub(super) fn operands(expression: &mut Expression) -> Option<Vec<&mut Handle<Ex
 
 pub(super) type OperandsAndBlocks<'a> = (Vec<&'a mut Handle<Expression>>, Vec<&'a mut Block>);
 
-/// Returns the expressions and blocks of a statement, or `None` if shaders may not use it. The range of an `Emit` is not
-/// included.
+/// Returns the expressions and blocks of a statement, or `None` if shaders may not use it. The range of an `Emit` is
+/// not included.
 pub(super) fn operands_and_blocks(statement: &mut Statement) -> Option<OperandsAndBlocks<'_>> {
     use Statement as S;
     Some(match statement {
