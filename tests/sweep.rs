@@ -629,6 +629,7 @@ fn killed_shards_resume_to_the_same_bytes() {
 
     let out = folder.path().join("out");
     let shards = ["1/2", "2/2"];
+    let mut interrupted = [0; 2];
     for (at, shard) in shards.into_iter().enumerate() {
         // Stops each shard three times, after different pauses: the first with SIGKILL, the second with SIGTERM.
         for pause in [0, 15, 40] {
@@ -636,7 +637,7 @@ fn killed_shards_resume_to_the_same_bytes() {
             std::thread::sleep(Duration::from_millis(pause));
             if at == 0 {
                 let _ = child.kill();
-                child.wait().unwrap();
+                interrupted[at] += usize::from(!child.wait().unwrap().success());
             } else {
                 let id = child.id().to_string();
                 let _ = Command::new("kill").args(["-TERM", &id]).status().unwrap();
@@ -644,6 +645,7 @@ fn killed_shards_resume_to_the_same_bytes() {
                 let message = String::from_utf8(output.stderr).unwrap();
                 assert!(matches!(output.status.code(), Some(75 | 0)), "{message}");
                 if output.status.code() == Some(75) {
+                    interrupted[at] += 1;
                     let command = message.lines().last().unwrap();
                     assert!(message.starts_with("stopped: everything is saved; continue with"), "{message}");
                     assert!(command.contains("--backend cpu --shard 2/2 --resume"), "{message}");
@@ -651,6 +653,7 @@ fn killed_shards_resume_to_the_same_bytes() {
             }
         }
     }
+    assert!(!interrupted.contains(&0), "shards finished before they were stopped: {interrupted:?}");
     fail(flotilla(&sweep, &out, &["--quiet", "--shard", "1/2"]), 1);
     for shard in shards {
         succeed(flotilla(&sweep, &out, &["--quiet", "--resume", "--shard", shard]));
@@ -672,7 +675,7 @@ fn points_killed_at_different_generations_resume_independently() {
     let mut child = start_until_checkpoint(&sweep, &out, &["--quiet"]);
     std::thread::sleep(Duration::from_millis(60));
     child.kill().unwrap();
-    child.wait().unwrap();
+    assert!(!child.wait().unwrap().success(), "the sweep finished before it was killed");
     // One point loses its checkpoints, another its whole folder.
     fs::remove_dir_all(out.join("points/0001/checkpoints")).unwrap();
     fs::remove_dir_all(out.join("points/0002")).unwrap();
