@@ -111,7 +111,7 @@ pub struct Progress<'a> {
 pub struct Results {
     /// Rows of the first and the last generation of every trial.
     pub rows: FirstAndLastRows,
-    /// Digest of the run. See [`Folder::digest`].
+    /// Digest of the run. See [`crate::record::folder::Folder::digest`].
     pub digest: String,
 }
 

@@ -34,7 +34,7 @@ impl Session {
     /// its run.
     ///
     /// # Errors
-    /// A folder cannot be used (see [`Folder::open`]), or there is not enough memory for the populations.
+    /// A folder cannot be used (see [`folder::Folder::open`]), or there is not enough memory for the populations.
     pub fn open(
         runs: Vec<(Config, PathBuf)>,
         start: Start,
