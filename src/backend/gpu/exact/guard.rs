@@ -7,8 +7,7 @@
 //! # Why no compiler can remove a guard
 //!
 //! To fuse or reorder `x` with the next operation, a compiler needs `x` itself. If a bit of the guard is set, that bit
-//! of
-//! `x | guard` is 1 for all `x`. So `x` cannot be computed from `x | guard` and the guard, and the pass gives float
+//! of `x | guard` is 1 for all `x`. So `x` cannot be computed from `x | guard` and the guard, and the pass gives float
 //! operations nothing else of `x`.
 //!
 //! An exclusive or would not be enough, because `(x ^ guard) ^ guard` is `x` for every guard. AMD's compiler used that
