@@ -117,9 +117,11 @@ struct Trial {
     weights: Vec<f32>,
     /// `[episodes][agents]`, with POIs if they move.
     starts: Vec<Vec<Vec2>>,
-    /// POIs observed in all episodes of the current generation: by constants, then random actions, then random
-    /// networks.
+    /// POIs observed in all episodes of the current generation: by the constants that play, then random actions, then
+    /// random networks.
     observed: Vec<u32>,
+    /// POIs that each constant observed when it last played.
+    of_constants: Vec<u32>,
     /// POIs that each constant observed in all generations.
     constants: Vec<u64>,
     /// The random actions and networks that observed most, best first.
@@ -160,17 +162,17 @@ impl Baselines {
         let mut playing: Vec<_> =
             self.places.iter_mut().filter(|place| generation <= place.config.learning.generations).collect();
         playing.iter_mut().for_each(|place| place.start(generation));
-        let most = playing.iter().map(|place| place.teams()).max().unwrap_or(0);
+        let most = playing.iter().map(|place| place.teams(generation)).max().unwrap_or(0);
         for first in (0..most).step_by(DRAWN_TOGETHER) {
             playing.iter_mut().for_each(|place| place.draw(generation, first));
             let mut rounds = Vec::new();
             for place in &playing {
-                let teams = place.teams().min(first + DRAWN_TOGETHER).saturating_sub(first);
+                let teams = place.teams(generation).min(first + DRAWN_TOGETHER).saturating_sub(first);
                 rounds.extend(place.trials.iter().filter(|_| teams > 0).map(|trial| place.round(trial, teams)));
             }
             let mut observed = play(backend, &rounds)?.into_iter();
             for place in &mut playing {
-                let playing = place.teams() > first;
+                let playing = place.teams(generation) > first;
                 place.trials.iter_mut().filter(|_| playing).zip(&mut observed).for_each(|(trial, observed)| {
                     trial.observed.extend(observed);
                 });
@@ -259,15 +261,28 @@ impl Setting {
             weights: vec![],
             starts: vec![vec![]; episodes_per_team],
             observed: Vec::with_capacity(constants.len() + 2 * config.learning.teams()),
+            of_constants: vec![],
             constants: vec![0; constants.len()],
             finalists: [vec![], vec![]],
         };
         Setting { trials: trials.map(trial).collect(), found, constants, config, world }
     }
 
-    /// Returns the number of teams per generation of a trial.
-    fn teams(&self) -> usize {
-        self.constants.len() + 2 * self.config.learning.teams()
+    /// Reports whether starts or POIs move.
+    fn moves(&self) -> bool {
+        let Learning { start_jitter, poi_jitter, .. } = self.config.learning;
+        start_jitter != 0.0 || poi_jitter != 0.0
+    }
+
+    /// Returns the number of constants that play in a generation. If nothing moves, they play only once, because every
+    /// generation would give the same result.
+    fn played_constants(&self, generation: usize) -> usize {
+        if generation == 0 || self.moves() { self.constants.len() } else { 0 }
+    }
+
+    /// Returns the number of teams of a trial that play in a generation.
+    fn teams(&self, generation: usize) -> usize {
+        self.played_constants(generation) + 2 * self.config.learning.teams()
     }
 
     /// Returns the round of a trial's teams whose policies are written.
@@ -278,7 +293,7 @@ impl Setting {
 
     /// Returns the team at a place among a generation's teams.
     fn team(&self, generation: usize, place: usize) -> Team {
-        let (constants, teams) = (self.constants.len(), self.config.learning.teams());
+        let (constants, teams) = (self.played_constants(generation), self.config.learning.teams());
         match place.checked_sub(constants) {
             None => Team::Constant(place),
             Some(slot) if slot < teams => Team::Action(generation, slot),
@@ -323,7 +338,7 @@ impl Setting {
 
     /// Draws up to [`DRAWN_TOGETHER`] of a generation's teams.
     fn draw(&mut self, generation: usize, first: usize) {
-        let last = self.teams().min(first + DRAWN_TOGETHER);
+        let last = self.teams(generation).min(first + DRAWN_TOGETHER);
         let teams: Vec<Team> = (first..last).map(|place| self.team(generation, place)).collect();
         if teams.is_empty() {
             return;
@@ -337,8 +352,13 @@ impl Setting {
     fn collect_results(&mut self, generation: usize) {
         let episodes_per_team = self.config.learning.episodes_per_team;
         let whole = (self.world.pois.len() * episodes_per_team) as f64;
+        let played = self.played_constants(generation);
         for (place, trial) in self.trials.iter_mut().enumerate() {
-            let (constants, random) = trial.observed.split_at(self.constants.len());
+            let (constants, random) = trial.observed.split_at(played);
+            if played > 0 {
+                trial.of_constants = constants.to_vec();
+            }
+            let constants = &trial.of_constants;
             trial.constants.iter_mut().zip(constants).for_each(|(sum, &observed)| *sum += u64::from(observed));
             let most = constants.iter().copied().max().unwrap_or(0);
             self.found.constant[place].push(f64::from(most) / whole);
@@ -364,7 +384,7 @@ impl Setting {
     fn outcome(&self, trial: &Trial, backend: &mut dyn Backend, episodes: u32) -> Result<Outcome, BackendError> {
         let Learning { generations, episodes_per_team, start_jitter, poi_jitter, .. } = self.config.learning;
         let all: Vec<Team> = (0..self.constants.len()).map(Team::Constant).collect();
-        if start_jitter == 0.0 && poi_jitter == 0.0 {
+        if !self.moves() {
             let whole = (self.world.pois.len() * episodes_per_team) as f64;
             let [action, network] = [0, 1].map(|kind| f64::from(trial.finalists[kind][0].0) / whole);
             let generations = (generations + 1) as f64;
