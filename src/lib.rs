@@ -93,6 +93,7 @@
 //! | [`verify`] | | check that two backends agree bit for bit |
 //! | [`baseline`] | | baselines without learning |
 //! | [`stepping`] | | stepping of teams with given actions |
+//! | [`script`] | `report` | teams whose leaders drive to given places |
 //! | [`memory`] | | a run's peak memory |
 //! | [`record`] | `record` | files: policies, metrics, checkpoints, directories |
 //! | [`run`] | `record` | a trainer together with its runs' directories |
@@ -178,6 +179,8 @@ pub mod report;
 pub mod run;
 #[doc(hidden)]
 pub mod sample;
+#[cfg(feature = "report")]
+pub mod script;
 pub(crate) mod shell;
 pub mod statistics;
 pub mod stepping;

@@ -1,18 +1,16 @@
-//! Tests the tasks in `configs/tasks/`, with scripted teams that solve some of them.
+//! Tests the tasks in `configs/tasks/`, with scripted teams that solve them.
 //!
-//! A scripted team is a table next to the config, with the columns `leader,until,x,y,speed`. Before step `until`, the
-//! leader drives to a place with at most this speed, and waits there. A leader's rows are in order.
-//!
-//! `FLOTILLA_TRACE=1` prints positions every five steps. `FLOTILLA_TASKS=DIR` tests the tasks in another directory.
+//! `FLOTILLA_TASKS=DIR` tests the tasks in another directory.
 
 #![cfg(feature = "cli")]
 
-use std::f32::consts::PI;
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use assert_cmd::cargo::cargo_bin_cmd;
 use flotilla::Config;
+use flotilla::script::Script;
+use flotilla::sweep::questions::parts;
 use tempfile::TempDir;
 
 fn task_files(ending: &str) -> Vec<PathBuf> {
@@ -24,79 +22,34 @@ fn task_files(ending: &str) -> Vec<PathBuf> {
     paths
 }
 
-/// A leader's target before a step.
-struct Leg {
-    leader: usize,
-    until: u32,
-    place: [f32; 2],
-    speed: f32,
-}
-
-/// Plays one team by a script, and returns the step at which each POI was first observed.
-fn play(config: &Config, script: &[Leg]) -> Vec<Option<u32>> {
-    let mut stepper = flotilla::stepper(config, 1, false).unwrap();
-    let leaders = config.learners();
-    let mut observed = vec![None; config.world.pois.len()];
-    while !stepper.is_over(0) {
-        let step = stepper.steps()[0];
-        let mut actions = [0.0, -1.0].repeat(leaders);
-        let states = stepper.states();
-        for (leader, action) in actions.chunks_exact_mut(2).enumerate() {
-            let Some(leg) = script.iter().find(|leg| leg.leader == leader && step < leg.until) else { continue };
-            let vector = |vectors: &[f32]| [vectors[2 * leader], vectors[2 * leader + 1]];
-            let ([x, y], [ahead, up]) = (vector(states.positions), vector(states.headings));
-            let (dx, dy) = (leg.place[0] - x, leg.place[1] - y);
-            let distance = dx.hypot(dy);
-            let turn = (ahead * dy - up * dx).atan2(ahead * dx + up * dy);
-            action[0] = turn / PI;
-            // Slow down near the place, and if it is not ahead.
-            let speed = leg.speed.min(2.0 * distance) * turn.cos().max(0.0);
-            action[1] = 2.0 * speed / config.motion.max_speed as f32 - 1.0;
-        }
-        stepper.step(&actions).unwrap();
-        for (first, _) in observed
-            .iter_mut()
-            .zip(stepper.observed())
-            .filter(|(first, observed_now)| first.is_none() && **observed_now)
-        {
-            *first = Some(step + 1);
-        }
-        if std::env::var_os("FLOTILLA_TRACE").is_some() && step % 5 == 4 {
-            let places: Vec<String> =
-                stepper.states().positions.chunks(2).map(|at| format!("{:.0},{:.0}", at[0], at[1])).collect();
-            println!("{:3} {} {:?}", step + 1, places.join(" "), stepper.observed());
-        }
-    }
-    observed
+fn play(config: &Config, path: &Path) -> Vec<Option<u32>> {
+    let script = Script::parse(&fs::read_to_string(path).unwrap()).unwrap();
+    // A team that does not move observes nothing, so the script matters.
+    assert!(Script::default().play(config).unwrap().iter().all(Option::is_none), "{}", path.display());
+    script.play(config).unwrap()
 }
 
 #[test]
 fn scripted_teams_observe_every_poi() {
     let scripts = task_files("csv");
     for path in &scripts {
-        let config = Config::load(&path.with_extension("toml")).unwrap();
-        let mut table = csv::Reader::from_path(path).unwrap();
-        assert_eq!(table.headers().unwrap(), vec!["leader", "until", "x", "y", "speed"]);
-        let script: Vec<Leg> = table
-            .records()
-            .map(|row| {
-                let row = row.unwrap();
-                let number = |at: usize| row[at].trim().parse::<f32>().unwrap();
-                let place = [number(2), number(3)];
-                Leg { leader: number(0) as usize, until: number(1) as u32, place, speed: number(4) }
-            })
-            .collect();
-        let observed = play(&config, &script);
+        let observed = play(&Config::load(&path.with_extension("toml")).unwrap(), path);
         println!("{}: {observed:?}", path.display());
-        assert!(
-            std::env::var_os("FLOTILLA_TRACE").is_some() || observed.iter().all(Option::is_some),
-            "{}: {observed:?}",
-            path.display()
-        );
-        // A team that does not move observes nothing, so the script matters.
-        assert!(play(&config, &[]).iter().all(Option::is_none), "{}", path.display());
+        assert!(observed.iter().all(Option::is_some), "{}: {observed:?}", path.display());
     }
-    assert!(!scripts.is_empty());
+    assert!(scripts.len() >= 8, "{scripts:?}");
+}
+
+/// Windows of 10 steps for the last POIs, as in one point of the study.
+#[test]
+fn a_scripted_team_solves_the_relay_with_an_enforced_hand_over() {
+    let relay = parts(&['c']).into_iter().find(|part| part.name == "relay_forced").unwrap();
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("configs/questions/relay_forced.csv");
+    let sweep = relay.sweep(&[]).unwrap();
+    let config = &sweep.points[4].config;
+    assert_eq!(config.world.windows[2], [37, 46]);
+    let observed = play(config, &path);
+    assert!(observed.iter().all(Option::is_some), "{observed:?}");
 }
 
 /// Between these marks, the page has what the test below prints.

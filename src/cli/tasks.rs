@@ -5,9 +5,12 @@ use std::path::{Path, PathBuf};
 use super::console::Console;
 use super::recovery::Loss;
 use super::{ConfigFile, Error, Printed, RunOptions, SetKeys, There, between};
+use crate::config;
+use crate::escape::PathExt;
 use crate::file;
 use crate::ops::tasks::{self, FITNESSES, OUT, Outcome, Request, SMALL, Task, mean};
 use crate::report::table::markdown;
+use crate::script::Script;
 use crate::statistics;
 
 #[derive(clap::Args)]
@@ -42,8 +45,9 @@ pub struct Args {
 pub fn run(args: Args) -> Result<(), Error> {
     let Args { configs, out, trials, population, seed, set, there, printed, loss, run } = args;
     let task = |path: PathBuf| {
-        let (name, scripted) = (file::stem(&path, "task"), path.with_extension("csv").is_file());
-        Ok::<_, Error>(Task { name, config: ConfigFile { path }.text(set.set.clone())?, scripted })
+        let (name, table) = (file::stem(&path, "task"), path.with_extension("csv"));
+        let script = if table.is_file() { Some(read_script(&table)?) } else { None };
+        Ok::<_, Error>(Task { name, config: ConfigFile { path }.text(set.set.clone())?, script })
     };
     let tasks = configs.into_iter().map(task).collect::<Result<_, _>>()?;
     let (named, start) = (out != Path::new(OUT), there.start());
@@ -54,6 +58,13 @@ pub fn run(args: Args) -> Result<(), Error> {
         .map_err(|error| error.or_advise(|| "run the same command with --resume to continue".into()))?;
     printed.outcome(&found, in_words)?;
     found.refused().map_or(Ok(()), Err)
+}
+
+/// Reads the scripted team beside a config.
+fn read_script(path: &Path) -> Result<Script, Error> {
+    let invalid = |error: csv::Error| format!("{}: {error}", path.escaped());
+    let text = config::read_file(path)?;
+    Script::parse(&text).map_err(|error| Error::Usage(invalid(error).into()))
 }
 
 fn in_words(found: &Outcome) -> String {
@@ -68,7 +79,6 @@ fn in_words(found: &Outcome) -> String {
         head.extend(FITNESSES.map(|fitness| format!("{population} policies, {fitness}")));
     }
     head.extend(["scripted team".into(), "admitted".into()]);
-    let word = |yes: bool| if yes { "yes" } else { "no" }.to_string();
     let row = |task: &tasks::Found| {
         let mut row = vec![task.name.clone()];
         row.extend(task.baselines.iter().map(|g| format!("{:.2}", mean(g))));
@@ -78,7 +88,8 @@ fn in_words(found: &Outcome) -> String {
             let champion = champion.map_or(String::new(), |g| format!("{:.2} [{:.2}, {:.2}]", g.value, g.low, g.high));
             format!("{champion} ({:.2}; {} of {})", mean(&found.best_g), found.solved(), found.champion_g.len())
         }));
-        row.extend([word(task.scripted), word(task.refused.is_none())]);
+        row.push(task.scripted_g.map_or("none".into(), |g| format!("{g:.2}")));
+        row.push(if task.refused.is_none() { "yes" } else { "no" }.into());
         row
     };
     format!("{}\n", markdown(&[head].into_iter().chain(found.tasks.iter().map(row)).collect::<Vec<_>>()))

@@ -1,7 +1,7 @@
 //! Trains the tasks of a suite, and checks that no baseline and no small population solves them.
 //!
 //! A task is admitted if no baseline reaches [`EASY`], if populations of [`SMALL`] policies solve it under no fitness,
-//! and if something solves it: a champion here, or a scripted team in a file beside the config.
+//! and if something solves it: a champion here, or a scripted team from a file beside the config.
 
 use std::path::{Path, PathBuf};
 
@@ -20,6 +20,7 @@ use crate::record::folder::{POLICIES, Start};
 use crate::record::ownership;
 use crate::report::runs;
 use crate::run::{Progress, Session, SessionEnd};
+use crate::script::Script;
 use crate::sweep::questions::champions;
 
 /// Default folder.
@@ -65,8 +66,8 @@ pub struct Task {
     pub name: String,
     /// The config.
     pub config: ConfigText,
-    /// Whether a scripted team that solves it is known.
-    pub scripted: bool,
+    /// A scripted team.
+    pub script: Option<Script>,
 }
 
 /// Results of a suite.
@@ -100,7 +101,9 @@ pub struct Found {
     pub baselines: [Vec<f64>; 3],
     /// The trainings.
     pub trained: Vec<Trained>,
-    /// Whether a scripted team is known.
+    /// G of the scripted team from the config's start, if there is one.
+    pub scripted_g: Option<f64>,
+    /// Whether the scripted team observes every POI.
     pub scripted: bool,
     /// Why the task is not admitted.
     pub refused: Option<String>,
@@ -185,9 +188,17 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
                 trained.push(measure(&config, &folder, &mut *backend.0)?);
             }
         }
-        let (scripted, refused) = (task.scripted, reason(&baselines, &trained, task.scripted));
         let pois = small.world.pois.len();
-        found.push(Found { name: name.clone(), pois, baselines, trained, scripted, refused });
+        let scripted_g = match &task.script {
+            Some(script) => {
+                let observed = script.play(small).map_err(|error| Error::Refused(error.to_string().into()))?;
+                Some(observed.iter().flatten().count() as f64 / pois as f64)
+            }
+            None => None,
+        };
+        let refused = reason(&baselines, &trained, scripted_g);
+        let scripted = scripted_g == Some(1.0);
+        found.push(Found { name: name.clone(), pois, baselines, trained, scripted_g, scripted, refused });
     }
     Ok(Outcome { population: request.population, tasks: found })
 }
@@ -246,7 +257,7 @@ fn measure(config: &Config, folder: &Path, backend: &mut dyn Backend) -> Result<
 }
 
 /// Returns why a task is not admitted.
-fn reason(baselines: &[Vec<f64>; 3], trained: &[Trained], scripted: bool) -> Option<String> {
+fn reason(baselines: &[Vec<f64>; 3], trained: &[Trained], scripted_g: Option<f64>) -> Option<String> {
     let names = ["the best constant speed", "random constant actions", "random networks"];
     for (name, g) in names.iter().zip(baselines) {
         let g = mean(g);
@@ -258,10 +269,14 @@ fn reason(baselines: &[Vec<f64>; 3], trained: &[Trained], scripted: bool) -> Opt
     if let Some(found) = trained.iter().filter(small).find(|found| 2 * found.solved() > found.champion_g.len()) {
         return Some(format!("{} policies solve it with fitness {}", SMALL.0, found.fitness));
     }
-    if !scripted && trained.iter().all(|found| found.solved() == 0) {
-        return Some("no champion solves it, and no scripted team stands beside the config".into());
+    if trained.iter().any(|found| found.solved() > 0) {
+        return None;
     }
-    None
+    match scripted_g {
+        Some(1.0) => None,
+        Some(g) => Some(format!("no champion solves it, and the scripted team has G {g:.2}")),
+        None => Some("no champion solves it, and there is no scripted team beside the config".into()),
+    }
 }
 
 /// Returns the mean of some values.
