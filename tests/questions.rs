@@ -151,7 +151,7 @@ fn the_pages_tables_agree_with_their_files() {
             let field = |at: usize| row.get(at).unwrap();
             let number = |at: usize| field(at).parse::<f64>().unwrap();
             assert_eq!(field(6), "30", "trials");
-            if !field(5).is_empty() || !["best_g", "fixed_pois_g", "moved_pois_g"].contains(&field(1)) {
+            if !field(5).is_empty() || !["champion_g", "fixed_pois_g", "moved_pois_g"].contains(&field(1)) {
                 continue;
             }
             let [value, low, high] = [8, 9, 10].map(number);

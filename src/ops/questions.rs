@@ -182,9 +182,10 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     (context.tell)(Event::Pause);
     let first = &parts[0].1.points[0].config.learning;
     let heading = format!(
-        "Means over {} trials of seed {} with 95 % bootstrap intervals; p by Mann and Whitney's test, two-sided, by Holm's\n\
-         correction for all pairs of arms at one place.\n",
-        first.trials, first.seed
+        "Means over {} trials of seed {} with 95 % bootstrap intervals. In parentheses beside a champion's G is that of the\n\
+         best of {} teams. p is from Mann and Whitney's test, two-sided, with Holm's correction for all pairs of arms at\n\
+         one place.\n",
+        first.trials, first.seed, first.population
     );
     let page = questions::page(&answers, &heading);
     write(&disk, &out.join(PAGE), Ok(page.clone().into_bytes()))?;

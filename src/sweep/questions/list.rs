@@ -12,7 +12,6 @@ const PLAIN: Study = Study {
     pairs: &[[0, 1]],
     at: &[],
     reach: None,
-    champion: false,
     warm_from: None,
     moved: None,
 };
@@ -86,7 +85,6 @@ pub const QUESTIONS: &[OpenQuestion] = &[
                 ])],
                 pairs: OF_CREDIT,
                 reach: Some(0.75),
-                champion: true,
             ),
             part!(
                 "relay_forced",
@@ -109,7 +107,6 @@ pub const QUESTIONS: &[OpenQuestion] = &[
                 by: "fitness",
                 pairs: OF_CREDIT,
                 reach: Some(0.75),
-                champion: true,
             ),
             part!(
                 "relay_led",

@@ -62,12 +62,10 @@ pub struct Study {
     words: &'static [(&'static str, &'static [&'static str])],
     /// The two arms of each difference in the table.
     pairs: &'static [[usize; 2]],
-    /// Generations at which the best team's G is reported. Empty means the last.
+    /// Generations at which G is reported. Empty means the last.
     at: &'static [usize],
     /// The G whose first generation is reported, if any.
     reach: Option<f64>,
-    /// Whether the champion's G is reported.
-    champion: bool,
     /// A source study with indices of its points, each with a name. The points of this study also start from the
     /// policies of those points, as additional arms.
     warm_from: Option<(&'static str, &'static [(usize, &'static str)])>,
@@ -326,19 +324,20 @@ impl Answer {
         self.rows.iter().map(|row| &row.comparison)
     }
 
-    /// Returns the measures to report, with their index among all.
+    /// Returns the measures to report, with their index among all. The best team's G is reported with the champion's.
     fn reported(&self) -> Vec<(usize, Measure)> {
         let measures = self.rows.first().map_or(&[][..], |row| &row.comparison.measures);
         let is_reported = |measure: &Measure| match measure {
-            Measure::BestG { .. } | Measure::Played { .. } => true,
+            Measure::ChampionG { .. } | Measure::Played { .. } => true,
             Measure::GenerationsToReach { .. } => self.part.reach.is_some(),
-            Measure::ChampionG { .. } => self.part.champion,
+            Measure::BestG { .. } => false,
         };
         let measures = measures.iter().map(|measured| measured.measure).enumerate();
         measures.filter(|(_, measure)| is_reported(measure)).collect()
     }
 
-    /// Returns one table per measure for a page, with means and differences.
+    /// Returns one table per measure for a page, with means and differences. Beside the champion's G, in parentheses, is
+    /// the best team's.
     pub fn tables(&self) -> String {
         let tables = self.reported().into_iter().map(|(at, measure)| {
             let arms = self.rows.first().map_or(&[][..], |row| &row.comparison.arms);
@@ -351,12 +350,20 @@ impl Answer {
                 let Measured { arms, pairs, .. } = &comparison.measures[at];
                 let place: Vec<&str> =
                     panel.iter().chain(Some(name).filter(|name| !name.is_empty())).map(|word| &**word).collect();
-                let mean = |(mean, named): (&Mean, &Named)| {
-                    let reached = mean.reached.map_or(String::new(), |count| format!(" ({count} of {})", named.trials));
-                    comparison::estimate(mean.mean, measure.digits(), false) + &reached
+                let best = comparison.measures.iter().find(|other| match (other.measure, measure) {
+                    (Measure::BestG { generation: best }, Measure::ChampionG { generation }) => best == generation,
+                    _ => false,
+                });
+                let mean = |(at, (mean, named)): (usize, (&Mean, &Named))| {
+                    let note = match (best, mean.reached) {
+                        (Some(best), _) => format!(" ({:.3})", best.arms[at].mean.value),
+                        (None, Some(count)) => format!(" ({count} of {})", named.trials),
+                        (None, None) => String::new(),
+                    };
+                    comparison::estimate(mean.mean, measure.digits(), false) + &note
                 };
                 let mut row = vec![place.join(", ")];
-                row.extend(arms.iter().zip(&comparison.arms).map(mean));
+                row.extend(arms.iter().zip(&comparison.arms).enumerate().map(mean));
                 row.extend(self.part.pairs.iter().map(|pair| {
                     pairs.iter().find(|versus| versus.arms == *pair).map_or(String::new(), |versus| {
                         let p = comparison::probability(versus.p_holm);
