@@ -12,7 +12,6 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use crate::VERSION;
 use crate::backend::cpu::Cpu;
 use crate::backend::gpu::device::{self, AdapterInfo, DeviceError, Wanted};
 use crate::backend::gpu::episode::{GpuBackend, ResidencyPolicy};
@@ -23,6 +22,7 @@ use crate::front::{self, Found, Processor};
 use crate::host::Instant;
 use crate::parallel::current_num_threads;
 use crate::trainer::Trainer;
+use crate::version::VERSION;
 use crate::world::World;
 
 /// Agent-steps per second of one CPU thread, about. Only runs that take longer than [`SHORT`] by this are measured.

@@ -122,8 +122,8 @@ struct Cli {
 
 /// Text of `--version`: the version, and the commit and target of the build.
 static VERSION: LazyLock<String> = LazyLock::new(|| {
-    let commit = crate::COMMIT.unwrap_or("not recorded");
-    format!("{}\ncommit  {commit}\ntarget  {}", env!("CARGO_PKG_VERSION"), env!("FLOTILLA_TARGET"))
+    let commit = crate::version::COMMIT.unwrap_or("not recorded");
+    format!("{}\ncommit  {commit}\ntarget  {}", crate::version::VERSION, env!("FLOTILLA_TARGET"))
 });
 
 /// The command line, program name first, if it differs from the process's own arguments.

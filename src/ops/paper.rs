@@ -243,7 +243,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let full = tables::full(&claims);
     write(CLAIMS.into(), tables::page(&baseline, &heading, &full).as_bytes())?;
     let summary = Summary {
-        version: env!("CARGO_PKG_VERSION"),
+        version: crate::version::VERSION,
         backend: session.run(0).backend.clone(),
         description: session.run(0).description.clone(),
         seconds,

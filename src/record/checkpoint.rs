@@ -102,7 +102,7 @@ impl<N: AsRef<[f32]>> Checkpoint<N> {
                 ("seconds", seconds.to_string()),
                 ("metrics_bytes", metrics.bytes.to_string()),
                 ("metrics_sha256", metrics.sha256.clone()),
-                (tensors::VERSION, crate::VERSION.into()),
+                (tensors::VERSION, crate::version::VERSION.into()),
             ]
             .map(|(key, value)| (key.to_string(), value)),
         );

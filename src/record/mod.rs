@@ -158,7 +158,7 @@ pub enum RecordError {
     #[error(
         "{path}: it was written by {}, in a format that is newer than this version ({}) reads",
         by(version),
-        crate::VERSION
+        crate::version::VERSION
     )]
     Newer {
         /// Path of the file.

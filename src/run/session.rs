@@ -246,7 +246,7 @@ impl Session {
     fn record_machine(&mut self, (backend, machine): &OpenBackend) {
         for run in self.members.iter_mut().filter(|member| member.unfinished.is_some()).map(|member| &mut member.run) {
             let Machine { backend: kind, adapter, driver, threads } = machine.clone();
-            let (version, commit) = (crate::VERSION.into(), crate::COMMIT.map(String::from));
+            let (version, commit) = (crate::version::VERSION.into(), crate::version::COMMIT.map(String::from));
             let description = backend.describe();
             *run = Run { version, commit, description, backend: kind, adapter, driver, threads, ..run.clone() };
         }

@@ -172,7 +172,7 @@ fn newer_version(text: &str) -> Option<String> {
         version.split(['-', '+']).next()?.split('.').map(|number| number.parse().ok()).collect()
     };
     let version = serde_json::from_str::<serde_json::Value>(text).ok()?.get("version")?.as_str()?.to_string();
-    (numbers(&version)? > numbers(crate::VERSION)?).then_some(version)
+    (numbers(&version)? > numbers(crate::version::VERSION)?).then_some(version)
 }
 
 /// Returns the current time in UTC, such as "2026-01-31T23:59:59Z".
