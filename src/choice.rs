@@ -178,9 +178,9 @@ fn generation(config: &Config) -> f64 {
     (config.max_teams() * config.learning.episodes_per_team) as f64 * team(config)
 }
 
-/// Returns the agent-steps of one team's episode.
+/// Returns the agent-steps of one team's episode. This is an estimate, which ignores stages.
 fn team(config: &Config) -> f64 {
-    let world = &config.at(0).world;
+    let world = &config.world;
     ((world.leaders.len() + world.followers.len()) * world.steps) as f64
 }
 

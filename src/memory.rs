@@ -10,7 +10,7 @@ use std::fs;
 use std::path::Path;
 
 use crate::backend::{self, BATCH_BYTES, PACKED_FROM, cpu};
-use crate::config::{Config, Method};
+use crate::config::{Config, Method, ValidConfig};
 use crate::trainer;
 use crate::world::World;
 
@@ -51,19 +51,15 @@ pub struct TooLittle {
 }
 
 impl Peaks {
-    /// Returns the peaks for training these valid configs together on `threads` threads.
-    pub fn of<'a>(configs: impl IntoIterator<Item = &'a Config>, threads: usize) -> Peaks {
+    /// Returns the peaks for training these configs together on `threads` threads.
+    pub fn of<'a>(configs: impl IntoIterator<Item = &'a ValidConfig>, threads: usize) -> Peaks {
         let lanes = cpu::lanes();
         let [mut training, mut next, mut checkpoint, mut queue] = [0_u64; 4];
         let [mut weights, mut record, mut states] = [0_u64; 3];
         let [mut block, mut order, mut populations, mut held] = [0_u64; 4];
         for config in configs {
-            let staged: Vec<(Config, World)> = (config.staged().into_iter())
-                .map(|(_, config)| {
-                    let world = World::new(&config);
-                    (config, world)
-                })
-                .collect();
+            let staged: Vec<(&Config, World)> =
+                config.stages().iter().map(|(_, config)| (config, World::new(config))).collect();
             // The largest stage determines each size.
             let most = |size: &dyn Fn(&Config, &World) -> u64| {
                 staged.iter().map(|(config, world)| size(config, world)).max().unwrap_or(0)

@@ -796,8 +796,9 @@ impl PlainTrial<'_> {
         let mut rows = Vec::new();
         // The champions of all past generations.
         let mut past: Vec<Vec<Vec<f32>>> = Vec::new();
+        let config = self.config.validate().unwrap();
         for generation in 0..=generations {
-            let stage = self.config.at(generation);
+            let stage = config.at(generation);
             let Learning { partners, leniency, hall_of_fame, .. } = stage.learning;
             let mut teams = vec![0; partners * population * leaders];
             for (round, teams) in teams.chunks_mut(population * leaders).enumerate() {

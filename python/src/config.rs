@@ -115,7 +115,8 @@ pub fn sweep<'py>(
         let pairs = sweep.axes.iter().zip(&point.values);
         pairs.map(|(axis, &value)| to_python(py, axis.values[value].clone())).collect::<PyResult<Vec<_>>>()
     };
-    let points = sweep.points.iter().map(|point| Ok((point.index, values(point)?, Config(point.config.clone()))));
+    let points =
+        sweep.points.iter().map(|point| Ok((point.index, values(point)?, Config(point.config.clone().into_config()))));
     let points = points.collect::<PyResult<Vec<_>>>()?;
     Ok((sweep.axes.iter().map(|axis| axis.key.clone()).collect(), points, sweep.text))
 }

@@ -72,11 +72,11 @@ pub fn run(args: Args) -> Result<(), Error> {
         }
     };
     // Only the first stage is measured.
-    let config = Config::read(&text, &name, &[], &args.overrides.list())?.at(0);
-    let configs = combinations(&config, &args)?;
+    let config = Config::read(&text, &name, &[], &args.overrides.list())?.validate()?;
+    let configs = combinations(config.at(0), &args)?;
     let (mut player, machine) = open(&args)?;
     for config in &configs {
-        let plan = Peaks::of([config], rayon::current_num_threads());
+        let plan = Peaks::of([&config.validate()?], rayon::current_num_threads());
         plan.check(machine.backend == "gpu").map_err(RunError::from)?;
     }
     if !args.json {

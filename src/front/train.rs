@@ -222,7 +222,7 @@ pub(super) fn previous_champions(trainer: &mut Trainer, config: &Config) -> Resu
 
 /// Checks that a training fits this machine's memory, and returns its trainer.
 pub(super) fn new_trainer(config: ValidConfig) -> Result<Trainer, Failure> {
-    let plan = Peaks::of([&*config], current_num_threads());
+    let plan = Peaks::of([&config], current_num_threads());
     // Nothing is saved during training, but the results stay in memory: every row twice, and the policies.
     let rows = config.learning.trials as u64 * (config.learning.generations as u64 + 1);
     // The last slots stay too, if they are needed to extend the run.

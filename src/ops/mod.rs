@@ -52,7 +52,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::backend::{BackendError, Machine, OpenBackend};
 use crate::choice::Work;
-use crate::config::{Config, Override};
+use crate::config::{Config, Override, ValidConfig};
 use crate::escape::PathExt;
 use crate::front;
 use crate::memory::Peaks;
@@ -169,7 +169,7 @@ impl Context<'_> {
     }
 
     /// Warns about every POI of a config that no team can observe.
-    pub(crate) fn warn_of_unreachable(&self, config: &Config) {
+    pub(crate) fn warn_of_unreachable(&self, config: &ValidConfig) {
         sweep::unreachable(config).iter().for_each(|line| self.warn(format_args!("warning: {line}")));
     }
 
@@ -261,7 +261,7 @@ impl ConfigText {
     }
 
     /// Reads the config. Reports notes for its author, and returns them, too.
-    fn read_noted(&self, context: Context<'_>) -> Result<(Config, Vec<String>), Error> {
+    fn read_noted(&self, context: Context<'_>) -> Result<(ValidConfig, Vec<String>), Error> {
         let (config, notes) = Config::read_noted(&Document::parse(&self.text), &self.name, &[], &self.set)?;
         context.notes(&notes);
         Ok((config, notes))
@@ -275,7 +275,7 @@ fn escaped<S: serde::Serializer>(path: &Path, serializer: S) -> Result<S::Ok, S:
 
 /// Refuses configs that need more memory than there is, each alone.
 fn check_memory<'a>(
-    configs: impl IntoIterator<Item = &'a crate::config::Config>,
+    configs: impl IntoIterator<Item = &'a ValidConfig>,
     (_, machine): &OpenBackend,
 ) -> Result<(), Error> {
     for config in configs {

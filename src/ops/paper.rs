@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::{BackendSource, Context, Error, Event, Processor, said};
 use crate::baseline::Baselines;
 use crate::choice::Work;
-use crate::config::{self, Actions, Fitness, Override, Paradigm};
+use crate::config::{self, Actions, Fitness, Override, Paradigm, ValidConfig};
 use crate::escape::PathExt;
 use crate::memory;
 use crate::parallel::current_num_threads;
@@ -130,7 +130,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     marks.compare(out, start)?;
     let (configs, places) = paper::trained(&arms);
     let (backend, on) = backends.open(Work::of(&configs))?;
-    let plan = memory::Peaks::of(&configs, current_num_threads());
+    let plan = memory::Peaks::of(&ValidConfig::all(&configs)?, current_num_threads());
     plan.check(backend.1.backend == "gpu").map_err(RunError::from)?;
     let disk = Disk::default();
     disk.create_folder(out).map_err(|error| RecordError::Write { path: out.clone(), error })?;

@@ -97,7 +97,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         )));
     }
     let configs = || parts.iter().flat_map(|(_, sweep)| &sweep.points).map(|point| &point.config);
-    let (backend, on) = backends.open(Work::of(configs()))?;
+    let (backend, on) = backends.open(Work::of(configs().map(|config| &**config)))?;
     check_memory(configs(), backend)?;
     let disk = Disk::default();
     disk.create_folder(out).map_err(|error| RecordError::Write { path: out.clone(), error })?;
@@ -110,7 +110,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let warm: Vec<_> = parts.iter().map(|(part, sweep)| part.warm(sweep, out)).collect();
     // All folders are checked before training, so that no part is trained only to fail at another part's folder.
     let points = parts.iter().flat_map(|(part, sweep)| {
-        sweep.points.iter().map(|point| (point_folder(&out.join(part.name), point), &point.config))
+        sweep.points.iter().map(|point| (point_folder(&out.join(part.name), point), &*point.config))
     });
     let warm_runs = warm.iter().flatten().map(|run| (run.folder.clone(), &run.config));
     let folders: Vec<(PathBuf, &Config)> = points.chain(warm_runs).collect();

@@ -195,7 +195,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let out = place.path();
     let kind = Form::of(out)?;
     kind.takes(out, request)?;
-    let config = points::config(folder, verification)?;
+    let config = points::config(folder, verification)?.validate()?;
     digests::without([folder]).into_iter().for_each(|note| context.note(note));
     let trial = request.trial.find(folder, &config, generation, team, verification)?;
     let generation = match generation {
@@ -238,14 +238,14 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let name = name.unwrap_or_else(|| folder.escaped().to_string());
     let motion = Film { width, fps: fps.unwrap_or(FPS) };
     let content = match kind {
-        Form::Page => Ok(replay::page(&name, &config, &played).into_bytes()),
-        Form::Gif => replay::gif(&config, &played, motion),
+        Form::Page => Ok(replay::page(&name, config, &played).into_bytes()),
+        Form::Gif => replay::gif(config, &played, motion),
         Form::Still(kind) => {
-            let scene = replay::still(&config, &played, step.unwrap_or(steps));
+            let scene = replay::still(config, &played, step.unwrap_or(steps));
             scene.file(kind, width.map_or(PRINT, |width| f64::from(width) / scene.width))
         }
         Form::Film(numbered) => {
-            let written = write_film(&numbered, out, &replay::Frames::new(&config, &played, motion))?;
+            let written = write_film(&numbered, out, &replay::Frames::new(config, &played, motion))?;
             return Ok(outcome(written, &played));
         }
     };

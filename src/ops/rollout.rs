@@ -141,12 +141,12 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let config = match request.stage {
         None => config,
         Some(stage) => {
-            let mut staged = config.staged();
-            if stage >= staged.len() {
-                let stages = numbered(staged.len(), "stage");
+            let config = config.validate()?;
+            let Some((_, config)) = config.stages().get(stage) else {
+                let stages = numbered(config.stages().len(), "stage");
                 return Err(Error::Usage(format!("--stage {stage}: the config has {stages}").into()));
-            }
-            staged.swap_remove(stage).1
+            };
+            config.clone()
         }
     };
     let starts = request.starts(config.learning.start_jitter, config.learning.poi_jitter)?;

@@ -11,7 +11,7 @@ use serde_json::Value;
 use super::{BackendSource, Context, Error, Event, check_memory};
 use crate::backend::OpenBackend;
 use crate::choice::Work;
-use crate::config::{self, Config, ConfigError, Override, Problem};
+use crate::config::{self, ConfigError, Override, Problem, ValidConfig};
 use crate::escape::PathExt;
 use crate::file;
 use crate::memory;
@@ -318,7 +318,7 @@ pub fn train(
     let shard = shard.map_err(|error| Error::Usage(error.into()))?;
     same_sweep(sweep, out)?;
     let points = shard.take(&sweep.points);
-    let (backend, on) = backends.open(Work::of(points.iter().map(|point| &point.config)))?;
+    let (backend, on) = backends.open(Work::of(points.iter().map(|point| &*point.config)))?;
     check_memory(points.iter().map(|point| &point.config), backend)?;
     warn_of_unreachable(sweep, &points, context);
     claim(&Disk::default(), sweep, out)?;
@@ -402,8 +402,8 @@ fn warn_of_unreachable(sweep: &Sweep, points: &[&Point], context: Context<'_>) {
 }
 
 /// Returns a line for each POI of a config that no team can observe, and advice.
-pub(crate) fn unreachable(config: &Config) -> Vec<String> {
-    let staged = config.staged();
+pub(crate) fn unreachable(config: &ValidConfig) -> Vec<String> {
+    let staged = config.stages();
     let mut lines = Vec::new();
     for (index, (_, config)) in staged.iter().enumerate() {
         let place = if staged.len() > 1 { format!("stage {index}: ") } else { String::new() };

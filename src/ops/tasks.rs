@@ -202,7 +202,7 @@ fn train(
     backend: &mut OpenBackend,
     context: Context<'_>,
 ) -> Result<(), Error> {
-    check_memory([config], backend)?;
+    check_memory([&config.validate()?], backend)?;
     let (mut session, _) = Session::open(vec![(config.clone(), folder.into())], start, disk)?;
     if session.is_done() {
         return Ok(());

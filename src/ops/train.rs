@@ -198,7 +198,7 @@ pub(crate) fn refuse_zip(path: &Path) -> Result<(), Error> {
 pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
     request.out.iter().try_for_each(|path| refuse_zip(path))?;
     let (config, notes) = request.config.read_noted(context)?;
-    let (backend, on) = backends.open(Work::of([&config]))?;
+    let (backend, on) = backends.open(Work::of([&*config]))?;
     check_memory([&config], backend)?;
     context.warn_of_unreachable(&config);
     let (init, start) = (request.init.as_deref(), request.start);
@@ -220,7 +220,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
             ownership::check(&disk, [folder.join(CURVES)])?;
         }
     }
-    let opened = Session::open_from(vec![(config.clone(), folder.clone(), first)], start, &disk);
+    let opened = Session::open_from(vec![(Config::clone(&config), folder.clone(), first)], start, &disk);
     let (mut session, found) = opened.map_err(|error| match error {
         RunError::Record(RecordError::Exists { .. }) if request.tensorboard => Error::Refused(said(
             format!("{error}\nfor event files of the run that is there:"),
@@ -286,7 +286,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         trials: learning.trials,
         population: learning.population,
         generations: learning.generations,
-        pois: config.pois(),
+        pois: config.validate()?.pois(),
         trained_generations: if was_done { 0 } else { (last + 1).saturating_sub(from) },
         seconds: if was_done { 0.0 } else { since.elapsed().as_secs_f64() },
         notes,
@@ -322,8 +322,8 @@ pub fn in_memory(
     backends: &mut dyn BackendSource,
     context: Context<'_>,
 ) -> Result<InMemory, Error> {
-    config.validate()?;
-    let (backend, on) = backends.open(Work::of([config]))?;
+    let config = &config.validate()?;
+    let (backend, on) = backends.open(Work::of([&**config]))?;
     context.notes(&config.notes());
     context.warn_of_unreachable(config);
     (context.tell)(Event::Begin(vec![(String::new(), config.pois())], 0, config.learning.generations));

@@ -272,11 +272,10 @@ fn plan(args: &Request) -> Result<(Plan, Option<Duration>), Error> {
         }
         None => Plan::random(seed..seed + u64::from(args.worlds.unwrap_or(WORLDS)), teams),
         Some((name, text)) => {
-            let config = Config::read(text, name, &[], &args.set)?;
-            let stages = config.staged().into_iter().enumerate().skip(1);
-            let stages: Vec<_> =
-                stages.map(|(stage, (_, config))| (format!("{name}, stage {stage}"), config)).collect();
-            let worlds = [vec![(name.clone(), config)], stages].concat();
+            let config = Config::read(text, name, &[], &args.set)?.validate()?;
+            let later = config.stages().iter().enumerate().skip(1);
+            let later = later.map(|(stage, (_, config))| (format!("{name}, stage {stage}"), config.clone()));
+            let worlds = [(name.clone(), Config::clone(&config))].into_iter().chain(later).collect();
             Plan { worlds, teams, seed, generations: 5 }
         }
     };

@@ -25,7 +25,9 @@ use std::path::Path;
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
 
-use crate::config::{self, Config, ConfigError, GENERATIONS, GRID, Override, Problem, STAGES, VARY, read_file};
+use crate::config::{
+    self, Config, ConfigError, GENERATIONS, GRID, Override, Problem, STAGES, VARY, ValidConfig, read_file,
+};
 use crate::escape;
 use crate::file;
 use crate::reader::Document;
@@ -106,7 +108,7 @@ pub struct Point {
     /// The index of its value on each axis.
     pub values: Vec<usize>,
     /// The config.
-    pub config: Config,
+    pub config: ValidConfig,
 }
 
 impl Sweep {
@@ -169,8 +171,8 @@ impl Sweep {
             .map(|index| {
                 let values = grid.values(index);
                 let overrides = [flags, &grid.overrides(&values), &layout.overrides(&grid, &values)].concat();
-                let config = Config::read_document(&document, name, &[GRID, VARY], &overrides);
-                Tried { index, values, config }
+                let config = Config::read_noted(&document, name, &[GRID, VARY], &overrides);
+                Tried { index, values, config: config.map(|(config, _)| config) }
             })
             .collect();
         let mut problems = grid.problems(&tried, skip);
@@ -196,7 +198,7 @@ impl Sweep {
 struct Tried {
     index: usize,
     values: Vec<usize>,
-    config: Result<Config, ConfigError>,
+    config: Result<ValidConfig, ConfigError>,
 }
 
 fn describe<'a>(axes: impl Iterator<Item = &'a Axis>, values: &[usize]) -> String {

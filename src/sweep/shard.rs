@@ -120,17 +120,14 @@ impl Display for Shard {
 /// Estimates the number of operations of a point: teams × steps × operations per step (networks, pairs of agents,
 /// sensing, coupling).
 pub fn cost(point: &Point) -> u128 {
-    point.config.shares().iter().map(cost_of_stage).sum()
+    point.config.stage_lengths().map(cost_of_stage).sum()
 }
 
-fn cost_of_stage(config: &Config) -> u128 {
+fn cost_of_stage((generations, config): (usize, &Config)) -> u128 {
     let learning = &config.learning;
     let world = World::new(config);
     let wide = |count: usize| count as u128;
-    let teams = wide(learning.trials)
-        * wide(learning.generations + 1)
-        * wide(config.max_teams())
-        * wide(learning.episodes_per_team);
+    let teams = wide(learning.trials) * wide(generations) * wide(config.max_teams()) * wide(learning.episodes_per_team);
     let (agents, leaders, pois) = (wide(world.agents()), wide(world.leaders()), wide(world.pois.len()));
     let step = leaders * (2 * wide(world.parameters()) + 25 * pois) + agents * (4 * agents + 6 * pois + 100);
     teams * wide(world.steps()) * step

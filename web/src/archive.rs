@@ -134,7 +134,7 @@ pub fn read(text: Option<&str>, bytes: &[u8]) -> Result<Answer, Refusal> {
         Ok(content)
     };
     let text = String::from_utf8(file(folder::CONFIG)?).map_err(|_| refuse("config.toml is not UTF-8 text"))?;
-    let config = Config::parse(&text, "config.toml")?;
+    let config = Config::parse(&text, "config.toml")?.validate()?;
     let (metrics, weights) = (file(folder::METRICS)?, file(folder::POLICIES)?);
     let run = Run::parse(&String::from_utf8_lossy(&file(folder::RUN)?))
         .map_err(|error| refuse(format!("run.json: {error}")))?;
@@ -180,7 +180,8 @@ pub fn read(text: Option<&str>, bytes: &[u8]) -> Result<Answer, Refusal> {
 ///
 /// `weights` are `[leaders][policies][parameters]`, or `[1][policies][parameters]` if all leaders share a policy.
 pub fn play(config: &Config, policies: usize, mut weights: Vec<f32>) -> Result<Value, Refusal> {
-    let config = &config.at(config.learning.generations);
+    let config = config.validate()?;
+    let config = config.at(config.learning.generations);
     let world = World::new(config);
     let (leaders, numbers) = (world.leaders(), policies.saturating_mul(world.parameters()));
     let fits = policies > 0 && [numbers, numbers.saturating_mul(leaders)].contains(&weights.len());

@@ -158,7 +158,7 @@ pub fn answer(session: &mut Session, text: &str, bytes: &[u8]) -> Result<Answer,
 fn resolve(text: &str, name: &str, changes: Vec<(String, String)>) -> Result<Value, Refusal> {
     let change = |(key, text): (String, String)| Override { name: key.clone(), key, text };
     let changes: Vec<Override> = changes.into_iter().map(change).collect();
-    let config = Config::read(text, name, &[], &changes)?;
+    let config = Config::read(text, name, &[], &changes)?.validate()?;
     let mut words = described(&config);
     // Besides training itself, snapshots are kept, and packing the archive copies all policies.
     words["bytes"] = (flotilla::memory::Peaks::of([&config], 1).host + 5 * config.policy_bytes()).into();

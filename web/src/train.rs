@@ -40,7 +40,7 @@ struct Kept {
 /// The training of one worker.
 #[derive(Default)]
 pub struct Training {
-    configs: Vec<Config>,
+    configs: Vec<ValidConfig>,
     batches: Vec<Batch>,
     kept: Kept,
 }
@@ -53,13 +53,12 @@ impl Default for Kept {
 
 impl Training {
     pub fn new(runs: Vec<Chosen>) -> Result<Training, Refusal> {
-        let parse = |chosen: &Chosen| Ok(Config::parse(&chosen.text, "the config")?);
+        let parse = |chosen: &Chosen| Ok(Config::parse(&chosen.text, "the config")?.validate()?);
         let configs = runs.iter().map(parse).collect::<Result<Vec<_>, Refusal>>()?;
-        let valid = ValidConfig::all(&configs)?;
         let mut batches = Vec::new();
         let whole: Vec<usize> = (0..runs.len()).filter(|&run| runs[run].trials.is_none()).collect();
         if !whole.is_empty() {
-            let trainer = Trainer::new(whole.iter().map(|&run| valid[run].clone()));
+            let trainer = Trainer::new(whole.iter().map(|&run| configs[run].clone()));
             batches.push(Batch { trainer, arms: whole.into_iter().map(|run| (run, None)).collect() });
         }
         for (run, chosen) in runs.iter().enumerate() {
@@ -67,7 +66,7 @@ impl Training {
                 if trial >= configs[run].learning.trials {
                     return Err(refuse(format!("no trial {trial}")));
                 }
-                let trainer = Trainer::of_trial(&valid[run], trial);
+                let trainer = Trainer::of_trial(&configs[run], trial);
                 batches.push(Batch { trainer, arms: vec![(run, Some(trial))] });
             }
         }
@@ -142,7 +141,7 @@ impl Training {
         if let Some((arm, batch)) = batch.filter(|_| at_hand == generation) {
             batch.keep(arm, &mut self.kept)?;
         }
-        let mut trainer = Trainer::of_trial(&config.validate()?, trial);
+        let mut trainer = Trainer::of_trial(config, trial);
         let before = self.kept.snapshots.range((run, trial, 0)..=(run, trial, generation)).next_back();
         if let Some((_, snapshot)) = before {
             // The sizes always match. If they did not, training from the start would give the same result.
@@ -161,7 +160,7 @@ impl Training {
             // Then followers are drawn with the leader that they saw most.
             played.led.clear();
         }
-        Ok(replay::detailed("", &config, &[played]))
+        Ok(replay::detailed("", config, &[played]))
     }
 
     /// Returns the results of a run's trials that this worker has finished.

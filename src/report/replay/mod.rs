@@ -267,7 +267,7 @@ pub fn replay(
     watch: &mut dyn FnMut(usize) -> bool,
 ) -> Result<Vec<Replayed>, ReplayError> {
     let name = || folder.escaped().to_string();
-    let config = runs::config(folder, verification)?;
+    let config = runs::config(folder, verification)?.validate().map_err(BackendError::from)?;
     let trials = config.learning.trials;
     if trial >= trials {
         return Err(ReplayError::NoTrial { folder: name(), trial, trials });
@@ -288,7 +288,7 @@ pub fn replay(
     let mut order: Vec<usize> = (0..generations.len()).collect();
     order.sort_by_key(|&index| generations[index]);
     let mut played: Vec<Option<Replayed>> = generations.iter().map(|_| None).collect();
-    let mut trainer = Trainer::of_trial(&config.validate().map_err(BackendError::from)?, trial);
+    let mut trainer = Trainer::of_trial(&config, trial);
     for index in order {
         let generation = generations[index];
         // The champion is in its slot only after its generation is over.
@@ -309,11 +309,11 @@ pub fn replay(
         }
         let (found, g) = match which {
             Which::Champion => {
-                let found = champion(&config.at(generation), &mut trainer, trial, backend)?;
+                let found = champion(config.at(generation), &mut trainer, trial, backend)?;
                 let g = found.team_g;
                 (found, g)
             }
-            _ => team(&config.at(generation), &mut trainer, trial, which, backend)?,
+            _ => team(config.at(generation), &mut trainer, trial, which, backend)?,
         };
         let expected = rows.get(generation, which).unwrap_or(f64::NAN);
         if g != expected {

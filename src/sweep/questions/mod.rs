@@ -153,7 +153,7 @@ impl Study {
         let Some((source, places)) = self.warm_from else { return vec![] };
         let run = |(at, &(index, from)): (usize, &(usize, &'static str))| Warm {
             from,
-            config: point.config.clone(),
+            config: Config::clone(&point.config),
             folder: out.join(self.name).join("warm").join(format!("{:04}-{at}", point.index)),
             policies: out.join(source).join("points").join(format!("{index:04}")).join(POLICIES),
         };
