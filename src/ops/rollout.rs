@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use super::{BackendSource, ConfigText, Context, Error, Processor, output, points, said};
 use crate::backend::{Backend, Group, Moment};
 use crate::choice::Work;
-use crate::config::{self, Config, Override, Sharing};
+use crate::config::{self, Config, Override};
 use crate::escape::PathExt;
 use crate::evaluate::{self, Batch, Evaluation, Spread, Starts};
 use crate::file;
@@ -153,9 +153,6 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     verify(&config_path, &policies, request.unverified, context)?;
     let policies = policies::read(&policies, &config, request.trial)?;
     let world = World::new(&config);
-    // The file says whether its leaders share a policy, not the config, which may be another layout's.
-    let own = policies.policies * world.leaders() * world.parameters();
-    let sharing = if policies.weights.len() == own { Sharing::PerLeader } else { Sharing::Shared };
     let work = Work::of_teams(&config, policies.policies * request.episodes.unwrap_or(1) as usize);
     let ((backend, machine), on) = backends.open(work)?;
     context.message(format_args!("playing on {on}"));
@@ -166,7 +163,8 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         weights: policies.weights[..].into(),
         policies: policies.policies,
         teams: &teams,
-        sharing,
+        // The config may be another layout's, so the file says whether its leaders share a policy.
+        sharing: policies.sharing,
         fitnesses: if request.scores.is_some() { evaluate::SCORES_AND_DT } else { evaluate::SCORES },
     };
     let playing = format!("playing {}", counted(policies.policies, starts.episodes()));

@@ -17,7 +17,7 @@ use sha2::{Digest, Sha256};
 use super::RecordError;
 use super::disk::Disk;
 use super::tensors::{self, Tensor, TensorFile};
-use crate::config::{Config, MAX_POPULATION};
+use crate::config::{Config, MAX_POPULATION, Sharing};
 use crate::escape;
 use crate::evolve::{MAX_WEIGHT, admit};
 
@@ -30,8 +30,10 @@ pub(super) const CONFIG: &str = "config";
 /// Policies of one trial.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Policies {
-    /// Number of policies per leader.
+    /// Number of policies per population.
     pub policies: usize,
+    /// Whether all leaders share a policy.
+    pub sharing: Sharing,
     /// Parameters, `[leaders][policies][parameters]`, or `[1][policies][parameters]` if all leaders share a policy.
     pub weights: Vec<f32>,
 }
@@ -146,7 +148,7 @@ impl Write for HashWriter<'_> {
 pub fn read_all(path: &Path, config: &Config) -> Result<Vec<Vec<f32>>, RecordError> {
     let mut file = tensors::open(path)?;
     let trial = |trial| {
-        let Policies { policies, weights } = from_file(&mut file, config, &[config.populations()], Some(trial))?;
+        let Policies { policies, weights, .. } = from_file(&mut file, config, &[config.populations()], Some(trial))?;
         let population = config.learning.population;
         match policies == population {
             true => Ok(weights),
@@ -219,5 +221,7 @@ pub(crate) fn from_file(
             weights[index]
         ));
     }
-    Ok(Policies { policies: shape[1], weights })
+    // A single leader shares its policy with nobody.
+    let sharing = if shape[0] == config.learners() { Sharing::PerLeader } else { Sharing::Shared };
+    Ok(Policies { policies: shape[1], sharing, weights })
 }

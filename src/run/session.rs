@@ -96,7 +96,7 @@ impl Session {
             let fits = match snapshot {
                 InitialState::Checkpoint(snapshot) => trainer.restore(unfinished.experiment, snapshot),
                 InitialState::Policies(Init { trials, .. }) => {
-                    (trials.into_iter().enumerate()).all(|(trial, Policies { policies, weights })| {
+                    (trials.into_iter().enumerate()).all(|(trial, Policies { policies, weights, .. })| {
                         trainer.start_from(unfinished.experiment, trial, policies, &weights)
                     })
                 }

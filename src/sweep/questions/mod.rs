@@ -298,7 +298,7 @@ pub fn champions(path: &Path, config: &Config) -> Result<Vec<f32>, RecordError> 
     let (leaders, trials, parameters) = (config.learners(), config.learning.trials, config.parameters());
     let mut champions = vec![0.0; leaders * trials * parameters];
     for trial in 0..trials {
-        let Policies { policies, weights } = policies::read(path, config, Some(trial))?;
+        let Policies { policies, weights, .. } = policies::read(path, config, Some(trial))?;
         for (leader, population) in weights.chunks(policies * parameters).enumerate() {
             champions[(leader * trials + trial) * parameters..][..parameters]
                 .copy_from_slice(&population[..parameters]);
