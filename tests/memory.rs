@@ -15,7 +15,7 @@ use flotilla::backend::cpu::Cpu;
 use flotilla::config::Config;
 use flotilla::front::Failure;
 use flotilla::memory::{self, Peaks};
-use flotilla::record::checkpoint::{self, Checkpoint, Keeper};
+use flotilla::record::checkpoint::{self, Checkpoint, CheckpointWriter};
 use flotilla::record::disk::Disk;
 use flotilla::record::metrics;
 use flotilla::trainer::Trainer;
@@ -189,23 +189,23 @@ fn checkpoints_from_a_copy_and_a_view_are_equal() {
     let files = ["copy", "view"].map(|name| {
         let path = folder.path().join(name);
         fs::create_dir(&path).unwrap();
-        let mut keeper = Keeper::new(disk.clone(), path.clone(), config.clone(), vec![0, 1], 1);
+        let mut writer = CheckpointWriter::new(disk.clone(), path.clone(), config.clone(), vec![0, 1], 1);
         let (config, seconds) = (flotilla::record::config_digest(&config), 2.5);
         let (metrics, output) = metrics.mark().unwrap();
         match name {
             "copy" => {
                 let snapshot = trainer.snapshot(0).unwrap();
                 let checkpoint = Checkpoint { config, init: None, seconds, metrics, snapshot };
-                keeper.save(checkpoint, output, Instant::now()).unwrap();
-                keeper.wait().unwrap();
+                writer.save(checkpoint, output, Instant::now()).unwrap();
+                writer.wait().unwrap();
             }
             _ => {
                 let checkpoint =
                     Checkpoint { config, init: None, seconds, metrics, snapshot: trainer.view(0).unwrap() };
-                keeper.save_now(&checkpoint, &output, Instant::now()).unwrap();
+                writer.save_now(&checkpoint, &output, Instant::now()).unwrap();
             }
         }
-        assert_eq!(keeper.newest(), Some(3));
+        assert_eq!(writer.newest(), Some(3));
         fs::read(checkpoint::path(&path, 3)).unwrap()
     });
     assert!(files[0].len() as u64 > config.policy_bytes() && files[0] == files[1]);

@@ -6,7 +6,7 @@ use clap::builder::{PossibleValue, PossibleValuesParser};
 use toml::{Table, Value};
 
 use super::layout::{SHAPES, StartLayout};
-use super::{Error, print, said, whole};
+use super::{Error, print, whole, with_remedy};
 use crate::config::{self, Config, Definition};
 use crate::escape::PathExt;
 use crate::ops::output;
@@ -66,7 +66,7 @@ fn template(args: &Args) -> Result<String, Error> {
         let given = [("--groups", args.groups), ("--followers", args.followers), ("--pois", args.pois)];
         if let Some((flag, _)) = given.into_iter().find(|(_, number)| number.is_some()) {
             let layout = &args.layout;
-            return Err(Error::Usage(said(
+            return Err(Error::Usage(with_remedy(
                 format!("{flag}: the layout {layout} is the paper's"),
                 "use it with ring, row or grid",
             )));

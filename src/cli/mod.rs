@@ -22,7 +22,7 @@ use crate::config::{self, Choice, Fitness, Override, Paradigm};
 use crate::escape;
 use crate::file;
 use crate::ops::ConfigText;
-pub use crate::ops::{Error, Processor, said};
+pub use crate::ops::{Error, Processor, with_remedy};
 use crate::record::folder::Start;
 
 mod backend;
@@ -203,7 +203,7 @@ fn of_clap(error: &clap::Error) -> Error {
     let text = text.trim().trim_start_matches("error: ");
     Error::Usage(match text.split_once("\n\n") {
         None => text.into(),
-        Some((message, advice)) => said(message, advice.trim()),
+        Some((message, advice)) => with_remedy(message, advice.trim()),
     })
 }
 

@@ -93,12 +93,12 @@ pub fn quoted(path: &Path) -> String {
 }
 
 /// Maximum number of characters of a command line that are kept.
-const MOST: usize = 1 << 13;
+const MAX_LINE: usize = 1 << 13;
 
 /// Returns the command line, quoted for a shell.
 pub fn typed() -> String {
     let line = shell::command(super::words());
-    match line.char_indices().nth(MOST) {
+    match line.char_indices().nth(MAX_LINE) {
         Some((end, _)) => format!("{} …", &line[..end]),
         None => line,
     }

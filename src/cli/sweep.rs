@@ -236,9 +236,11 @@ pub fn run(mut args: Args) -> Result<(), Error> {
             false => print(&format!("When all shards are done: {command}\n")),
         };
     }
-    let found = console::tell(args.quiet, |context| ops::sweep::collect(&request, &sweep, &axes, context)).map_err(
-        |error| error.or_advise(|| format!("run its shards first: {}", args.command(&out, &["--shard", "1/N"]))),
-    )?;
+    let found =
+        console::run_without_backend(args.quiet, |context| ops::sweep::collect(&request, &sweep, &axes, context))
+            .map_err(|error| {
+                error.or_advise(|| format!("run its shards first: {}", args.command(&out, &["--shard", "1/N"])))
+            })?;
     match args.json {
         true => print_json(&found)?,
         false => print(&found.text)?,
@@ -249,7 +251,7 @@ pub fn run(mut args: Args) -> Result<(), Error> {
 
 fn list(sweep: &Sweep, shards: usize) -> Result<(), Error> {
     let total: u128 = sweep.points.iter().map(shard::cost).sum();
-    let of = shard::deal(&sweep.points, shards);
+    let of = shard::assign_to_shards(&sweep.points, shards);
     let mut loads = vec![0; shards];
     sweep.points.iter().zip(&of).for_each(|(point, shard)| loads[shard - 1] += shard::cost(point));
     let part = |cost: u128| cost as f64 * 100.0 / total.max(1) as f64;

@@ -18,7 +18,7 @@ use crate::sweep::questions::Unanswered;
 
 /// An error with its remedy. It is displayed as one text.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Said {
+pub struct MessageWithRemedy {
     /// The error.
     pub message: String,
     /// The remedy, if there is one.
@@ -26,25 +26,25 @@ pub struct Said {
 }
 
 /// Returns a message with what to do about it.
-pub fn said(message: impl Into<String>, remedy: impl Into<String>) -> Said {
-    Said { message: message.into(), remedy: Some(remedy.into()) }
+pub fn with_remedy(message: impl Into<String>, remedy: impl Into<String>) -> MessageWithRemedy {
+    MessageWithRemedy { message: message.into(), remedy: Some(remedy.into()) }
 }
 
-impl From<String> for Said {
-    fn from(message: String) -> Said {
-        Said { message, remedy: None }
+impl From<String> for MessageWithRemedy {
+    fn from(message: String) -> MessageWithRemedy {
+        MessageWithRemedy { message, remedy: None }
     }
 }
 
-impl From<&str> for Said {
-    fn from(message: &str) -> Said {
-        Said::from(message.to_string())
+impl From<&str> for MessageWithRemedy {
+    fn from(message: &str) -> MessageWithRemedy {
+        MessageWithRemedy::from(message.to_string())
     }
 }
 
-impl Display for Said {
+impl Display for MessageWithRemedy {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Said { message, remedy } = self;
+        let MessageWithRemedy { message, remedy } = self;
         match remedy {
             None => f.write_str(message),
             Some(remedy) if message.contains('\n') => write!(f, "{message}\n{remedy}"),
@@ -92,19 +92,19 @@ pub enum Error {
     Signals(io::Error),
     /// Wrong usage that is only found when flags are read together.
     #[error("{0}")]
-    Usage(Said),
+    Usage(MessageWithRemedy),
     /// Results that differ but should be equal.
     #[error("{0}")]
-    Different(Said),
+    Different(MessageWithRemedy),
     /// A command that is refused, for example because it would overwrite files.
     #[error("{0}")]
-    Refused(Said),
+    Refused(MessageWithRemedy),
     /// Results that do not exist yet.
     #[error("{0}")]
-    Missing(Said),
+    Missing(MessageWithRemedy),
     /// Stopped by a signal. Runs are saved and can be resumed.
     #[error("{0}")]
-    Stopped(Said),
+    Stopped(MessageWithRemedy),
 }
 
 impl Error {
@@ -161,11 +161,11 @@ impl Error {
             Error::Run(error) => error.to_string(),
             Error::Read(error) => error.to_string(),
             Error::Replayed(error) => error.to_string(),
-            Error::Usage(said)
-            | Error::Different(said)
-            | Error::Refused(said)
-            | Error::Missing(said)
-            | Error::Stopped(said) => said.message.clone(),
+            Error::Usage(text)
+            | Error::Different(text)
+            | Error::Refused(text)
+            | Error::Missing(text)
+            | Error::Stopped(text) => text.message.clone(),
             Error::Unanswered(_) | Error::Output(_) | Error::Signals(_) => self.to_string(),
         }
     }
@@ -182,8 +182,8 @@ impl Error {
     /// Adds what to do about a result that does not exist yet, a refused request or a stop, if nothing is said about
     /// that yet. The caller knows how it was called.
     pub fn or_advise(mut self, remedy: impl FnOnce() -> String) -> Error {
-        if let Error::Usage(said) | Error::Refused(said) | Error::Missing(said) | Error::Stopped(said) = &mut self {
-            said.remedy.get_or_insert_with(remedy);
+        if let Error::Usage(text) | Error::Refused(text) | Error::Missing(text) | Error::Stopped(text) = &mut self {
+            text.remedy.get_or_insert_with(remedy);
         }
         self
     }

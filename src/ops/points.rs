@@ -12,7 +12,7 @@ use crate::report::runs::{self, ReadError};
 use crate::sweep::{Sweep, results};
 
 /// Maximum number of points that are listed.
-const MOST: usize = 40;
+const MAX_LISTED_POINTS: usize = 40;
 
 /// Reads a run's config. If the folder is a sweep's, the error lists its points with their values.
 ///
@@ -30,10 +30,10 @@ pub fn config(folder: &Path, verification: Verification) -> Result<Config, Error
 
 fn list(sweep: &Sweep, folder: &Path) -> String {
     let mut text = format!("{} holds a sweep; name one of its points:", folder.escaped());
-    for point in sweep.points.iter().take(MOST) {
+    for point in sweep.points.iter().take(MAX_LISTED_POINTS) {
         let _ = write!(text, "\n  {}  {}", results::point_folder(folder, point).escaped(), sweep.describe(point));
     }
-    if let more @ 1.. = sweep.points.len().saturating_sub(MOST) {
+    if let more @ 1.. = sweep.points.len().saturating_sub(MAX_LISTED_POINTS) {
         let _ = write!(text, "\n  … and {more} more");
     }
     text

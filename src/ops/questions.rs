@@ -6,7 +6,7 @@ use serde::Serialize;
 
 use super::paper::Request;
 use super::sweep::{claim, free_memory, same_sweep};
-use super::{BackendSource, Context, Error, Event, check_memory, said};
+use super::{BackendSource, Context, Error, Event, check_memory, with_remedy};
 use crate::choice::Work;
 use crate::config::Config;
 use crate::escape::PathExt;
@@ -82,16 +82,16 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         return Err(Error::Usage(format!("--trials {trials}: intervals and tests take two trials or more").into()));
     }
     if let Some(what) = folder::collection(out) {
-        return Err(Error::Refused(said(format!("{} holds {what}", out.escaped()), "choose another --out")));
+        return Err(Error::Refused(with_remedy(format!("{} holds {what}", out.escaped()), "choose another --out")));
     }
     if folder::holds_run(out)? {
-        return Err(Error::Refused(said(format!("{} holds a run", out.escaped()), "choose another --out")));
+        return Err(Error::Refused(with_remedy(format!("{} holds a run", out.escaped()), "choose another --out")));
     }
     parts.iter().try_for_each(|(part, sweep)| same_sweep(sweep, &out.join(part.name)))?;
     if !all_parts().any(|part| out.join(part.name).join(SWEEP).exists())
         && let Some(theirs) = files().chain([PAGE.into()]).find(|name| out.join(name).exists())
     {
-        return Err(Error::Refused(said(
+        return Err(Error::Refused(with_remedy(
             format!("{} holds {theirs}, but none of the questions' sweeps", out.escaped()),
             "choose another --out",
         )));
@@ -129,7 +129,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         let share = |now: &SweepProgress| {
             let share = now.played as f64 / now.total.max(1) as f64;
             let text = format!("{}: {}/{} experiments done", part.name, now.done, now.points);
-            (context.tell)(Event::Fraction((before + share * cost(sweep)) / whole, text));
+            (context.report)(Event::Fraction((before + share * cost(sweep)) / whole, text));
         };
         let ended =
             super::sweep::train_points(context, sweep, &points, &folder, start, &disk, free_memory(), backend, &share)?;
@@ -145,7 +145,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         });
         let (mut session, _) = Session::open_from(runs.collect::<Result<_, RecordError>>()?, start, &disk)?;
         let mut watch = |_: &crate::run::Progress<'_>| {
-            (context.tell)(Event::Fraction(before / whole, format!("{}: warm starts", part.name)));
+            (context.report)(Event::Fraction(before / whole, format!("{}: warm starts", part.name)));
         };
         if !session.is_done()
             && context.train(&mut watch, |options| session.train(backend, options))? == SessionEnd::Stopped
@@ -164,7 +164,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
             }
             let sweep = parts.iter().find(|(other, _)| other.name == part.name).map(|(_, sweep)| sweep);
             let Some(sweep) = sweep else { continue };
-            (context.tell)(Event::Fraction(1.0, format!("comparing {}", part.name)));
+            (context.report)(Event::Fraction(1.0, format!("comparing {}", part.name)));
             let answer = part.answer(sweep, out, &mut *backend.0)?;
             for kind in Format::ALL {
                 let path = out.join(format!("{}.{}", part.name, kind.extension()));
@@ -179,7 +179,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         }
         answers.push((*question, of_parts));
     }
-    (context.tell)(Event::Pause);
+    (context.report)(Event::Pause);
     let first = &parts[0].1.points[0].config.learning;
     let heading = format!(
         "Means over {} trials of seed {} with 95 % bootstrap intervals; p by Mann and Whitney's test, two-sided, by Holm's\n\

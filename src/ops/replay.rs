@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::output::Destination;
-use super::{BackendSource, Context, Error, escaped, points, said};
+use super::{BackendSource, Context, Error, escaped, points, with_remedy};
 use crate::choice::Work;
 use crate::config::{Config, Learning};
 use crate::escape::PathExt;
@@ -230,7 +230,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let played = replay::replay(folder, trial, &generations, team, verification, &mut **backend, &mut watch);
     context.pause();
     let played = played.map_err(|error| match error {
-        ReplayError::Stopped => Error::Stopped(said("before the episode was played", "nothing was written")),
+        ReplayError::Stopped => Error::Stopped(with_remedy("before the episode was played", "nothing was written")),
         error => error.into(),
     })?;
 

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::{BackendSource, ConfigText, Context, Error, Processor, output, points, said};
+use super::{BackendSource, ConfigText, Context, Error, Processor, output, points, with_remedy};
 use crate::backend::{Backend, Group, Moment};
 use crate::choice::Work;
 use crate::config::{self, Config, Override};
@@ -106,7 +106,7 @@ impl Request {
     fn starts(&self, jitter: f64, poi_jitter: f64) -> Result<Starts, Error> {
         let (Some(episodes), seed) = (self.episodes, self.seed.unwrap_or(0)) else { return Ok(Starts::Own) };
         if jitter == 0.0 && poi_jitter == 0.0 && (episodes > 1 || self.seed.is_some()) {
-            return Err(Error::Usage(said(
+            return Err(Error::Usage(with_remedy(
                 format!("--episodes {episodes}: learning.start_jitter is 0, so all episodes are the same"),
                 "set it or learning.poi_jitter in the config, or give --start-jitter or --poi-jitter",
             )));
@@ -129,7 +129,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         path => (path.to_path_buf(), None),
     };
     let Some(policies) = request.policies.clone().or(trained) else {
-        return Err(Error::Usage(said(
+        return Err(Error::Usage(with_remedy(
             "--policies: a config file needs a file of policies",
             format!("or name a run's folder in place of {}", request.path.escaped()),
         )));
@@ -173,7 +173,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let evaluation = evaluate::evaluate_until(&mut **backend, &group, &starts, share, until);
     context.pause();
     let evaluation = evaluation?;
-    context.go_on()?;
+    context.check_not_stopped()?;
     if let Some(path) = &request.scores {
         output::write_with(path, |file| write_scores(file, &evaluation))?;
     }

@@ -225,7 +225,7 @@ pub fn picture_axes(sweep: &Sweep, names: &[String]) -> Result<Vec<usize>, Error
 }
 
 /// Returns whether a file exists, or an error if the system does not allow checking that.
-fn there(path: &Path) -> Result<bool, RecordError> {
+fn exists(path: &Path) -> Result<bool, RecordError> {
     file::exists(path).map_err(|error| RecordError::Read { path: path.into(), error })
 }
 
@@ -239,8 +239,8 @@ pub(crate) fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
         let problems = vec![Problem { line: None, key: String::new(), message }];
         Err(ConfigError::Invalid { name: path.escaped().to_string(), problems, unlisted: 0 }.into())
     };
-    if !there(&path)? {
-        let holds = match there(&out.join(CONFIG))? {
+    if !exists(&path)? {
+        let holds = match exists(&out.join(CONFIG))? {
             true => Some("a run"),
             false => folder::collection(out),
         };
@@ -258,10 +258,10 @@ pub(crate) fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
             None => Ok(()),
         };
     }
-    let there = config::read_file(&path)?;
+    let existing = config::read_file(&path)?;
     // A person may have written the file, so the same sweep may be formatted differently.
     let normal = |text: &str| Some(Sweep::read(text, SWEEP, &[], sweep.skipped > 0).ok()?.text);
-    if there == sweep.text || normal(&there).as_ref() == Some(&sweep.text) {
+    if existing == sweep.text || normal(&existing).as_ref() == Some(&sweep.text) {
         return Ok(());
     }
     let missing = |from: &str, other: &str, where_: &str| {
@@ -274,8 +274,8 @@ pub(crate) fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
     refuse(format!(
         "{} holds another sweep; what differs:{}{}\nchoose another --out",
         out.escaped(),
-        missing(&there, &sweep.text, "there"),
-        missing(&sweep.text, &there, "here"),
+        missing(&existing, &sweep.text, "there"),
+        missing(&sweep.text, &existing, "here"),
     ))
 }
 
@@ -336,7 +336,7 @@ pub fn train(
         let SweepProgress { done, points, batch, generation, last, played, total } = *progress;
         let text =
             format!("{done}/{points} points done, {batch} side by side at generation {}/{last}", generation.min(last));
-        (context.tell)(Event::Fraction(played as f64 / total.max(1) as f64, text));
+        (context.report)(Event::Fraction(played as f64 / total.max(1) as f64, text));
     };
     match train_points(context, sweep, &points, out, request.start, &disk, memory, backend, &share)? {
         SessionEnd::Finished => Ok(()),
@@ -378,12 +378,12 @@ pub(super) fn train_points(
         },
     };
     let ended = run::run(points, out, backend, &mut options);
-    (context.tell)(Event::Pause);
+    (context.report)(Event::Pause);
     Ok(ended?)
 }
 
 /// Maximum number of POIs that are named one by one.
-const MOST_POIS: usize = 6;
+const MAX_NAMED_POIS: usize = 6;
 
 /// Warns about every POI of a sweep's points that no team can observe, each warning once.
 fn warn_of_unreachable(sweep: &Sweep, points: &[&Point], context: Context<'_>) {
@@ -393,10 +393,10 @@ fn warn_of_unreachable(sweep: &Sweep, points: &[&Point], context: Context<'_>) {
             found.entry(line).or_insert_with(|| (0, sweep.describe(point))).0 += 1;
         }
     }
-    for (line, (count, first)) in found.iter().take(2 * MOST_POIS) {
+    for (line, (count, first)) in found.iter().take(2 * MAX_NAMED_POIS) {
         context.warn(format_args!("warning: {line}; at {count} of {} points, the first {first}", points.len()));
     }
-    if let more @ 1.. = found.len().saturating_sub(2 * MOST_POIS) {
+    if let more @ 1.. = found.len().saturating_sub(2 * MAX_NAMED_POIS) {
         context.warn(format_args!("warning: … and {more} more; `flotilla check` lists those of one config"));
     }
 }
@@ -416,9 +416,12 @@ pub(crate) fn unreachable(config: &ValidConfig) -> Vec<String> {
             }
         }
         lines.extend(
-            reasons.iter().take(MOST_POIS).map(|(first, others)| format!("{place}{first}{}", same_holds_for(others))),
+            reasons
+                .iter()
+                .take(MAX_NAMED_POIS)
+                .map(|(first, others)| format!("{place}{first}{}", further_pois(others))),
         );
-        if let more @ 1.. = reasons.iter().skip(MOST_POIS).map(|(_, others)| 1 + others.len()).sum::<usize>() {
+        if let more @ 1.. = reasons.iter().skip(MAX_NAMED_POIS).map(|(_, others)| 1 + others.len()).sum::<usize>() {
             lines.push(format!("{place}{more} more POIs cannot be observed"));
         }
         if let Some(steps) = reach::fewest_steps(config, &found) {
@@ -432,7 +435,7 @@ pub(crate) fn unreachable(config: &ValidConfig) -> Vec<String> {
 }
 
 /// Names more POIs to which a warning applies: "; the same holds for POIs 1, 2 and 3".
-fn same_holds_for(pois: &[usize]) -> String {
+fn further_pois(pois: &[usize]) -> String {
     match pois {
         [] => String::new(),
         [poi] => format!("; the same holds for POI {poi}"),
@@ -454,7 +457,7 @@ pub(crate) fn free_memory() -> usize {
 /// The folder holds no such sweep, or files cannot be written.
 pub fn collect(request: &Request, sweep: &Sweep, axes: &[usize], context: Context<'_>) -> Result<Outcome, Error> {
     let out = &*request.out;
-    if !there(&out.join(SWEEP))? {
+    if !exists(&out.join(SWEEP))? {
         return Err(Error::Usage(format!("{} holds no sweep", out.escaped()).into()));
     }
     same_sweep(sweep, out)?;

@@ -168,7 +168,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         let name = &task.name;
         context.message(format_args!("{name}: playing baselines and training on {on}"));
         let small = configs[0].as_ref().expect("small populations are always trained");
-        let quiet = Context { tell: &|_| (), ..context };
+        let quiet = Context { report: &|_| (), ..context };
         let played = baseline::play(small, SEEDS, EPISODES, &mut *backend.0, quiet)?;
         let g = |of: fn(&Played) -> f64| played.iter().map(of).collect();
         let baselines = [g(|played| played.constants[played.best_constant]), g(|p| p.action), g(|p| p.network)];
@@ -210,7 +210,7 @@ fn train(
     let learning = &config.learning;
     let title = format!("{task}, {} policies, {}", learning.population, learning.fitness);
     let names = vec![(title, Some(config.world.pois.len()))];
-    (context.tell)(Event::Begin(names, session.generations()[0], learning.generations));
+    (context.report)(Event::Begin(names, session.generations()[0], learning.generations));
     let mut watch = |now: &Progress<'_>| context.rows(now.generations[0], now.rows);
     let ended = context.train(&mut watch, |options| session.train(backend, options));
     context.pause();

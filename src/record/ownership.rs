@@ -88,13 +88,13 @@ struct RunMark {
 /// # Errors
 /// The folder has a file that a run would replace but holds no run, or it cannot be read.
 pub(crate) fn holds_run(folder: &Path, config: &Config) -> Result<bool, RecordError> {
-    let there = |name: &str| {
+    let existing = |name: &str| {
         let path = folder.join(name);
-        let there = file::exists(&path).map_err(RecordError::read(&path))?;
-        Ok::<_, RecordError>(there.then_some(path))
+        let exists = file::exists(&path).map_err(RecordError::read(&path))?;
+        Ok::<_, RecordError>(exists.then_some(path))
     };
     let refuse = |path: PathBuf| Err(RecordError::NotOurs { path });
-    let run = there(RUN)?;
+    let run = existing(RUN)?;
     if let Some(path) = &run {
         match read_text(path, MAX_RUN_BYTES) {
             Ok(text) if serde_json::from_str::<RunMark>(&text).is_ok() => return Ok(true),
@@ -108,26 +108,26 @@ pub(crate) fn holds_run(folder: &Path, config: &Config) -> Result<bool, RecordEr
     if paths().any(|path| tensors::open(&path).is_ok_and(|file| file.kind().is_some())) {
         return Ok(true);
     }
-    let no_folder = there(CHECKPOINTS)?.filter(|path| !path.is_dir());
+    let no_folder = existing(CHECKPOINTS)?.filter(|path| !path.is_dir());
     if let Some(path) = run.or_else(|| paths().next()).or(no_folder) {
         return refuse(path);
     }
-    if let Some(path) = there(CONFIG)? {
+    if let Some(path) = existing(CONFIG)? {
         // A run may start from a config with the same content.
         match Config::load(&path) {
-            Ok(there) if without_checkpoint(&there) == without_checkpoint(config) => {}
+            Ok(existing) if without_checkpoint(&existing) == without_checkpoint(config) => {}
             _ => return refuse(path),
         }
     }
     let mut left = false;
-    if let Some(path) = there(METRICS)? {
+    if let Some(path) = existing(METRICS)? {
         if !metrics::begins(&path).map_err(RecordError::read(&path))? {
             return refuse(path);
         }
         left = true;
     }
-    if let Some(path) = there(POLICIES)? {
-        if !policies::are_of(&path, config) {
+    if let Some(path) = existing(POLICIES)? {
+        if !policies::belongs_to(&path, config) {
             return refuse(path);
         }
         left = true;
@@ -245,11 +245,11 @@ fn digest(disk: &Disk, path: &Path) -> Result<Option<String>, RecordError> {
         return Ok(None);
     }
     // A link, a folder or a pipe is an error, because it could not be replaced either.
-    let mut there = disk.read(path).map_err(RecordError::write(path))?;
+    let mut file = disk.read(path).map_err(RecordError::write(path))?;
     let mut hash = Sha256::new();
     let mut chunk = vec![0; 1 << 16];
     loop {
-        match there.read(&mut chunk).map_err(RecordError::read(path))? {
+        match file.read(&mut chunk).map_err(RecordError::read(path))? {
             0 => return Ok(Some(hex(&hash.finalize()))),
             read => hash.update(&chunk[..read]),
         }

@@ -61,12 +61,12 @@ pub fn write(disk: &Disk, path: &Path, config: &Config, trials: &[impl AsRef<[f3
 }
 
 /// Returns whether a file can be read and belongs to a run of this config.
-pub(crate) fn are_of(path: &Path, config: &Config) -> bool {
-    mark(path).0 == Some(super::config_digest(config))
+pub(crate) fn belongs_to(path: &Path, config: &Config) -> bool {
+    digests_in(path).0 == Some(super::config_digest(config))
 }
 
 /// Returns the config digest and the checksum in a file. Each is `None` if it is missing or the file cannot be read.
-pub fn mark(path: &Path) -> (Option<String>, Option<String>) {
+pub fn digests_in(path: &Path) -> (Option<String>, Option<String>) {
     let Ok(file) = tensors::open(path) else { return (None, None) };
     (file.metadata(CONFIG).map(String::from), file.checksum().map(String::from))
 }

@@ -59,14 +59,14 @@ impl Cohort {
 
     /// Returns the arm's name and its directories, for messages.
     fn described(&self) -> String {
-        const MOST: usize = 3;
+        const MAX_NAMED_FOLDERS: usize = 3;
         let folders: Vec<String> = self.folders.iter().map(|folder| folder.escaped().to_string()).collect();
-        match folders.len().checked_sub(MOST) {
+        match folders.len().checked_sub(MAX_NAMED_FOLDERS) {
             _ if folders == [&*self.name] || self.name.ends_with(&format!("({})", folders.concat())) => {
                 self.name.clone()
             }
             None | Some(0) => format!("{} ({})", self.name, folders.join(", ")),
-            Some(more) => format!("{} ({} and {more} more)", self.name, folders[..MOST].join(", ")),
+            Some(more) => format!("{} ({} and {more} more)", self.name, folders[..MAX_NAMED_FOLDERS].join(", ")),
         }
     }
 

@@ -76,7 +76,7 @@ impl std::str::FromStr for TeamKind {
 
 /// A run's metrics by generation, as shares of the POIs averaged over trials.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(crate) struct Courses {
+pub(crate) struct RunMetrics {
     /// G of the best team.
     pub best: Vec<Average>,
     /// G of the mean team.
@@ -85,7 +85,7 @@ pub(crate) struct Courses {
     pub champion: Vec<Average>,
 }
 
-impl Courses {
+impl RunMetrics {
     /// Returns G of one kind of team.
     pub fn of(&self, kind: TeamKind) -> &[Average] {
         match kind {
@@ -99,8 +99,8 @@ impl Courses {
     ///
     /// # Errors
     /// See [`metrics()`].
-    pub fn read(folder: &Path, config: &Config, verification: Verification) -> Result<Courses, ReadError> {
-        let mut courses = Courses::default();
+    pub fn read(folder: &Path, config: &Config, verification: Verification) -> Result<RunMetrics, ReadError> {
+        let mut courses = RunMetrics::default();
         metrics(folder, config, verification, |row| courses.add(row))?;
         Ok(courses)
     }
@@ -151,7 +151,7 @@ pub fn figure(
     verification: Verification,
 ) -> Result<Figure, ReadError> {
     let configs = folders.iter().map(|folder| config(folder, verification)).collect::<Result<Vec<_>, _>>()?;
-    let all = folders.iter().zip(&configs).map(|(folder, config)| Courses::read(folder, config, verification));
+    let all = folders.iter().zip(&configs).map(|(folder, config)| RunMetrics::read(folder, config, verification));
     let all = all.collect::<Result<Vec<_>, _>>()?;
     let shown = Figure {
         band,
@@ -167,14 +167,14 @@ pub fn figure(
 
 /// Returns the learning curves of one run as [`figure`] does, from its rows and its digest.
 pub fn figure_of<'a>(config: &Config, rows: impl Iterator<Item = &'a Row>, digest: &str) -> Figure {
-    let mut courses = Courses::default();
+    let mut courses = RunMetrics::default();
     rows.for_each(|row| courses.add(row));
     let figure = of_courses(&[courses], std::slice::from_ref(config), Vec::new, None);
     Figure { source: Some(digest.into()), ..figure }
 }
 
 fn of_courses(
-    all: &[Courses],
+    all: &[RunMetrics],
     configs: &[Config],
     labels: impl FnOnce() -> Vec<String>,
     measure: Option<TeamKind>,

@@ -11,13 +11,13 @@ use std::time::Duration;
 use crc::{CRC_32_ISCSI, Crc};
 
 use crate::host::{self, Instant};
-use crate::record::beneath::FileKind;
 use crate::record::disk::Disk;
 use crate::record::metrics;
+use crate::record::rooted_folder::FileKind;
 use crate::trainer::Row;
 
 /// Number of buffered bytes of a trial above which they are flushed.
-const MOST: usize = 1 << 16;
+const MAX_BUFFERED_BYTES: usize = 1 << 16;
 /// Interval between flushes.
 const FLUSH: Duration = Duration::from_secs(2);
 /// The part of a file name by which TensorBoard recognises event files.
@@ -60,7 +60,7 @@ impl Events {
         let start = now() - rows()?.last().map_or(0.0, |(_, seconds)| seconds);
         for (row, seconds) in rows()? {
             events.add_at(&row, start + seconds);
-            if events.new.get(row.trial).is_some_and(|new| new.len() > MOST) {
+            if events.new.get(row.trial).is_some_and(|new| new.len() > MAX_BUFFERED_BYTES) {
                 events.flush()?;
             }
         }

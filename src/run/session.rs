@@ -223,10 +223,10 @@ impl Session {
     pub fn end(&mut self) -> Result<usize, RunError> {
         let mut last = 0;
         for member in &mut self.members {
-            if let Some(Unfinished { experiment, keeper, .. }) = &mut member.unfinished {
+            if let Some(Unfinished { experiment, checkpoints, .. }) = &mut member.unfinished {
                 let shorter = checkpoint::of_length(&member.config, self.trainer.end(*experiment));
                 if shorter != member.config {
-                    keeper.shorten(&shorter)?;
+                    checkpoints.shorten(&shorter)?;
                     member.folder.write_config(&shorter)?;
                     member.run.origin = Some(Origin::of(&shorter));
                     member.config = shorter;
@@ -308,7 +308,7 @@ impl Session {
         let seconds = self.seconds();
         for run in self.unfinished().collect::<Vec<_>>() {
             let member = &mut self.members[run];
-            let first = member.unfinished.as_ref().is_some_and(|unfinished| unfinished.keeper.newest().is_none());
+            let first = member.unfinished.as_ref().is_some_and(|unfinished| unfinished.checkpoints.newest().is_none());
             if member.run.init.is_some() && first && self.generations[run] == 0 {
                 member.save(&mut self.trainer, 0, seconds)?;
             }

@@ -35,8 +35,8 @@ impl Twin {
         let Twin { of, of_config, folder, config } = self;
         let run = Run::read(&of.join(folder::RUN))?;
         let (folder, found) = Folder::open(&folder, start, &config, StartFrom::Random, disk.clone())?;
-        let there = found.run.filter(|_| found.finished.is_some());
-        if there.is_some_and(|there| there.digest == run.digest) {
+        let existing = found.run.filter(|_| found.finished.is_some());
+        if existing.is_some_and(|existing| existing.digest == run.digest) {
             return Ok(());
         }
         let (from, path) = (of.join(METRICS), folder.file(METRICS));

@@ -93,7 +93,7 @@ pub fn batches<'a>(points: &'a [&'a Point], memory: usize) -> Vec<&'a [&'a Point
 pub fn run(
     points: &[&Point],
     out: &Path,
-    player: &mut OpenBackend,
+    backend: &mut OpenBackend,
     options: &mut SweepOptions<'_>,
 ) -> Result<SessionEnd, RunError> {
     let total = points.iter().map(|point| team_steps(&point.config)).sum();
@@ -129,7 +129,7 @@ pub fn run(
         let mut watch = |now: &run::Progress<'_>| tell(now.generations);
         let run::Options { command, stop, save, ref mut fallback, ref mut on_recovery, .. } = options.runs;
         let mut runs = run::Options { command, stop, save, fallback, on_recovery, watch: &mut watch };
-        if !session.is_done() && session.train(player, &mut runs)? == SessionEnd::Stopped {
+        if !session.is_done() && session.train(backend, &mut runs)? == SessionEnd::Stopped {
             return Ok(SessionEnd::Stopped);
         }
     }

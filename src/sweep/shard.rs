@@ -78,15 +78,15 @@ impl Shard {
         shard.map(Some).map_err(|error| format!("{names}: {error}; say --shard I/N where the array has gaps"))
     }
 
-    /// Returns the points of this shard in order, see [`deal`].
+    /// Returns the points of this shard in order, see [`assign_to_shards`].
     pub fn take<'a>(&self, points: &'a [Point]) -> Vec<&'a Point> {
-        let of = deal(points, self.count);
+        let of = assign_to_shards(points, self.count);
         points.iter().zip(of).filter(|(_, of)| *of == self.index).map(|(point, _)| point).collect()
     }
 }
 
 /// Assigns each point to one of `count` shards, from 1: in order of decreasing cost, each to the least loaded shard.
-pub(crate) fn deal(points: &[Point], count: usize) -> Vec<usize> {
+pub(crate) fn assign_to_shards(points: &[Point], count: usize) -> Vec<usize> {
     let mut order: Vec<(u128, usize)> = points.iter().map(cost).zip(0..).collect();
     order.sort_by_key(|&(cost, at)| (Reverse(cost), points[at].index));
     let mut loads: BinaryHeap<_> = (1..=count).map(|shard| Reverse((0, shard))).collect();

@@ -90,6 +90,11 @@ impl Residency {
         }
     }
 
+    /// Records that the last generation is over. The host's weights are current, and the device's copy is dropped.
+    pub fn moved_to_host(&mut self) {
+        *self = Residency::Host { generation: self.generation() + 1, declined: true };
+    }
+
     /// Records that the populations, wherever they are, became the next generation.
     pub fn bred(&mut self) {
         match self {

@@ -110,8 +110,7 @@ impl Experiment {
         };
         let rows = self.trials.iter_mut().filter_map(row).collect();
         // The weights were fetched before.
-        self.residency.lose();
-        self.residency.bred();
+        self.residency.moved_to_host();
         rows
     }
 }

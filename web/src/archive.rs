@@ -20,7 +20,7 @@ use zip::{ZipArchive, ZipWriter, write::SimpleFileOptions};
 use crate::answer::{Answer, Refusal, described, floats, refuse};
 
 /// Maximum bytes read from one file of an archive.
-const MOST: u64 = 1 << 30;
+const MAX_FILE_BYTES: u64 = 1 << 30;
 
 /// Describes a finished run to export.
 ///
@@ -130,7 +130,7 @@ pub fn read(text: Option<&str>, bytes: &[u8]) -> Result<Answer, Refusal> {
         let found = found.ok_or_else(|| refuse(format!("the archive has no {name}: it is no run's")))?;
         let mut content = Vec::new();
         let file = zip.by_name(found).map_err(refuse)?;
-        file.take(MOST).read_to_end(&mut content).map_err(refuse)?;
+        file.take(MAX_FILE_BYTES).read_to_end(&mut content).map_err(refuse)?;
         Ok(content)
     };
     let text = String::from_utf8(file(folder::CONFIG)?).map_err(|_| refuse("config.toml is not UTF-8 text"))?;

@@ -16,10 +16,10 @@ use serde_json::{Value, json};
 
 use crate::answer::{Answer, Refusal, described, floats, refuse};
 use crate::archive::{self, Recorded};
-use crate::arms;
 use crate::baseline::{self, Random};
 use crate::drive::Drive;
 use crate::edit;
+use crate::experiments;
 use crate::train::{Chosen, Training};
 
 /// A request of the page.
@@ -32,9 +32,12 @@ enum Ask {
     Edit { text: String, changes: Vec<(String, String)> },
     /// Returns G of the best constant action.
     Constant { text: String },
-    /// Returns learning curves with their intervals, and the comparison of arms. The numbers are G, see
-    /// [`arms::compare`].
-    Compare { arms: Vec<arms::Arm> },
+    /// Returns learning curves with their intervals, and the comparison of experiments. The numbers are G, see
+    /// [`experiments::compare`].
+    Compare {
+        #[serde(rename = "arms")]
+        experiments: Vec<experiments::Experiment>,
+    },
     /// Names runs by what differs between their configs, or by their files.
     Labels { texts: Vec<String>, names: Vec<String> },
     /// Starts the baseline of random networks.
@@ -102,7 +105,7 @@ pub fn answer(session: &mut Session, text: &str, bytes: &[u8]) -> Result<Answer,
         Ask::Resolve { text, name, changes } => words(resolve(&text, &name, changes)?),
         Ask::Edit { text, changes } => words(json!({ "text": edit::set(&text, &changes).map_err(refuse)? })),
         Ask::Constant { text } => words(baseline::constant(parse(&text)?)?),
-        Ask::Compare { arms } => words(arms::compare(arms, bytes)?),
+        Ask::Compare { experiments } => words(experiments::compare(experiments, bytes)?),
         Ask::Labels { texts, names } => {
             let configs = texts.iter().map(|text| parse(text)).collect::<Result<Vec<_>, _>>()?;
             let names: Vec<PathBuf> = names.into_iter().map(PathBuf::from).collect();

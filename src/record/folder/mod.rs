@@ -181,13 +181,13 @@ impl Folder {
         }
         let lock = lock(&disk, path)?;
         // Another process may have written here before the lock was taken, so the check is repeated.
-        let there = holds_run()?;
+        let holds_run = holds_run()?;
         let folder = Folder { path: path.into(), disk, lock };
         let mut found = Resumed { checkpoint: None, kept: vec![], run: None, finished: None, notes: vec![] };
         found.notes.extend(folder.lock.is_none().then_some(Note::NotLocked));
         let interrupted = Run::read(&folder.file(RUN)).ok().filter(|run| run.state == Status::Replacing);
         match (start, interrupted) {
-            (Start::Force, _) if there => {
+            (Start::Force, _) if holds_run => {
                 folder.clear(&Run { init: from.digest(), ..Run::new(config) }, config, &mut found)?;
             }
             (Start::Resume, Some(run)) => {
@@ -219,10 +219,10 @@ impl Folder {
     /// Records in `run.json` what a run starts from. A finished run that is extended is marked as running, so that its
     /// files are no longer compared with outdated digests.
     fn record_origin(&self, config: &Config, from: StartFrom<'_>, found: &mut Resumed) -> Result<(), RecordError> {
-        let there = found.checkpoint.as_ref().and_then(|(checkpoint, _)| checkpoint.init.clone());
+        let init = found.checkpoint.as_ref().and_then(|(checkpoint, _)| checkpoint.init.clone());
         let before = found.run.clone();
         let mut run = before.clone().unwrap_or_else(|| Run::new(config));
-        run.init = from.digest().or(there).or(run.init);
+        run.init = from.digest().or(init).or(run.init);
         if run.state == Status::Done {
             run = Run { state: Status::Running, digest: None, files: None, ..run };
         }
@@ -257,7 +257,7 @@ impl Folder {
                 return Ok(Some(path));
             }
             // An interrupted session already made this copy.
-            if read_text(&path, MAX_KEPT_BYTES).is_ok_and(|there| there == text) {
+            if read_text(&path, MAX_KEPT_BYTES).is_ok_and(|existing| existing == text) {
                 return Ok(Some(path));
             }
         }
@@ -269,7 +269,7 @@ impl Folder {
     fn clear(&self, by: &Run, config: &Config, found: &mut Resumed) -> Result<(), RecordError> {
         self.write_run(&Run { state: Status::Replacing, ..by.clone() })?;
         let checkpoints = self.file(CHECKPOINTS);
-        let generations = checkpoint::tidy(&self.disk, &checkpoints)?;
+        let generations = checkpoint::remove_temporary_files(&self.disk, &checkpoints)?;
         let old = generations.into_iter().map(|generation| checkpoint::path(&checkpoints, generation));
         for path in old.chain([METRICS, POLICIES].map(|name| self.file(name))) {
             self.disk.remove(&path).map_err(RecordError::write(&path))?;

@@ -151,7 +151,7 @@ impl Experiment {
 }
 
 /// Returns the configs to play baselines of, one per layout and paradigm. The fitness does not matter for them.
-pub fn grounds(arms: &[Experiment]) -> Vec<Config> {
+pub fn baseline_configs(arms: &[Experiment]) -> Vec<Config> {
     let firsts = arms.iter().filter(|arm| arm.fitness == FITNESSES[0] && !arm.selects);
     firsts.map(|arm| arm.config.clone()).collect()
 }
@@ -161,7 +161,7 @@ pub fn grounds(arms: &[Experiment]) -> Vec<Config> {
 pub struct Evidence<'a> {
     /// The experiments of [`arms()`], with their results.
     pub arms: &'a [Experiment],
-    /// The baselines of [`grounds`].
+    /// The baselines of [`baseline_configs`].
     pub baselines: &'a [Baseline],
 }
 
@@ -201,7 +201,7 @@ impl std::fmt::Display for Source {
 
 /// The results of one source for one layout and paradigm.
 #[derive(Clone, Copy, Debug)]
-pub struct Course<'a> {
+pub struct TrialCurves<'a> {
     /// G of the champion, `[trials][generations + 1]`. For baselines, the same as `best`.
     pub champion: &'a [Vec<f64>],
     /// G of the best team, `[trials][generations + 1]`.
@@ -214,7 +214,7 @@ pub struct Course<'a> {
 
 impl Evidence<'_> {
     /// Returns the results of a source on one of [`LAYOUTS`]. None if there are no such arms.
-    pub fn course(&self, layout: usize, paradigm: Paradigm, source: Source) -> Option<Course<'_>> {
+    pub fn course(&self, layout: usize, paradigm: Paradigm, source: Source) -> Option<TrialCurves<'_>> {
         let name = LAYOUTS.get(layout)?.name;
         let is_here = |arm: &&Experiment| (arm.layout.name, arm.paradigm, arm.selects) == (name, paradigm, false);
         let mut here = self.arms.iter().filter(is_here);
@@ -231,18 +231,18 @@ impl Evidence<'_> {
         };
         // The paper's starts are fixed. If starts or POIs move, results depend on the trial.
         let certain = source == Source::Constant && best.windows(2).all(|pair| pair[0] == pair[1]);
-        Some(Course { champion, best, pois, certain })
+        Some(TrialCurves { champion, best, pois, certain })
     }
 
     /// Returns the results of all-leaders teams on one of [`LAYOUTS`] that choose among known behaviours.
-    pub(crate) fn selecting(&self, layout: usize, fitness: Fitness) -> Option<Course<'_>> {
+    pub(crate) fn selecting(&self, layout: usize, fitness: Fitness) -> Option<TrialCurves<'_>> {
         let name = LAYOUTS.get(layout)?.name;
         let arm = self.arms.iter().find(|arm| (arm.layout.name, arm.selects, arm.fitness) == (name, true, fitness))?;
-        Some(Course { champion: &arm.champion, best: &arm.best, pois: arm.pois(), certain: false })
+        Some(TrialCurves { champion: &arm.champion, best: &arm.best, pois: arm.pois(), certain: false })
     }
 }
 
-impl Course<'_> {
+impl TrialCurves<'_> {
     /// Returns the POIs that the champion observed, per trial. None if the run is shorter.
     pub fn observed(&self, generation: usize) -> Option<Vec<f64>> {
         self.champion.iter().map(|trial| Some(trial.get(generation)? * self.pois as f64)).collect()
@@ -373,7 +373,7 @@ impl Trajectory {
     /// Returns every curve by layout, paradigm and source. The curves of teams that choose among behaviours follow.
     pub fn all(results: Evidence<'_>) -> Vec<Trajectory> {
         let mut all = Vec::new();
-        let mut add = |layout: usize, paradigm, source: Source, selects, course: Option<Course<'_>>| {
+        let mut add = |layout: usize, paradigm, source: Source, selects, course: Option<TrialCurves<'_>>| {
             let Some(course) = course else { return };
             let fitness = if let Source::Evolved(fitness) = source { Some(fitness) } else { None };
             all.push(Trajectory {
@@ -385,7 +385,11 @@ impl Trajectory {
                 pois: course.pois,
                 curve: course.curve(),
                 deviation: course.tallies().iter().map(Average::deviation).collect(),
-                best_mean: Course { champion: course.best, ..course }.tallies().iter().map(Average::mean).collect(),
+                best_mean: TrialCurves { champion: course.best, ..course }
+                    .tallies()
+                    .iter()
+                    .map(Average::mean)
+                    .collect(),
             });
         };
         for layout in 0..LAYOUTS.len() {

@@ -2,7 +2,7 @@
 //!
 //! Each claim has one measure and, for each source of policies, a verdict. It is *yes* if the interval lies within what
 //! the words allow, *no* if it lies outside, and *not decided* if it contains the threshold. If the paper gives no
-//! number, [`SMALL`] and [`FEW`] replace its words.
+//! number, [`SMALL`] and [`ALMOST_NEVER`] replace its words.
 //!
 //! All measures are of champions, unless a claim is about random teams. The paper's curves are averages over trials, so
 //! claims about curves are judged by averages. The verdicts on evolved teams are corrected for each other using Holm's
@@ -12,7 +12,7 @@
 
 use serde::Serialize;
 
-use super::{Course, Evidence, LAYOUTS, SOURCES, Source};
+use super::{Evidence, LAYOUTS, SOURCES, Source, TrialCurves};
 use crate::config::Paradigm;
 use crate::statistics::{self, Estimate};
 
@@ -21,7 +21,7 @@ mod list;
 /// Maximum difference, as a share of the POIs, that counts as "about similar", "comparable" or "slight".
 pub(crate) const SMALL: f64 = 0.1;
 /// Maximum share of trials that counts as "almost never". A larger share is "some of the time".
-pub(crate) const FEW: f64 = 0.1;
+pub(crate) const ALMOST_NEVER: f64 = 0.1;
 /// The generation at which the paper judges results: "After 100 generations".
 pub const END: usize = 100;
 
@@ -190,17 +190,17 @@ struct Lookup<'a> {
 }
 
 impl<'a> Lookup<'a> {
-    fn course(&'a self, paradigm: Paradigm) -> Option<Course<'a>> {
+    fn course(&'a self, paradigm: Paradigm) -> Option<TrialCurves<'a>> {
         self.results.course(self.layout, paradigm, self.source)
     }
 
     /// Returns the results of all-leaders teams.
-    fn all(&'a self) -> Option<Course<'a>> {
+    fn all(&'a self) -> Option<TrialCurves<'a>> {
         self.course(Paradigm::AllLeaders)
     }
 
     /// Returns the results of leader-follower teams.
-    fn led(&'a self) -> Option<Course<'a>> {
+    fn led(&'a self) -> Option<TrialCurves<'a>> {
         self.course(Paradigm::LeaderFollower)
     }
 
@@ -218,7 +218,7 @@ impl<'a> Lookup<'a> {
     }
 
     /// Returns the results of all-leaders teams that choose among known behaviours.
-    fn selecting(&'a self) -> Option<Course<'a>> {
+    fn selecting(&'a self) -> Option<TrialCurves<'a>> {
         let Source::Evolved(fitness) = self.source else { return None };
         self.results.selecting(self.layout, fitness)
     }
@@ -234,7 +234,7 @@ fn less(values: &[f64], others: &[f64]) -> Vec<f64> {
     values.iter().zip(others).map(|(value, other)| value - other).collect()
 }
 
-impl Course<'_> {
+impl TrialCurves<'_> {
     /// Returns the first generation at which each trial's champion observes every POI. None within a trial means never
     /// up to `last`.
     fn solved(&self, last: usize) -> Option<Vec<Option<usize>>> {
