@@ -10,6 +10,7 @@ use crate::escape::PathExt;
 use crate::ops::train::{self, Extremes, Outcome, Request};
 use crate::record::folder::{CONFIG, METRICS, POLICIES, RUN};
 use crate::record::ownership::CURVES;
+use crate::report::map::counted;
 use crate::trainer::Row;
 
 #[derive(clap::Args)]
@@ -55,11 +56,6 @@ type Score = fn(&Row) -> f64;
 /// All scores, with their names.
 const SCORES: [(&str, Score); 3] =
     [("best team", |row| row.best_g), ("mean team", |row| row.mean_g), ("champion", |row| row.champion_g)];
-
-/// Returns a count with its noun: "1 trial", "2 trials".
-fn counted(count: usize, what: &str) -> String {
-    format!("{count} {what}{}", if count == 1 { "" } else { "s" })
-}
 
 /// Returns a time in seconds, or in milliseconds if it is short.
 fn time(seconds: f64) -> String {

@@ -343,7 +343,7 @@ impl Viewport {
 }
 
 /// Formats a count as "1 leader" or "2 leaders".
-pub fn count(number: usize, what: &str) -> String {
+pub(crate) fn counted(number: usize, what: &str) -> String {
     format!("{number} {what}{}", if number == 1 { "" } else { "s" })
 }
 

@@ -68,8 +68,8 @@ impl Replayed {
             times.len(),
             if list.is_empty() { "" } else { ": " },
             list.join(", "),
-            map::count(world.leaders(), "leader"),
-            map::count(world.followers(), "follower"),
+            map::counted(world.leaders(), "leader"),
+            map::counted(world.followers(), "follower"),
         )
     }
 }

@@ -110,7 +110,7 @@ pub enum ReplayError {
 
 /// Formats a count and its indices as "3 trials, 0 to 2" or "1 trial, 0".
 pub(crate) fn numbered(count: usize, what: &str) -> String {
-    format!("{}, {}", map::count(count, what), places(count))
+    format!("{}, {}", map::counted(count, what), places(count))
 }
 
 /// Formats the indices of a count as "0 to 2" or "0".
