@@ -20,7 +20,7 @@ pub(crate) const SCORES: &[Fitness] = &[Fitness::D, Fitness::Df, Fitness::Dpp];
 /// [`SCORES`] and Dt, which needs a record of who was seen at every step.
 pub const SCORES_AND_DT: &[Fitness] = &[Fitness::D, Fitness::Df, Fitness::Dpp, Fitness::Dt];
 
-/// Returns what an evaluation computes beside a fitness: Dt only if that is asked for.
+/// Returns the fitnesses that an evaluation computes: Dt only if it is the given fitness.
 pub fn scores_beside(fitness: Fitness) -> &'static [Fitness] {
     if fitness == Fitness::Dt { SCORES_AND_DT } else { SCORES }
 }

@@ -71,7 +71,7 @@ impl Peaks {
             checkpoint += checkpoint_bytes(config);
             queue += most(&|config, _| teams(config).div_ceil(lanes) * 16);
             block = block.max(most(&|config, world| cpu::block_bytes(world, config.learning.fitness)));
-            // With an evolution strategy, utilities come beside the order.
+            // An evolution strategy also needs the utilities.
             let strategy = config.learning.method != Method::Tournament;
             let ranked = size_of::<usize>() + if strategy { size_of::<f64>() } else { 0 };
             order = order.max((policies * ranked) as u64);
@@ -130,7 +130,7 @@ pub fn check(needed: u64, checkpoint: u64) -> Result<(), TooLittle> {
     }
 }
 
-/// Returns whether a checkpoint of these configs is copied and written while training continues. Larger checkpoints are
+/// Reports whether a checkpoint of these configs is copied and written while training continues. Larger checkpoints are
 /// written directly from the populations, and training waits.
 pub fn copies_checkpoint<'a>(configs: impl IntoIterator<Item = &'a Config>) -> bool {
     configs.into_iter().map(trainer::snapshot_bytes).sum::<u64>() <= COPIED

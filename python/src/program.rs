@@ -42,7 +42,7 @@ pub fn answer(py: Python<'_>, request: &str, backend: &str, command: &str) -> Py
         .map(|outcome| outcome.to_string())
 }
 
-/// Receives the rows of a generation, the number of the last one, and champions if they were asked for. Returns whether
+/// Receives the rows of a generation, the number of the last one, and champions if they were asked for. Reports whether
 /// to end the training there.
 type Watch<'a> = &'a (dyn Fn(&[Row], usize, Option<&[f32]>) -> PyResult<bool> + Sync);
 

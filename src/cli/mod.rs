@@ -189,7 +189,7 @@ fn run() -> Result<Result<(), clap::Error>, Error> {
     Ok(Ok(()))
 }
 
-/// Returns whether a command line asks for JSON. It may be one that clap rejects.
+/// Reports whether a command line asks for JSON. It may be one that clap rejects.
 fn wants_json(words: &[OsString]) -> bool {
     words.iter().take_while(|word| *word != "--").any(|word| word == "--json")
 }
@@ -419,7 +419,7 @@ impl ConfigArgs {
     }
 }
 
-/// The flags that say what a command prints.
+/// The flags that control what a command prints.
 #[derive(clap::Args, Clone, Copy)]
 pub struct Printed {
     /// Print no progress, and no summary of a training or an episode; --json still prints its object
@@ -470,7 +470,7 @@ impl There {
     }
 }
 
-/// Flags that stand for config keys; their ranges are checked with the config.
+/// Flags that set config keys. Their ranges are checked with the config.
 #[derive(clap::Args, Default)]
 pub struct Overrides {
     /// Random seed

@@ -30,13 +30,13 @@ pub enum OnLoss {
 }
 
 impl Loss {
-    /// Returns whether the CPU continues after another backend failed.
+    /// Reports whether the CPU continues after another backend failed.
     pub fn falls_back(self) -> bool {
         self.on_device_loss == OnLoss::Cpu
     }
 }
 
-/// How often runs are saved, instead of what their config says.
+/// How often runs are saved. Overrides the config.
 #[derive(clap::Args)]
 pub struct Checkpoints {
     /// Write a checkpoint every N generations; 0 means never

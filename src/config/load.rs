@@ -20,7 +20,7 @@ impl Config {
     }
 }
 
-/// Returns whether a path is `-`, which means standard input.
+/// Reports whether a path is `-`, which means standard input.
 pub(crate) fn is_standard_input(path: &Path) -> bool {
     path.as_os_str() == "-"
 }

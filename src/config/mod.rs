@@ -69,9 +69,9 @@ pub struct Config {
     pub world: WorldConfig,
     /// `[motion]`: how agents move.
     pub motion: Motion,
-    /// `[follow]`: what followers do.
+    /// `[follow]`: the behaviour of followers.
     pub follow: Follow,
-    /// `[sense]`: what leaders sense.
+    /// `[sense]`: the inputs of leaders.
     pub sense: Sense,
     /// `[policy]`: the leaders' network.
     pub policy: Policy,
@@ -311,7 +311,7 @@ pub enum ConfigError {
 }
 
 impl ConfigError {
-    /// Returns whether all problems come from flags and none from the file.
+    /// Reports whether all problems come from flags and none from the file.
     pub fn is_usage(&self) -> bool {
         match self {
             ConfigError::Unreadable { .. } => false,

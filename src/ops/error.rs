@@ -1,4 +1,4 @@
-//! The error of every use case: a stable code, a message, and what to do about it.
+//! The error of every use case: a stable code, a message and a remedy.
 
 use std::fmt::{self, Display};
 use std::io;
@@ -25,7 +25,7 @@ pub struct MessageWithRemedy {
     pub remedy: Option<String>,
 }
 
-/// Returns a message with what to do about it.
+/// Returns a message with its remedy.
 pub fn with_remedy(message: impl Into<String>, remedy: impl Into<String>) -> MessageWithRemedy {
     MessageWithRemedy { message: message.into(), remedy: Some(remedy.into()) }
 }
@@ -170,7 +170,7 @@ impl Error {
         }
     }
 
-    /// Returns what to do about the error, if there is something.
+    /// Returns the remedy, if there is one.
     pub fn remedy(&self) -> Option<String> {
         let (whole, message) = (self.to_string(), self.message());
         // The library's errors are followed by advice in the same sentence.
@@ -179,8 +179,8 @@ impl Error {
         (!advice.is_empty()).then(|| advice.to_string())
     }
 
-    /// Adds what to do about a result that does not exist yet, a refused request or a stop, if nothing is said about
-    /// that yet. The caller knows how it was called.
+    /// Adds a remedy to wrong usage, a missing result, a refused request or a stop, unless it has one. The caller knows
+    /// which command was called.
     pub fn or_advise(mut self, remedy: impl FnOnce() -> String) -> Error {
         if let Error::Usage(text) | Error::Refused(text) | Error::Missing(text) | Error::Stopped(text) = &mut self {
             text.remedy.get_or_insert_with(remedy);
@@ -202,7 +202,7 @@ impl Error {
         }
     }
 
-    /// Returns whether the request was wrong, as opposed to a failure of a valid request.
+    /// Reports whether the request was wrong, as opposed to a failure of a valid request.
     pub fn is_usage(&self) -> bool {
         match self {
             Error::Usage(_)

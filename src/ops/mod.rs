@@ -188,7 +188,7 @@ impl Context<'_> {
         if self.is_stopped() { Err(stopped()) } else { Ok(()) }
     }
 
-    /// Returns whether a stopped training ends with the generation that plays next. If so, it continues until then.
+    /// Reports whether a stopped training ends with the generation that plays next. If so, it continues until then.
     fn ends(&self) -> bool {
         let ends = self.end.swap(false, Relaxed);
         self.stop.fetch_and(!ends, Relaxed);

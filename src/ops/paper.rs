@@ -48,7 +48,7 @@ pub struct Request {
 }
 
 impl Request {
-    /// Returns whether the user chose the folder.
+    /// Reports whether the user chose the folder.
     pub(super) fn is_out_named(&self) -> bool {
         self.out != Path::new(OUT)
     }

@@ -20,9 +20,10 @@ use crate::report::runs;
 use crate::run::RunError;
 use crate::shell;
 
-/// `EMFILE`. It has this number on every Unix, and no name in Rust.
+/// `EMFILE`: the process has too many open files. The number is the same on every Unix, and the standard library has no
+/// name for it.
 const TOO_MANY_FILES: i32 = 24;
-/// `EIO`, likewise.
+/// `EIO`: a device failed to read or write. The number is the same on every Unix.
 const INPUT_OUTPUT: i32 = 5;
 
 /// Advice on a comparison without a GPU.

@@ -163,7 +163,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         weights: policies.weights[..].into(),
         policies: policies.policies,
         teams: &teams,
-        // The config may be another layout's, so the file says whether its leaders share a policy.
+        // The config may be that of another layout, so the file decides whether its leaders share a policy.
         sharing: policies.sharing,
         fitnesses: if request.scores.is_some() { evaluate::SCORES_AND_DT } else { evaluate::SCORES },
     };

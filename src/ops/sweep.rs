@@ -224,7 +224,7 @@ pub fn picture_axes(sweep: &Sweep, names: &[String]) -> Result<Vec<usize>, Error
     }
 }
 
-/// Returns whether a file exists, or an error if the system does not allow checking that.
+/// Reports whether a file exists, or an error if the system does not allow checking that.
 fn exists(path: &Path) -> Result<bool, RecordError> {
     file::exists(path).map_err(|error| RecordError::Read { path: path.into(), error })
 }

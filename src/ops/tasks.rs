@@ -1,7 +1,7 @@
 //! Trains the tasks of a suite, and checks that no baseline and no small population solves them.
 //!
 //! A task is admitted if no baseline reaches [`EASY`], if populations of [`SMALL`] policies solve it under no fitness,
-//! and if something solves it: a champion here, or a scripted team in a file beside the config.
+//! and if something solves it: a champion here, or a scripted team in a file next to the config.
 
 use std::path::{Path, PathBuf};
 

@@ -178,8 +178,8 @@ impl Request {
     }
 }
 
-/// Refuses a run in a zip file, because its folder would be removed at the end. The message says how to unpack and
-/// resume it.
+/// Refuses a run in a zip file, because its folder would be removed at the end. The message shows the commands
+/// that unpack and resume it.
 pub(crate) fn refuse_zip(path: &Path) -> Result<(), Error> {
     let Some(top) = archive::run_prefix(path) else { return Ok(()) };
     let inner = if top.is_empty() { file::stem(path, "run") } else { top.clone() };

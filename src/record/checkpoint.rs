@@ -64,7 +64,7 @@ pub struct Checkpoint<N = Vec<f32>> {
 }
 
 impl<N> Checkpoint<N> {
-    /// Returns whether the checkpoint belongs to a run of this config, or to the same run with fewer generations.
+    /// Reports whether the checkpoint belongs to a run of this config, or to the same run with fewer generations.
     pub fn is_of(&self, config: &Config) -> bool {
         let last = self.snapshot.last;
         last <= config.learning.generations && self.config == config_digest(&of_length(config, last))
@@ -309,7 +309,7 @@ impl CheckpointWriter {
         CheckpointWriter { disk, folder, config: Arc::new(config), kept, writing: None, last }
     }
 
-    /// Returns whether a checkpoint is due before a generation is played.
+    /// Reports whether a checkpoint is due before a generation is played.
     pub fn is_due(&self, schedule: &Schedule, generation: usize) -> bool {
         let (last, moment, cost) = self.last;
         if generation == last {

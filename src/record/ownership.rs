@@ -69,7 +69,7 @@ pub fn open_output_folder(disk: &Disk, folder: &Path, named: bool) -> Result<Dis
     }
 }
 
-/// Returns whether a user may write in the folder of an owner.
+/// Reports whether a user may write in the folder of an owner.
 pub fn may_write(owner: u32, user: u32, named: bool) -> bool {
     named || owner == user
 }
@@ -83,7 +83,7 @@ struct RunMark {
     seed: u64,
 }
 
-/// Returns whether a folder holds a run, shown by a `run.json`, a checkpoint or leftover files of a run of this config.
+/// Reports whether a folder holds a run, shown by a `run.json`, a checkpoint or leftover files of a run of this config.
 ///
 /// # Errors
 /// The folder has a file that a run would replace but holds no run, or it cannot be read.
@@ -205,7 +205,7 @@ pub(crate) fn remove_published(disk: &Disk, path: &Path) -> Result<(), RecordErr
     }
 }
 
-/// Returns whether the content of a file is an SVG or PNG that flotilla drew.
+/// Reports whether the content of a file is an SVG or PNG that flotilla drew.
 pub(crate) fn is_drawing(path: &Path) -> bool {
     let mut start = Vec::new();
     let read = file::open(path).and_then(|file| file.take(1 << 12).read_to_end(&mut start));

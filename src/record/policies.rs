@@ -60,7 +60,7 @@ pub fn write(disk: &Disk, path: &Path, config: &Config, trials: &[impl AsRef<[f3
     Ok(checksum)
 }
 
-/// Returns whether a file can be read and belongs to a run of this config.
+/// Reports whether a file can be read and belongs to a run of this config.
 pub(crate) fn belongs_to(path: &Path, config: &Config) -> bool {
     digests_in(path).0 == Some(super::config_digest(config))
 }

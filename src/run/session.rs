@@ -110,7 +110,7 @@ impl Session {
         Ok((Session { members, generations, trainer, runs_of_experiments, since: Instant::now() }, notes))
     }
 
-    /// Returns whether all runs are finished.
+    /// Reports whether all runs are finished.
     pub fn is_done(&self) -> bool {
         self.members.iter().all(|member| member.unfinished.is_none())
     }
@@ -279,7 +279,7 @@ impl Session {
         on_threads(ends, |(member, (policies, end))| member.finish(&policies, end, seconds)).map(drop)
     }
 
-    /// Returns whether any run is due for a checkpoint. All runs then write one.
+    /// Reports whether any run is due for a checkpoint. All runs then write one.
     fn is_due(&self) -> bool {
         self.members.iter().zip(&self.generations).any(|(member, &next)| member.is_due(next))
     }

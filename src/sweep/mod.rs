@@ -2,7 +2,7 @@
 //!
 //! A sweep file is a config with a section `[grid]`. Its keys are dotted config keys with lists of values, or the
 //! special axes of [`layout`]. Every combination of values is a [`Point`]: one config, trained as a run in
-//! `points/NNNN`. Its results do not depend on the points that train beside it.
+//! `points/NNNN`. Its results do not depend on the points that train at the same time.
 //!
 //! The keys of a section `[vary]` change one at a time. Every combination of `[grid]` has a point with the file's
 //! values, and one for each value of each key of `[vary]`.

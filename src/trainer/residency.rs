@@ -83,7 +83,7 @@ impl Residency {
         }
     }
 
-    /// Drops the device's copy. The host's, which may be older, is then all there is.
+    /// Drops the device's copy. Only the host's copy is left, which may be older.
     pub fn lose(&mut self) {
         if let Residency::Device { host_generation, .. } = *self {
             *self = Residency::Host { generation: host_generation, declined: true };

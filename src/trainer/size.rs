@@ -39,7 +39,7 @@ fn bytes_of_stage(config: &Config) -> u64 {
         + schedule_bytes(config)
 }
 
-/// Start positions of the previous stage's champions, kept beside those of the stage that begins.
+/// Start positions of the previous stage's champions, kept while the next stage begins.
 fn previous_stage_bytes(config: &ValidConfig) -> u64 {
     if config.stages.is_empty() { 0 } else { max_over_stages(config, start_bytes) }
 }

@@ -42,11 +42,11 @@ const MAX_KEPT_BYTES: u64 = 1 << 20;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Start {
-    /// Fail.
+    /// Fails if the folder holds a run.
     Fresh,
-    /// Replace the run.
+    /// Replaces the run.
     Force,
-    /// Resume the run, or start one if there is none.
+    /// Resumes the run, or starts one if there is none.
     Resume,
 }
 
@@ -119,7 +119,7 @@ pub enum Note {
 }
 
 impl Note {
-    /// Returns whether the user must be warned. The other notes are normal for a resumed run.
+    /// Reports whether the user must be warned. The other notes are normal for a resumed run.
     pub fn is_damage(&self) -> bool {
         matches!(self, Note::SetAside(_) | Note::Rewritten(_) | Note::StartingOver | Note::NotLocked)
     }
@@ -359,7 +359,7 @@ pub(crate) fn lock(disk: &Disk, path: &Path) -> Result<Option<File>, RecordError
     }
 }
 
-/// Returns whether the file system does not support locks. NFS without its lock service returns `ENOLCK`.
+/// Reports whether the file system does not support locks. NFS without its lock service returns `ENOLCK`.
 fn has_no_locks(error: &io::Error) -> bool {
     const ENOLCK: i32 = if cfg!(target_os = "linux") { 37 } else { 77 };
     error.kind() == ErrorKind::Unsupported || cfg!(unix) && error.raw_os_error() == Some(ENOLCK)

@@ -8,7 +8,7 @@ use super::{ARMS, CHECKPOINTS, CONFIG, LOCK, METRICS, PAPER, POINTS, POLICIES, R
 use crate::file;
 use crate::record::RecordError;
 
-/// Returns whether a folder contains any file of a run.
+/// Reports whether a folder contains any file of a run.
 pub(crate) fn holds_run(path: &Path) -> Result<bool, RecordError> {
     for name in [CONFIG, RUN, METRICS, POLICIES, CHECKPOINTS] {
         let name = path.join(name);

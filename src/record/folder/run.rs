@@ -73,7 +73,7 @@ impl Origin {
         Origin { config: config_digest(config), generations: config.learning.generations }
     }
 
-    /// Returns whether a run with this origin may be resumed with a config.
+    /// Reports whether a run with this origin may be resumed with a config.
     pub(super) fn allows(&self, config: &Config) -> bool {
         self.generations <= config.learning.generations
             && self.config == config_digest(&checkpoint::of_length(config, self.generations))

@@ -283,12 +283,12 @@ impl Viewport {
         })
     }
 
-    /// Draws the leaders' numbers beside their arrows, as far as there is room.
+    /// Draws the leaders' numbers beside their arrows, if there is room.
     fn numbers(&self, scene: &mut Scene, team: &Team, mut taken: Vec<[f64; 4]>) {
         // More numbers than this never fit, and trying takes time.
-        const MAX_ARROWS: usize = 256;
+        const MAX_NUMBERS: usize = 256;
         let arrow = self.agent_size(team) * 1.35;
-        let leaders = &team.agents[..team.leaders.min(MAX_ARROWS)];
+        let leaders = &team.agents[..team.leaders.min(MAX_NUMBERS)];
         let arrows: Vec<_> = leaders.iter().map(|leader| around(self.at(leader.place), arrow * 0.6)).collect();
         let size = if team.leaders > 20 { MIN_LABEL } else { LABEL };
         for (number, leader) in leaders.iter().enumerate() {
