@@ -443,6 +443,6 @@ pub(crate) fn remove_temporary_files(disk: &Disk, folder: &Path) -> Result<Vec<u
 }
 
 /// Returns the path to which an unusable checkpoint is renamed.
-pub fn quarantine_path(path: &Path) -> PathBuf {
+pub(crate) fn quarantine_path(path: &Path) -> PathBuf {
     path.with_extension("safetensors.damaged")
 }

@@ -31,7 +31,7 @@ pub const METRICS: &str = "metrics.csv";
 /// Policies that the run learned. See [`super::policies`].
 pub const POLICIES: &str = "policies.safetensors";
 /// Folder of the [`super::checkpoint`]s.
-pub const CHECKPOINTS: &str = "checkpoints";
+pub(crate) const CHECKPOINTS: &str = "checkpoints";
 /// File that marks a folder as the folder of a paper.
 pub(crate) const PAPER: &str = "paper.toml";
 /// Folder of the runs of a paper.
@@ -43,7 +43,7 @@ pub(crate) const RESULTS: &str = "results.csv";
 /// Points of a sweep, one per line.
 pub(crate) const POINTS: &str = "points.csv";
 /// Training curves in the folder of a run.
-pub const CURVES: &str = "curves.svg";
+pub(crate) const CURVES: &str = "curves.svg";
 /// Replay page in the folder of a run.
 pub(crate) const REPLAY: &str = "replay.html";
 /// List of the files made from runs. Each line has SHA-256 and name, in the format of `sha256sum`.
@@ -58,7 +58,7 @@ const MAX_LIST_BYTES: u64 = 1 << 24;
 ///
 /// # Errors
 /// The folder cannot be opened, or it belongs to another user and was not named.
-pub fn open_output_folder(disk: &Disk, folder: &Path, named: bool) -> Result<Disk, RecordError> {
+pub(crate) fn open_output_folder(disk: &Disk, folder: &Path, named: bool) -> Result<Disk, RecordError> {
     let inside = disk.within(folder).map_err(RecordError::write(folder))?;
     let owners = inside.root().map_or(Ok(None), |root| root.owners()).map_err(RecordError::write(folder))?;
     match owners {
@@ -170,7 +170,7 @@ pub fn check<P: AsRef<Path>>(disk: &Disk, paths: impl IntoIterator<Item = P>) ->
 ///
 /// # Errors
 /// A file of that name was not created by flotilla or has changed, or the file cannot be written.
-pub fn publish(
+pub(crate) fn publish(
     disk: &Disk,
     path: &Path,
     content: impl FnOnce(&mut dyn Write) -> io::Result<()>,

@@ -66,7 +66,7 @@ pub(crate) fn belongs_to(path: &Path, config: &Config) -> bool {
 }
 
 /// Returns the config digest and the checksum in a file. Each is `None` if it is missing or the file cannot be read.
-pub fn digests_in(path: &Path) -> (Option<String>, Option<String>) {
+pub(crate) fn digests_in(path: &Path) -> (Option<String>, Option<String>) {
     let Ok(file) = tensors::open(path) else { return (None, None) };
     (file.metadata(CONFIG).map(String::from), file.checksum().map(String::from))
 }

@@ -166,7 +166,7 @@ pub fn figure(
 }
 
 /// Returns the learning curves of one run as [`figure`] does, from its rows and its digest.
-pub fn figure_of<'a>(config: &Config, rows: impl Iterator<Item = &'a Row>, digest: &str) -> Figure {
+pub(crate) fn figure_of<'a>(config: &Config, rows: impl Iterator<Item = &'a Row>, digest: &str) -> Figure {
     let mut courses = RunMetrics::default();
     rows.for_each(|row| courses.add(row));
     let figure = of_courses(&[courses], std::slice::from_ref(config), Vec::new, None);

@@ -13,9 +13,10 @@ use std::path::{Path, PathBuf};
 
 use super::checkpoint::{self, Checkpoint};
 use super::disk::Disk;
+pub(crate) use super::ownership::CHECKPOINTS;
 use super::ownership::{self, CURVES, REPLAY};
 pub(crate) use super::ownership::{ARMS, PAPER, POINTS, RESULTS};
-pub use super::ownership::{CHECKPOINTS, CONFIG, METRICS, POLICIES, RUN, SWEEP};
+pub use super::ownership::{CONFIG, METRICS, POLICIES, RUN, SWEEP};
 use super::{RecordError, metrics, read_text};
 use crate::config::Config;
 use crate::file;
@@ -24,8 +25,8 @@ mod paths;
 mod resume;
 mod run;
 
-pub use paths::{around, collection, latest, owner};
-pub(crate) use paths::{holds_run, next_free};
+pub use paths::{around, collection, owner};
+pub(crate) use paths::{holds_run, latest, next_free};
 pub use resume::{FirstAndLastRows, differences};
 pub(crate) use run::RunSums;
 pub use run::{FileSums, Origin, Run, Status, now};

@@ -77,7 +77,7 @@ pub(crate) fn next_free(parent: &Path, stem: &str) -> Result<PathBuf, RecordErro
 }
 
 /// Returns the last existing path of `stem`, `stem-2`, …, or `stem` if none exists.
-pub fn latest(parent: &Path, stem: &str) -> PathBuf {
+pub(crate) fn latest(parent: &Path, stem: &str) -> PathBuf {
     numbered(parent, stem, newest(parent, stem).max(1))
 }
 
