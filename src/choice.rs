@@ -1,7 +1,7 @@
 //! Chooses the processor that is expected to finish first, if the user requests none. Results do not depend on it.
 //!
 //! Opening a GPU and compiling for it takes seconds, so short runs play on the CPU. Long runs measure both processors
-//! once. The measurement is kept in a file per device, in the user's cache directory.
+//! once. The measurement is kept in a file per device, in the user's cache folder.
 
 use std::fs;
 use std::io;
@@ -264,7 +264,7 @@ fn seconds(backend: &mut dyn Backend, teams: usize) -> Result<(f64, f64), Backen
 }
 
 /// Returns the file that keeps the measurement of a device, if there is a place for it. `FLOTILLA_CACHE` names the
-/// directory; if it is empty, nothing is kept.
+/// folder; if it is empty, nothing is kept.
 fn file(adapter: &AdapterInfo) -> Option<PathBuf> {
     let variable = |name: &str| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
     let folder = match std::env::var_os("FLOTILLA_CACHE") {

@@ -95,8 +95,8 @@
 //! | [`baseline`] | | baselines without learning |
 //! | [`stepping`] | | stepping of teams with given actions |
 //! | [`memory`] | | a run's peak memory |
-//! | [`record`] | `record` | files: policies, metrics, checkpoints, directories |
-//! | [`run`] | `record` | a trainer together with its runs' directories |
+//! | [`record`] | `record` | files: policies, metrics, checkpoints, folders |
+//! | [`run`] | `record` | a trainer together with its runs' folders |
 //! | [`report`] | `report` | pictures, films, pages; the paper's claims |
 //! | [`sweep`] | `report` | many runs of a parameter grid |
 //! | [`front`] | | the functions that most programs need |

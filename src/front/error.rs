@@ -102,7 +102,7 @@ pub enum Failure {
     /// The teams could not be created.
     #[error(transparent)]
     Step(#[from] StepError),
-    /// A run's directory could not be read.
+    /// A run's folder could not be read.
     #[cfg(feature = "record")]
     #[error(transparent)]
     Run(#[from] runs::ReadError),

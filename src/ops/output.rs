@@ -75,7 +75,7 @@ impl Destination {
 /// its flag.
 ///
 /// # Errors
-/// Fails for such an output, for a directory, and for a file whose folder does not exist.
+/// Fails for such an output, for a folder, and for a file whose folder does not exist.
 pub fn check(outputs: &[(&str, Option<&Path>)], inputs: &[&Path]) -> Result<(), Error> {
     let mut taken: Vec<_> = inputs.iter().map(|path| (file::resolved(path), "is read from".to_string())).collect();
     for &(flag, path) in outputs {

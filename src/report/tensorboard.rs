@@ -38,9 +38,9 @@ pub(crate) struct Events {
 }
 
 impl Events {
-    /// Creates event files in `folder/trial-N`, one directory per trial, with all rows of `metrics` so far.
+    /// Creates event files in `folder/trial-N`, one folder per trial, with all rows of `metrics` so far.
     ///
-    /// The new files replace those of earlier sessions. `disk` is limited to the run directory.
+    /// The new files replace those of earlier sessions. `disk` is limited to the run's folder.
     ///
     /// # Errors
     /// The files cannot be written.
@@ -129,7 +129,7 @@ fn new_file(disk: &Disk, folder: &Path, mut seconds: u64) -> io::Result<PathBuf>
     }
 }
 
-/// Returns the paths in a directory; none if it does not exist.
+/// Returns the paths in a folder; none if it does not exist.
 fn names(folder: &Path) -> io::Result<Vec<PathBuf>> {
     match fs::read_dir(folder) {
         Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => Ok(vec![]),

@@ -1,4 +1,4 @@
-//! Exports and imports runs as zip archives of a run directory, in the format of `flotilla train`.
+//! Exports and imports runs as zip archives of a run's folder, in the format of `flotilla train`.
 
 use std::io::{self, Cursor, Read};
 use std::ops::Range;
@@ -42,7 +42,7 @@ pub struct Recorded {
     rows: usize,
 }
 
-/// Returns the digest of a finished run, and its directory as a zip archive.
+/// Returns the digest of a finished run, and its folder as a zip archive.
 pub fn write(recorded: &Recorded, bytes: &[u8]) -> Result<Answer, Refusal> {
     let config = Config::parse(&recorded.text, "the config")?;
     let (trials, last) = (config.learning.trials, config.learning.generations);

@@ -59,7 +59,7 @@ enum Ask {
     Best { run: usize, trial: usize, generation: Option<usize> },
     /// Returns the results of a run's finished trials. The numbers are policies and fitness.
     Ends { run: usize },
-    /// Returns a finished run's directory as an archive, made from its rows, policies and fitness.
+    /// Returns a finished run's folder as an archive, made from its rows, policies and fitness.
     Record(Recorded),
     /// Reads an archive or a file of policies, see [`archive::read`].
     Read { text: Option<String> },

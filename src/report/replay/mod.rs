@@ -42,7 +42,7 @@ pub enum ReplayError {
     /// The run has no such trial.
     #[error("{folder} has no trial {trial}: its config has {}", numbered(*trials, "trial"))]
     NoTrial {
-        /// The run directory.
+        /// The run's folder.
         folder: String,
         /// The requested trial, from 0.
         trial: usize,
@@ -55,7 +55,7 @@ pub enum ReplayError {
         newest.map_or(String::new(), |newest| format!("; the newest is {newest}: choose one up to that"))
     )]
     NoGeneration {
-        /// The run directory.
+        /// The run's folder.
         folder: String,
         /// The requested trial, from 0.
         trial: usize,
@@ -78,7 +78,7 @@ pub enum ReplayError {
          generation {generation}"
     )]
     NoStart {
-        /// The run directory.
+        /// The run's folder.
         folder: String,
         /// The requested generation, from 0.
         generation: usize,
@@ -90,7 +90,7 @@ pub enum ReplayError {
          replay it"
     )]
     Differs {
-        /// The run directory.
+        /// The run's folder.
         folder: String,
         /// Whose G differs: "best team" or "champion".
         who: &'static str,
