@@ -450,7 +450,7 @@ impl Printed {
 
 /// The flags for results that are in the output directory.
 #[derive(clap::Args, Clone, Copy)]
-pub struct There {
+pub struct ExistingResults {
     /// Resume what is in the directory, and start what is missing
     #[arg(long, conflicts_with = "force")]
     resume: bool,
@@ -459,7 +459,7 @@ pub struct There {
     force: bool,
 }
 
-impl There {
+impl ExistingResults {
     /// Returns what happens to the results.
     pub fn start(self) -> Start {
         match (self.resume, self.force) {

@@ -8,7 +8,7 @@ use serde_json::json;
 
 use super::console::{self, Console};
 use super::recovery::{self, Loss};
-use super::{Error, Overrides, RunOptions, There, between, print, print_json, say, whole};
+use super::{Error, ExistingResults, Overrides, RunOptions, between, print, print_json, say, whole};
 use crate::config;
 use crate::escape::PathExt;
 use crate::ops::sweep::{Request, Results, claim};
@@ -37,7 +37,7 @@ pub struct Args {
     #[arg(long, short, value_name = "DIR")]
     out: Option<PathBuf>,
     #[command(flatten)]
-    there: There,
+    existing: ExistingResults,
     /// Leave out impossible points, for example a coupling above the number of agents
     #[arg(long)]
     skip_impossible: bool,
@@ -161,7 +161,7 @@ impl Args {
             skip_impossible: self.skip_impossible,
             out: out.into(),
             named: self.out.is_some(),
-            start: self.there.start(),
+            start: self.existing.start(),
             shard: shard.map(|shard| (shard.index, shard.count)),
             memory: self.memory.map(|gib| (gib * f64::from(1 << 30)) as usize),
             results: Results {

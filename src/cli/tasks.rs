@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use super::console::Console;
 use super::recovery::Loss;
-use super::{ConfigFile, Error, Printed, RunOptions, SetKeys, There, between};
+use super::{ConfigFile, Error, ExistingResults, Printed, RunOptions, SetKeys, between};
 use crate::file;
 use crate::ops::tasks::{self, FITNESSES, OUT, Outcome, Request, SMALL, Task, mean};
 use crate::report::table::markdown;
@@ -30,7 +30,7 @@ pub struct Args {
     #[command(flatten)]
     set: SetKeys,
     #[command(flatten)]
-    there: There,
+    existing: ExistingResults,
     #[command(flatten)]
     printed: Printed,
     #[command(flatten)]
@@ -40,13 +40,13 @@ pub struct Args {
 }
 
 pub fn run(args: Args) -> Result<(), Error> {
-    let Args { configs, out, trials, population, seed, set, there, printed, loss, run } = args;
+    let Args { configs, out, trials, population, seed, set, existing, printed, loss, run } = args;
     let task = |path: PathBuf| {
         let (name, scripted) = (file::stem(&path, "task"), path.with_extension("csv").is_file());
         Ok::<_, Error>(Task { name, config: ConfigFile { path }.text(set.set.clone())?, scripted })
     };
     let tasks = configs.into_iter().map(task).collect::<Result<_, _>>()?;
-    let (named, start) = (out != Path::new(OUT), there.start());
+    let (named, start) = (out != Path::new(OUT), existing.start());
     let request = Request { tasks, out, named, start, trials, population, seed };
     let mut console = Console::new(&run, loss, printed.quiet);
     let found = console

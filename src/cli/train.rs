@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use super::console::Console;
 use super::recovery::{Checkpoints, Loss, quoted};
-use super::{ConfigArgs, Error, Printed, RunOptions, There};
+use super::{ConfigArgs, Error, ExistingResults, Printed, RunOptions};
 use crate::escape::PathExt;
 use crate::ops::train::{self, Extremes, Outcome, Request};
 use crate::record::folder::{CONFIG, METRICS, POLICIES, RUN};
@@ -24,7 +24,7 @@ pub struct Args {
     #[arg(long, short, value_name = "DIR")]
     out: Option<PathBuf>,
     #[command(flatten)]
-    there: There,
+    existing: ExistingResults,
     /// Start from the policies in a safetensors file instead of random ones. Trial i takes the tensor `weights.i`, or
     /// all take `weights`: f32 [leaders, policies, parameters]. Missing policies are random
     #[arg(long, value_name = "FILE")]
@@ -41,10 +41,10 @@ pub struct Args {
 }
 
 pub fn run(args: Args) -> Result<(), Error> {
-    let Args { config, run, out, there, init, tensorboard, printed, checkpoints, loss } = args;
+    let Args { config, run, out, existing, init, tensorboard, printed, checkpoints, loss } = args;
     // Before the config is read: the message names it where it will be.
     [Some(&config.file.path), out.as_ref()].into_iter().flatten().try_for_each(|path| train::refuse_zip(path))?;
-    let (name, start) = (config.name(), there.start());
+    let (name, start) = (config.name(), existing.start());
     let request = Request { config: config.text(checkpoints.list())?, name, out, start, init, tensorboard };
     let mut console = Console::new(&run, loss, printed.quiet);
     let found = console.run(|player, context| train::run(&request, player, context))?;

@@ -100,19 +100,18 @@ impl RunMetrics {
     /// # Errors
     /// See [`metrics()`].
     pub fn read(folder: &Path, config: &Config, verification: Verification) -> Result<RunMetrics, ReadError> {
-        let mut courses = RunMetrics::default();
-        metrics(folder, config, verification, |row| courses.add(row))?;
-        Ok(courses)
+        let mut run = RunMetrics::default();
+        metrics(folder, config, verification, |row| run.add(row))?;
+        Ok(run)
     }
 
     fn add(&mut self, row: &Row) {
-        let courses =
-            [(&mut self.best, row.best_g), (&mut self.mean, row.mean_g), (&mut self.champion, row.champion_g)];
-        for (course, g) in courses {
-            if course.len() <= row.generation {
-                course.resize(row.generation + 1, Average::default());
+        let added = [(&mut self.best, row.best_g), (&mut self.mean, row.mean_g), (&mut self.champion, row.champion_g)];
+        for (averages, g) in added {
+            if averages.len() <= row.generation {
+                averages.resize(row.generation + 1, Average::default());
             }
-            course[row.generation].add(g);
+            averages[row.generation].add(g);
         }
     }
 }
@@ -160,32 +159,32 @@ pub fn figure(
             _ => None,
         },
         warning: verification.is_skipped().then(|| UNVERIFIED.into()),
-        ..of_courses(&all, &configs, || labels(folders, &configs), measure)
+        ..figure_of_runs(&all, &configs, || labels(folders, &configs), measure)
     };
     Ok(shown)
 }
 
 /// Returns the learning curves of one run as [`figure`] does, from its rows and its digest.
 pub(crate) fn figure_of<'a>(config: &Config, rows: impl Iterator<Item = &'a Row>, digest: &str) -> Figure {
-    let mut courses = RunMetrics::default();
-    rows.for_each(|row| courses.add(row));
-    let figure = of_courses(&[courses], std::slice::from_ref(config), Vec::new, None);
+    let mut run = RunMetrics::default();
+    rows.for_each(|row| run.add(row));
+    let figure = figure_of_runs(&[run], std::slice::from_ref(config), Vec::new, None);
     Figure { source: Some(digest.into()), ..figure }
 }
 
-fn of_courses(
+fn figure_of_runs(
     all: &[RunMetrics],
     configs: &[Config],
     labels: impl FnOnce() -> Vec<String>,
     measure: Option<TeamKind>,
 ) -> Figure {
     let (legend, curves): (Vec<String>, Vec<Curve>) = match (all, measure) {
-        ([courses], None) => {
-            TeamKind::ALL.into_iter().map(|kind| (kind.name().to_string(), Curve::new(courses.of(kind)))).unzip()
+        ([run], None) => {
+            TeamKind::ALL.into_iter().map(|kind| (kind.name().to_string(), Curve::new(run.of(kind)))).unzip()
         }
-        ([courses], Some(kind)) => (vec![kind.name().to_string()], vec![Curve::new(courses.of(kind))]),
+        ([run], Some(kind)) => (vec![kind.name().to_string()], vec![Curve::new(run.of(kind))]),
         (all, kind) => {
-            let curves = all.iter().map(|courses| Curve::new(courses.of(kind.unwrap_or_default())));
+            let curves = all.iter().map(|run| Curve::new(run.of(kind.unwrap_or_default())));
             labels().into_iter().zip(curves).unzip()
         }
     };

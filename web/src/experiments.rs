@@ -37,11 +37,11 @@ pub fn compare(experiments: Vec<Experiment>, bytes: &[u8]) -> Result<Value, Refu
         let shared = lengths.iter().copied().min().unwrap_or(0);
         let (mut trials, mut best) = (Vec::new(), vec![Average::default(); shared]);
         for (trial, length) in lengths.into_iter().enumerate() {
-            let (course, rest) = pairs.split_at_checked(length).ok_or_else(|| refuse("the rows are incomplete"))?;
+            let (scores, rest) = pairs.split_at_checked(length).ok_or_else(|| refuse("the rows are incomplete"))?;
             pairs = rest;
-            best.iter_mut().zip(course).for_each(|(best, [g, _])| best.add(*g));
+            best.iter_mut().zip(scores).for_each(|(best, [g, _])| best.add(*g));
             let key = (config.learning.seed, trial);
-            trials.push(Trial { key, course: course.to_vec(), from: config.last_from() });
+            trials.push(Trial { key, scores: scores.to_vec(), from: config.last_from() });
         }
         let (curve, _) = Curve::new(&best).thinned();
         let band = curve.outline(Band::Interval, 1.0);

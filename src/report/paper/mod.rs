@@ -214,13 +214,13 @@ pub struct TrialCurves<'a> {
 
 impl Evidence<'_> {
     /// Returns the results of a source on one of [`LAYOUTS`]. None if there are no such arms.
-    pub fn course(&self, layout: usize, paradigm: Paradigm, source: Source) -> Option<TrialCurves<'_>> {
+    pub fn curves(&self, layout: usize, paradigm: Paradigm, source: Source) -> Option<TrialCurves<'_>> {
         let name = LAYOUTS.get(layout)?.name;
         let is_here = |arm: &&Experiment| (arm.layout.name, arm.paradigm, arm.selects) == (name, paradigm, false);
         let mut here = self.arms.iter().filter(is_here);
         let pois = here.clone().next()?.pois();
-        let ground = PARADIGMS.len() * layout + PARADIGMS.iter().position(|&other| other == paradigm)?;
-        let baseline = self.baselines.get(ground);
+        let index = PARADIGMS.len() * layout + PARADIGMS.iter().position(|&other| other == paradigm)?;
+        let baseline = self.baselines.get(index);
         let (champion, best) = match source {
             Source::Constant => (&baseline?.constant, &baseline?.constant),
             Source::Actions => (&baseline?.actions, &baseline?.actions),
@@ -292,13 +292,13 @@ pub fn figure(results: Evidence<'_>, layout: usize) -> Figure {
         title: format!("({letter}) {}", title(paradigm)),
         curves: sources
             .iter()
-            .filter_map(|&source| results.course(layout, paradigm, source))
-            .map(|course| course.curve())
+            .filter_map(|&source| results.curves(layout, paradigm, source))
+            .map(|curves| curves.curve())
             .enumerate()
             .collect(),
         stages: vec![],
     };
-    let pois = |paradigm| results.course(layout, paradigm, evolved[0]).map_or(1.0, |course| course.pois as f64);
+    let pois = |paradigm| results.curves(layout, paradigm, evolved[0]).map_or(1.0, |curves| curves.pois as f64);
     Figure {
         panels: ["a", "b"].into_iter().zip(PARADIGMS).map(panel).collect(),
         legend: evolved.map(|source| source.to_string()).to_vec(),
@@ -373,8 +373,8 @@ impl Trajectory {
     /// Returns every curve by layout, paradigm and source. The curves of teams that choose among behaviours follow.
     pub fn all(results: Evidence<'_>) -> Vec<Trajectory> {
         let mut all = Vec::new();
-        let mut add = |layout: usize, paradigm, source: Source, selects, course: Option<TrialCurves<'_>>| {
-            let Some(course) = course else { return };
+        let mut add = |layout: usize, paradigm, source: Source, selects, curves: Option<TrialCurves<'_>>| {
+            let Some(curves) = curves else { return };
             let fitness = if let Source::Evolved(fitness) = source { Some(fitness) } else { None };
             all.push(Trajectory {
                 layout: LAYOUTS[layout].name,
@@ -382,10 +382,10 @@ impl Trajectory {
                 source: source.to_string(),
                 fitness,
                 selects,
-                pois: course.pois,
-                curve: course.curve(),
-                deviation: course.tallies().iter().map(Average::deviation).collect(),
-                best_mean: TrialCurves { champion: course.best, ..course }
+                pois: curves.pois,
+                curve: curves.curve(),
+                deviation: curves.tallies().iter().map(Average::deviation).collect(),
+                best_mean: TrialCurves { champion: curves.best, ..curves }
                     .tallies()
                     .iter()
                     .map(Average::mean)
@@ -395,7 +395,7 @@ impl Trajectory {
         for layout in 0..LAYOUTS.len() {
             for paradigm in PARADIGMS {
                 for source in SOURCES {
-                    add(layout, paradigm, source, false, results.course(layout, paradigm, source));
+                    add(layout, paradigm, source, false, results.curves(layout, paradigm, source));
                 }
             }
         }

@@ -317,7 +317,7 @@ pub(super) const TESTS: &[(usize, &[Test])] = &[
                 "distance of a trial's POIs at generation 100 from the median trial's, leader-follower less \
                   all-leaders, by pair (Brown-Forsythe): below 0",
                 |view| {
-                    let distances = |course: TrialCurves<'_>| Some(statistics::distances(&course.observed(END)?));
+                    let distances = |curves: TrialCurves<'_>| Some(statistics::distances(&curves.observed(END)?));
                     Some(Criterion::Difference(less(&distances(view.led()?)?, &distances(view.all()?)?), BELOW_0))
                 },
             ),

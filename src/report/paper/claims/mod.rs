@@ -190,18 +190,18 @@ struct Lookup<'a> {
 }
 
 impl<'a> Lookup<'a> {
-    fn course(&'a self, paradigm: Paradigm) -> Option<TrialCurves<'a>> {
-        self.results.course(self.layout, paradigm, self.source)
+    fn curves(&'a self, paradigm: Paradigm) -> Option<TrialCurves<'a>> {
+        self.results.curves(self.layout, paradigm, self.source)
     }
 
     /// Returns the results of all-leaders teams.
     fn all(&'a self) -> Option<TrialCurves<'a>> {
-        self.course(Paradigm::AllLeaders)
+        self.curves(Paradigm::AllLeaders)
     }
 
     /// Returns the results of leader-follower teams.
     fn led(&'a self) -> Option<TrialCurves<'a>> {
-        self.course(Paradigm::LeaderFollower)
+        self.curves(Paradigm::LeaderFollower)
     }
 
     /// Returns the POIs observed by leader-follower teams minus those by all-leaders teams at generation [`END`], per
@@ -213,8 +213,8 @@ impl<'a> Lookup<'a> {
     /// Returns the difference of a measure between two sources of leader-follower teams at generation [`END`], per
     /// pair.
     fn between(&self, by: Source, other: Source, measure: fn(&[f64]) -> Vec<f64>) -> Option<Vec<f64>> {
-        let course = |source| self.results.course(self.layout, Paradigm::LeaderFollower, source)?.observed(END);
-        Some(less(&measure(&course(by)?), &measure(&course(other)?)))
+        let curves = |source| self.results.curves(self.layout, Paradigm::LeaderFollower, source)?.observed(END);
+        Some(less(&measure(&curves(by)?), &measure(&curves(other)?)))
     }
 
     /// Returns the results of all-leaders teams that choose among known behaviours.
@@ -225,7 +225,7 @@ impl<'a> Lookup<'a> {
 
     /// Returns a share of the POIs as a number of POIs.
     fn pois(&self, share: f64) -> f64 {
-        share * self.led().map_or(0, |course| course.pois) as f64
+        share * self.led().map_or(0, |curves| curves.pois) as f64
     }
 }
 
@@ -296,7 +296,7 @@ impl Test {
     fn finding(&self, view: Lookup<'_>) -> Option<Finding> {
         let source = view.source;
         let column = SOURCES.iter().position(|&other| other == source)?;
-        let course = view.led()?;
+        let curves = view.led()?;
         let of = match self.sources {
             list::EVOLVED => format!("{source} − {}", list::next(source)),
             [list::G, list::D] | [list::G] => format!("{} − {source}", list::DF),
@@ -305,13 +305,13 @@ impl Test {
         let without = |verdict, measured: String| {
             Some(Finding { column, of: of.clone(), verdict, measured, estimate: None, p: None, p_holm: None })
         };
-        if course.champion.iter().any(|trial| trial.len() <= self.needs) {
+        if curves.champion.iter().any(|trial| trial.len() <= self.needs) {
             return without(Verdict::Open, format!("takes {} generations", self.needs));
         }
-        if course.trials() < 2 && !course.certain {
+        if curves.trials() < 2 && !curves.certain {
             return without(Verdict::Open, "takes 2 trials".into());
         }
-        let found = (self.find)(view)?.find(column, of.clone(), course.certain, course.pois as f64);
+        let found = (self.find)(view)?.find(column, of.clone(), curves.certain, curves.pois as f64);
         found.or_else(|| without(Verdict::Undecided, "no pair differs".into()))
     }
 }
