@@ -21,6 +21,7 @@ use crate::escape::PathExt;
 use crate::front::{self, Found, Processor};
 use crate::host::Instant;
 use crate::parallel::current_num_threads;
+use crate::record::hex;
 use crate::trainer::Trainer;
 use crate::version::VERSION;
 use crate::world::World;
@@ -277,8 +278,7 @@ fn file(adapter: &AdapterInfo) -> Option<PathBuf> {
     };
     // Another driver or version may be faster or slower.
     let digest = Sha256::digest(format!("{adapter} {VERSION}"));
-    let name: String = digest[..8].iter().map(|byte| format!("{byte:02x}")).collect();
-    folder.map(|folder| folder.join(format!("device-{name}.json")))
+    folder.map(|folder| folder.join(format!("device-{}.json", hex(&digest[..8]))))
 }
 
 /// Returns an earlier measurement of a device. A damaged file counts as none.

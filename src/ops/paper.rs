@@ -132,9 +132,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let (backend, on) = backends.open(Work::of(&configs))?;
     let plan = memory::Peaks::of(&ValidConfig::all(&configs)?, current_num_threads());
     plan.check(backend.1.backend == "gpu").map_err(RunError::from)?;
-    let disk = Disk::default();
-    disk.create_folder(out).map_err(|error| RecordError::Write { path: out.clone(), error })?;
-    let disk = ownership::open_output_folder(&disk, out, request.is_out_named())?;
+    let disk = ownership::create_output_folder(&Disk::default(), out, request.is_out_named())?;
     let _lock = folder::lock(&disk, out)?;
     // Compared again, because another process could write here until the folder was locked.
     marks.compare(out, start)?;
@@ -221,10 +219,6 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let ran = (0..configs.len()).map(|run| session.run(run));
     let seconds = ran.map(|run| run.seconds).fold(0.0, f64::max);
 
-    let failed = |path: &Path| {
-        let path = path.to_path_buf();
-        |error| RecordError::Write { path, error }
-    };
     let write = |name: String, content: &[u8]| -> Result<(), Error> {
         Ok(ownership::publish(&disk, &out.join(name), |output| output.write_all(content))?)
     };
@@ -233,7 +227,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         let scene = paper::figure(found, index).scene();
         for kind in Format::ALL {
             let name = format!("figure{number}.{}", kind.extension());
-            let picture = scene.file(kind, PRINT).map_err(failed(&out.join(&name)))?;
+            let picture = scene.file(kind, PRINT).map_err(RecordError::write(&out.join(&name)))?;
             write(name, &picture)?;
         }
     }
@@ -388,14 +382,10 @@ impl Marks {
 
     /// Marks the folder as this paper's. `Start::Force` first removes what was made from earlier runs.
     fn claim(&self, out: &Path, start: Start, disk: &Disk) -> Result<(), Error> {
-        let failed = |path: &Path| {
-            let path = path.to_path_buf();
-            |error| RecordError::Write { path, error }
-        };
         if start == Start::Force {
             products().try_for_each(|name| ownership::remove_published(disk, &out.join(name)))?;
         }
         let path = out.join(PAPER);
-        Ok(disk.replace(&path, |output| output.write_all(self.text().as_bytes())).map_err(failed(&path))?)
+        Ok(disk.replace(&path, |output| output.write_all(self.text().as_bytes())).map_err(RecordError::write(&path))?)
     }
 }

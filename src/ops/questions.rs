@@ -99,9 +99,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let configs = || parts.iter().flat_map(|(_, sweep)| &sweep.points).map(|point| &point.config);
     let (backend, on) = backends.open(Work::of(configs().map(|config| &**config)))?;
     check_memory(configs(), backend)?;
-    let disk = Disk::default();
-    disk.create_folder(out).map_err(|error| RecordError::Write { path: out.clone(), error })?;
-    let disk = ownership::open_output_folder(&disk, out, request.is_out_named())?;
+    let disk = ownership::create_output_folder(&Disk::default(), out, request.is_out_named())?;
     let _lock = folder::lock(&disk, out)?;
     ownership::check(&disk, files().chain([PAGE.into()]).map(|name| out.join(name)))?;
     let points: usize = parts.iter().map(|(_, sweep)| sweep.points.len()).sum();
@@ -204,6 +202,6 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
 }
 
 fn write(disk: &Disk, path: &Path, bytes: std::io::Result<Vec<u8>>) -> Result<(), Error> {
-    let bytes = bytes.map_err(|error| RecordError::Write { path: path.into(), error })?;
+    let bytes = bytes.map_err(RecordError::write(path))?;
     Ok(ownership::publish(disk, path, |output| output.write_all(&bytes))?)
 }

@@ -13,7 +13,6 @@ use crate::backend::OpenBackend;
 use crate::choice::Work;
 use crate::config::{self, ConfigError, Override, Problem, ValidConfig};
 use crate::escape::PathExt;
-use crate::file;
 use crate::memory;
 use crate::reach::{self, Unreachable};
 use crate::record::RecordError;
@@ -21,6 +20,7 @@ use crate::record::digests::{self, UNVERIFIED, Verification};
 use crate::record::disk::Disk;
 use crate::record::folder::{self, CONFIG, RUN, Run, SWEEP, Start};
 use crate::record::ownership;
+use crate::record::runs;
 use crate::report::curves::Band;
 use crate::report::runs::TeamKind;
 use crate::run::{self as training, SessionEnd};
@@ -224,11 +224,6 @@ pub fn picture_axes(sweep: &Sweep, names: &[String]) -> Result<Vec<usize>, Error
     }
 }
 
-/// Reports whether a file exists, or an error if the system does not allow checking that.
-fn exists(path: &Path) -> Result<bool, RecordError> {
-    file::exists(path).map_err(|error| RecordError::Read { path: path.into(), error })
-}
-
 /// Refuses a folder with other content than this sweep.
 pub(crate) fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
     let path = out.join(SWEEP);
@@ -239,8 +234,8 @@ pub(crate) fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
         let problems = vec![Problem { line: None, key: String::new(), message }];
         Err(ConfigError::Invalid { name: path.escaped().to_string(), problems, unlisted: 0 }.into())
     };
-    if !exists(&path)? {
-        let holds = match exists(&out.join(CONFIG))? {
+    if !runs::exists(&path)? {
+        let holds = match runs::exists(&out.join(CONFIG))? {
             true => Some("a run"),
             false => folder::collection(out),
         };
@@ -281,16 +276,12 @@ pub(crate) fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
 
 /// Marks the folder as this sweep's. Shards that start at the same moment write the same content.
 pub(crate) fn claim(disk: &Disk, sweep: &Sweep, out: &Path) -> Result<(), Error> {
-    let failed = |path: &Path| {
-        let path = path.to_path_buf();
-        move |error| RecordError::Write { path, error }
-    };
     let path = out.join(SWEEP);
-    disk.create_folder(out).map_err(failed(out))?;
-    let disk = disk.within(out).map_err(failed(out))?;
-    if disk.kind(&path).map_err(failed(&path))?.is_none() {
+    disk.create_folder(out).map_err(RecordError::write(out))?;
+    let disk = disk.within(out).map_err(RecordError::write(out))?;
+    if disk.kind(&path).map_err(RecordError::write(&path))?.is_none() {
         let text = |output: &mut dyn io::Write| output.write_all(sweep.text.as_bytes());
-        disk.replace_shared(&path, text, || Ok(())).map_err(failed(&path))?;
+        disk.replace_shared(&path, text, || Ok(())).map_err(RecordError::write(&path))?;
     }
     same_sweep(sweep, out)
 }
@@ -457,7 +448,7 @@ pub(crate) fn free_memory() -> usize {
 /// The folder holds no such sweep, or files cannot be written.
 pub fn collect(request: &Request, sweep: &Sweep, axes: &[usize], context: Context<'_>) -> Result<Outcome, Error> {
     let out = &*request.out;
-    if !exists(&out.join(SWEEP))? {
+    if !runs::exists(&out.join(SWEEP))? {
         return Err(Error::Usage(format!("{} holds no sweep", out.escaped()).into()));
     }
     same_sweep(sweep, out)?;

@@ -160,9 +160,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         FITNESSES.iter().for_each(|_| work += Work::of([config]));
     }
     let (backend, on) = backends.open(work)?;
-    let disk = Disk::default();
-    disk.create_folder(&request.out).map_err(RecordError::write(&request.out))?;
-    let disk = ownership::open_output_folder(&disk, &request.out, request.named)?;
+    let disk = ownership::create_output_folder(&Disk::default(), &request.out, request.named)?;
     let mut found = Vec::new();
     for (task, configs) in &tasks {
         let name = &task.name;

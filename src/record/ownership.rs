@@ -69,6 +69,15 @@ pub(crate) fn open_output_folder(disk: &Disk, folder: &Path, named: bool) -> Res
     }
 }
 
+/// Creates a folder if it is missing, and prepares it as [`open_output_folder`] does.
+///
+/// # Errors
+/// The folder cannot be created, or see [`open_output_folder`].
+pub(crate) fn create_output_folder(disk: &Disk, folder: &Path, named: bool) -> Result<Disk, RecordError> {
+    disk.create_folder(folder).map_err(RecordError::write(folder))?;
+    open_output_folder(disk, folder, named)
+}
+
 /// Reports whether a user may write in the folder of an owner.
 pub fn may_write(owner: u32, user: u32, named: bool) -> bool {
     named || owner == user

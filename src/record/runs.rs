@@ -73,7 +73,7 @@ pub fn config(folder: &Path, verification: Verification) -> Result<Config, ReadE
         return Err(ReadError::NoFolder(folder.into()));
     }
     let path = folder.join(CONFIG);
-    if !seen(&path)? {
+    if !exists(&path)? {
         if let Some(what) = folder::collection(folder) {
             let example = if what == "a sweep" { "points/0000" } else { "arms/chaotic-leader-follower-Df" };
             return Err(ReadError::Collection { folder: folder.into(), what, example });
@@ -86,8 +86,8 @@ pub fn config(folder: &Path, verification: Verification) -> Result<Config, ReadE
 }
 
 /// Reports whether a file exists.
-fn seen(path: &Path) -> Result<bool, RecordError> {
-    file::exists(path).map_err(|error| RecordError::Read { path: path.into(), error })
+pub(crate) fn exists(path: &Path) -> Result<bool, RecordError> {
+    file::exists(path).map_err(RecordError::read(path))
 }
 
 /// Calls `each` with every complete row of a run's metrics. A partial last line is ignored, because it is still being
@@ -106,7 +106,7 @@ pub fn metrics(
     // The digests are read before the metrics, because the run may finish in between.
     let digests = Digests::read(folder, verification)?;
     let unfinished = |reason: String| ReadError::Unfinished { folder: folder.into(), reason };
-    if !seen(&path)? {
+    if !exists(&path)? {
         return Err(unfinished(format!("it has no {METRICS} yet")));
     }
     let damaged = |reason: String| ReadError::Record(RecordError::Damaged { path: path.clone(), reason });

@@ -75,7 +75,7 @@ pub fn draw(
         for kind in Format::ALL {
             let name = format!("{name}.{}", kind.extension());
             let path = out.join(&name);
-            let bytes = scene.file(kind, PRINT).map_err(|error| RecordError::Write { path: path.clone(), error })?;
+            let bytes = scene.file(kind, PRINT).map_err(RecordError::write(&path))?;
             ownership::publish(&disk, &path, |output| output.write_all(&bytes))?;
             names.push(name);
         }
