@@ -61,8 +61,7 @@ impl Config {
     }
 
     fn to_dict<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        let table =
-            self.0.to_toml().parse::<toml::Table>().map_err(|error| PyValueError::new_err(error.to_string()))?;
+        let table = toml::Table::try_from(&self.0).map_err(|error| PyValueError::new_err(error.to_string()))?;
         to_python(py, Value::Table(table))
     }
 

@@ -86,7 +86,7 @@ fn template(args: &Args) -> Result<String, Error> {
 /// Returns `config` as a config file, after the opening comment of the text `from`. Each key has a comment with its
 /// meaning, unit, kind, range and default.
 fn commented(from: &str, config: &Config) -> String {
-    let values: Table = config.to_toml().parse().expect("it was just written");
+    let values = Table::try_from(config).expect("a config that was read is TOML");
     let opening: String =
         from.lines().take_while(|line| line.starts_with('#')).map(|line| format!("{line}\n")).collect();
     let mut text = opening + "#\n# Every key follows, with its meaning and (unit; allowed values; default).\n";

@@ -100,24 +100,11 @@ impl Config {
     /// # Errors
     /// Fails if the text or an override is invalid. The error lists their problems.
     pub fn read(text: &str, name: &str, ignored: &[&str], overrides: &[Override]) -> Result<Config, ConfigError> {
-        Config::read_document(&Document::parse(text), name, ignored, overrides)
+        Ok(Config::read_noted(&Document::parse(text), name, ignored, overrides)?.0.into_config())
     }
 
-    /// Reads a config from a parsed text, as [`Config::read`] does.
-    ///
-    /// # Errors
-    /// Fails if the text or an override is invalid. The error lists their problems.
-    pub(crate) fn read_document(
-        document: &Document<'_>,
-        name: &str,
-        ignored: &[&str],
-        overrides: &[Override],
-    ) -> Result<Config, ConfigError> {
-        Ok(Config::read_noted(document, name, ignored, overrides)?.0.into_config())
-    }
-
-    /// Reads a config as [`Config::read_document`] does, and returns notes for its author. The notes report defaults
-    /// that other keys do not allow, stages that are left out, and the results of [`ValidConfig::notes`].
+    /// Reads a config from a parsed text as [`Config::read`] does, and returns notes for its author. The notes report
+    /// defaults that other keys do not allow, stages that are left out, and the results of [`ValidConfig::notes`].
     ///
     /// # Errors
     /// Fails if the text or an override is invalid. The error lists their problems.

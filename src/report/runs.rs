@@ -228,7 +228,8 @@ pub fn paired(folders: &[PathBuf], verification: Verification) -> Result<bool, R
 
 /// Labels runs by the config keys that differ between them, or by their directories if none differ.
 pub fn labels(folders: &[PathBuf], configs: &[Config]) -> Vec<String> {
-    let tables: Vec<toml::Table> = configs.iter().map(|config| config.to_toml().parse().unwrap_or_default()).collect();
+    let table = |config: &Config| toml::Table::try_from(config).unwrap_or_default();
+    let tables: Vec<toml::Table> = configs.iter().map(table).collect();
     let Some(first) = tables.first() else { return vec![] };
     let value = |table: &toml::Table, section: &str, key: &str| {
         let text = table.get(section).and_then(|section| section.get(key)).map_or("-".into(), toml::Value::to_string);

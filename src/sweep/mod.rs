@@ -131,7 +131,7 @@ impl Sweep {
     pub fn read(text: &str, name: &str, flags: &[Override], skip: bool) -> Result<Sweep, ConfigError> {
         let document = Document::parse(text);
         let Ok(mut base) = text.parse::<Table>() else {
-            Config::read_document(&document, name, &[GRID, VARY], &[])?;
+            Config::read_noted(&document, name, &[GRID, VARY], &[])?;
             return Err(invalid(name, vec![problem(None, "", "it is not TOML")]));
         };
         let sections = [GRID, VARY].map(|section| base.remove(section));
@@ -454,7 +454,7 @@ impl Grid {
 /// Returns the value of a dotted key in a config.
 fn value_of(config: &Config, key: &str) -> Option<Value> {
     let (section, leaf) = key.split_once('.')?;
-    config.to_toml().parse::<Table>().ok()?.get(section)?.get(leaf).cloned()
+    Table::try_from(config).ok()?.get(section)?.get(leaf).cloned()
 }
 
 /// Returns a text that is the same for equal values only.
