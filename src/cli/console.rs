@@ -86,7 +86,7 @@ fn run_reported<R>(
     falls_back: bool,
     work: impl FnOnce(Context<'_>) -> Result<R, Error>,
 ) -> Result<R, Error> {
-    let (show, command) = (Display::new(quiet), recovery::typed());
+    let (show, command) = (Display::new(quiet), recovery::command_line());
     let (Signals { stop, save }, report) = (signals, |event: Event<'_>| show.event(event));
     let done = work(Context { stop, save, command: &command, flags, falls_back, ..Context::new(&report) });
     show.event(Event::Pause);

@@ -96,7 +96,7 @@ pub fn quoted(path: &Path) -> String {
 const MAX_LINE: usize = 1 << 13;
 
 /// Returns the command line, quoted for a shell.
-pub fn typed() -> String {
+pub fn command_line() -> String {
     let line = shell::command(super::words());
     match line.char_indices().nth(MAX_LINE) {
         Some((end, _)) => format!("{} …", &line[..end]),

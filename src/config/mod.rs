@@ -49,16 +49,13 @@ pub(crate) const VARY: &str = "vary";
 /// Returns every key of a config, in the order of [`Config::to_toml`].
 pub fn keys() -> Vec<Definition> {
     let (config, mut keys) = reader::keys(Config::ask);
-    let mut order = Vec::new();
     let text = config.to_toml();
-    let mut section = "";
-    for line in text.lines() {
-        match line.split_once(" = ") {
-            Some((leaf, _)) => order.push(format!("{section}.{leaf}")),
-            None => section = line.trim_matches(['[', ']']),
-        }
-    }
-    keys.sort_by_key(|key| order.iter().position(|name| name == key.name));
+    let place = |key: &Definition| {
+        let (section, leaf) = key.name.split_once('.')?;
+        let start = text.find(&format!("[{section}]\n"))?;
+        Some(start + text[start..].find(&format!("\n{leaf} = "))?)
+    };
+    keys.sort_by_key(place);
     keys
 }
 

@@ -40,7 +40,7 @@ impl Folder {
         found.finished = found.run.as_ref().map_or(Ok(None), |run| self.finished(run, config))?;
         let began = found.run.as_ref().map(|run| run.init.clone());
         if found.finished.is_some() {
-            return began.map_or(Ok(()), |existing| self.started_alike(existing, init));
+            return began.map_or(Ok(()), |existing| self.check_init(existing, init));
         }
         // If the config file agrees with the given config but the origin does not, then the file was edited.
         let edited = || {
@@ -62,7 +62,7 @@ impl Folder {
             // Checkpoints of earlier versions lack the number of generations. The config in the folder has it.
             let reason = match checkpoint::read(&path, &self.file(POLICIES), before.as_ref().unwrap_or(config)) {
                 Ok(Some(checkpoint)) if checkpoint.is_of(config) => {
-                    self.started_alike(checkpoint.init.clone(), init)?;
+                    self.check_init(checkpoint.init.clone(), init)?;
                     let metrics = self.file(METRICS);
                     let resumed = metrics::Writer::resume(&self.disk, &metrics, &checkpoint.metrics, config);
                     match resumed.map_err(RecordError::write(&metrics))? {
@@ -104,7 +104,7 @@ impl Folder {
             }
         }
         if let Some(existing) = began.filter(|_| found.checkpoint.is_none()) {
-            self.started_alike(existing.clone(), init)?;
+            self.check_init(existing.clone(), init)?;
             if let Some(existing) = existing.filter(|_| init.is_none()) {
                 return Err(RecordError::InitNeeded { path: self.path.clone(), existing });
             }
@@ -133,7 +133,7 @@ impl Folder {
     }
 
     /// Fails if the given policies are not those that the run started from.
-    fn started_alike(&self, existing: Option<String>, requested: Option<&str>) -> Result<(), RecordError> {
+    fn check_init(&self, existing: Option<String>, requested: Option<&str>) -> Result<(), RecordError> {
         match requested {
             Some(requested) if existing.as_deref() != Some(requested) => {
                 Err(RecordError::InitDiffers { path: self.path.clone(), existing, requested: requested.into() })
