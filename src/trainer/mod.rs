@@ -42,7 +42,7 @@ use schedule::TeamSchedule;
 pub struct Trainer {
     experiments: Vec<Experiment>,
     level: Level,
-    times: PhaseTimes,
+    times: GenerationTimes,
     recovered_error: Option<BackendError>,
 }
 
@@ -112,7 +112,7 @@ impl Snapshot<&[f32]> {
 
 /// The time that generations took, by phase.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct PhaseTimes {
+pub struct GenerationTimes {
     /// Drawing team schedules, unless that was done while others played.
     pub prepare: Duration,
     /// Rollouts and scores.
@@ -146,14 +146,14 @@ impl Trainer {
         let level = Level::new();
         let experiment = |config: ValidConfig| Experiment::new(&config, 0..config.learning.trials, level);
         let experiments = configs.into_iter().map(experiment).collect();
-        Trainer { experiments, level, times: PhaseTimes::default(), recovered_error: None }
+        Trainer { experiments, level, times: GenerationTimes::default(), recovered_error: None }
     }
 
     /// Creates random populations for one trial of a config. Its rows are the same as among the other trials.
     pub fn of_trial(config: &ValidConfig, trial: usize) -> Trainer {
         let level = Level::new();
         let experiments = vec![Experiment::new(config, trial..trial + 1, level)];
-        Trainer { experiments, level, times: PhaseTimes::default(), recovered_error: None }
+        Trainer { experiments, level, times: GenerationTimes::default(), recovered_error: None }
     }
 
     /// Returns the generation that an experiment plays next: two past its last when it is done.
@@ -177,7 +177,7 @@ impl Trainer {
     }
 
     /// Returns and resets the times of generations.
-    pub fn take_times(&mut self) -> PhaseTimes {
+    pub fn take_times(&mut self) -> GenerationTimes {
         std::mem::take(&mut self.times)
     }
 
