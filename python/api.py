@@ -25,7 +25,7 @@ This page is made from the docstrings by `python python/api.py > docs/reference/
 ORDER = [
     ("Configs", ["Config", "Key", "ConfigError", "Problem"]),
     ("Training", ["train", "Run", "Generation", "Error", "loggers"]),
-    ("Your own fitness", ["Coevolution", "Asked", "Played"]),
+    ("Your own fitness", ["Coevolution", "Proposal", "Played"]),
     ("Looking", ["Replay", "Episode", "Figure", "plot", "compare"]),
     ("Evaluating", ["rollout", "Rollout", "Trace", "forward", "collect", "Collected", "to_onnx"]),
     ("Environments", ["VectorEnv", "team_env", "parallel_env"]),
@@ -100,7 +100,7 @@ def entry(name: str, thing: object, level: str) -> str:
 
 
 # Classes that users do not construct, because functions return them. Their signatures are not shown.
-HIDDEN = {"Run", "Replay", "Figure", "Rollout", "Trace", "Sweep", "Generation", "Asked", "Played", "Collected"}
+HIDDEN = {"Run", "Replay", "Figure", "Rollout", "Trace", "Sweep", "Generation", "Proposal", "Played", "Collected"}
 
 
 def page() -> str:

@@ -1,7 +1,7 @@
-//! Chooses the processor that is expected to be done first, where none is asked for. Results do not depend on it.
+//! Chooses the processor that is expected to finish first, if the user requests none. Results do not depend on it.
 //!
-//! Opening a GPU and compiling for it takes seconds, and short runs are over before. Long runs pay for a measurement of
-//! both processors. It is kept in a file per device, in the user's cache.
+//! Opening a GPU and compiling for it takes seconds, so short runs play on the CPU. Long runs measure both processors
+//! once. The measurement is kept in a file per device, in the user's cache folder.
 
 use std::fs;
 use std::io;
@@ -12,7 +12,6 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use crate::VERSION;
 use crate::backend::cpu::Cpu;
 use crate::backend::gpu::device::{self, AdapterInfo, DeviceError, Wanted};
 use crate::backend::gpu::episode::{GpuBackend, ResidencyPolicy};
@@ -22,17 +21,19 @@ use crate::escape::PathExt;
 use crate::front::{self, Found, Processor};
 use crate::host::Instant;
 use crate::parallel::current_num_threads;
+use crate::record::hex;
 use crate::trainer::Trainer;
+use crate::version::VERSION;
 use crate::world::World;
 
-/// Agent-steps per second of one CPU thread, about. Only runs that take longer than [`SHORT`] by this are measured.
+/// Rough number of agent-steps per second of one CPU thread, for deciding whether a run is worth a measurement.
 const CPU_RATE: f64 = 1e8;
-/// Seconds of a run on the CPU below which no GPU is opened, because opening takes about as long.
-const SHORT: f64 = 5.0;
+/// Minimum seconds of work on the CPU for opening a GPU, which takes about as long.
+const MIN_GPU_WORK_SECONDS: f64 = 5.0;
 /// Teams of the generations that are timed: of a GPU's fixed cost, of its rate, and of the CPU's rate.
-const SMALL: usize = 50;
-const LARGE: usize = 16_384;
-const ON_CPU: usize = 2048;
+const SMALL_TEAMS: usize = 50;
+const LARGE_TEAMS: usize = 16_384;
+const CPU_TEAMS: usize = 2048;
 /// Timed generations, of which the shortest counts.
 const REPEATS: usize = 3;
 /// The layout that is timed.
@@ -76,24 +77,24 @@ impl AddAssign for Work {
     }
 }
 
-/// The work of a process that plays one piece after the other. Many short pieces are worth a GPU as one long one is.
+/// The total work of a process that plays many short pieces. Together they may be worth a GPU.
 #[derive(Debug, Default)]
-pub struct Ledger {
+pub struct WorkTotal {
     /// All work so far.
     all: Work,
-    /// All work when a GPU was last looked for.
+    /// All work when a GPU was last searched for.
     looked: Work,
 }
 
-impl Ledger {
-    /// Returns an empty ledger.
-    pub const fn new() -> Ledger {
+impl WorkTotal {
+    /// Returns a total of no work.
+    pub const fn new() -> WorkTotal {
         const NONE: Work = Work { generations: 0.0, agent_steps: 0.0 };
-        Ledger { all: NONE, looked: NONE }
+        WorkTotal { all: NONE, looked: NONE }
     }
 
-    /// Adds some work. Returns all work so far if [`find`] should decide by that: when it is no longer short, and each
-    /// time that it has doubled. Otherwise the decision stays.
+    /// Adds some work. Returns the total if [`find`] should choose again: when it is no longer short, and each time it has
+    /// doubled.
     pub fn add(&mut self, work: Work) -> Option<Work> {
         self.add_for(work, current_num_threads())
     }
@@ -178,9 +179,9 @@ fn generation(config: &Config) -> f64 {
     (config.max_teams() * config.learning.episodes_per_team) as f64 * team(config)
 }
 
-/// Returns the agent-steps of one team's episode.
+/// Returns the agent-steps of one team's episode. This is an estimate, which ignores stages.
 fn team(config: &Config) -> f64 {
-    let world = &config.at(0).world;
+    let world = &config.world;
     ((world.leaders.len() + world.followers.len()) * world.steps) as f64
 }
 
@@ -204,12 +205,12 @@ struct Choice {
     reason: String,
 }
 
-/// Chooses by the work, the CPU's threads and what was measured. `None` if a measurement is worth its time.
+/// Chooses by the work, the CPU's threads and the measurement. `None` if there is none and it is worth its time.
 fn choose(work: Work, threads: usize, measured: Option<Measured>) -> Option<Choice> {
     let rate = measured.map_or(CPU_RATE, |measured| measured.cpu_agent_steps_per_s);
     let on_cpu = work.agent_steps / (rate * threads.max(1) as f64);
     match measured {
-        _ if on_cpu < SHORT => {
+        _ if on_cpu < MIN_GPU_WORK_SECONDS => {
             Some(Choice { gpu: false, reason: format!("{} of work, too little for a GPU to pay", time(on_cpu)) })
         }
         None => None,
@@ -235,9 +236,9 @@ fn time(seconds: f64) -> String {
 
 /// Times generations on a GPU that took `open_s` seconds to open, and on the CPU.
 fn measure(gpu: &mut GpuBackend, open_s: f64, threads: usize) -> Result<Measured, BackendError> {
-    let (small, _) = seconds(gpu, SMALL)?;
-    let (large, steps) = seconds(gpu, LARGE)?;
-    let (cpu, cpu_steps) = seconds(&mut Cpu::default(), ON_CPU)?;
+    let (small, _) = seconds(gpu, SMALL_TEAMS)?;
+    let (large, steps) = seconds(gpu, LARGE_TEAMS)?;
+    let (cpu, cpu_steps) = seconds(&mut Cpu::default(), CPU_TEAMS)?;
     Ok(Measured {
         open_s,
         generation_s: small,
@@ -246,7 +247,7 @@ fn measure(gpu: &mut GpuBackend, open_s: f64, threads: usize) -> Result<Measured
     })
 }
 
-/// Returns seconds per generation of so many teams, and its agent-steps.
+/// Returns the seconds per generation of this many teams, and its agent-steps.
 fn seconds(backend: &mut dyn Backend, teams: usize) -> Result<(f64, f64), BackendError> {
     let mut config = Config::parse(CONFIG, "generally_forward.toml").expect("the project's own config");
     (config.learning.trials, config.learning.population) = (1, teams);
@@ -264,7 +265,7 @@ fn seconds(backend: &mut dyn Backend, teams: usize) -> Result<(f64, f64), Backen
 }
 
 /// Returns the file that keeps the measurement of a device, if there is a place for it. `FLOTILLA_CACHE` names the
-/// directory; if it is empty, nothing is kept.
+/// folder; if it is empty, nothing is kept.
 fn file(adapter: &AdapterInfo) -> Option<PathBuf> {
     let variable = |name: &str| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
     let folder = match std::env::var_os("FLOTILLA_CACHE") {
@@ -277,11 +278,10 @@ fn file(adapter: &AdapterInfo) -> Option<PathBuf> {
     };
     // Another driver or version may be faster or slower.
     let digest = Sha256::digest(format!("{adapter} {VERSION}"));
-    let name: String = digest[..8].iter().map(|byte| format!("{byte:02x}")).collect();
-    folder.map(|folder| folder.join(format!("device-{name}.json")))
+    folder.map(|folder| folder.join(format!("device-{}.json", hex(&digest[..8]))))
 }
 
-/// Returns what was measured of a device before. A damaged file counts as none.
+/// Returns an earlier measurement of a device. A damaged file counts as none.
 fn recall(adapter: &AdapterInfo) -> Option<Measured> {
     let text = fs::read(file(adapter)?).ok()?;
     let measured: Measured = serde_json::from_slice(&text).ok()?;
@@ -290,12 +290,12 @@ fn recall(adapter: &AdapterInfo) -> Option<Measured> {
     sound.then_some(measured)
 }
 
-/// Keeps what was measured. Returns a message if that fails, because each run measures again.
+/// Writes a measurement to the cache. Returns a message if that fails, because each run then measures again.
 fn remember(adapter: &AdapterInfo, measured: &Measured) -> Result<(), String> {
     let Some(path) = file(adapter) else { return Ok(()) };
     let text = serde_json::to_vec_pretty(measured).expect("numbers have a JSON form");
     let folder = path.parent().map_or(Ok(()), fs::create_dir_all);
-    // Whoever reads it meanwhile gets the old file or the new one.
+    // Another process that reads it now gets the old file or the new one.
     let new = path.with_extension(format!("{}", std::process::id()));
     let written = folder.and_then(|()| fs::write(&new, text)).and_then(|()| fs::rename(&new, &path));
     written.map_err(|error: io::Error| {
@@ -337,15 +337,15 @@ mod tests {
 
     #[test]
     fn many_short_calls_are_worth_a_look_for_a_gpu() {
-        let (mut ledger, short) = (Ledger::new(), work(4096, 20, 1));
-        let looked: Vec<usize> = (1..=64 * 64).filter(|_| ledger.add_for(short, 2).is_some()).collect();
+        let (mut total, short) = (WorkTotal::new(), work(4096, 20, 1));
+        let looked: Vec<usize> = (1..=64 * 64).filter(|_| total.add_for(short, 2).is_some()).collect();
         // Not at first, and ever more rarely.
         let first = looked[0];
         assert!(first > 1 && looked.len() > 3, "{looked:?}");
         assert!(looked.windows(2).all(|pair| pair[1] == 2 * pair[0]), "{looked:?}");
         // Work that takes no time is no reason.
-        assert_eq!(ledger.add_for(Work::default(), 2), None);
-        assert!(Ledger::new().add_for(work(1 << 20, 200, 1), 2).is_some());
+        assert_eq!(total.add_for(Work::default(), 2), None);
+        assert!(WorkTotal::new().add_for(work(1 << 20, 200, 1), 2).is_some());
     }
 
     #[test]

@@ -20,7 +20,7 @@ pub(crate) const SCORES: &[Fitness] = &[Fitness::D, Fitness::Df, Fitness::Dpp];
 /// [`SCORES`] and Dt, which needs a record of who was seen at every step.
 pub const SCORES_AND_DT: &[Fitness] = &[Fitness::D, Fitness::Df, Fitness::Dpp, Fitness::Dt];
 
-/// Returns what an evaluation computes beside a fitness: Dt only if that is asked for.
+/// Returns the fitnesses that an evaluation computes: Dt only if it is the given fitness.
 pub fn scores_beside(fitness: Fitness) -> &'static [Fitness] {
     if fitness == Fitness::Dt { SCORES_AND_DT } else { SCORES }
 }
@@ -264,9 +264,9 @@ pub(crate) fn evaluate_until(
             done += groups.len() * count;
             watch(done as f64 / (teams * episodes) as f64);
             let took = started.elapsed();
-            if took < SHORT {
+            if took < SHORT_BATCH {
                 limit = limit.saturating_mul(2);
-            } else if took > LONG {
+            } else if took > LONG_BATCH {
                 limit = (limit / 2).max(1);
             }
             first_team += count;
@@ -292,10 +292,11 @@ pub(crate) fn evaluate_until(
     Ok(evaluation)
 }
 
-/// Steps of teams that [`evaluate_until`] plays first at once, and the time that later ones should take.
+/// Number of team-steps in the first batch of [`evaluate_until`].
 const FIRST_STEPS: usize = 1 << 16;
-const SHORT: Duration = Duration::from_millis(100);
-const LONG: Duration = Duration::from_millis(300);
+/// Range of time that each later batch should take.
+const SHORT_BATCH: Duration = Duration::from_millis(100);
+const LONG_BATCH: Duration = Duration::from_millis(300);
 
 #[cfg(test)]
 mod tests {

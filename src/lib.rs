@@ -74,6 +74,7 @@
 //!
 //! | module | feature | contents |
 //! |---|---|---|
+//! | [`version`] | | the version and commit of this build |
 //! | [`escape`], [`mod@file`], [`shell`] | | reading and writing of names, files and command lines |
 //! | [`host`], [`parallel`] | | time, waiting, threads and the cache |
 //! | [`config_enum`], [`gpu_struct`] | | enums that configs write as words, structs shared with shaders |
@@ -95,8 +96,8 @@
 //! | [`stepping`] | | stepping of teams with given actions |
 //! | [`script`] | `report` | teams whose leaders drive to given places |
 //! | [`memory`] | | a run's peak memory |
-//! | [`record`] | `record` | files: policies, metrics, checkpoints, directories |
-//! | [`run`] | `record` | a trainer together with its runs' directories |
+//! | [`record`] | `record` | files: policies, metrics, checkpoints, folders |
+//! | [`run`] | `record` | a trainer together with its runs' folders |
 //! | [`report`] | `report` | pictures, films, pages; the paper's claims |
 //! | [`sweep`] | `report` | many runs of a parameter grid |
 //! | [`front`] | | the functions that most programs need |
@@ -131,15 +132,6 @@
     allow(dead_code, unused_imports, reason = "the callers may be in features that are left out")
 )]
 #![allow(rustdoc::private_intra_doc_links, reason = "tables of modules name the internal ones, too")]
-
-/// The commit that this build was made from, if it is known. Debug builds do not know it.
-pub const COMMIT: Option<&str> = {
-    let commit = env!("FLOTILLA_COMMIT");
-    if commit.is_empty() { None } else { Some(commit) }
-};
-
-/// The version of this crate, as recorded in `run.json`.
-pub const VERSION: &str = env!("CARGO_PKG_VERSION");
 
 pub mod backend;
 pub mod baseline;
@@ -188,9 +180,11 @@ pub mod stepping;
 pub mod sweep;
 pub mod trainer;
 pub mod verify;
+pub(crate) mod version;
 pub mod world;
 
 pub use config::Config;
 #[cfg(feature = "gpu")]
 pub use front::open;
 pub use front::{play, stepper, trace, train};
+pub use version::{COMMIT, VERSION};

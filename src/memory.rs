@@ -10,7 +10,7 @@ use std::fs;
 use std::path::Path;
 
 use crate::backend::{self, BATCH_BYTES, PACKED_FROM, cpu};
-use crate::config::{Config, Method};
+use crate::config::{Config, Method, ValidConfig};
 use crate::trainer;
 use crate::world::World;
 
@@ -51,19 +51,15 @@ pub struct TooLittle {
 }
 
 impl Peaks {
-    /// Returns the peaks for training these valid configs together on `threads` threads.
-    pub fn of<'a>(configs: impl IntoIterator<Item = &'a Config>, threads: usize) -> Peaks {
+    /// Returns the peaks for training these configs together on `threads` threads.
+    pub fn of<'a>(configs: impl IntoIterator<Item = &'a ValidConfig>, threads: usize) -> Peaks {
         let lanes = cpu::lanes();
         let [mut training, mut next, mut checkpoint, mut queue] = [0_u64; 4];
         let [mut weights, mut record, mut states] = [0_u64; 3];
         let [mut block, mut order, mut populations, mut held] = [0_u64; 4];
         for config in configs {
-            let staged: Vec<(Config, World)> = (config.staged().into_iter())
-                .map(|(_, config)| {
-                    let world = World::new(&config);
-                    (config, world)
-                })
-                .collect();
+            let staged: Vec<(&Config, World)> =
+                config.stages().iter().map(|(_, config)| (config, World::new(config))).collect();
             // The largest stage determines each size.
             let most = |size: &dyn Fn(&Config, &World) -> u64| {
                 staged.iter().map(|(config, world)| size(config, world)).max().unwrap_or(0)
@@ -75,7 +71,7 @@ impl Peaks {
             checkpoint += checkpoint_bytes(config);
             queue += most(&|config, _| teams(config).div_ceil(lanes) * 16);
             block = block.max(most(&|config, world| cpu::block_bytes(world, config.learning.fitness)));
-            // With an evolution strategy, utilities come beside the order.
+            // An evolution strategy also needs the utilities.
             let strategy = config.learning.method != Method::Tournament;
             let ranked = size_of::<usize>() + if strategy { size_of::<f64>() } else { 0 };
             order = order.max((policies * ranked) as u64);
@@ -134,7 +130,7 @@ pub fn check(needed: u64, checkpoint: u64) -> Result<(), TooLittle> {
     }
 }
 
-/// Returns whether a checkpoint of these configs is copied and written while training continues. Larger checkpoints are
+/// Reports whether a checkpoint of these configs is copied and written while training continues. Larger checkpoints are
 /// written directly from the populations, and training waits.
 pub fn copies_checkpoint<'a>(configs: impl IntoIterator<Item = &'a Config>) -> bool {
     configs.into_iter().map(trainer::snapshot_bytes).sum::<u64>() <= COPIED

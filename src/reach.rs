@@ -50,7 +50,7 @@ pub enum Why {
 
 #[cfg(all(feature = "gpu", feature = "report"))]
 impl Unreachable {
-    /// Returns whether a message gives the same reason for another POI, after rounding.
+    /// Reports whether a message gives the same reason for another POI, after rounding.
     pub(crate) fn same_reason(&self, other: &Unreachable) -> bool {
         self.to_string() == Unreachable { poi: self.poi, why: other.why.clone() }.to_string()
     }

@@ -127,7 +127,7 @@ pub fn compare(
     let mut all = Vec::with_capacity(plan.worlds.len());
     for (name, config) in &plan.worlds {
         // Only the first stage plays here. Training below plays all of them.
-        let teams = Teams::new(&config.at(0), plan.teams, plan.seed, outcome.worlds % 2 == 0);
+        let teams = Teams::new(config.validate()?.at(0), plan.teams, plan.seed, outcome.worlds % 2 == 0);
         if let Some(mismatch) = compare_stages(&teams, reference, backend)? {
             outcome.mismatch = Some(format!("{name}: {mismatch}"));
             return Ok(outcome);

@@ -157,7 +157,7 @@ fn played(mut baselines: Baselines) -> Baselines {
 #[test]
 fn random_baselines_equal_the_best_teams_that_a_backend_plays() {
     let arms = arms(2, 2);
-    let configs = paper::grounds(&arms);
+    let configs = paper::baseline_configs(&arms);
     let found = played(Baselines::new(configs.clone())).found();
     assert!(found.iter().all(|found| found.constant[1] == [1.0; 3]), "a constant speed solves every layout");
     assert!(found.iter().any(|found| found.random[0] != found.random[1]), "both trials drew the same policies");
@@ -201,7 +201,7 @@ fn observed(world: &World, weights: &[f32], policies: usize) -> Vec<u32> {
 
 #[test]
 fn constant_speed_baselines_equal_stepped_teams_and_solve_every_layout() {
-    for (place, config) in paper::grounds(&arms(1, 0)).into_iter().enumerate() {
+    for (place, config) in paper::baseline_configs(&arms(1, 0)).into_iter().enumerate() {
         let found = played(Baselines::of_trial(config.clone(), 0));
         let outcome = found.outcomes(&mut Cpu::default(), 1).unwrap().concat().remove(0);
         let teams = baseline::SPEEDS;
@@ -224,7 +224,7 @@ fn constant_speed_baselines_equal_stepped_teams_and_solve_every_layout() {
 
 #[test]
 fn baselines_with_moved_pois_are_measured_from_held_out_starts() {
-    let mut config = paper::grounds(&arms(2, 3))[1].clone();
+    let mut config = paper::baseline_configs(&arms(2, 3))[1].clone();
     (config.learning.poi_jitter, config.learning.population, config.learning.episodes_per_team) = (5.0, 6, 2);
     let baselines = played(Baselines::of_trial(config.clone(), 5));
     let outcome = baselines.outcomes(&mut Cpu::default(), 30).unwrap().concat().remove(0);

@@ -796,8 +796,9 @@ impl PlainTrial<'_> {
         let mut rows = Vec::new();
         // The champions of all past generations.
         let mut past: Vec<Vec<Vec<f32>>> = Vec::new();
+        let config = self.config.validate().unwrap();
         for generation in 0..=generations {
-            let stage = self.config.at(generation);
+            let stage = config.at(generation);
             let Learning { partners, leniency, hall_of_fame, .. } = stage.learning;
             let mut teams = vec![0; partners * population * leaders];
             for (round, teams) in teams.chunks_mut(population * leaders).enumerate() {
@@ -809,7 +810,7 @@ impl PlainTrial<'_> {
             for (index, team) in teams.chunks(leaders).enumerate() {
                 let team: Vec<usize> =
                     team.iter().map(|&policy| if shared { index } else { policy as usize }).collect();
-                let (share, scores) = self.play(generation, &stage, &team);
+                let (share, scores) = self.play(generation, stage, &team);
                 observed.push(share);
                 if shared {
                     let sum = scores.iter().fold(0.0, |sum, &score| sum + f64::from(score));
@@ -831,7 +832,7 @@ impl PlainTrial<'_> {
                 {
                     let mut team = vec![population; leaders];
                     team[leader] = policy;
-                    scored[leader][policy].push(self.play(generation, &stage, &team).1[leader]);
+                    scored[leader][policy].push(self.play(generation, stage, &team).1[leader]);
                 }
                 self.policies.iter_mut().for_each(|policies| policies.truncate(population));
             }
@@ -869,13 +870,13 @@ impl PlainTrial<'_> {
             let champion: Vec<usize> = (0..leaders).map(|leader| ranked[if shared { 0 } else { leader }][0]).collect();
             let of_leader = |leader: usize| self.policies[if shared { 0 } else { leader }][champion[leader]].clone();
             past.push((0..leaders).map(of_leader).collect());
-            let (champion, _) = self.play(generation + 1, &stage, &champion);
+            let (champion, _) = self.play(generation + 1, stage, &champion);
             rows.push(Row {
                 experiment: 0,
                 trial: self.trial,
                 generation,
                 best_g: observed.iter().copied().fold(0.0, f64::max),
-                mean_g: mean(&observed, &stage),
+                mean_g: mean(&observed, stage),
                 champion_g: champion,
             });
             for (leader, (policies, order)) in self.policies.clone().iter().zip(&ranked).enumerate() {

@@ -189,7 +189,8 @@ fn training_starts_from_given_policies() {
         flotilla::front::train_from(&config, &mut Cpu::default(), policies, first, |_| Continue(()))
     };
     let warm = train_from(policies, &learned.policies).unwrap();
-    let trials = learned.policies.iter().map(|weights| Policies { policies, weights: weights.clone() }).collect();
+    let of_trial = |weights: &Vec<f32>| Policies { policies, sharing: Sharing::PerLeader, weights: weights.clone() };
+    let trials = learned.policies.iter().map(of_trial).collect();
     let folder = tempfile::tempdir().unwrap();
     let init = Init { digest: "of no file".into(), trials };
     assert_eq!(warm.digest(), run_digest_from(&config, folder.path(), Some(init)));

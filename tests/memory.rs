@@ -15,7 +15,7 @@ use flotilla::backend::cpu::Cpu;
 use flotilla::config::Config;
 use flotilla::front::Failure;
 use flotilla::memory::{self, Peaks};
-use flotilla::record::checkpoint::{self, Checkpoint, Keeper};
+use flotilla::record::checkpoint::{self, Checkpoint, CheckpointWriter};
 use flotilla::record::disk::Disk;
 use flotilla::record::metrics;
 use flotilla::trainer::Trainer;
@@ -58,6 +58,11 @@ fn predicted(config: &std::path::Path) -> u64 {
     json["cost"]["host_bytes"].as_u64().unwrap()
 }
 
+fn peaks(configs: &[&Config], threads: usize) -> Peaks {
+    let valid: Vec<_> = configs.iter().map(|config| config.validate().unwrap()).collect();
+    Peaks::of(&valid, threads)
+}
+
 #[test]
 fn runs_use_the_predicted_memory() {
     for (population, trials, checkpoint) in [
@@ -91,7 +96,7 @@ fn a_run_without_enough_memory_does_not_start() {
     let (path, out) = (folder.path().join("config.toml"), folder.path().join("run"));
     let text = config_text(1 << 20, 140, 1, "generations = 0\nseconds = 0.0");
     let config = Config::parse(&text, "config").unwrap();
-    let needed = Peaks::of([&config], 1).host;
+    let needed = peaks(&[&config], 1).host;
     if memory::available().is_none_or(|available| available >= needed) {
         println!("skipped: this system does not report free memory, or has {needed} bytes");
         return;
@@ -119,7 +124,7 @@ fn peaks_of_configs_that_train_together_add_up() {
     let config = |population| Config::parse(&config_text(population, 2, 1, "generations = 1"), "config").unwrap();
     let [small, large] = [config(1000), config(9000)];
     let [small_only, large_only, both] =
-        [vec![&small], vec![&large], vec![&small, &large]].map(|configs| Peaks::of(configs, 3));
+        [vec![&small], vec![&large], vec![&small, &large]].map(|configs| peaks(&configs, 3));
     let growing = |plan: Peaks| plan.host - memory::PROGRAM;
     assert_eq!(both.checkpoint, small_only.checkpoint + large_only.checkpoint);
     assert!(growing(both) > growing(large_only) && growing(both) <= growing(small_only) + growing(large_only));
@@ -135,10 +140,10 @@ fn the_largest_stage_determines_the_peak() {
     let config = |stages: &str| Config::parse(&[&plain, stages].concat(), "config").unwrap();
     let stage = |from: usize, set: &str| format!("[[stages]]\nfrom = {from}\nset = {{ {set} }}\n");
     let (large, small) = ("learning.episodes_per_team = 5, world.steps = 90", "world.steps = 5");
-    let expected = Peaks::of([&config(&stage(0, large))], 3);
-    assert!(expected.host > Peaks::of([&config("")], 3).host);
+    let expected = peaks(&[&config(&stage(0, large))], 3);
+    assert!(expected.host > peaks(&[&config("")], 3).host);
     for stages in [stage(4, large), stage(2, large) + &stage(4, small), stage(2, small) + &stage(4, large)] {
-        assert_eq!(Peaks::of([&config(&stages)], 3), expected, "{stages}");
+        assert_eq!(peaks(&[&config(&stages)], 3), expected, "{stages}");
     }
 }
 
@@ -147,7 +152,7 @@ fn the_largest_stage_determines_the_peak() {
 fn packed_records_and_populations_are_counted() {
     let adapter = |population| {
         let config = Config::parse(&config_text(population, 2, 1, "generations = 0"), "config").unwrap();
-        Peaks::of([&config], 1).adapter
+        peaks(&[&config], 1).adapter
     };
     // Per team, weights and record: 4 leaders of 112 weights; 25 steps of 4 POIs, and 8 followers with 4 leaders each.
     let (weights, record) = (4 * 112 * 4, (25 * 4 + 8 * 4) * 4);
@@ -167,7 +172,7 @@ fn states_between_dispatches_are_counted() {
     let config = Config::parse(&text(1024), "config").unwrap();
     // Per team, weights, record and states: 112 weights; 25 steps of 32 words, and 1023 followers with one leader.
     let (weights, record, states) = (112 * 4, (25 * 32 + 1023) * 4, 1024 * 20);
-    assert_eq!(Peaks::of([&config], 1).adapter, 2 * 51 * (weights + record + states) / 2);
+    assert_eq!(peaks(&[&config], 1).adapter, 2 * 51 * (weights + record + states) / 2);
 }
 
 /// A checkpoint written from the populations must equal one written from a copy of them.
@@ -184,23 +189,23 @@ fn checkpoints_from_a_copy_and_a_view_are_equal() {
     let files = ["copy", "view"].map(|name| {
         let path = folder.path().join(name);
         fs::create_dir(&path).unwrap();
-        let mut keeper = Keeper::new(disk.clone(), path.clone(), config.clone(), vec![0, 1], 1);
+        let mut writer = CheckpointWriter::new(disk.clone(), path.clone(), config.clone(), vec![0, 1], 1);
         let (config, seconds) = (flotilla::record::config_digest(&config), 2.5);
         let (metrics, output) = metrics.mark().unwrap();
         match name {
             "copy" => {
                 let snapshot = trainer.snapshot(0).unwrap();
                 let checkpoint = Checkpoint { config, init: None, seconds, metrics, snapshot };
-                keeper.save(checkpoint, output, Instant::now()).unwrap();
-                keeper.wait().unwrap();
+                writer.save(checkpoint, output, Instant::now()).unwrap();
+                writer.wait().unwrap();
             }
             _ => {
                 let checkpoint =
                     Checkpoint { config, init: None, seconds, metrics, snapshot: trainer.view(0).unwrap() };
-                keeper.save_now(&checkpoint, &output, Instant::now()).unwrap();
+                writer.save_now(&checkpoint, &output, Instant::now()).unwrap();
             }
         }
-        assert_eq!(keeper.newest(), Some(3));
+        assert_eq!(writer.newest(), Some(3));
         fs::read(checkpoint::path(&path, 3)).unwrap()
     });
     assert!(files[0].len() as u64 > config.policy_bytes() && files[0] == files[1]);

@@ -352,7 +352,8 @@ fn compiling() {
         }
     }
     let sweep = Sweep::read(include_str!("../configs/sweeps/large.toml"), "large.toml", &[], false).unwrap();
-    cases.push(("large.toml".into(), sweep.points.into_iter().map(|point| small(point.config)).collect()));
+    cases
+        .push(("large.toml".into(), sweep.points.into_iter().map(|point| small(point.config.into_config())).collect()));
     for (request, info) in support::adapters("compiling") {
         for (name, configs) in &cases {
             let backend = || GpuBackend::new(gpu::open(request.clone()).unwrap()).unwrap();

@@ -71,7 +71,7 @@ fn every_rule_key_can_be_a_grid_axis() {
     assert_eq!(last.world.after, [vec![1], vec![]]);
     let learning = &last.learning;
     assert_eq!((learning.fitness, learning.led_within, learning.led_by), (Fitness::Dt, 3, LedBy::AnySeen));
-    assert_eq!(sweep.points[0].config, Config::parse(&base, "x").unwrap().with(&[fitness("D")]).unwrap());
+    assert_eq!(*sweep.points[0].config, Config::parse(&base, "x").unwrap().with(&[fitness("D")]).unwrap());
 }
 
 fn fitness(word: &str) -> Override {

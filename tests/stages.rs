@@ -51,19 +51,21 @@ fn error_lines(text: &str) -> Vec<String> {
 fn each_stage_changes_the_config_of_the_file() {
     let config = staged();
     assert_eq!(Config::parse(&config.to_toml(), "again").unwrap(), config, "{}", config.to_toml());
-    let stages = config.staged();
+    let valid = config.validate().unwrap();
+    let stages = valid.stages();
     let froms: Vec<usize> = stages.iter().map(|(from, _)| *from).collect();
     assert_eq!(froms, [0, 2, 4]);
     let without_stages = Config { stages: vec![], ..config.clone() };
     assert_eq!(stages[0].1, without_stages);
     // Changes of one stage do not carry over to the next.
     assert_eq!((stages[1].1.world.steps, stages[2].1.world.steps), (14, 9));
-    assert_eq!((stages[1].1.world.pois.len(), stages[2].1.world.pois.len(), config.pois()), (2, 3, None));
-    assert_eq!((0..7).map(|generation| config.stage_of(generation)).collect::<Vec<_>>(), [0, 0, 1, 1, 2, 2, 2]);
-    let shares: Vec<usize> = config.shares().iter().map(|share| share.learning.generations + 1).collect();
-    assert_eq!(shares, [2, 2, 3]);
+    assert_eq!((stages[1].1.world.pois.len(), stages[2].1.world.pois.len(), valid.pois()), (2, 3, None));
+    assert_eq!((0..7).map(|generation| valid.stage_of(generation)).collect::<Vec<_>>(), [0, 0, 1, 1, 2, 2, 2]);
+    let lengths: Vec<usize> = valid.stage_lengths().map(|(generations, _)| generations).collect();
+    assert_eq!(lengths, [2, 2, 3]);
     let immediate = self::config(&format!("{SMALL}[[stages]]\nfrom = 0\nset = {{ world.coupling = 1 }}\n"));
-    assert_eq!((immediate.staged().len(), immediate.stage_of(6)), (1, 0));
+    let immediate = immediate.validate().unwrap();
+    assert_eq!((immediate.stages().len(), immediate.stage_of(6)), (1, 0));
     assert_eq!(immediate.at(0).world.coupling, flotilla::config::Coupling::Same(1));
 }
 
@@ -197,10 +199,10 @@ fn a_staged_run_resumes_to_the_same_results() {
     let place = tempfile::tempdir().unwrap();
     let (config, whole) = (staged(), place.path().join("whole"));
     let expected = train(&config, &whole, None, Start::Fresh, 99).unwrap().unwrap();
-    let metrics = rows(&whole);
+    let (metrics, valid) = (rows(&whole), config.validate().unwrap());
     assert_eq!(metrics[0], ["trial", "generation", "best_g", "mean_g", "champion_g", "stage"]);
     for row in &metrics[1..] {
-        assert_eq!(row[5], config.stage_of(row[1].parse().unwrap()).to_string());
+        assert_eq!(row[5], valid.stage_of(row[1].parse().unwrap()).to_string());
     }
     // Before generation 2, where a stage begins, the metrics equal those of a run without stages.
     let plain = place.path().join("plain");

@@ -93,7 +93,7 @@ fn pages_agree_with_the_full_study() {
         return;
     }
     let arms = train_experiments(TRIALS);
-    let mut baselines = Baselines::new(paper::grounds(&arms));
+    let mut baselines = Baselines::new(paper::baseline_configs(&arms));
     while !baselines.is_done() {
         baselines.advance(&mut Cpu::default()).unwrap();
     }

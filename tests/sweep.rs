@@ -144,7 +144,7 @@ fn config_of_layout(followers: usize, groups: usize) -> Config {
         "[world]\ncoupling = 1\n[learning]\npopulation = 2\n\
          [grid]\nfollowers_per_leader = [{followers}]\ngroups = [{groups}]\n"
     );
-    parse(&text).points.remove(0).config
+    parse(&text).points.remove(0).config.into_config()
 }
 
 #[test]
@@ -444,9 +444,9 @@ fn the_shard_is_read_from_the_variables_of_job_arrays() {
 #[test]
 fn points_trained_in_one_batch_equal_points_trained_alone() {
     let sweep = parse(SMALL);
-    let train = |configs: Vec<Config>| {
+    let train = |configs: Vec<ValidConfig>| {
         let experiments = configs.len();
-        let mut trainer = Trainer::new(ValidConfig::all(&configs).unwrap());
+        let mut trainer = Trainer::new(configs);
         let rows = trainer.finish(&mut Cpu::default()).unwrap();
         (0..experiments)
             .map(|experiment| {
@@ -940,8 +940,8 @@ fn a_batch_of_unequal_points_takes_as_long_as_its_points() {
     let text = "[learning]\ngenerations = 20\ntrials = 2\n[grid]\nfollowers_per_leader = [0, 1, 4, 16]\n\
                 \"world.coupling\" = [1, 4]\n\"world.steps\" = [10, 25, 100]\n";
     let sweep = parse(text);
-    let seconds = |configs: Vec<Config>| {
-        let mut trainer = Trainer::new(ValidConfig::all(&configs).unwrap());
+    let seconds = |configs: Vec<ValidConfig>| {
+        let mut trainer = Trainer::new(configs);
         let mut backend = Cpu::default();
         let start = Instant::now();
         trainer.finish(&mut backend).unwrap();

@@ -13,7 +13,7 @@ import os
 from typing import TYPE_CHECKING, Any
 
 from flotilla import _native, loggers
-from flotilla._coevolution import Asked, Coevolution, Played
+from flotilla._coevolution import Coevolution, Played, Proposal
 from flotilla._config import Config, Key
 from flotilla._errors import ConfigError, Error, Problem
 from flotilla._play import Collected, Rollout, Trace, collect, forward, rollout, to_onnx
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 __version__: str = _native.__version__
 
 __all__ = [
-    "Asked",
     "Coevolution",
     "Collected",
     "Config",
@@ -43,6 +42,7 @@ __all__ = [
     "Played",
     "Point",
     "Problem",
+    "Proposal",
     "Replay",
     "Rollout",
     "Run",

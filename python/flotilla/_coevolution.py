@@ -14,7 +14,7 @@ from flotilla._config import Config
 from flotilla._run import Generation, Run, first_policies
 
 
-class Asked(NamedTuple):
+class Proposal(NamedTuple):
     """What a generation plays, see `Coevolution`."""
 
     policies: Floats
@@ -97,7 +97,7 @@ class Coevolution:
         """Whether all generations have a fitness."""
         return self._native.done
 
-    def ask(self) -> Asked:
+    def ask(self) -> Proposal:
         """Returns the generation's policies, teams and starts. Asking again returns the same.
 
         Example:
@@ -105,7 +105,7 @@ class Coevolution:
             >>> asked.policies.shape, asked.teams.shape, asked.starts.shape
             ((5, 4, 51, 112), (5, 50, 4), (5, 1, 12, 2))
         """
-        return Asked(*self._native.ask())
+        return Proposal(*self._native.ask())
 
     def play(self) -> Played:
         """Plays the generation's teams, and returns their G and the config's fitness."""

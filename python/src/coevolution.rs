@@ -33,7 +33,7 @@ type Given<'py> = (
 /// `[trials, episodes, agents (+ pois), 2]`.
 type Candidates<'py> = (Bound<'py, PyArray4<f32>>, Bound<'py, PyArray3<u32>>, Bound<'py, PyArray4<f32>>);
 
-/// A training whose caller decides what policies are worth.
+/// A training whose caller scores the policies.
 #[pyclass(frozen)]
 pub struct Coevolution {
     inner: Mutex<front::Coevolution>,

@@ -61,8 +61,7 @@ impl Config {
     }
 
     fn to_dict<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        let table =
-            self.0.to_toml().parse::<toml::Table>().map_err(|error| PyValueError::new_err(error.to_string()))?;
+        let table = toml::Table::try_from(&self.0).map_err(|error| PyValueError::new_err(error.to_string()))?;
         to_python(py, Value::Table(table))
     }
 
@@ -115,7 +114,8 @@ pub fn sweep<'py>(
         let pairs = sweep.axes.iter().zip(&point.values);
         pairs.map(|(axis, &value)| to_python(py, axis.values[value].clone())).collect::<PyResult<Vec<_>>>()
     };
-    let points = sweep.points.iter().map(|point| Ok((point.index, values(point)?, Config(point.config.clone()))));
+    let points =
+        sweep.points.iter().map(|point| Ok((point.index, values(point)?, Config(point.config.clone().into_config()))));
     let points = points.collect::<PyResult<Vec<_>>>()?;
     Ok((sweep.axes.iter().map(|axis| axis.key.clone()).collect(), points, sweep.text))
 }

@@ -189,8 +189,8 @@ const BITS: [[bool; 8]; 256] = {
 /// Writes sets of agents, one bit per agent in whole words, as one bool per agent.
 pub fn write_members(sets: &[u32], agents: usize, members: &mut [bool]) {
     /// Minimum number of sets per task.
-    const LEAST: usize = 4096;
-    let sets = sets.par_chunks(agents.div_ceil(32)).with_min_len(LEAST);
+    const MIN_SETS_PER_TASK: usize = 4096;
+    let sets = sets.par_chunks(agents.div_ceil(32)).with_min_len(MIN_SETS_PER_TASK);
     members.par_chunks_mut(agents).zip(sets).for_each(|(members, set)| {
         let bytes = set.iter().flat_map(|word| word.to_le_bytes());
         for (members, byte) in members.chunks_mut(8).zip(bytes) {

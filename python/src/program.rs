@@ -42,7 +42,7 @@ pub fn answer(py: Python<'_>, request: &str, backend: &str, command: &str) -> Py
         .map(|outcome| outcome.to_string())
 }
 
-/// Receives the rows of a generation, the number of the last one, and champions if they were asked for. Returns whether
+/// Receives the rows of a generation, the number of the last one, and champions if they were asked for. Reports whether
 /// to end the training there.
 type Watch<'a> = &'a (dyn Fn(&[Row], usize, Option<&[f32]>) -> PyResult<bool> + Sync);
 
@@ -59,7 +59,7 @@ pub fn perform<R: Send>(
         let [stop, end] = [false; 2].map(AtomicBool::new);
         let (asked, interrupted) = (Cell::new(Instant::now()), Cell::new(None));
         let (last, ended) = (Cell::new(0), Cell::new(false));
-        let tell = |event: Event<'_>| {
+        let report = |event: Event<'_>| {
             let is_due = asked.get().elapsed() >= PATIENCE;
             let generation = |a: &Row, b: &Row| a.generation == b.generation;
             let found = match event {
@@ -97,7 +97,7 @@ pub fn perform<R: Send>(
                 stop.store(true, Relaxed);
             }
         };
-        let mut context = Context::new(&tell);
+        let mut context = Context::new(&report);
         (context.stop, context.end, context.command) = (&stop, &end, command);
         let outcome = work(&mut backends, context);
         (outcome, interrupted.into_inner())

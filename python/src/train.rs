@@ -96,14 +96,14 @@ impl Generation {
     }
 }
 
-/// The callback, and what it is told.
+/// The callback and its arguments.
 struct Watcher<'a> {
     callback: Option<&'a Py<PyAny>>,
     populations: usize,
 }
 
 impl Watcher<'_> {
-    /// Reports a generation to the callback. Returns whether to stop.
+    /// Reports a generation to the callback. Reports whether to stop.
     fn tell(&self, rows: &[Row], last: usize, champions: Option<&[f32]>) -> PyResult<bool> {
         let (Some(callback), Some(row)) = (self.callback, rows.first()) else { return Ok(false) };
         Python::attach(|py| {

@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::{Mutex, PoisonError};
 
 use flotilla::backend::OpenBackend;
-use flotilla::choice::{self, Chosen, Ledger, Work};
+use flotilla::choice::{self, Chosen, Work, WorkTotal};
 use flotilla::front::{self, Processor};
 use flotilla::parallel;
 use pyo3::exceptions::PyRuntimeWarning;
@@ -15,9 +15,9 @@ use crate::errors::Raise;
 /// Open backends that are not in use, by requested name. Opening a GPU takes longer than many rollouts.
 static IDLE: Mutex<Vec<(String, OpenBackend)>> = Mutex::new(Vec::new());
 /// The work that "auto" was asked to play in this process.
-static WORK: Mutex<Ledger> = Mutex::new(Ledger::new());
+static WORK: Mutex<WorkTotal> = Mutex::new(WorkTotal::new());
 /// Maximum number of idle backends.
-const MOST: usize = 4;
+const MAX_IDLE_BACKENDS: usize = 4;
 /// Whether this process was forked. Threads of its parent do not exist in it.
 static FORKED: AtomicBool = AtomicBool::new(false);
 
@@ -142,7 +142,7 @@ impl Lent {
     /// Keeps the backend for the next call. Call this only if the backend did not fail.
     pub fn give_back(self) {
         if let Ok(mut idle) = IDLE.try_lock()
-            && idle.len() < MOST
+            && idle.len() < MAX_IDLE_BACKENDS
         {
             idle.push((self.name, self.player));
         }

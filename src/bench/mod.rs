@@ -12,7 +12,7 @@ use crate::config::{Config, Coupling};
 use crate::evolve::{Key, Purpose, random_policy, teams_of};
 use crate::host::Instant;
 use crate::sweep::layout::{self, MAX_FOLLOWERS, MAX_GROUPS};
-use crate::trainer::{Times, Trainer};
+use crate::trainer::{GenerationTimes, Trainer};
 use crate::world::World;
 
 pub mod ceiling;
@@ -100,7 +100,7 @@ pub struct Profile {
     /// The number of these generations.
     pub generations: usize,
     /// The trainer's phases.
-    pub times: Times,
+    pub times: GenerationTimes,
     /// The phases of a GPU's rollouts.
     pub stages: Option<Stages>,
     /// Bytes over the bus, in rollouts and between them.

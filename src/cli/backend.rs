@@ -1,6 +1,6 @@
 //! Opens the backends that play episodes.
 
-use super::{BackendChoice, Breed, Error, RunOptions, said, say};
+use super::{BackendChoice, Breed, Error, RunOptions, say, with_remedy};
 use crate::backend::OpenBackend;
 use crate::backend::gpu::device;
 use crate::backend::gpu::episode::{GpuBackend, ResidencyPolicy};
@@ -35,7 +35,7 @@ pub fn open_gpu(options: &RunOptions, work: Option<Work>) -> Result<(Option<GpuB
         Breed::Device => Some(ResidencyPolicy::Always),
     };
     if (options.backend, options.breed) == (BackendChoice::Cpu, Breed::Device) {
-        return Err(Error::Usage(said(
+        return Err(Error::Usage(with_remedy(
             "--breed device needs a GPU, --backend cpu uses none",
             "leave out one of the two",
         )));

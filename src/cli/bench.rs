@@ -7,7 +7,9 @@ use std::time::Duration;
 use fearless_simd::Level;
 use serde_json::json;
 
-use super::{BackendChoice, Breed, Error, Overrides, Processor, RunOptions, backend, between, print, print_json, said};
+use super::{
+    BackendChoice, Breed, Error, Overrides, Processor, RunOptions, backend, between, print, print_json, with_remedy,
+};
 use crate::backend::Machine;
 use crate::backend::cpu::{Cpu, level_name};
 use crate::bench::{self, Generations, Profile, Subject, Timing};
@@ -72,11 +74,11 @@ pub fn run(args: Args) -> Result<(), Error> {
         }
     };
     // Only the first stage is measured.
-    let config = Config::read(&text, &name, &[], &args.overrides.list())?.at(0);
-    let configs = combinations(&config, &args)?;
+    let config = Config::read(&text, &name, &[], &args.overrides.list())?.validate()?;
+    let configs = combinations(config.at(0), &args)?;
     let (mut player, machine) = open(&args)?;
     for config in &configs {
-        let plan = Peaks::of([config], rayon::current_num_threads());
+        let plan = Peaks::of([&config.validate()?], rayon::current_num_threads());
         plan.check(machine.backend == "gpu").map_err(RunError::from)?;
     }
     if !args.json {
@@ -138,7 +140,7 @@ fn open(args: &Args) -> Result<(Subject, Machine), Error> {
     let level = match &args.instructions {
         None => Level::new(),
         Some(_) if args.run.backend == BackendChoice::Gpu => {
-            return Err(Error::Usage(said("--instructions is for the CPU backend", "leave out --backend gpu")));
+            return Err(Error::Usage(with_remedy("--instructions is for the CPU backend", "leave out --backend gpu")));
         }
         Some(name) => {
             let levels = Cpu::levels();
@@ -148,7 +150,7 @@ fn open(args: &Args) -> Result<(Subject, Machine), Error> {
                 return Err(Error::Usage(format!("--instructions: found {name}, this processor has {names}").into()));
             };
             if args.run.adapter.is_some() || args.run.breed == Breed::Device {
-                return Err(Error::Usage(said(
+                return Err(Error::Usage(with_remedy(
                     "--instructions is for the CPU backend",
                     "leave out --adapter and --breed device",
                 )));
@@ -168,7 +170,7 @@ fn open(args: &Args) -> Result<(Subject, Machine), Error> {
         }
         None if args.teams_per_workgroup.is_some() => {
             let message = "--teams-per-workgroup is for specialised kernels of a GPU, and none is used";
-            return Err(Error::Usage(said(message, "leave it out, or name a GPU with --adapter")));
+            return Err(Error::Usage(with_remedy(message, "leave it out, or name a GPU with --adapter")));
         }
         None => (Subject::Cpu(Cpu::at_level(level), level), front::cpu().1),
     })

@@ -24,7 +24,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     let Args { config, json, out } = args;
     output::check(&[("--out", out.as_deref())], &[&config.file.path])?;
     let request = Request { name: config.name(), config: config.text(vec![])?, out };
-    let found = console::tell(false, |context| check::run(&request, context))?;
+    let found = console::run_without_backend(false, |context| check::run(&request, context))?;
     if json {
         return print_json(&found);
     }

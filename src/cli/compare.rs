@@ -51,7 +51,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     let opened = folders.iter().map(|folder| RunFolder::open(folder)).collect::<Result<Vec<_>, _>>()?;
     let folders = opened.iter().map(|folder| folder.path().into()).collect();
     let request = Request { folders, by, at, reach, paired, unverified };
-    let found = console::tell(false, |context| ops::compare::run(&request, context))?;
+    let found = console::run_without_backend(false, |context| ops::compare::run(&request, context))?;
     if csv {
         let mut text = Vec::new();
         comparison::csv(&found.comparisons, &mut text).map_err(Error::Output)?;

@@ -8,7 +8,7 @@ use super::{Error, RunOptions, backend, say};
 use crate::backend::OpenBackend;
 use crate::choice::Work;
 use crate::ops::{BackendSource, Context, Event};
-use crate::report::progress::{Board, Meter};
+use crate::report::progress::{Meter, ProgressBars};
 
 /// The flags of a command that concern every use case.
 pub struct Console<'a> {
@@ -67,7 +67,7 @@ impl<'a> Console<'a> {
         work: impl FnOnce(&mut dyn BackendSource, Context<'_>) -> Result<R, Error>,
     ) -> Result<R, Error> {
         let flags = recovery::words_of_machine(self.machine.options, self.loss);
-        told(self.quiet, signals, &flags, self.loss.falls_back(), |context| work(&mut self.machine, context))
+        run_reported(self.quiet, signals, &flags, self.loss.falls_back(), |context| work(&mut self.machine, context))
     }
 }
 
@@ -75,20 +75,20 @@ impl<'a> Console<'a> {
 ///
 /// # Errors
 /// The use case fails.
-pub fn tell<R>(quiet: bool, work: impl FnOnce(Context<'_>) -> Result<R, Error>) -> Result<R, Error> {
-    told(quiet, &Signals::default(), &[], false, work)
+pub fn run_without_backend<R>(quiet: bool, work: impl FnOnce(Context<'_>) -> Result<R, Error>) -> Result<R, Error> {
+    run_reported(quiet, &Signals::default(), &[], false, work)
 }
 
-fn told<R>(
+fn run_reported<R>(
     quiet: bool,
     signals: &Signals,
     flags: &[OsString],
     falls_back: bool,
     work: impl FnOnce(Context<'_>) -> Result<R, Error>,
 ) -> Result<R, Error> {
-    let (show, command) = (Display::new(quiet), recovery::typed());
-    let (Signals { stop, save }, tell) = (signals, |event: Event<'_>| show.event(event));
-    let done = work(Context { stop, save, command: &command, flags, falls_back, ..Context::new(&tell) });
+    let (show, command) = (Display::new(quiet), recovery::command_line());
+    let (Signals { stop, save }, report) = (signals, |event: Event<'_>| show.event(event));
+    let done = work(Context { stop, save, command: &command, flags, falls_back, ..Context::new(&report) });
     show.event(Event::Pause);
     done
 }
@@ -102,7 +102,7 @@ struct Display {
 /// The drawing on the terminal.
 enum View {
     Nothing,
-    Curves(Board),
+    Curves(ProgressBars),
     Meter(Meter),
 }
 
@@ -117,7 +117,7 @@ impl Display {
             (Event::Warning(text) | Event::Note(text), _) => say(text),
             (Event::Message(text), _) if !self.quiet => say(text),
             (Event::Begin(names, from, last), shown) => {
-                *shown = View::Curves(Board::new(names, from, last, self.quiet));
+                *shown = View::Curves(ProgressBars::new(names, from, last, self.quiet));
             }
             (Event::Rows { next, rows, .. }, View::Curves(board)) => board.show(next, rows),
             (Event::Fraction(part, text), View::Meter(meter)) => meter.show(part, || text),

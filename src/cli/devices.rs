@@ -17,7 +17,7 @@ pub struct Args {
     json: bool,
 }
 
-/// Opens every adapter in turn, because only an open device can be tested.
+/// Opens every adapter, one after the other, because only an open device can be tested.
 pub fn run(args: Args) -> Result<(), Error> {
     backend::start_threads(None);
     let adapters: Vec<_> = device::adapters()

@@ -6,7 +6,7 @@ use clap::builder::{PossibleValue, PossibleValuesParser};
 use toml::{Table, Value};
 
 use super::layout::{SHAPES, StartLayout};
-use super::{Error, print, said, whole};
+use super::{Error, print, whole, with_remedy};
 use crate::config::{self, Config, Definition};
 use crate::escape::PathExt;
 use crate::ops::output;
@@ -66,7 +66,7 @@ fn template(args: &Args) -> Result<String, Error> {
         let given = [("--groups", args.groups), ("--followers", args.followers), ("--pois", args.pois)];
         if let Some((flag, _)) = given.into_iter().find(|(_, number)| number.is_some()) {
             let layout = &args.layout;
-            return Err(Error::Usage(said(
+            return Err(Error::Usage(with_remedy(
                 format!("{flag}: the layout {layout} is the paper's"),
                 "use it with ring, row or grid",
             )));
@@ -86,7 +86,7 @@ fn template(args: &Args) -> Result<String, Error> {
 /// Returns `config` as a config file, after the opening comment of the text `from`. Each key has a comment with its
 /// meaning, unit, kind, range and default.
 fn commented(from: &str, config: &Config) -> String {
-    let values: Table = config.to_toml().parse().expect("it was just written");
+    let values = Table::try_from(config).expect("a config that was read is TOML");
     let opening: String =
         from.lines().take_while(|line| line.starts_with('#')).map(|line| format!("{line}\n")).collect();
     let mut text = opening + "#\n# Every key follows, with its meaning and (unit; allowed values; default).\n";

@@ -7,6 +7,7 @@ use glam::DVec2;
 
 use crate::config::{Config, ConfigError, MAX_AGENTS, MAX_POIS};
 use crate::reach;
+use crate::report::map::counted;
 use crate::world::World;
 
 /// The arrangement of groups and POIs.
@@ -175,7 +176,6 @@ impl StartLayout {
 
     fn header(&self, needed: usize) -> String {
         let StartLayout { groups, followers, pois, .. } = *self;
-        let count = |number: usize, what: &str| format!("{number} {what}{}", if number == 1 { "" } else { "s" });
         let (name, looks) = match self.shape {
             Pattern::Ring => ("Ring", "start around the centre of the map and face outwards"),
             Pattern::Row => ("Row", "start side by side and face up"),
@@ -189,11 +189,11 @@ impl StartLayout {
         format!(
             "# {name}: {}, each a leader with {}.\n#\n# The groups {looks}. The {} {} {place}.\n# A POI is \
              observed when {} {} within its radius in the same step.\n",
-            count(groups, "group"),
-            count(followers, "follower"),
-            count(pois, "POI"),
+            counted(groups, "group"),
+            counted(followers, "follower"),
+            counted(pois, "POI"),
             if pois == 1 { "is" } else { "are" },
-            count(needed, "agent"),
+            counted(needed, "agent"),
             if needed == 1 { "is" } else { "are" },
         )
     }

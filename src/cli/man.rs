@@ -24,10 +24,7 @@ const TITLE: &str = ".TH flotilla";
 
 /// Writes the pages, and overwrites earlier versions of them.
 pub fn run(args: Args) -> Result<(), Error> {
-    let disk = Disk::default();
-    let failed = |path: PathBuf| move |error| RecordError::Write { path, error };
-    disk.create_folder(&args.out).map_err(failed(args.out.clone()))?;
-    let disk = ownership::open_output_folder(&disk, &args.out, true)?;
+    let disk = ownership::create_output_folder(&Disk::default(), &args.out, true)?;
     let mut all = Cli::command().disable_help_subcommand(true);
     all.build();
     let commands: Vec<_> = std::iter::once(&all).chain(all.get_subcommands()).cloned().collect();
@@ -38,7 +35,7 @@ pub fn run(args: Args) -> Result<(), Error> {
         if path.symlink_metadata().is_ok() && !fs::read_to_string(&path).is_ok_and(|text| text.contains(TITLE)) {
             return Err(RecordError::NotOurs { path }.into());
         }
-        disk.replace(&path, |output| page.render(output)).map_err(failed(path))?;
+        disk.replace(&path, |output| page.render(output)).map_err(RecordError::write(&path))?;
     }
     print(&format!("{}\n", args.out.escaped()))
 }

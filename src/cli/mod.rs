@@ -22,7 +22,7 @@ use crate::config::{self, Choice, Fitness, Override, Paradigm};
 use crate::escape;
 use crate::file;
 use crate::ops::ConfigText;
-pub use crate::ops::{Error, Processor, said};
+pub use crate::ops::{Error, Processor, with_remedy};
 use crate::record::folder::Start;
 
 mod backend;
@@ -122,8 +122,8 @@ struct Cli {
 
 /// Text of `--version`: the version, and the commit and target of the build.
 static VERSION: LazyLock<String> = LazyLock::new(|| {
-    let commit = crate::COMMIT.unwrap_or("not recorded");
-    format!("{}\ncommit  {commit}\ntarget  {}", env!("CARGO_PKG_VERSION"), env!("FLOTILLA_TARGET"))
+    let commit = crate::version::COMMIT.unwrap_or("not recorded");
+    format!("{}\ncommit  {commit}\ntarget  {}", crate::version::VERSION, env!("FLOTILLA_TARGET"))
 });
 
 /// The command line, program name first, if it differs from the process's own arguments.
@@ -189,7 +189,7 @@ fn run() -> Result<Result<(), clap::Error>, Error> {
     Ok(Ok(()))
 }
 
-/// Returns whether a command line asks for JSON. It may be one that clap rejects.
+/// Reports whether a command line asks for JSON. It may be one that clap rejects.
 fn wants_json(words: &[OsString]) -> bool {
     words.iter().take_while(|word| *word != "--").any(|word| word == "--json")
 }
@@ -203,7 +203,7 @@ fn of_clap(error: &clap::Error) -> Error {
     let text = text.trim().trim_start_matches("error: ");
     Error::Usage(match text.split_once("\n\n") {
         None => text.into(),
-        Some((message, advice)) => said(message, advice.trim()),
+        Some((message, advice)) => with_remedy(message, advice.trim()),
     })
 }
 
@@ -419,7 +419,7 @@ impl ConfigArgs {
     }
 }
 
-/// The flags that say what a command prints.
+/// The flags that control what a command prints.
 #[derive(clap::Args, Clone, Copy)]
 pub struct Printed {
     /// Print no progress, and no summary of a training or an episode; --json still prints its object
@@ -450,7 +450,7 @@ impl Printed {
 
 /// The flags for results that are in the output directory.
 #[derive(clap::Args, Clone, Copy)]
-pub struct There {
+pub struct ExistingResults {
     /// Resume what is in the directory, and start what is missing
     #[arg(long, conflicts_with = "force")]
     resume: bool,
@@ -459,7 +459,7 @@ pub struct There {
     force: bool,
 }
 
-impl There {
+impl ExistingResults {
     /// Returns what happens to the results.
     pub fn start(self) -> Start {
         match (self.resume, self.force) {
@@ -470,7 +470,7 @@ impl There {
     }
 }
 
-/// Flags that stand for config keys; their ranges are checked with the config.
+/// Flags that set config keys. Their ranges are checked with the config.
 #[derive(clap::Args, Default)]
 pub struct Overrides {
     /// Random seed

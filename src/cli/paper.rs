@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use super::console::Console;
 use super::recovery::{self, Checkpoints, Loss};
-use super::{Error, Overrides, Printed, RunOptions, SetKeys, There, number};
+use super::{Error, ExistingResults, Overrides, Printed, RunOptions, SetKeys, number};
 use crate::config::Override;
 use crate::escape::PathExt;
 use crate::ops;
@@ -35,7 +35,7 @@ pub struct Args {
     #[command(flatten)]
     set: SetKeys,
     #[command(flatten)]
-    there: There,
+    existing: ExistingResults,
     #[command(flatten)]
     printed: Printed,
     #[command(flatten)]
@@ -68,7 +68,7 @@ impl Args {
 
 pub fn run(args: Args) -> Result<(), Error> {
     let mut console = Console::new(&args.run, args.loss, args.printed.quiet);
-    let (set, start) = (args.overrides(), args.there.start());
+    let (set, start) = (args.overrides(), args.existing.start());
     let request = Request { out: args.out.clone(), start, set, questions: args.questions.clone() };
     let resume = |error: Error| error.or_advise(|| format!("continue with\n  {}", args.command_to_resume()));
     let out = args.out.escaped();

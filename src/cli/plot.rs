@@ -36,7 +36,7 @@ pub struct Args {
 pub fn run(args: Args) -> Result<(), Error> {
     let Args { runs, out, measure, band, unverified, json } = args;
     let request = Request { runs, out, measure, band, unverified };
-    let found = console::tell(false, |context| plot::run(&request, context))?;
+    let found = console::run_without_backend(false, |context| plot::run(&request, context))?;
     let out = found.out.escaped();
     match json {
         true => print_json(&found),

@@ -40,9 +40,9 @@ fn suppress_driver_noise() {
 fn allow_many_files() {
     use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
     /// macOS allows no more, even if it reports a larger limit.
-    const MOST: u64 = 10_240;
+    const MAX_OPEN_FILES: u64 = 10_240;
     let Rlimit { current, maximum } = getrlimit(Resource::Nofile);
-    let wanted = maximum.map_or(MOST, |maximum| maximum.min(MOST));
+    let wanted = maximum.map_or(MAX_OPEN_FILES, |maximum| maximum.min(MAX_OPEN_FILES));
     if current.is_some_and(|current| current < wanted) {
         // If this is refused, the error appears when a file cannot be opened.
         let _ = setrlimit(Resource::Nofile, Rlimit { current: Some(wanted), maximum });

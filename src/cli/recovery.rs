@@ -30,13 +30,13 @@ pub enum OnLoss {
 }
 
 impl Loss {
-    /// Returns whether the CPU continues after another backend failed.
+    /// Reports whether the CPU continues after another backend failed.
     pub fn falls_back(self) -> bool {
         self.on_device_loss == OnLoss::Cpu
     }
 }
 
-/// How often runs are saved, instead of what their config says.
+/// How often runs are saved. Overrides the config.
 #[derive(clap::Args)]
 pub struct Checkpoints {
     /// Write a checkpoint every N generations; 0 means never
@@ -93,12 +93,12 @@ pub fn quoted(path: &Path) -> String {
 }
 
 /// Maximum number of characters of a command line that are kept.
-const MOST: usize = 1 << 13;
+const MAX_LINE: usize = 1 << 13;
 
 /// Returns the command line, quoted for a shell.
-pub fn typed() -> String {
+pub fn command_line() -> String {
     let line = shell::command(super::words());
-    match line.char_indices().nth(MOST) {
+    match line.char_indices().nth(MAX_LINE) {
         Some((end, _)) => format!("{} …", &line[..end]),
         None => line,
     }

@@ -8,7 +8,7 @@ use serde_json::json;
 
 use super::console::{self, Console};
 use super::recovery::{self, Loss};
-use super::{Error, Overrides, RunOptions, There, between, print, print_json, say, whole};
+use super::{Error, ExistingResults, Overrides, RunOptions, between, print, print_json, say, whole};
 use crate::config;
 use crate::escape::PathExt;
 use crate::ops::sweep::{Request, Results, claim};
@@ -37,7 +37,7 @@ pub struct Args {
     #[arg(long, short, value_name = "DIR")]
     out: Option<PathBuf>,
     #[command(flatten)]
-    there: There,
+    existing: ExistingResults,
     /// Leave out impossible points, for example a coupling above the number of agents
     #[arg(long)]
     skip_impossible: bool,
@@ -161,7 +161,7 @@ impl Args {
             skip_impossible: self.skip_impossible,
             out: out.into(),
             named: self.out.is_some(),
-            start: self.there.start(),
+            start: self.existing.start(),
             shard: shard.map(|shard| (shard.index, shard.count)),
             memory: self.memory.map(|gib| (gib * f64::from(1 << 30)) as usize),
             results: Results {
@@ -236,9 +236,11 @@ pub fn run(mut args: Args) -> Result<(), Error> {
             false => print(&format!("When all shards are done: {command}\n")),
         };
     }
-    let found = console::tell(args.quiet, |context| ops::sweep::collect(&request, &sweep, &axes, context)).map_err(
-        |error| error.or_advise(|| format!("run its shards first: {}", args.command(&out, &["--shard", "1/N"]))),
-    )?;
+    let found =
+        console::run_without_backend(args.quiet, |context| ops::sweep::collect(&request, &sweep, &axes, context))
+            .map_err(|error| {
+                error.or_advise(|| format!("run its shards first: {}", args.command(&out, &["--shard", "1/N"])))
+            })?;
     match args.json {
         true => print_json(&found)?,
         false => print(&found.text)?,
@@ -249,7 +251,7 @@ pub fn run(mut args: Args) -> Result<(), Error> {
 
 fn list(sweep: &Sweep, shards: usize) -> Result<(), Error> {
     let total: u128 = sweep.points.iter().map(shard::cost).sum();
-    let of = shard::deal(&sweep.points, shards);
+    let of = shard::assign_to_shards(&sweep.points, shards);
     let mut loads = vec![0; shards];
     sweep.points.iter().zip(&of).for_each(|(point, shard)| loads[shard - 1] += shard::cost(point));
     let part = |cost: u128| cost as f64 * 100.0 / total.max(1) as f64;

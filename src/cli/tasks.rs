@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use super::console::Console;
 use super::recovery::Loss;
-use super::{ConfigFile, Error, Printed, RunOptions, SetKeys, There, between};
+use super::{ConfigFile, Error, ExistingResults, Printed, RunOptions, SetKeys, between};
 use crate::config;
 use crate::escape::PathExt;
 use crate::file;
@@ -33,7 +33,7 @@ pub struct Args {
     #[command(flatten)]
     set: SetKeys,
     #[command(flatten)]
-    there: There,
+    existing: ExistingResults,
     #[command(flatten)]
     printed: Printed,
     #[command(flatten)]
@@ -43,14 +43,14 @@ pub struct Args {
 }
 
 pub fn run(args: Args) -> Result<(), Error> {
-    let Args { configs, out, trials, population, seed, set, there, printed, loss, run } = args;
+    let Args { configs, out, trials, population, seed, set, existing, printed, loss, run } = args;
     let task = |path: PathBuf| {
         let (name, table) = (file::stem(&path, "task"), path.with_extension("csv"));
         let script = if table.is_file() { Some(read_script(&table)?) } else { None };
         Ok::<_, Error>(Task { name, config: ConfigFile { path }.text(set.set.clone())?, script })
     };
     let tasks = configs.into_iter().map(task).collect::<Result<_, _>>()?;
-    let (named, start) = (out != Path::new(OUT), there.start());
+    let (named, start) = (out != Path::new(OUT), existing.start());
     let request = Request { tasks, out, named, start, trials, population, seed };
     let mut console = Console::new(&run, loss, printed.quiet);
     let found = console

@@ -5,11 +5,12 @@ use std::path::PathBuf;
 
 use super::console::Console;
 use super::recovery::{Checkpoints, Loss, quoted};
-use super::{ConfigArgs, Error, Printed, RunOptions, There};
+use super::{ConfigArgs, Error, ExistingResults, Printed, RunOptions};
 use crate::escape::PathExt;
 use crate::ops::train::{self, Extremes, Outcome, Request};
 use crate::record::folder::{CONFIG, METRICS, POLICIES, RUN};
 use crate::record::ownership::CURVES;
+use crate::report::map::counted;
 use crate::trainer::Row;
 
 #[derive(clap::Args)]
@@ -23,7 +24,7 @@ pub struct Args {
     #[arg(long, short, value_name = "DIR")]
     out: Option<PathBuf>,
     #[command(flatten)]
-    there: There,
+    existing: ExistingResults,
     /// Start from the policies in a safetensors file instead of random ones. Trial i takes the tensor `weights.i`, or
     /// all take `weights`: f32 [leaders, policies, parameters]. Missing policies are random
     #[arg(long, value_name = "FILE")]
@@ -40,10 +41,10 @@ pub struct Args {
 }
 
 pub fn run(args: Args) -> Result<(), Error> {
-    let Args { config, run, out, there, init, tensorboard, printed, checkpoints, loss } = args;
+    let Args { config, run, out, existing, init, tensorboard, printed, checkpoints, loss } = args;
     // Before the config is read: the message names it where it will be.
     [Some(&config.file.path), out.as_ref()].into_iter().flatten().try_for_each(|path| train::refuse_zip(path))?;
-    let (name, start) = (config.name(), there.start());
+    let (name, start) = (config.name(), existing.start());
     let request = Request { config: config.text(checkpoints.list())?, name, out, start, init, tensorboard };
     let mut console = Console::new(&run, loss, printed.quiet);
     let found = console.run(|player, context| train::run(&request, player, context))?;
@@ -55,11 +56,6 @@ type Score = fn(&Row) -> f64;
 /// All scores, with their names.
 const SCORES: [(&str, Score); 3] =
     [("best team", |row| row.best_g), ("mean team", |row| row.mean_g), ("champion", |row| row.champion_g)];
-
-/// Returns a count with its noun: "1 trial", "2 trials".
-fn counted(count: usize, what: &str) -> String {
-    format!("{count} {what}{}", if count == 1 { "" } else { "s" })
-}
 
 /// Returns a time in seconds, or in milliseconds if it is short.
 fn time(seconds: f64) -> String {

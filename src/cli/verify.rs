@@ -58,7 +58,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     let Args { config, set, teams, worlds, seed, adapter, pass, kernel, report, note, printed } = args;
     let (config, set, evidence) = (config.map(read).transpose()?, set.set, report.is_some());
     let request = Request { config, set, teams, worlds, seed, adapter, pass, kernel, evidence, note };
-    let found = console::tell(printed.quiet, |context| ops::verify::run(&request, context))?;
+    let found = console::run_without_backend(printed.quiet, |context| ops::verify::run(&request, context))?;
     if let (Some(path), Some(evidence)) = (&report, &found.evidence) {
         output::write(path, evidence.to_json().as_bytes())?;
     }

@@ -20,7 +20,7 @@ impl Config {
     }
 }
 
-/// Returns whether a path is `-`, which means standard input.
+/// Reports whether a path is `-`, which means standard input.
 pub(crate) fn is_standard_input(path: &Path) -> bool {
     path.as_os_str() == "-"
 }
@@ -33,7 +33,7 @@ pub fn name(path: &Path) -> String {
 /// Reads the text of a config or sweep file, or of standard input if the path is `-`.
 ///
 /// # Errors
-/// Fails if the file cannot be read, is a directory, is larger than [`MAX_FILE_BYTES`] or is not UTF-8.
+/// Fails if the file cannot be read, is a folder, is larger than [`MAX_FILE_BYTES`] or is not UTF-8.
 pub(crate) fn read_file(path: &Path) -> Result<String, ConfigError> {
     let fail = |reason: String| ConfigError::Unreadable { name: name(path), reason, is_missing: false };
     let missing = |error: std::io::Error| ConfigError::Unreadable {

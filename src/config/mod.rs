@@ -39,6 +39,8 @@ mod world;
 
 /// Maximum size of the policies of all trials of a run, in bytes.
 pub(crate) const MAX_POLICY_BYTES: u64 = 1 << 38;
+/// The name in errors of a config that does not come from a file.
+const OWN_NAME: &str = "the config";
 /// The section that makes a config a sweep: lists of values to combine.
 pub const GRID: &str = "grid";
 /// The section of a sweep with values to try one at a time.
@@ -47,16 +49,13 @@ pub(crate) const VARY: &str = "vary";
 /// Returns every key of a config, in the order of [`Config::to_toml`].
 pub fn keys() -> Vec<Definition> {
     let (config, mut keys) = reader::keys(Config::ask);
-    let mut order = Vec::new();
     let text = config.to_toml();
-    let mut section = "";
-    for line in text.lines() {
-        match line.split_once(" = ") {
-            Some((leaf, _)) => order.push(format!("{section}.{leaf}")),
-            None => section = line.trim_matches(['[', ']']),
-        }
-    }
-    keys.sort_by_key(|key| order.iter().position(|name| name == key.name));
+    let place = |key: &Definition| {
+        let (section, leaf) = key.name.split_once('.')?;
+        let start = text.find(&format!("[{section}]\n"))?;
+        Some(start + text[start..].find(&format!("\n{leaf} = "))?)
+    };
+    keys.sort_by_key(place);
     keys
 }
 
@@ -67,9 +66,9 @@ pub struct Config {
     pub world: WorldConfig,
     /// `[motion]`: how agents move.
     pub motion: Motion,
-    /// `[follow]`: what followers do.
+    /// `[follow]`: the behaviour of followers.
     pub follow: Follow,
-    /// `[sense]`: what leaders sense.
+    /// `[sense]`: the inputs of leaders.
     pub sense: Sense,
     /// `[policy]`: the leaders' network.
     pub policy: Policy,
@@ -77,7 +76,7 @@ pub struct Config {
     pub learning: Learning,
     /// `[checkpoint]`: how often a run saves.
     pub checkpoint: CheckpointConfig,
-    /// `[[stages]]`: keys that change from some generation on, see [`Config::staged`].
+    /// `[[stages]]`: keys that change from some generation on, see [`ValidConfig::stages`].
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub stages: Vec<Stage>,
 }
@@ -98,24 +97,11 @@ impl Config {
     /// # Errors
     /// Fails if the text or an override is invalid. The error lists their problems.
     pub fn read(text: &str, name: &str, ignored: &[&str], overrides: &[Override]) -> Result<Config, ConfigError> {
-        Config::read_document(&Document::parse(text), name, ignored, overrides)
+        Ok(Config::read_noted(&Document::parse(text), name, ignored, overrides)?.0.into_config())
     }
 
-    /// Reads a config from a parsed text, as [`Config::read`] does.
-    ///
-    /// # Errors
-    /// Fails if the text or an override is invalid. The error lists their problems.
-    pub(crate) fn read_document(
-        document: &Document<'_>,
-        name: &str,
-        ignored: &[&str],
-        overrides: &[Override],
-    ) -> Result<Config, ConfigError> {
-        Ok(Config::read_noted(document, name, ignored, overrides)?.0)
-    }
-
-    /// Reads a config as [`Config::read_document`] does, and returns notes for its author. The notes report defaults
-    /// that other keys do not allow, stages that are left out, and the results of [`Config::notes`].
+    /// Reads a config from a parsed text as [`Config::read`] does, and returns notes for its author. The notes report
+    /// defaults that other keys do not allow, stages that are left out, and the results of [`ValidConfig::notes`].
     ///
     /// # Errors
     /// Fails if the text or an override is invalid. The error lists their problems.
@@ -124,7 +110,7 @@ impl Config {
         name: &str,
         ignored: &[&str],
         overrides: &[Override],
-    ) -> Result<(Config, Vec<String>), ConfigError> {
+    ) -> Result<(ValidConfig, Vec<String>), ConfigError> {
         let (staging, overrides): (Vec<_>, Vec<_>) =
             overrides.iter().cloned().partition(|set| set.key == stages::STAGES);
         let invalid = |problems, unlisted| ConfigError::Invalid { name: name.to_string(), problems, unlisted };
@@ -150,24 +136,14 @@ impl Config {
             invalid(problems, unlisted)
         })?;
         let last = own.learning.generations;
-        let (stages, later): (Vec<Stage>, Vec<Stage>) = stages.into_iter().partition(|stage| stage.from <= last);
-        notes.extend(later.iter().map(|Stage { from, .. }| {
+        let (stages, later): (Vec<_>, Vec<_>) = stages.into_iter().partition(|(stage, _)| stage.from <= last);
+        notes.extend(later.iter().map(|(Stage { from, .. }, _)| {
             format!("the stage from generation {from} on is left out, because this run ends with generation {last}")
         }));
-        let config = Config { stages, ..own };
+        let (stages, configs) = stages.into_iter().unzip();
+        let config = ValidConfig::new(Config { stages, ..own }, configs);
         notes.extend(config.notes());
         Ok((config, notes))
-    }
-
-    /// Returns a note for each setting that is valid but likely a mistake.
-    pub fn notes(&self) -> Vec<String> {
-        let too_short = |config: &Config| config.motion.too_short(config.world.dt, config.world.map);
-        let degrees = |config: &Config| config.world.heading.likely_degrees();
-        let staged = self.staged();
-        let mut notes: Vec<String> =
-            staged.iter().flat_map(|(_, config)| [too_short(config), degrees(config)]).flatten().collect();
-        notes.dedup();
-        notes
     }
 
     /// Reads all keys except the stages, which change the config that these keys make.
@@ -189,12 +165,31 @@ impl Config {
     /// # Errors
     /// Fails if an override is invalid. The error lists the problems.
     pub fn with(&self, overrides: &[Override]) -> Result<Config, ConfigError> {
-        Config::read(&self.to_toml(), "the config", &[], overrides)
+        Config::read(&self.serialised()?, OWN_NAME, &[], overrides)
+    }
+
+    /// Validates a config whose fields a program has set, as if it had been read from a file.
+    ///
+    /// # Errors
+    /// Fails if the config is invalid. The error lists its problems.
+    pub fn validate(&self) -> Result<ValidConfig, ConfigError> {
+        Ok(Config::read_noted(&Document::parse(&self.serialised()?), OWN_NAME, &[], &[])?.0)
     }
 
     /// Returns the text of a config file for this config, with every key written out.
+    ///
+    /// # Panics
+    /// Panics if a program has set a whole number that TOML cannot represent, which is one above 2⁶³ − 1. Such a config
+    /// is invalid, see [`Config::validate`].
     pub fn to_toml(&self) -> String {
-        toml::to_string(self).expect("numbers, words and lists of them under plain keys are TOML")
+        self.serialised().expect("numbers, words and lists of them under plain keys are TOML")
+    }
+
+    fn serialised(&self) -> Result<String, ConfigError> {
+        toml::to_string(self).map_err(|error| {
+            let problem = Problem { line: None, key: String::new(), message: error.to_string() };
+            ConfigError::Invalid { name: OWN_NAME.into(), problems: vec![problem], unlisted: 0 }
+        })
     }
 
     /// Returns the number of agents that learn: the leaders, and in the all-leaders paradigm also the followers.
@@ -300,7 +295,7 @@ pub enum ConfigError {
 }
 
 impl ConfigError {
-    /// Returns whether all problems come from flags and none from the file.
+    /// Reports whether all problems come from flags and none from the file.
     pub fn is_usage(&self) -> bool {
         match self {
             ConfigError::Unreadable { .. } => false,

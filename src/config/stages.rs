@@ -44,65 +44,10 @@ pub struct Stage {
     pub set: BTreeMap<String, toml::Value>,
 }
 
-impl Stage {
-    /// Returns the stage's keys as overrides. Errors name each by its place in the config.
-    fn overrides(&self, index: usize) -> Vec<Override> {
-        let one = |(key, value): (&String, &toml::Value)| {
-            Override::new(key.clone(), value.clone(), format!("{STAGES}[{index}].set.{key}"))
-        };
-        self.set.iter().map(one).collect()
-    }
-}
-
 impl Config {
-    /// Returns the config of each stage with its first generation. If the first stage starts after generation 0, the
-    /// file's own config comes before it. The config must be valid, because this panics if a stage is not.
-    pub fn staged(&self) -> Vec<(usize, Config)> {
-        let own = Config { stages: vec![], ..self.clone() };
-        let mut staged = Vec::with_capacity(self.stages.len() + 1);
-        if self.stages.first().is_none_or(|first| first.from > 0) {
-            staged.push((0, own.clone()));
-        }
-        for (index, stage) in self.stages.iter().enumerate() {
-            let config = own.with(&stage.overrides(index)).expect("stages are read with their config");
-            staged.push((stage.from, config));
-        }
-        staged
-    }
-
-    /// Returns the index of a generation's stage in [`Config::staged`].
-    pub fn stage_of(&self, generation: usize) -> usize {
-        let begun = self.stages.iter().filter(|stage| stage.from <= generation).count();
-        begun - usize::from(self.stages.first().is_some_and(|first| first.from == 0))
-    }
-
     /// Returns the first generation of the last stage, or 0 without stages.
     pub fn last_from(&self) -> usize {
         self.stages.last().map_or(0, |stage| stage.from)
-    }
-
-    /// Returns the config that a generation plays with.
-    pub fn at(&self, generation: usize) -> Config {
-        self.staged().swap_remove(self.stage_of(generation)).1
-    }
-
-    /// Returns the config of each stage, with `learning.generations` set to the generations after the stage's first
-    /// one.
-    pub fn shares(&self) -> Vec<Config> {
-        let mut staged = self.staged();
-        let mut end = self.learning.generations + 1;
-        for (from, config) in staged.iter_mut().rev() {
-            config.learning.generations = end.saturating_sub(*from + 1);
-            end = *from;
-        }
-        staged.into_iter().map(|(_, config)| config).collect()
-    }
-
-    /// Returns the number of POIs, or `None` if it differs between stages.
-    pub fn pois(&self) -> Option<usize> {
-        let staged = self.staged();
-        let count = |(_, config): &(usize, Config)| config.world.pois.len();
-        staged.windows(2).all(|pair| count(&pair[0]) == count(&pair[1])).then(|| count(&staged[0]))
     }
 }
 
@@ -112,9 +57,10 @@ struct Written<'a> {
     text: &'a str,
 }
 
-/// Reads the stages of a document whose other keys make a valid config. Problems have lines unless the document comes
-/// from outside the file. `shortened` means that the run's length was set from outside, in which case stages may begin
-/// after its end.
+/// Reads the stages of a document, each with its resolved config. The document's other keys make the valid config `own`.
+///
+/// Problems have lines unless the document comes from outside the file. `shortened` means that the run's length was set
+/// from outside, in which case stages may begin after its end.
 ///
 /// # Errors
 /// Fails if a stage is invalid. The error lists all problems by line.
@@ -123,7 +69,7 @@ pub(super) fn read(
     outside: bool,
     own: &Config,
     shortened: bool,
-) -> Result<Vec<Stage>, Vec<Problem>> {
+) -> Result<Vec<(Stage, Config)>, Vec<Problem>> {
     let text = document.text();
     let line_of = |offset: usize| (!outside).then(|| document.lines().line(offset));
     let Some(list) = document.table().get(STAGES) else { return Ok(vec![]) };
@@ -134,7 +80,10 @@ pub(super) fn read(
         let message = format!("allowed a list of up to {MAX_STAGES} tables [[{STAGES}]], each with `from` and `set`");
         return Err(vec![Problem { line: line_of(list.span().start), key: STAGES.into(), message }]);
     };
-    let mut stages: Vec<Stage> = Vec::new();
+    // A stage changes the values of `own`, so defaults that depend on other keys stay as they are there.
+    let own_text = own.to_toml();
+    let own_document = Document::parse(&own_text);
+    let mut stages: Vec<(Stage, Config)> = Vec::new();
     for (index, table) in tables.iter().enumerate() {
         let (name, start) = (format!("{STAGES}[{index}]"), table.span().start);
         let Some(keys) = table.get_ref().as_table() else {
@@ -146,7 +95,7 @@ pub(super) fn read(
             let (place, offset) = (format!("{name}.{}", key.get_ref()), key.span().start);
             match (key.get_ref().as_ref(), value.get_ref()) {
                 ("from", number) => {
-                    let least = stages.last().map_or(0, |before| before.from + 1);
+                    let least = stages.last().map_or(0, |(before, _)| before.from + 1);
                     let most = if shortened { MAX_GENERATIONS } else { own.learning.generations };
                     match <usize as Number>::read(number).flatten() {
                         Some(number) if (least..=most).contains(&number) => from = Some(number),
@@ -201,32 +150,31 @@ pub(super) fn read(
             let within = |(name, _): &(&String, &Written)| key.starts_with(&format!("{STAGES}[{index}].set.{name}"));
             written.iter().find(within).map_or(line_of(start), |(_, written)| written.line)
         };
-        match own.with(&overrides) {
-            Ok(config) => {
-                let counts = |config: &Config| [config.learners(), config.world.leaders.len()];
-                if counts(&config) != counts(own) {
-                    let key = if written.contains_key("world.leaders") { "world.leaders" } else { "world.followers" };
-                    let [found, expected] = [&config, own].map(Config::learners);
-                    let key = format!("{name}.set.{key}");
-                    let message = format!("{found} leaders learn in this stage, {expected} in all others");
-                    report_line(line(&key), key, message);
-                }
-            }
-            Err(super::ConfigError::Invalid { problems: found, .. }) => {
-                for Problem { key, message, .. } in found {
+        let config = match Config::without_stages(&own_document, &[], &overrides) {
+            Ok((config, _)) => config,
+            Err(problems) => {
+                for Problem { key, message, .. } in problems.listed {
                     let line = line(&key);
                     let key = if key.starts_with(STAGES) { key } else { format!("{name}: {key}") };
                     report_line(line, key, message);
                 }
+                own.clone()
             }
-            Err(error) => report(start, name, error.to_string()),
+        };
+        let counts = |config: &Config| [config.learners(), config.world.leaders.len()];
+        if counts(&config) != counts(own) {
+            let key = if written.contains_key("world.leaders") { "world.leaders" } else { "world.followers" };
+            let [found, expected] = [&config, own].map(Config::learners);
+            let key = format!("{name}.set.{key}");
+            let message = format!("{found} leaders learn in this stage, {expected} in all others");
+            report_line(line(&key), key, message);
         }
         let value = |text: &str| {
             let table: Option<toml::Table> = format!("value = {text}").parse().ok();
             table.and_then(|mut table| table.remove("value"))
         };
         let set = written.iter().filter_map(|(key, written)| Some((key.clone(), value(written.text)?))).collect();
-        stages.push(Stage { from: from.unwrap_or(0), set });
+        stages.push((Stage { from: from.unwrap_or(0), set }, config));
     }
     let problems = problems.into_inner();
     if problems.is_empty() { Ok(stages) } else { Err(problems) }

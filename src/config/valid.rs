@@ -2,9 +2,9 @@
 
 use std::ops::Deref;
 
-use super::{Config, ConfigError, Problem};
+use super::{Config, ConfigError};
 
-/// A config whose every key is in its range, with its stages resolved. Only [`Config::validate`] makes one.
+/// A config whose every key is in its range, with its stages resolved. Only reading or [`Config::validate`] returns one.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ValidConfig {
     config: Config,
@@ -20,23 +20,16 @@ impl Deref for ValidConfig {
     }
 }
 
-impl Config {
-    /// Validates a config whose fields a program has set, as if it had been read from a file.
-    ///
-    /// # Errors
-    /// Fails if the config is invalid. The error lists its problems.
-    pub fn validate(&self) -> Result<ValidConfig, ConfigError> {
-        let name = "the config";
-        let text = toml::to_string(self).map_err(|error| {
-            let problem = Problem { line: None, key: String::new(), message: error.to_string() };
-            ConfigError::Invalid { name: name.into(), problems: vec![problem], unlisted: 0 }
-        })?;
-        let config = Config::parse(&text, name)?;
-        Ok(ValidConfig { stages: config.staged(), config })
-    }
-}
-
 impl ValidConfig {
+    /// Returns a config with the resolved configs of its stages.
+    pub(super) fn new(config: Config, of_stages: Vec<Config>) -> ValidConfig {
+        let mut stages: Vec<_> = config.stages.iter().map(|stage| stage.from).zip(of_stages).collect();
+        if stages.first().is_none_or(|(from, _)| *from > 0) {
+            stages.insert(0, (0, Config { stages: vec![], ..config.clone() }));
+        }
+        ValidConfig { config, stages }
+    }
+
     /// Validates several configs.
     ///
     /// # Errors
@@ -45,9 +38,47 @@ impl ValidConfig {
         configs.iter().map(Config::validate).collect()
     }
 
-    /// Returns the stages, each with its first generation, in order. A config without stages is its own only stage.
+    /// Returns the config of each stage with its first generation, in order. If the first stage starts after generation
+    /// 0, the file's own config comes before it.
     pub fn stages(&self) -> &[(usize, Config)] {
         &self.stages
+    }
+
+    /// Returns the index of a generation's stage in [`ValidConfig::stages`].
+    pub fn stage_of(&self, generation: usize) -> usize {
+        self.stages.iter().rposition(|(from, _)| *from <= generation).unwrap_or(0)
+    }
+
+    /// Returns the config that a generation plays with.
+    pub fn at(&self, generation: usize) -> &Config {
+        &self.stages[self.stage_of(generation)].1
+    }
+
+    /// Returns the number of generations that each stage plays, including generation 0, with the stage's config.
+    pub fn stage_lengths(&self) -> impl Iterator<Item = (usize, &Config)> {
+        let ends = self.stages.iter().skip(1).map(|(from, _)| *from).chain([self.learning.generations + 1]);
+        self.stages.iter().zip(ends).map(|((from, config), end)| (end.saturating_sub(*from), config))
+    }
+
+    /// Returns the number of POIs, or `None` if it differs between stages.
+    pub fn pois(&self) -> Option<usize> {
+        let count = self.stages[0].1.world.pois.len();
+        self.stages.iter().all(|(_, config)| config.world.pois.len() == count).then_some(count)
+    }
+
+    /// Returns a note for each setting that is valid but likely a mistake.
+    pub fn notes(&self) -> Vec<String> {
+        let too_short = |config: &Config| config.motion.too_short(config.world.dt, config.world.map);
+        let degrees = |config: &Config| config.world.heading.likely_degrees();
+        let mut notes: Vec<String> =
+            self.stages.iter().flat_map(|(_, config)| [too_short(config), degrees(config)]).flatten().collect();
+        notes.dedup();
+        notes
+    }
+
+    /// Returns the config as it was read, without its resolved stages.
+    pub fn into_config(self) -> Config {
+        self.config
     }
 
     /// Returns the config with at most this number of generations. Stages that begin later are never played.
@@ -82,6 +113,6 @@ mod tests {
         config.stages[0].set.insert("world.coupling".into(), 9.into());
         assert!(config.validate().unwrap_err().to_string().contains("stages[0].set.world.coupling"));
         config.learning.seed = u64::MAX;
-        assert!(config.validate().is_err());
+        assert!(config.validate().is_err() && config.with(&[]).is_err());
     }
 }

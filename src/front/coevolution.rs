@@ -1,4 +1,4 @@
-//! Training in which the caller decides what policies are worth.
+//! Training by ask and tell, in which the caller scores the policies.
 
 use super::train::{new_trainer, previous_champions, start_from};
 use super::{Failure, Generation, Trained};
@@ -7,7 +7,7 @@ use crate::config::Config;
 use crate::trainer::{Candidates, Row, Snapshot, Trainer};
 use crate::world::World;
 
-/// Training by ask and tell: the caller decides what each leader of each team was worth.
+/// Training by ask and tell: the caller scores each leader of each team.
 ///
 /// ```
 /// use flotilla::{Config, front::{self, Coevolution}};

@@ -90,7 +90,7 @@ pub enum Failure {
         /// Number of episodes.
         episodes: usize,
     },
-    /// The fitness that was told does not fit, or is not finite.
+    /// The given fitness has the wrong size, or is not finite.
     #[error("fitness: {0}")]
     Fitness(String),
     /// A saved state does not fit the config.
@@ -102,7 +102,7 @@ pub enum Failure {
     /// The teams could not be created.
     #[error(transparent)]
     Step(#[from] StepError),
-    /// A run's directory could not be read.
+    /// A run's folder could not be read.
     #[cfg(feature = "record")]
     #[error(transparent)]
     Run(#[from] runs::ReadError),

@@ -11,7 +11,7 @@
 //! | `error` | what all functions return if they fail |
 //! | `open` | the processor that plays, and its backend |
 //! | `train` | training with a callback, and its results |
-//! | `coevolution` | training in which the caller decides what policies are worth |
+//! | `coevolution` | training by ask and tell, in which the caller scores the policies |
 //! | `play` | playing, tracing and stepping of given policies |
 
 mod coevolution;

@@ -48,7 +48,7 @@ pub struct Trained {
     pub champion_g: Vec<f64>,
     /// The last generation's policies, best first in each population: `[trials]` of `[leaders][policies][parameters]`.
     pub policies: Vec<Vec<f32>>,
-    /// State that a longer run continues from. `None` if the run was read from a directory without its last checkpoint.
+    /// State that a longer run continues from. `None` if the run was read from a folder without its last checkpoint.
     pub ending: Option<Ending>,
 }
 
@@ -80,10 +80,10 @@ impl Trained {
         Ok(Trained::new(config, rows, policies, Some(Ending { weights, fitness })))
     }
 
-    /// Reads the results of a finished run from its directory.
+    /// Reads the results of a finished run from its folder.
     ///
     /// # Errors
-    /// The directory has no finished run, or its files are damaged or were changed after the run.
+    /// The folder has no finished run, or its files are damaged or were changed after the run.
     #[cfg(feature = "record")]
     pub fn read(folder: &Path, verification: Verification) -> Result<Trained, Failure> {
         let config = runs::config(folder, verification)?;
@@ -222,7 +222,7 @@ pub(super) fn previous_champions(trainer: &mut Trainer, config: &Config) -> Resu
 
 /// Checks that a training fits this machine's memory, and returns its trainer.
 pub(super) fn new_trainer(config: ValidConfig) -> Result<Trainer, Failure> {
-    let plan = Peaks::of([&*config], current_num_threads());
+    let plan = Peaks::of([&config], current_num_threads());
     // Nothing is saved during training, but the results stay in memory: every row twice, and the policies.
     let rows = config.learning.trials as u64 * (config.learning.generations as u64 + 1);
     // The last slots stay too, if they are needed to extend the run.

@@ -150,7 +150,7 @@ pub(super) fn play(
             let done = seed * generations + baselines.generation();
             let part = done as f64 / (seeds * generations) as f64;
             context.fraction(part, format!("playing random teams of seed {seed}"));
-            context.go_on()?;
+            context.check_not_stopped()?;
         }
         outcomes.extend(baselines.outcomes(backend, episodes)?.concat());
     }

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{ConfigText, Context, Error, output, plot};
 use crate::backend;
-use crate::config::Config;
+use crate::config::{Config, ValidConfig};
 use crate::memory::Peaks;
 use crate::parallel;
 use crate::reach;
@@ -50,7 +50,7 @@ pub fn run(request: &Request, context: Context<'_>) -> Result<Outcome, Error> {
         output::write(out, &plot::content(&map::layout(&request.name, &config), kind, out)?)?;
     }
     context.warn_of_unreachable(&config);
-    Ok(Outcome { cost: Cost::of(&config), config, notes })
+    Ok(Outcome { cost: Cost::of(&config), config: config.into_config(), notes })
 }
 
 /// The cost of a whole run: all trials, all generations including the random start, all teams and the champions.
@@ -87,16 +87,16 @@ pub struct Cost {
 }
 
 impl Cost {
-    fn of(config: &Config) -> Cost {
+    fn of(config: &ValidConfig) -> Cost {
         let wide = |count: usize| count as u128;
         let [mut teams, mut team_steps, mut agent_steps] = [0; 3];
         let (mut agents, mut record_bytes, mut travel) = (0, 0, 0.0_f64);
         // Over the stages, played episodes and steps add up. Sizes are those of the largest stage.
-        for (stage, share) in config.shares().into_iter().enumerate() {
-            let (world, learning) = (World::new(&share), &share.learning);
+        for (stage, (generations, config)) in config.stage_lengths().enumerate() {
+            let (world, learning) = (World::new(config), &config.learning);
             // Generation 0 has no past champions.
-            let without = if stage == 0 { wide(share.hall_teams(1)) } else { 0 };
-            let of_trial = wide(learning.generations + 1) * wide(share.max_teams()) - without;
+            let without = if stage == 0 { wide(config.hall_teams(1)) } else { 0 };
+            let of_trial = wide(generations) * wide(config.max_teams()) - without;
             let played = wide(learning.trials) * of_trial * wide(learning.episodes_per_team);
             teams += played;
             team_steps += played * wide(world.steps());

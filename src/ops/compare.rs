@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::{Context, Error, said};
+use super::{Context, Error, with_remedy};
 use crate::config::{Config, WorldConfig};
 use crate::escape::PathExt;
 use crate::file;
@@ -101,9 +101,9 @@ pub fn run(args: &Request, context: Context<'_>) -> Result<Outcome, Error> {
     let folders = groups.iter().flat_map(|(_, arms)| arms).flat_map(|arm| &arm.folders);
     digests::without(folders.map(|folder| &**folder)).into_iter().for_each(|note| context.warn(note));
     // Printed even if nothing can be compared, because the notes may explain that.
-    let tell = |notes: &[String]| notes.iter().for_each(|note| context.warn(format_args!("note: {note}")));
-    tell(&notes);
-    let told = notes.len();
+    let report = |notes: &[String]| notes.iter().for_each(|note| context.warn(format_args!("note: {note}")));
+    report(&notes);
+    let reported = notes.len();
     let compare = |(place, arms): &Contest| {
         comparison::compare(place, arms, &question).map_err(|error| match error {
             ComparisonError::Beyond { at, .. } => Error::Usage(format!("--at {at}: {error}").into()),
@@ -119,7 +119,7 @@ pub fn run(args: &Request, context: Context<'_>) -> Result<Outcome, Error> {
         let place = if comparison.place.is_empty() { String::new() } else { format!("{}: ", comparison.place) };
         notes.extend(comparison.notes.iter().map(|note| format!("{place}{note}")));
     }
-    let nothing = |arm: &Cohort| arm.trials.iter().all(|trial| trial.course.iter().flatten().all(|&g| g == 0.0));
+    let nothing = |arm: &Cohort| arm.trials.iter().all(|trial| trial.scores.iter().flatten().all(|&g| g == 0.0));
     if groups.iter().all(|(_, arms)| arms.iter().all(nothing)) {
         notes.push(
             "no team of these runs observed any POI in any generation: there is nothing to compare; `flotilla check CONFIG` \
@@ -128,11 +128,11 @@ pub fn run(args: &Request, context: Context<'_>) -> Result<Outcome, Error> {
         );
     }
     // For several runs, the notes so far report different layouts or copies. Then pairing is no useful advice.
-    let alike = args.folders.len() == 1 || told == 0;
+    let alike = args.folders.len() == 1 || reported == 0;
     if !args.paired && alike && groups.iter().all(|(_, arms)| comparison::paired(arms)) {
         notes.push("these arms have the same seeds, so their trials are pairs: --paired compares pair by pair".into());
     }
-    tell(&notes[told..]);
+    report(&notes[reported..]);
     Ok(Outcome {
         confidence: statistics::CONFIDENCE,
         resamples: statistics::RESAMPLES,
@@ -156,12 +156,12 @@ fn of_runs(folders: &[PathBuf], args: &Request, notes: &mut Vec<String>) -> Resu
         let folder = folders[0].escaped();
         // Problems of the folder are reported first.
         runs::config(&folders[0], verification)?;
-        return Err(Error::Usage(said(format!("{folder} is one run"), "name another to compare it with")));
+        return Err(Error::Usage(with_remedy(format!("{folder} is one run"), "name another to compare it with")));
     }
     too_many(folders.len(), "runs")?;
     let mut seen = BTreeSet::new();
     if let Some(twice) = folders.iter().find(|folder| !seen.insert(file::resolved(folder))) {
-        return Err(Error::Usage(said(format!("{} is named twice", twice.escaped()), "name other runs")));
+        return Err(Error::Usage(with_remedy(format!("{} is named twice", twice.escaped()), "name other runs")));
     }
     let configs = folders.iter().map(|folder| runs::config(folder, verification)).collect::<Result<Vec<_>, _>>()?;
     let first = &configs[0].world;
@@ -249,7 +249,7 @@ fn of_sweep(out: &Path, args: &Request, notes: &mut Vec<String>) -> Result<Vec<C
     let command = shell::command(["flotilla".into(), "sweep".into(), file, "--out".into(), folder, "--resume".into()]);
     match groups.is_empty() {
         false => Ok(groups),
-        true => Err(Error::Missing(said(
+        true => Err(Error::Missing(with_remedy(
             format!("{}: no two values of {} have runs to compare", out.escaped(), sweep.axes[by].key),
             format!("`{command}` trains them"),
         ))),
@@ -260,7 +260,7 @@ fn of_sweep(out: &Path, args: &Request, notes: &mut Vec<String>) -> Result<Vec<C
 fn too_many(count: usize, what: &str) -> Result<(), Error> {
     match count <= MAX_RUNS {
         true => Ok(()),
-        false => Err(Error::Usage(said(
+        false => Err(Error::Usage(with_remedy(
             format!("{count} {what} are too many to compare, two by two"),
             format!("{MAX_RUNS} at most"),
         ))),

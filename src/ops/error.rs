@@ -1,4 +1,4 @@
-//! The error of every use case: a stable code, a message, and what to do about it.
+//! The error of every use case: a stable code, a message and a remedy.
 
 use std::fmt::{self, Display};
 use std::io;
@@ -18,33 +18,33 @@ use crate::sweep::questions::Unanswered;
 
 /// An error with its remedy. It is displayed as one text.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Said {
+pub struct MessageWithRemedy {
     /// The error.
     pub message: String,
     /// The remedy, if there is one.
     pub remedy: Option<String>,
 }
 
-/// Returns a message with what to do about it.
-pub fn said(message: impl Into<String>, remedy: impl Into<String>) -> Said {
-    Said { message: message.into(), remedy: Some(remedy.into()) }
+/// Returns a message with its remedy.
+pub fn with_remedy(message: impl Into<String>, remedy: impl Into<String>) -> MessageWithRemedy {
+    MessageWithRemedy { message: message.into(), remedy: Some(remedy.into()) }
 }
 
-impl From<String> for Said {
-    fn from(message: String) -> Said {
-        Said { message, remedy: None }
+impl From<String> for MessageWithRemedy {
+    fn from(message: String) -> MessageWithRemedy {
+        MessageWithRemedy { message, remedy: None }
     }
 }
 
-impl From<&str> for Said {
-    fn from(message: &str) -> Said {
-        Said::from(message.to_string())
+impl From<&str> for MessageWithRemedy {
+    fn from(message: &str) -> MessageWithRemedy {
+        MessageWithRemedy::from(message.to_string())
     }
 }
 
-impl Display for Said {
+impl Display for MessageWithRemedy {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Said { message, remedy } = self;
+        let MessageWithRemedy { message, remedy } = self;
         match remedy {
             None => f.write_str(message),
             Some(remedy) if message.contains('\n') => write!(f, "{message}\n{remedy}"),
@@ -92,19 +92,19 @@ pub enum Error {
     Signals(io::Error),
     /// Wrong usage that is only found when flags are read together.
     #[error("{0}")]
-    Usage(Said),
+    Usage(MessageWithRemedy),
     /// Results that differ but should be equal.
     #[error("{0}")]
-    Different(Said),
+    Different(MessageWithRemedy),
     /// A command that is refused, for example because it would overwrite files.
     #[error("{0}")]
-    Refused(Said),
+    Refused(MessageWithRemedy),
     /// Results that do not exist yet.
     #[error("{0}")]
-    Missing(Said),
+    Missing(MessageWithRemedy),
     /// Stopped by a signal. Runs are saved and can be resumed.
     #[error("{0}")]
-    Stopped(Said),
+    Stopped(MessageWithRemedy),
 }
 
 impl Error {
@@ -161,16 +161,16 @@ impl Error {
             Error::Run(error) => error.to_string(),
             Error::Read(error) => error.to_string(),
             Error::Replayed(error) => error.to_string(),
-            Error::Usage(said)
-            | Error::Different(said)
-            | Error::Refused(said)
-            | Error::Missing(said)
-            | Error::Stopped(said) => said.message.clone(),
+            Error::Usage(text)
+            | Error::Different(text)
+            | Error::Refused(text)
+            | Error::Missing(text)
+            | Error::Stopped(text) => text.message.clone(),
             Error::Unanswered(_) | Error::Output(_) | Error::Signals(_) => self.to_string(),
         }
     }
 
-    /// Returns what to do about the error, if there is something.
+    /// Returns the remedy, if there is one.
     pub fn remedy(&self) -> Option<String> {
         let (whole, message) = (self.to_string(), self.message());
         // The library's errors are followed by advice in the same sentence.
@@ -179,11 +179,11 @@ impl Error {
         (!advice.is_empty()).then(|| advice.to_string())
     }
 
-    /// Adds what to do about a result that does not exist yet, a refused request or a stop, if nothing is said about
-    /// that yet. The caller knows how it was called.
+    /// Adds a remedy to wrong usage, a missing result, a refused request or a stop, unless it has one. The caller knows
+    /// which command was called.
     pub fn or_advise(mut self, remedy: impl FnOnce() -> String) -> Error {
-        if let Error::Usage(said) | Error::Refused(said) | Error::Missing(said) | Error::Stopped(said) = &mut self {
-            said.remedy.get_or_insert_with(remedy);
+        if let Error::Usage(text) | Error::Refused(text) | Error::Missing(text) | Error::Stopped(text) = &mut self {
+            text.remedy.get_or_insert_with(remedy);
         }
         self
     }
@@ -202,7 +202,7 @@ impl Error {
         }
     }
 
-    /// Returns whether the request was wrong, as opposed to a failure of a valid request.
+    /// Reports whether the request was wrong, as opposed to a failure of a valid request.
     pub fn is_usage(&self) -> bool {
         match self {
             Error::Usage(_)

@@ -1,7 +1,7 @@
 //! The use cases of the program, below the command line, Python and the page.
 //!
-//! Each takes a request that can be serialised, tells a [`Context`] what happens on the way, and returns an outcome
-//! that can be serialised, or an [`Error`] with a stable code. [`answer`] takes any request as data.
+//! Each use case takes a request and reports its progress to a [`Context`]. It returns an outcome, or an [`Error`] with a
+//! stable code. Requests and outcomes can be serialised, and [`answer`] takes any request as data.
 //!
 //! # Example
 //!
@@ -52,7 +52,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::backend::{BackendError, Machine, OpenBackend};
 use crate::choice::Work;
-use crate::config::{Config, Override};
+use crate::config::{Config, Override, ValidConfig};
 use crate::escape::PathExt;
 use crate::front;
 use crate::memory::Peaks;
@@ -79,7 +79,7 @@ pub mod tasks;
 pub mod train;
 pub mod verify;
 
-pub use error::{Error, Said, said};
+pub use error::{Error, MessageWithRemedy, with_remedy};
 #[cfg(feature = "cli")]
 pub(crate) use remedy::{RUNS, device as advice_on_device};
 
@@ -115,7 +115,7 @@ pub enum Event<'a> {
 #[non_exhaustive]
 pub struct Context<'a> {
     /// Receives events.
-    pub tell: &'a dyn Fn(Event<'_>),
+    pub report: &'a dyn Fn(Event<'_>),
     /// Set by the caller to save and stop.
     pub stop: &'a AtomicBool,
     /// Set by the caller to save and continue.
@@ -133,30 +133,30 @@ pub struct Context<'a> {
 }
 
 impl<'a> Context<'a> {
-    /// Returns a context that reports to `tell`, and never stops.
-    pub fn new(tell: &'a dyn Fn(Event<'_>)) -> Context<'a> {
+    /// Returns a context that reports to `report`, and never stops.
+    pub fn new(report: &'a dyn Fn(Event<'_>)) -> Context<'a> {
         static NEVER: AtomicBool = AtomicBool::new(false);
-        Context { tell, stop: &NEVER, save: &NEVER, end: &NEVER, command: "", flags: &[], falls_back: false }
+        Context { report, stop: &NEVER, save: &NEVER, end: &NEVER, command: "", flags: &[], falls_back: false }
     }
 }
 
 impl Context<'_> {
     pub(crate) fn message(&self, text: impl ToString) {
-        (self.tell)(Event::Message(text.to_string()));
+        (self.report)(Event::Message(text.to_string()));
     }
 
     pub(crate) fn note(&self, text: impl ToString) {
-        (self.tell)(Event::Note(text.to_string()));
+        (self.report)(Event::Note(text.to_string()));
     }
 
     /// Reports rows that became complete.
     fn rows(&self, next: usize, rows: &[Row]) {
-        (self.tell)(Event::Rows { next, rows, champions: None });
+        (self.report)(Event::Rows { next, rows, champions: None });
     }
 
     /// Reports the fraction of the work that is done.
     pub(crate) fn fraction(&self, part: f64, text: impl ToString) {
-        (self.tell)(Event::Fraction(part, text.to_string()));
+        (self.report)(Event::Fraction(part, text.to_string()));
     }
 
     /// Reports notes for the author of a config.
@@ -165,17 +165,17 @@ impl Context<'_> {
     }
 
     pub(crate) fn pause(&self) {
-        (self.tell)(Event::Pause);
+        (self.report)(Event::Pause);
     }
 
     /// Warns about every POI of a config that no team can observe.
-    pub(crate) fn warn_of_unreachable(&self, config: &Config) {
+    pub(crate) fn warn_of_unreachable(&self, config: &ValidConfig) {
         sweep::unreachable(config).iter().for_each(|line| self.warn(format_args!("warning: {line}")));
     }
 
     /// Reports a warning.
     pub fn warn(&self, text: impl ToString) {
-        (self.tell)(Event::Warning(text.to_string()));
+        (self.report)(Event::Warning(text.to_string()));
     }
 
     fn is_stopped(&self) -> bool {
@@ -183,12 +183,12 @@ impl Context<'_> {
     }
 
     /// Fails if the caller asked to stop work that leaves nothing to resume.
-    fn go_on(&self) -> Result<(), Error> {
-        let stopped = || Error::Stopped(said("before everything was played", "nothing was written"));
+    fn check_not_stopped(&self) -> Result<(), Error> {
+        let stopped = || Error::Stopped(with_remedy("before everything was played", "nothing was written"));
         if self.is_stopped() { Err(stopped()) } else { Ok(()) }
     }
 
-    /// Returns whether a stopped training ends with the generation that plays next. If so, it continues until then.
+    /// Reports whether a stopped training ends with the generation that plays next. If so, it continues until then.
     fn ends(&self) -> bool {
         let ends = self.end.swap(false, Relaxed);
         self.stop.fetch_and(!ends, Relaxed);
@@ -261,7 +261,7 @@ impl ConfigText {
     }
 
     /// Reads the config. Reports notes for its author, and returns them, too.
-    fn read_noted(&self, context: Context<'_>) -> Result<(Config, Vec<String>), Error> {
+    fn read_noted(&self, context: Context<'_>) -> Result<(ValidConfig, Vec<String>), Error> {
         let (config, notes) = Config::read_noted(&Document::parse(&self.text), &self.name, &[], &self.set)?;
         context.notes(&notes);
         Ok((config, notes))
@@ -275,7 +275,7 @@ fn escaped<S: serde::Serializer>(path: &Path, serializer: S) -> Result<S::Ok, S:
 
 /// Refuses configs that need more memory than there is, each alone.
 fn check_memory<'a>(
-    configs: impl IntoIterator<Item = &'a crate::config::Config>,
+    configs: impl IntoIterator<Item = &'a ValidConfig>,
     (_, machine): &OpenBackend,
 ) -> Result<(), Error> {
     for config in configs {

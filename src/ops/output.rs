@@ -8,7 +8,7 @@ use std::sync::{OnceLock, mpsc};
 use std::thread;
 use std::time::Duration;
 
-use super::{Error, said};
+use super::{Error, with_remedy};
 use crate::escape::PathExt;
 use crate::file;
 use crate::record::disk::Disk;
@@ -75,7 +75,7 @@ impl Destination {
 /// its flag.
 ///
 /// # Errors
-/// Fails for such an output, for a directory, and for a file whose folder does not exist.
+/// Fails for such an output, for a folder, and for a file whose folder does not exist.
 pub fn check(outputs: &[(&str, Option<&Path>)], inputs: &[&Path]) -> Result<(), Error> {
     let mut taken: Vec<_> = inputs.iter().map(|path| (file::resolved(path), "is read from".to_string())).collect();
     for &(flag, path) in outputs {
@@ -98,7 +98,10 @@ pub fn check(outputs: &[(&str, Option<&Path>)], inputs: &[&Path]) -> Result<(), 
         disk(path).map_err(RecordError::write(path))?;
         let resolved = file::resolved(path);
         let refused = |why: &str| {
-            Err(Error::Usage(said(format!("{flag} {}: this file {why}", path.escaped()), "name another to write")))
+            Err(Error::Usage(with_remedy(
+                format!("{flag} {}: this file {why}", path.escaped()),
+                "name another to write",
+            )))
         };
         if let Some((_, why)) = taken.iter().find(|(other, _)| *other == resolved) {
             return refused(why);
@@ -130,7 +133,7 @@ pub fn write_with(path: &Path, content: impl FnOnce(&mut dyn Write) -> io::Resul
         drop(opened);
         content(output)
     };
-    let written = disk(path).and_then(|disk| disk.deliver(path, content));
+    let written = disk(path).and_then(|disk| disk.write_user_file(path, content));
     Ok(written.map_err(RecordError::write(path))?)
 }
 

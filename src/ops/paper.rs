@@ -4,10 +4,10 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::{BackendSource, Context, Error, Event, Processor, said};
+use super::{BackendSource, Context, Error, Event, Processor, with_remedy};
 use crate::baseline::Baselines;
 use crate::choice::Work;
-use crate::config::{self, Actions, Fitness, Override, Paradigm};
+use crate::config::{self, Actions, Fitness, Override, Paradigm, ValidConfig};
 use crate::escape::PathExt;
 use crate::memory;
 use crate::parallel::current_num_threads;
@@ -48,7 +48,7 @@ pub struct Request {
 }
 
 impl Request {
-    /// Returns whether the user chose the folder.
+    /// Reports whether the user chose the folder.
     pub(super) fn is_out_named(&self) -> bool {
         self.out != Path::new(OUT)
     }
@@ -130,11 +130,9 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     marks.compare(out, start)?;
     let (configs, places) = paper::trained(&arms);
     let (backend, on) = backends.open(Work::of(&configs))?;
-    let plan = memory::Peaks::of(&configs, current_num_threads());
+    let plan = memory::Peaks::of(&ValidConfig::all(&configs)?, current_num_threads());
     plan.check(backend.1.backend == "gpu").map_err(RunError::from)?;
-    let disk = Disk::default();
-    disk.create_folder(out).map_err(|error| RecordError::Write { path: out.clone(), error })?;
-    let disk = ownership::open_output_folder(&disk, out, request.is_out_named())?;
+    let disk = ownership::create_output_folder(&Disk::default(), out, request.is_out_named())?;
     let _lock = folder::lock(&disk, out)?;
     // Compared again, because another process could write here until the folder was locked.
     marks.compare(out, start)?;
@@ -167,7 +165,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         ));
         let names = arms.iter().map(|arm| (arm.name(), Some(arm.pois()))).collect();
         let next = |generations: &[usize]| generations.iter().min().copied().unwrap_or(0);
-        (context.tell)(Event::Begin(names, next(session.generations()), learning.generations));
+        (context.report)(Event::Begin(names, next(session.generations()), learning.generations));
         let of_arms = |row: &Row| {
             let (row, places) = (*row, places.iter().enumerate());
             places
@@ -179,7 +177,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
             context.rows(next(now.generations), &rows);
         };
         let ended = context.train(&mut watch, |options| session.train(backend, options));
-        (context.tell)(Event::Pause);
+        (context.report)(Event::Pause);
         if ended? == SessionEnd::Stopped {
             return Err(Error::Stopped(
                 format!(
@@ -202,7 +200,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         let config = arm.config.clone();
         runs::metrics(folder, &config, Verification::Required, |row| arm.add(row))?;
     }
-    let mut baselines = Baselines::new(paper::grounds(&arms));
+    let mut baselines = Baselines::new(paper::baseline_configs(&arms));
     while !baselines.is_done() {
         if context.is_stopped() {
             return Err(Error::Stopped("before all that needs no learning was played, with every run done".into()));
@@ -213,18 +211,14 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         }
         let (generation, last) = (baselines.generation(), learning.generations);
         let part = generation as f64 / (last + 1) as f64;
-        (context.tell)(Event::Fraction(part, format!("playing random teams: generation {generation} of {last}")));
+        (context.report)(Event::Fraction(part, format!("playing random teams: generation {generation} of {last}")));
     }
-    (context.tell)(Event::Pause);
+    (context.report)(Event::Pause);
     let baselines = baselines.found();
     let found = Evidence { arms: &arms, baselines: &baselines };
     let ran = (0..configs.len()).map(|run| session.run(run));
     let seconds = ran.map(|run| run.seconds).fold(0.0, f64::max);
 
-    let failed = |path: &Path| {
-        let path = path.to_path_buf();
-        |error| RecordError::Write { path, error }
-    };
     let write = |name: String, content: &[u8]| -> Result<(), Error> {
         Ok(ownership::publish(&disk, &out.join(name), |output| output.write_all(content))?)
     };
@@ -233,7 +227,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         let scene = paper::figure(found, index).scene();
         for kind in Format::ALL {
             let name = format!("figure{number}.{}", kind.extension());
-            let picture = scene.file(kind, PRINT).map_err(failed(&out.join(&name)))?;
+            let picture = scene.file(kind, PRINT).map_err(RecordError::write(&out.join(&name)))?;
             write(name, &picture)?;
         }
     }
@@ -243,7 +237,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let full = tables::full(&claims);
     write(CLAIMS.into(), tables::page(&baseline, &heading, &full).as_bytes())?;
     let summary = Summary {
-        version: env!("CARGO_PKG_VERSION"),
+        version: crate::version::VERSION,
         backend: session.run(0).backend.clone(),
         description: session.run(0).description.clone(),
         seconds,
@@ -331,7 +325,7 @@ impl Marks {
             () => match like_ours {
                 None => return Ok(()),
                 Some(theirs) => {
-                    return Err(Error::Refused(said(
+                    return Err(Error::Refused(with_remedy(
                         format!("{name} holds {theirs}, but no {PAPER}, which would say that it is a paper's"),
                         "choose another --out",
                     )));
@@ -340,20 +334,20 @@ impl Marks {
         };
         match start {
             Start::Force if what == "a paper" => self.compare_mark(out),
-            Start::Fresh if what == "a paper" => Err(Error::Refused(said(
+            Start::Fresh if what == "a paper" => Err(Error::Refused(with_remedy(
                 format!("{name} holds a paper already"),
                 "pass --resume to continue it or --force to overwrite it, or choose another --out",
             ))),
             Start::Resume if what == "a paper" => self.compare_paper(out),
-            _ => Err(Error::Refused(said(format!("{name} holds {what}, no paper"), "choose another --out"))),
+            _ => Err(Error::Refused(with_remedy(format!("{name} holds {what}, no paper"), "choose another --out"))),
         }
     }
 
     /// Refuses a folder whose `paper.toml` was not made by flotilla.
     fn compare_mark(&self, out: &Path) -> Result<(), Error> {
         let path = out.join(PAPER);
-        let there: Option<toml::Table> = config::read_file(&path)?.parse().ok();
-        let like_ours = there.is_some_and(|there| self.0.iter().all(|(key, _)| there.contains_key(*key)));
+        let existing: Option<toml::Table> = config::read_file(&path)?.parse().ok();
+        let like_ours = existing.is_some_and(|existing| self.0.iter().all(|(key, _)| existing.contains_key(*key)));
         match like_ours || out.join(ARMS).is_dir() {
             true => Ok(()),
             false => Err(RecordError::NotOurs { path }.into()),
@@ -364,23 +358,23 @@ impl Marks {
     fn compare_paper(&self, out: &Path) -> Result<(), Error> {
         let path = out.join(PAPER);
         let text = config::read_file(&path)?;
-        let there: toml::Table = text.parse().map_err(|error: toml::de::Error| RecordError::Damaged {
+        let existing: toml::Table = text.parse().map_err(|error: toml::de::Error| RecordError::Damaged {
             path: path.clone(),
             reason: format!("it is damaged: {}; write over the paper by --force", error.message()),
         })?;
-        let differs = |&(key, here): &(&str, u64)| {
-            let there = there.get(key).and_then(toml::Value::as_integer).and_then(|there| u64::try_from(there).ok());
-            match there {
-                Some(there) if there == here || key == "generations" && there < here => None,
-                Some(there) => Some(format!("\n  {key}: {there} there, {here} here")),
-                None => Some(format!("\n  {key}: nothing there, {here} here")),
+        let differs = |&(key, requested): &(&str, u64)| {
+            let found = existing.get(key).and_then(toml::Value::as_integer).and_then(|found| u64::try_from(found).ok());
+            match found {
+                Some(found) if found == requested || key == "generations" && found < requested => None,
+                Some(found) => Some(format!("\n  {key}: {found} there, {requested} here")),
+                None => Some(format!("\n  {key}: nothing there, {requested} here")),
             }
         };
         let differences: String = self.0.iter().filter_map(differs).collect();
         if differences.is_empty() {
             return Ok(());
         }
-        Err(Error::Refused(said(
+        Err(Error::Refused(with_remedy(
             format!("{} holds another paper; what differs:{differences}", out.escaped()),
             "use its own flags (generations may be more), or choose another --out",
         )))
@@ -388,14 +382,10 @@ impl Marks {
 
     /// Marks the folder as this paper's. `Start::Force` first removes what was made from earlier runs.
     fn claim(&self, out: &Path, start: Start, disk: &Disk) -> Result<(), Error> {
-        let failed = |path: &Path| {
-            let path = path.to_path_buf();
-            |error| RecordError::Write { path, error }
-        };
         if start == Start::Force {
             products().try_for_each(|name| ownership::remove_published(disk, &out.join(name)))?;
         }
         let path = out.join(PAPER);
-        Ok(disk.replace(&path, |output| output.write_all(self.text().as_bytes())).map_err(failed(&path))?)
+        Ok(disk.replace(&path, |output| output.write_all(self.text().as_bytes())).map_err(RecordError::write(&path))?)
     }
 }

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::output::Destination;
-use super::{Context, Error, escaped, said};
+use super::{Context, Error, escaped, with_remedy};
 use crate::escape::PathExt;
 use crate::record::RecordError;
 use crate::record::archive::RunFolder;
@@ -56,7 +56,7 @@ pub fn run(request: &Request, context: Context<'_>) -> Result<Outcome, Error> {
     let verification = Verification::unless(request.unverified);
     if request.runs.len() > MAX_RUNS {
         let text = format!("{} runs are too many to tell apart", request.runs.len());
-        return Err(Error::Usage(said(text, format!("name {MAX_RUNS} at most"))));
+        return Err(Error::Usage(with_remedy(text, format!("name {MAX_RUNS} at most"))));
     }
     let opened = request.runs.iter().map(|run| RunFolder::open(run)).collect::<Result<Vec<_>, _>>()?;
     let runs: Vec<PathBuf> = opened.iter().map(|run| run.path().into()).collect();

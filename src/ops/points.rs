@@ -12,12 +12,12 @@ use crate::report::runs::{self, ReadError};
 use crate::sweep::{Sweep, results};
 
 /// Maximum number of points that are listed.
-const MOST: usize = 40;
+const MAX_LISTED_POINTS: usize = 40;
 
 /// Reads a run's config. If the folder is a sweep's, the error lists its points with their values.
 ///
 /// # Errors
-/// Fails if the folder is not a run directory, or if its config is damaged.
+/// Fails if the folder is not a run's folder, or if its config is damaged.
 pub fn config(folder: &Path, verification: Verification) -> Result<Config, Error> {
     runs::config(folder, verification).map_err(|error| match error {
         ReadError::Collection { what: "a sweep", .. } => match Sweep::load(&folder.join(SWEEP), &[], false) {
@@ -30,10 +30,10 @@ pub fn config(folder: &Path, verification: Verification) -> Result<Config, Error
 
 fn list(sweep: &Sweep, folder: &Path) -> String {
     let mut text = format!("{} holds a sweep; name one of its points:", folder.escaped());
-    for point in sweep.points.iter().take(MOST) {
+    for point in sweep.points.iter().take(MAX_LISTED_POINTS) {
         let _ = write!(text, "\n  {}  {}", results::point_folder(folder, point).escaped(), sweep.describe(point));
     }
-    if let more @ 1.. = sweep.points.len().saturating_sub(MOST) {
+    if let more @ 1.. = sweep.points.len().saturating_sub(MAX_LISTED_POINTS) {
         let _ = write!(text, "\n  … and {more} more");
     }
     text

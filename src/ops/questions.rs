@@ -6,7 +6,7 @@ use serde::Serialize;
 
 use super::paper::Request;
 use super::sweep::{claim, free_memory, same_sweep};
-use super::{BackendSource, Context, Error, Event, check_memory, said};
+use super::{BackendSource, Context, Error, Event, check_memory, with_remedy};
 use crate::choice::Work;
 use crate::config::Config;
 use crate::escape::PathExt;
@@ -82,26 +82,24 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         return Err(Error::Usage(format!("--trials {trials}: intervals and tests take two trials or more").into()));
     }
     if let Some(what) = folder::collection(out) {
-        return Err(Error::Refused(said(format!("{} holds {what}", out.escaped()), "choose another --out")));
+        return Err(Error::Refused(with_remedy(format!("{} holds {what}", out.escaped()), "choose another --out")));
     }
     if folder::holds_run(out)? {
-        return Err(Error::Refused(said(format!("{} holds a run", out.escaped()), "choose another --out")));
+        return Err(Error::Refused(with_remedy(format!("{} holds a run", out.escaped()), "choose another --out")));
     }
     parts.iter().try_for_each(|(part, sweep)| same_sweep(sweep, &out.join(part.name)))?;
     if !all_parts().any(|part| out.join(part.name).join(SWEEP).exists())
         && let Some(theirs) = files().chain([PAGE.into()]).find(|name| out.join(name).exists())
     {
-        return Err(Error::Refused(said(
+        return Err(Error::Refused(with_remedy(
             format!("{} holds {theirs}, but none of the questions' sweeps", out.escaped()),
             "choose another --out",
         )));
     }
     let configs = || parts.iter().flat_map(|(_, sweep)| &sweep.points).map(|point| &point.config);
-    let (backend, on) = backends.open(Work::of(configs()))?;
+    let (backend, on) = backends.open(Work::of(configs().map(|config| &**config)))?;
     check_memory(configs(), backend)?;
-    let disk = Disk::default();
-    disk.create_folder(out).map_err(|error| RecordError::Write { path: out.clone(), error })?;
-    let disk = ownership::open_output_folder(&disk, out, request.is_out_named())?;
+    let disk = ownership::create_output_folder(&Disk::default(), out, request.is_out_named())?;
     let _lock = folder::lock(&disk, out)?;
     ownership::check(&disk, files().chain([PAGE.into()]).map(|name| out.join(name)))?;
     let points: usize = parts.iter().map(|(_, sweep)| sweep.points.len()).sum();
@@ -110,7 +108,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let warm: Vec<_> = parts.iter().map(|(part, sweep)| part.warm(sweep, out)).collect();
     // All folders are checked before training, so that no part is trained only to fail at another part's folder.
     let points = parts.iter().flat_map(|(part, sweep)| {
-        sweep.points.iter().map(|point| (point_folder(&out.join(part.name), point), &point.config))
+        sweep.points.iter().map(|point| (point_folder(&out.join(part.name), point), &*point.config))
     });
     let warm_runs = warm.iter().flatten().map(|run| (run.folder.clone(), &run.config));
     let folders: Vec<(PathBuf, &Config)> = points.chain(warm_runs).collect();
@@ -129,7 +127,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         let share = |now: &SweepProgress| {
             let share = now.played as f64 / now.total.max(1) as f64;
             let text = format!("{}: {}/{} experiments done", part.name, now.done, now.points);
-            (context.tell)(Event::Fraction((before + share * cost(sweep)) / whole, text));
+            (context.report)(Event::Fraction((before + share * cost(sweep)) / whole, text));
         };
         let ended =
             super::sweep::train_points(context, sweep, &points, &folder, start, &disk, free_memory(), backend, &share)?;
@@ -145,7 +143,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         });
         let (mut session, _) = Session::open_from(runs.collect::<Result<_, RecordError>>()?, start, &disk)?;
         let mut watch = |_: &crate::run::Progress<'_>| {
-            (context.tell)(Event::Fraction(before / whole, format!("{}: warm starts", part.name)));
+            (context.report)(Event::Fraction(before / whole, format!("{}: warm starts", part.name)));
         };
         if !session.is_done()
             && context.train(&mut watch, |options| session.train(backend, options))? == SessionEnd::Stopped
@@ -164,7 +162,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
             }
             let sweep = parts.iter().find(|(other, _)| other.name == part.name).map(|(_, sweep)| sweep);
             let Some(sweep) = sweep else { continue };
-            (context.tell)(Event::Fraction(1.0, format!("comparing {}", part.name)));
+            (context.report)(Event::Fraction(1.0, format!("comparing {}", part.name)));
             let answer = part.answer(sweep, out, &mut *backend.0)?;
             for kind in Format::ALL {
                 let path = out.join(format!("{}.{}", part.name, kind.extension()));
@@ -179,7 +177,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         }
         answers.push((*question, of_parts));
     }
-    (context.tell)(Event::Pause);
+    (context.report)(Event::Pause);
     let first = &parts[0].1.points[0].config.learning;
     let heading = format!(
         "Means over {} trials of seed {} with 95 % bootstrap intervals. In parentheses beside a champion's G is that of the\n\
@@ -205,6 +203,6 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
 }
 
 fn write(disk: &Disk, path: &Path, bytes: std::io::Result<Vec<u8>>) -> Result<(), Error> {
-    let bytes = bytes.map_err(|error| RecordError::Write { path: path.into(), error })?;
+    let bytes = bytes.map_err(RecordError::write(path))?;
     Ok(ownership::publish(disk, path, |output| output.write_all(&bytes))?)
 }

@@ -20,9 +20,10 @@ use crate::report::runs;
 use crate::run::RunError;
 use crate::shell;
 
-/// `EMFILE`. It has this number on every Unix, and no name in Rust.
+/// `EMFILE`: the process has too many open files. The number is the same on every Unix, and the standard library has no
+/// name for it.
 const TOO_MANY_FILES: i32 = 24;
-/// `EIO`, likewise.
+/// `EIO`: a device failed to read or write. The number is the same on every Unix.
 const INPUT_OUTPUT: i32 = 5;
 
 /// Advice on a comparison without a GPU.
@@ -95,18 +96,18 @@ pub fn record(error: &RecordError, again: &str) -> String {
         RecordError::NotOurs { .. } => "; move it away, or choose another --out".into(),
         RecordError::OfAnotherUser { .. } => "; to write there all the same, name it with --out".into(),
         RecordError::NoFolder { .. } => "; choose a folder by --out".into(),
-        RecordError::Shorter { there, .. } => {
-            format!("; resume with --generations {there} or more, or choose another --out")
+        RecordError::Shorter { existing, .. } => {
+            format!("; resume with --generations {existing} or more, or choose another --out")
         }
         RecordError::Locked { .. } => "; wait for it, stop it, or choose another --out".into(),
         RecordError::ConfigDiffers { path, .. } => format!(
             "\nresume with the config it was started with ({}/{CONFIG}), or choose another --out",
             path.escaped()
         ),
-        RecordError::InitDiffers { there: Some(_), .. } => {
+        RecordError::InitDiffers { existing: Some(_), .. } => {
             "; resume without --init or with that file, or choose another --out".into()
         }
-        RecordError::InitDiffers { there: None, .. } => "; resume without --init, or choose another --out".into(),
+        RecordError::InitDiffers { existing: None, .. } => "; resume without --init, or choose another --out".into(),
         RecordError::OriginUnknown { .. } => {
             "; give the policies that it started from by --init, or start it over by --force".into()
         }

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::output::Destination;
-use super::{BackendSource, Context, Error, escaped, points, said};
+use super::{BackendSource, Context, Error, escaped, points, with_remedy};
 use crate::choice::Work;
 use crate::config::{Config, Learning};
 use crate::escape::PathExt;
@@ -195,7 +195,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let out = place.path();
     let kind = Form::of(out)?;
     kind.takes(out, request)?;
-    let config = points::config(folder, verification)?;
+    let config = points::config(folder, verification)?.validate()?;
     digests::without([folder]).into_iter().for_each(|note| context.note(note));
     let trial = request.trial.find(folder, &config, generation, team, verification)?;
     let generation = match generation {
@@ -230,7 +230,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let played = replay::replay(folder, trial, &generations, team, verification, &mut **backend, &mut watch);
     context.pause();
     let played = played.map_err(|error| match error {
-        ReplayError::Stopped => Error::Stopped(said("before the episode was played", "nothing was written")),
+        ReplayError::Stopped => Error::Stopped(with_remedy("before the episode was played", "nothing was written")),
         error => error.into(),
     })?;
 
@@ -238,14 +238,14 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let name = name.unwrap_or_else(|| folder.escaped().to_string());
     let motion = Film { width, fps: fps.unwrap_or(FPS) };
     let content = match kind {
-        Form::Page => Ok(replay::page(&name, &config, &played).into_bytes()),
-        Form::Gif => replay::gif(&config, &played, motion),
+        Form::Page => Ok(replay::page(&name, config, &played).into_bytes()),
+        Form::Gif => replay::gif(config, &played, motion),
         Form::Still(kind) => {
-            let scene = replay::still(&config, &played, step.unwrap_or(steps));
+            let scene = replay::still(config, &played, step.unwrap_or(steps));
             scene.file(kind, width.map_or(PRINT, |width| f64::from(width) / scene.width))
         }
         Form::Film(numbered) => {
-            let written = write_film(&numbered, out, &replay::Frames::new(&config, &played, motion))?;
+            let written = write_film(&numbered, out, &replay::Frames::new(config, &played, motion))?;
             return Ok(outcome(written, &played));
         }
     };

@@ -6,10 +6,10 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::{BackendSource, ConfigText, Context, Error, Processor, output, points, said};
+use super::{BackendSource, ConfigText, Context, Error, Processor, output, points, with_remedy};
 use crate::backend::{Backend, Group, Moment};
 use crate::choice::Work;
-use crate::config::{self, Config, Override, Sharing};
+use crate::config::{self, Config, Override};
 use crate::escape::PathExt;
 use crate::evaluate::{self, Batch, Evaluation, Spread, Starts};
 use crate::file;
@@ -106,7 +106,7 @@ impl Request {
     fn starts(&self, jitter: f64, poi_jitter: f64) -> Result<Starts, Error> {
         let (Some(episodes), seed) = (self.episodes, self.seed.unwrap_or(0)) else { return Ok(Starts::Own) };
         if jitter == 0.0 && poi_jitter == 0.0 && (episodes > 1 || self.seed.is_some()) {
-            return Err(Error::Usage(said(
+            return Err(Error::Usage(with_remedy(
                 format!("--episodes {episodes}: learning.start_jitter is 0, so all episodes are the same"),
                 "set it or learning.poi_jitter in the config, or give --start-jitter or --poi-jitter",
             )));
@@ -129,7 +129,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         path => (path.to_path_buf(), None),
     };
     let Some(policies) = request.policies.clone().or(trained) else {
-        return Err(Error::Usage(said(
+        return Err(Error::Usage(with_remedy(
             "--policies: a config file needs a file of policies",
             format!("or name a run's folder in place of {}", request.path.escaped()),
         )));
@@ -141,21 +141,18 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let config = match request.stage {
         None => config,
         Some(stage) => {
-            let mut staged = config.staged();
-            if stage >= staged.len() {
-                let stages = numbered(staged.len(), "stage");
+            let config = config.validate()?;
+            let Some((_, config)) = config.stages().get(stage) else {
+                let stages = numbered(config.stages().len(), "stage");
                 return Err(Error::Usage(format!("--stage {stage}: the config has {stages}").into()));
-            }
-            staged.swap_remove(stage).1
+            };
+            config.clone()
         }
     };
     let starts = request.starts(config.learning.start_jitter, config.learning.poi_jitter)?;
     verify(&config_path, &policies, request.unverified, context)?;
     let policies = policies::read(&policies, &config, request.trial)?;
     let world = World::new(&config);
-    // The file says whether its leaders share a policy, not the config, which may be another layout's.
-    let own = policies.policies * world.leaders() * world.parameters();
-    let sharing = if policies.weights.len() == own { Sharing::PerLeader } else { Sharing::Shared };
     let work = Work::of_teams(&config, policies.policies * request.episodes.unwrap_or(1) as usize);
     let ((backend, machine), on) = backends.open(work)?;
     context.message(format_args!("playing on {on}"));
@@ -166,7 +163,8 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         weights: policies.weights[..].into(),
         policies: policies.policies,
         teams: &teams,
-        sharing,
+        // The config may be that of another layout, so the file decides whether its leaders share a policy.
+        sharing: policies.sharing,
         fitnesses: if request.scores.is_some() { evaluate::SCORES_AND_DT } else { evaluate::SCORES },
     };
     let playing = format!("playing {}", counted(policies.policies, starts.episodes()));
@@ -175,7 +173,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let evaluation = evaluate::evaluate_until(&mut **backend, &group, &starts, share, until);
     context.pause();
     let evaluation = evaluation?;
-    context.go_on()?;
+    context.check_not_stopped()?;
     if let Some(path) = &request.scores {
         output::write_with(path, |file| write_scores(file, &evaluation))?;
     }

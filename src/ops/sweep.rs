@@ -11,9 +11,8 @@ use serde_json::Value;
 use super::{BackendSource, Context, Error, Event, check_memory};
 use crate::backend::OpenBackend;
 use crate::choice::Work;
-use crate::config::{self, Config, ConfigError, Override, Problem};
+use crate::config::{self, ConfigError, Override, Problem, ValidConfig};
 use crate::escape::PathExt;
-use crate::file;
 use crate::memory;
 use crate::reach::{self, Unreachable};
 use crate::record::RecordError;
@@ -21,6 +20,7 @@ use crate::record::digests::{self, UNVERIFIED, Verification};
 use crate::record::disk::Disk;
 use crate::record::folder::{self, CONFIG, RUN, Run, SWEEP, Start};
 use crate::record::ownership;
+use crate::record::runs;
 use crate::report::curves::Band;
 use crate::report::runs::TeamKind;
 use crate::run::{self as training, SessionEnd};
@@ -224,11 +224,6 @@ pub fn picture_axes(sweep: &Sweep, names: &[String]) -> Result<Vec<usize>, Error
     }
 }
 
-/// Returns whether a file exists, or an error if the system does not allow checking that.
-fn there(path: &Path) -> Result<bool, RecordError> {
-    file::exists(path).map_err(|error| RecordError::Read { path: path.into(), error })
-}
-
 /// Refuses a folder with other content than this sweep.
 pub(crate) fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
     let path = out.join(SWEEP);
@@ -239,8 +234,8 @@ pub(crate) fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
         let problems = vec![Problem { line: None, key: String::new(), message }];
         Err(ConfigError::Invalid { name: path.escaped().to_string(), problems, unlisted: 0 }.into())
     };
-    if !there(&path)? {
-        let holds = match there(&out.join(CONFIG))? {
+    if !runs::exists(&path)? {
+        let holds = match runs::exists(&out.join(CONFIG))? {
             true => Some("a run"),
             false => folder::collection(out),
         };
@@ -258,10 +253,10 @@ pub(crate) fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
             None => Ok(()),
         };
     }
-    let there = config::read_file(&path)?;
+    let existing = config::read_file(&path)?;
     // A person may have written the file, so the same sweep may be formatted differently.
     let normal = |text: &str| Some(Sweep::read(text, SWEEP, &[], sweep.skipped > 0).ok()?.text);
-    if there == sweep.text || normal(&there).as_ref() == Some(&sweep.text) {
+    if existing == sweep.text || normal(&existing).as_ref() == Some(&sweep.text) {
         return Ok(());
     }
     let missing = |from: &str, other: &str, where_: &str| {
@@ -274,23 +269,19 @@ pub(crate) fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
     refuse(format!(
         "{} holds another sweep; what differs:{}{}\nchoose another --out",
         out.escaped(),
-        missing(&there, &sweep.text, "there"),
-        missing(&sweep.text, &there, "here"),
+        missing(&existing, &sweep.text, "there"),
+        missing(&sweep.text, &existing, "here"),
     ))
 }
 
 /// Marks the folder as this sweep's. Shards that start at the same moment write the same content.
 pub(crate) fn claim(disk: &Disk, sweep: &Sweep, out: &Path) -> Result<(), Error> {
-    let failed = |path: &Path| {
-        let path = path.to_path_buf();
-        move |error| RecordError::Write { path, error }
-    };
     let path = out.join(SWEEP);
-    disk.create_folder(out).map_err(failed(out))?;
-    let disk = disk.within(out).map_err(failed(out))?;
-    if disk.kind(&path).map_err(failed(&path))?.is_none() {
+    disk.create_folder(out).map_err(RecordError::write(out))?;
+    let disk = disk.within(out).map_err(RecordError::write(out))?;
+    if disk.kind(&path).map_err(RecordError::write(&path))?.is_none() {
         let text = |output: &mut dyn io::Write| output.write_all(sweep.text.as_bytes());
-        disk.replace_shared(&path, text, || Ok(())).map_err(failed(&path))?;
+        disk.replace_shared(&path, text, || Ok(())).map_err(RecordError::write(&path))?;
     }
     same_sweep(sweep, out)
 }
@@ -318,7 +309,7 @@ pub fn train(
     let shard = shard.map_err(|error| Error::Usage(error.into()))?;
     same_sweep(sweep, out)?;
     let points = shard.take(&sweep.points);
-    let (backend, on) = backends.open(Work::of(points.iter().map(|point| &point.config)))?;
+    let (backend, on) = backends.open(Work::of(points.iter().map(|point| &*point.config)))?;
     check_memory(points.iter().map(|point| &point.config), backend)?;
     warn_of_unreachable(sweep, &points, context);
     claim(&Disk::default(), sweep, out)?;
@@ -336,7 +327,7 @@ pub fn train(
         let SweepProgress { done, points, batch, generation, last, played, total } = *progress;
         let text =
             format!("{done}/{points} points done, {batch} side by side at generation {}/{last}", generation.min(last));
-        (context.tell)(Event::Fraction(played as f64 / total.max(1) as f64, text));
+        (context.report)(Event::Fraction(played as f64 / total.max(1) as f64, text));
     };
     match train_points(context, sweep, &points, out, request.start, &disk, memory, backend, &share)? {
         SessionEnd::Finished => Ok(()),
@@ -378,12 +369,12 @@ pub(super) fn train_points(
         },
     };
     let ended = run::run(points, out, backend, &mut options);
-    (context.tell)(Event::Pause);
+    (context.report)(Event::Pause);
     Ok(ended?)
 }
 
 /// Maximum number of POIs that are named one by one.
-const MOST_POIS: usize = 6;
+const MAX_NAMED_POIS: usize = 6;
 
 /// Warns about every POI of a sweep's points that no team can observe, each warning once.
 fn warn_of_unreachable(sweep: &Sweep, points: &[&Point], context: Context<'_>) {
@@ -393,17 +384,17 @@ fn warn_of_unreachable(sweep: &Sweep, points: &[&Point], context: Context<'_>) {
             found.entry(line).or_insert_with(|| (0, sweep.describe(point))).0 += 1;
         }
     }
-    for (line, (count, first)) in found.iter().take(2 * MOST_POIS) {
+    for (line, (count, first)) in found.iter().take(2 * MAX_NAMED_POIS) {
         context.warn(format_args!("warning: {line}; at {count} of {} points, the first {first}", points.len()));
     }
-    if let more @ 1.. = found.len().saturating_sub(2 * MOST_POIS) {
+    if let more @ 1.. = found.len().saturating_sub(2 * MAX_NAMED_POIS) {
         context.warn(format_args!("warning: … and {more} more; `flotilla check` lists those of one config"));
     }
 }
 
 /// Returns a line for each POI of a config that no team can observe, and advice.
-pub(crate) fn unreachable(config: &Config) -> Vec<String> {
-    let staged = config.staged();
+pub(crate) fn unreachable(config: &ValidConfig) -> Vec<String> {
+    let staged = config.stages();
     let mut lines = Vec::new();
     for (index, (_, config)) in staged.iter().enumerate() {
         let place = if staged.len() > 1 { format!("stage {index}: ") } else { String::new() };
@@ -416,9 +407,12 @@ pub(crate) fn unreachable(config: &Config) -> Vec<String> {
             }
         }
         lines.extend(
-            reasons.iter().take(MOST_POIS).map(|(first, others)| format!("{place}{first}{}", same_holds_for(others))),
+            reasons
+                .iter()
+                .take(MAX_NAMED_POIS)
+                .map(|(first, others)| format!("{place}{first}{}", further_pois(others))),
         );
-        if let more @ 1.. = reasons.iter().skip(MOST_POIS).map(|(_, others)| 1 + others.len()).sum::<usize>() {
+        if let more @ 1.. = reasons.iter().skip(MAX_NAMED_POIS).map(|(_, others)| 1 + others.len()).sum::<usize>() {
             lines.push(format!("{place}{more} more POIs cannot be observed"));
         }
         if let Some(steps) = reach::fewest_steps(config, &found) {
@@ -432,7 +426,7 @@ pub(crate) fn unreachable(config: &Config) -> Vec<String> {
 }
 
 /// Names more POIs to which a warning applies: "; the same holds for POIs 1, 2 and 3".
-fn same_holds_for(pois: &[usize]) -> String {
+fn further_pois(pois: &[usize]) -> String {
     match pois {
         [] => String::new(),
         [poi] => format!("; the same holds for POI {poi}"),
@@ -454,7 +448,7 @@ pub(crate) fn free_memory() -> usize {
 /// The folder holds no such sweep, or files cannot be written.
 pub fn collect(request: &Request, sweep: &Sweep, axes: &[usize], context: Context<'_>) -> Result<Outcome, Error> {
     let out = &*request.out;
-    if !there(&out.join(SWEEP))? {
+    if !runs::exists(&out.join(SWEEP))? {
         return Err(Error::Usage(format!("{} holds no sweep", out.escaped()).into()));
     }
     same_sweep(sweep, out)?;

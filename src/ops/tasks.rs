@@ -1,7 +1,7 @@
 //! Trains the tasks of a suite, and checks that no baseline and no small population solves them.
 //!
 //! A task is admitted if no baseline reaches [`EASY`], if populations of [`SMALL`] policies solve it under no fitness,
-//! and if something solves it: a champion here, or a scripted team from a file beside the config.
+//! and if something solves it: a champion here, or a scripted team from a file next to the config.
 
 use std::path::{Path, PathBuf};
 
@@ -163,15 +163,13 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         FITNESSES.iter().for_each(|_| work += Work::of([config]));
     }
     let (backend, on) = backends.open(work)?;
-    let disk = Disk::default();
-    disk.create_folder(&request.out).map_err(RecordError::write(&request.out))?;
-    let disk = ownership::open_output_folder(&disk, &request.out, request.named)?;
+    let disk = ownership::create_output_folder(&Disk::default(), &request.out, request.named)?;
     let mut found = Vec::new();
     for (task, configs) in &tasks {
         let name = &task.name;
         context.message(format_args!("{name}: playing baselines and training on {on}"));
         let small = configs[0].as_ref().expect("small populations are always trained");
-        let quiet = Context { tell: &|_| (), ..context };
+        let quiet = Context { report: &|_| (), ..context };
         let played = baseline::play(small, SEEDS, EPISODES, &mut *backend.0, quiet)?;
         let g = |of: fn(&Played) -> f64| played.iter().map(of).collect();
         let baselines = [g(|played| played.constants[played.best_constant]), g(|p| p.action), g(|p| p.network)];
@@ -213,7 +211,7 @@ fn train(
     backend: &mut OpenBackend,
     context: Context<'_>,
 ) -> Result<(), Error> {
-    check_memory([config], backend)?;
+    check_memory([&config.validate()?], backend)?;
     let (mut session, _) = Session::open(vec![(config.clone(), folder.into())], start, disk)?;
     if session.is_done() {
         return Ok(());
@@ -221,7 +219,7 @@ fn train(
     let learning = &config.learning;
     let title = format!("{task}, {} policies, {}", learning.population, learning.fitness);
     let names = vec![(title, Some(config.world.pois.len()))];
-    (context.tell)(Event::Begin(names, session.generations()[0], learning.generations));
+    (context.report)(Event::Begin(names, session.generations()[0], learning.generations));
     let mut watch = |now: &Progress<'_>| context.rows(now.generations[0], now.rows);
     let ended = context.train(&mut watch, |options| session.train(backend, options));
     context.pause();

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use super::remedy::RUNS;
-use super::{BackendSource, ConfigText, Context, Error, Event, Processor, check_memory, escaped, said};
+use super::{BackendSource, ConfigText, Context, Error, Event, Processor, check_memory, escaped, with_remedy};
 use crate::choice::Work;
 use crate::config::Config;
 use crate::escape::PathExt;
@@ -89,9 +89,9 @@ pub struct Outcome {
     /// Notes for the config's author.
     pub notes: Vec<String>,
     /// Scores of the random start.
-    pub first: Course,
+    pub first: GenerationScores,
     /// Scores of the last generation.
-    pub last: Course,
+    pub last: GenerationScores,
     /// The files by their content.
     pub files: BTreeMap<&'static str, String>,
     /// The processor of the run's last session.
@@ -111,7 +111,7 @@ pub struct Outcome {
 /// Scores of a generation, over trials.
 #[derive(Clone, Copy, Debug, Serialize)]
 #[non_exhaustive]
-pub struct Course {
+pub struct GenerationScores {
     /// G of the best team.
     pub best_g: Extremes,
     /// G of the mean team.
@@ -120,10 +120,14 @@ pub struct Course {
     pub champion_g: Extremes,
 }
 
-impl Course {
-    fn of(rows: &[Row]) -> Course {
+impl GenerationScores {
+    fn of(rows: &[Row]) -> GenerationScores {
         let of = |share: fn(&Row) -> f64| Extremes::of(rows.iter().map(share));
-        Course { best_g: of(|row| row.best_g), mean_g: of(|row| row.mean_g), champion_g: of(|row| row.champion_g) }
+        GenerationScores {
+            best_g: of(|row| row.best_g),
+            mean_g: of(|row| row.mean_g),
+            champion_g: of(|row| row.champion_g),
+        }
     }
 }
 
@@ -174,8 +178,8 @@ impl Request {
     }
 }
 
-/// Refuses a run in a zip file, because its folder would be removed at the end. The message says how to unpack and
-/// resume it.
+/// Refuses a run in a zip file, because its folder would be removed at the end. The message shows the commands
+/// that unpack and resume it.
 pub(crate) fn refuse_zip(path: &Path) -> Result<(), Error> {
     let Some(top) = archive::run_prefix(path) else { return Ok(()) };
     let inner = if top.is_empty() { file::stem(path, "run") } else { top.clone() };
@@ -185,7 +189,7 @@ pub(crate) fn refuse_zip(path: &Path) -> Result<(), Error> {
     }
     let [config, folder] = [Path::new(&inner).join(CONFIG), inner.into()].map(|path| shell::argument(&path));
     let resume = ["flotilla".into(), "train".into(), config, "--out".into(), folder, "--resume".into()];
-    Err(Error::Usage(said(
+    Err(Error::Usage(with_remedy(
         format!("{} is a run in a zip file, and a run resumes in a folder", path.escaped()),
         format!("unpack it, and resume it there:\n  {}\n  {}", shell::command(unpack), shell::command(resume)),
     )))
@@ -198,7 +202,7 @@ pub(crate) fn refuse_zip(path: &Path) -> Result<(), Error> {
 pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
     request.out.iter().try_for_each(|path| refuse_zip(path))?;
     let (config, notes) = request.config.read_noted(context)?;
-    let (backend, on) = backends.open(Work::of([&config]))?;
+    let (backend, on) = backends.open(Work::of([&*config]))?;
     check_memory([&config], backend)?;
     context.warn_of_unreachable(&config);
     let (init, start) = (request.init.as_deref(), request.start);
@@ -206,11 +210,11 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let folder = request.folder()?;
     if let Some(what) = folder::collection(&folder) {
         let text = format!("{} holds {what}, not a run", folder.escaped());
-        return Err(Error::Refused(said(text, "choose another --out")));
+        return Err(Error::Refused(with_remedy(text, "choose another --out")));
     }
     if let Some(path) = init.filter(|path| file::resolved(path) == file::resolved(&folder.join(POLICIES))) {
         let text = format!("--init {}: this run would be written over it", path.escaped());
-        return Err(Error::Usage(said(text, "choose another --out")));
+        return Err(Error::Usage(with_remedy(text, "choose another --out")));
     }
     let disk = Disk::default();
     if folder.is_dir() {
@@ -220,9 +224,9 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
             ownership::check(&disk, [folder.join(CURVES)])?;
         }
     }
-    let opened = Session::open_from(vec![(config.clone(), folder.clone(), first)], start, &disk);
+    let opened = Session::open_from(vec![(Config::clone(&config), folder.clone(), first)], start, &disk);
     let (mut session, found) = opened.map_err(|error| match error {
-        RunError::Record(RecordError::Exists { .. }) if request.tensorboard => Error::Refused(said(
+        RunError::Record(RecordError::Exists { .. }) if request.tensorboard => Error::Refused(with_remedy(
             format!("{error}\nfor event files of the run that is there:"),
             format!("  {}", request.command_to_resume(&folder, context)),
         )),
@@ -240,7 +244,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let (was_done, mut last) = (session.is_done(), config.learning.generations);
     if !was_done {
         context.message(format_args!("training on {on}, into {}", folder.escaped()));
-        (context.tell)(Event::Begin(vec![(String::new(), config.pois())], from, last));
+        (context.report)(Event::Begin(vec![(String::new(), config.pois())], from, last));
     }
     while !session.is_done() {
         let mut watch = |progress: &Progress<'_>| {
@@ -255,7 +259,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         }
         if !context.ends() {
             let next = session.generations()[0];
-            return Err(Error::Stopped(said(
+            return Err(Error::Stopped(with_remedy(
                 format!("before generation {next} of {last}, with everything saved"),
                 format!("continue with\n  {}", request.command_to_resume(&folder, context)),
             )));
@@ -286,12 +290,12 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         trials: learning.trials,
         population: learning.population,
         generations: learning.generations,
-        pois: config.pois(),
+        pois: config.validate()?.pois(),
         trained_generations: if was_done { 0 } else { (last + 1).saturating_sub(from) },
         seconds: if was_done { 0.0 } else { since.elapsed().as_secs_f64() },
         notes,
-        first: Course::of(&results.rows.first),
-        last: Course::of(&results.rows.last),
+        first: GenerationScores::of(&results.rows.first),
+        last: GenerationScores::of(&results.rows.last),
         files: FILES.into_iter().map(|(name, file)| (name, folder.join(file).escaped().to_string())).collect(),
         processor: Processor::of_run(session.run(0)),
         rows: results.rows.clone(),
@@ -322,16 +326,16 @@ pub fn in_memory(
     backends: &mut dyn BackendSource,
     context: Context<'_>,
 ) -> Result<InMemory, Error> {
-    config.validate()?;
-    let (backend, on) = backends.open(Work::of([config]))?;
+    let config = &config.validate()?;
+    let (backend, on) = backends.open(Work::of([&**config]))?;
     context.notes(&config.notes());
     context.warn_of_unreachable(config);
-    (context.tell)(Event::Begin(vec![(String::new(), config.pois())], 0, config.learning.generations));
+    (context.report)(Event::Begin(vec![(String::new(), config.pois())], 0, config.learning.generations));
     let (since, mut seconds, mut stopped) = (Instant::now(), Vec::new(), false);
     let watch = |generation: Generation<'_>| {
         seconds.push(since.elapsed().as_secs_f64());
         let Generation { generation: number, rows, champions, .. } = generation;
-        (context.tell)(Event::Rows { next: number + 1, rows, champions });
+        (context.report)(Event::Rows { next: number + 1, rows, champions });
         if !context.is_stopped() {
             return ControlFlow::Continue(());
         }
@@ -344,7 +348,7 @@ pub fn in_memory(
     };
     let trained = trained.map_err(Error::of_training)?;
     if stopped {
-        return Err(Error::Stopped(said("before the last generation", "nothing was saved")));
+        return Err(Error::Stopped(with_remedy("before the last generation", "nothing was saved")));
     }
     // After an early end, one more generation is played and not reported.
     seconds.resize(trained.config.learning.generations + 1, since.elapsed().as_secs_f64());

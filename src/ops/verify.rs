@@ -7,7 +7,7 @@ use std::time::Duration;
 use fearless_simd::Level;
 use serde::{Deserialize, Serialize};
 
-use super::{Context, Error, Event, said};
+use super::{Context, Error, Event, with_remedy};
 use crate::backend::Backend;
 use crate::backend::cpu::{Cpu, level_name};
 use crate::backend::gpu;
@@ -85,7 +85,7 @@ impl Outcome {
     pub fn difference(&self) -> Option<Error> {
         let failed = self.comparisons.iter().filter(|line| !line.equal).count();
         (failed > 0).then(|| {
-            Error::Different(said(
+            Error::Different(with_remedy(
                 format!("{failed} of {} comparisons found other bits than the CPU's", self.comparisons.len()),
                 "until this is fixed, use --backend cpu",
             ))
@@ -127,7 +127,7 @@ pub fn run(args: &Request, context: Context<'_>) -> Result<Outcome, Error> {
             let Combination { info, pass, kernel, .. } = combination;
             let of = if budget.is_some() { String::new() } else { format!(" of {}", plan.worlds.len()) };
             let text = format!("{}, {pass} pass, {kernel} kernel: {}{of} worlds", info.name, outcome.worlds);
-            (context.tell)(Event::Fraction((place as f64 + done) / combinations.len() as f64, text));
+            (context.report)(Event::Fraction((place as f64 + done) / combinations.len() as f64, text));
         };
         let result = verify(&plan, budget.map(|all| all / combinations.len() as u32), combination, &mut shown);
         lines.push(Compared {
@@ -136,7 +136,7 @@ pub fn run(args: &Request, context: Context<'_>) -> Result<Outcome, Error> {
             ..line(combination.info.to_string(), &Cpu::default(), result)
         });
     }
-    (context.tell)(Event::Pause);
+    (context.report)(Event::Pause);
     let evidence = args.evidence.then(|| evidence(&lines, args.note.clone(), context)).transpose()?;
     Ok(Outcome { equal: lines.iter().all(|line| line.equal), comparisons: lines, evidence })
 }
@@ -217,9 +217,9 @@ fn instruction_sets(plan: &Plan, context: Context<'_>) -> Vec<Compared> {
         let compared = compare(plan, &mut reference, &mut wider, |outcome| {
             let (done, all) = (outcome.worlds, plan.worlds.len());
             let text = format!("{}: {done} of {all} worlds", level_name(level));
-            (context.tell)(Event::Fraction(done as f64 / all as f64, text));
+            (context.report)(Event::Fraction(done as f64 / all as f64, text));
         });
-        (context.tell)(Event::Pause);
+        (context.report)(Event::Pause);
         line(wider.describe(), &reference, compared.map_err(Error::from))
     });
     wider.collect()
@@ -230,11 +230,11 @@ fn evidence(lines: &[Compared], note: Option<String>, context: Context<'_>) -> R
     let mut trained = Vec::new();
     let trainings = short_trainings();
     for (index, (name, config)) in trainings.iter().enumerate() {
-        (context.tell)(Event::Fraction(index as f64 / trainings.len() as f64, format!("training {name}")));
-        let came = front::train(config, &mut Cpu::default(), |_| Continue(())).map_err(Error::of_training)?;
-        trained.push(ShortTraining { config: name.clone(), digest: came.digest() });
+        (context.report)(Event::Fraction(index as f64 / trainings.len() as f64, format!("training {name}")));
+        let run = front::train(config, &mut Cpu::default(), |_| Continue(())).map_err(Error::of_training)?;
+        trained.push(ShortTraining { config: name.clone(), digest: run.digest() });
     }
-    (context.tell)(Event::Pause);
+    (context.report)(Event::Pause);
     Ok(MachineReport {
         processor: processor(),
         instructions: Some(level_name(Level::new()).into()),
@@ -247,7 +247,7 @@ fn evidence(lines: &[Compared], note: Option<String>, context: Context<'_>) -> R
 
 /// Returns the processor's name, if the system reports it.
 fn processor() -> Option<String> {
-    let told = match std::env::consts::OS {
+    let processor = match std::env::consts::OS {
         "linux" => std::fs::read_to_string("/proc/cpuinfo").ok().and_then(|text| {
             let names = text.lines().filter_map(|line| line.split_once(':'));
             names.into_iter().find(|(key, _)| key.trim() == "model name").map(|(_, name)| name.to_string())
@@ -259,7 +259,7 @@ fn processor() -> Option<String> {
             .map(|output| String::from_utf8_lossy(&output.stdout).into_owned()),
         _ => std::env::var("PROCESSOR_IDENTIFIER").ok(),
     };
-    told.map(|name| escape::line(name.trim()).into_owned()).filter(|name| !name.is_empty())
+    processor.map(|name| escape::line(name.trim()).into_owned()).filter(|name| !name.is_empty())
 }
 
 /// Returns what to compare, and the time budget if no amount is requested.
@@ -268,15 +268,17 @@ fn plan(args: &Request) -> Result<(Plan, Option<Duration>), Error> {
     let is_open = args.config.is_none() && args.worlds.is_none() && !args.evidence;
     let plan = match &args.config {
         None if !args.set.is_empty() => {
-            return Err(Error::Usage(said("--set changes a config, and none is given", "name a config to compare")));
+            return Err(Error::Usage(with_remedy(
+                "--set changes a config, and none is given",
+                "name a config to compare",
+            )));
         }
         None => Plan::random(seed..seed + u64::from(args.worlds.unwrap_or(WORLDS)), teams),
         Some((name, text)) => {
-            let config = Config::read(text, name, &[], &args.set)?;
-            let stages = config.staged().into_iter().enumerate().skip(1);
-            let stages: Vec<_> =
-                stages.map(|(stage, (_, config))| (format!("{name}, stage {stage}"), config)).collect();
-            let worlds = [vec![(name.clone(), config)], stages].concat();
+            let config = Config::read(text, name, &[], &args.set)?.validate()?;
+            let later = config.stages().iter().enumerate().skip(1);
+            let later = later.map(|(stage, (_, config))| (format!("{name}, stage {stage}"), config.clone()));
+            let worlds = [(name.clone(), Config::clone(&config))].into_iter().chain(later).collect();
             Plan { worlds, teams, seed, generations: 5 }
         }
     };

@@ -43,7 +43,7 @@ impl<T: Number> Allowed<T> {
             || self.unlimited && value.is_infinite()
     }
 
-    /// Returns whether the value is above 0 and below the smallest allowed number other than 0.
+    /// Reports whether the value is above 0 and below the smallest allowed number other than 0.
     pub(super) fn is_too_small(&self, value: T) -> bool {
         self.zero && T::ZERO < value && value < self.low
     }
@@ -107,7 +107,7 @@ pub trait Number: Copy + PartialOrd + Display + Serialize {
     /// Returns the number of a value: `None` for another kind of value, `Some(None)` for a number outside the type.
     fn read(value: &DeValue<'_>) -> Option<Option<Self>>;
 
-    /// Returns whether the number is infinity.
+    /// Reports whether the number is infinity.
     fn is_infinite(self) -> bool {
         false
     }

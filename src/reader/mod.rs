@@ -59,7 +59,7 @@ impl Override {
         Override { key: key.into(), text: value.into().to_string(), name: name.into() }
     }
 
-    /// Sets `key` to what a text says in TOML; errors call it `name`.
+    /// Sets `key` to the value of a TOML text. Errors call it `name`.
     pub(crate) fn of_text(key: impl Into<String>, text: impl Into<String>, name: impl Into<String>) -> Override {
         Override { key: key.into(), text: text.into(), name: name.into() }
     }
@@ -156,8 +156,8 @@ impl LineNumbers {
     }
 }
 
-/// Reads a text, with some keys set by overrides: `ask` requests every key. Also returns a note about each key that was
-/// left out and whose default other keys leave no room for.
+/// Reads a text, with some keys set by overrides: `ask` requests every key. Also returns a note about each omitted
+/// key whose default other keys do not allow.
 ///
 /// # Errors
 /// All problems of the text and the overrides.

@@ -43,7 +43,7 @@ impl RunFolder {
         &self.path
     }
 
-    /// Returns whether the run came from a zip file, so that nothing may be written into its folder.
+    /// Reports whether the run came from a zip file, so that nothing may be written into its folder.
     pub(crate) fn is_unpacked(&self) -> bool {
         self.unpacked.is_some()
     }

@@ -1,6 +1,6 @@
 //! Checkpoints: the state from which a run resumes, in `checkpoints/GENERATION.safetensors`.
 //!
-//! A [`Keeper`] writes them on a separate thread. It keeps the last two, and also the checkpoint of generation 0 if
+//! A [`CheckpointWriter`] writes them on a separate thread. It keeps the last two, and also the checkpoint of generation 0 if
 //! there is one. Each checkpoint records the digest of its config and the length of `metrics.csv` at that time. The
 //! checksum of [`super::tensors`] protects it.
 //!
@@ -64,7 +64,7 @@ pub struct Checkpoint<N = Vec<f32>> {
 }
 
 impl<N> Checkpoint<N> {
-    /// Returns whether the checkpoint belongs to a run of this config, or to the same run with fewer generations.
+    /// Reports whether the checkpoint belongs to a run of this config, or to the same run with fewer generations.
     pub fn is_of(&self, config: &Config) -> bool {
         let last = self.snapshot.last;
         last <= config.learning.generations && self.config == config_digest(&of_length(config, last))
@@ -102,7 +102,7 @@ impl<N: AsRef<[f32]>> Checkpoint<N> {
                 ("seconds", seconds.to_string()),
                 ("metrics_bytes", metrics.bytes.to_string()),
                 ("metrics_sha256", metrics.sha256.clone()),
-                (tensors::VERSION, crate::VERSION.into()),
+                (tensors::VERSION, crate::version::VERSION.into()),
             ]
             .map(|(key, value)| (key.to_string(), value)),
         );
@@ -291,7 +291,7 @@ pub struct Schedule {
 }
 
 /// Writes checkpoints during training, one at a time.
-pub struct Keeper {
+pub struct CheckpointWriter {
     disk: Disk,
     folder: PathBuf,
     config: Arc<Config>,
@@ -302,14 +302,14 @@ pub struct Keeper {
     last: (usize, Instant, Duration),
 }
 
-impl Keeper {
-    /// Creates a keeper for an existing folder with the checkpoints `kept`. The run resumes before `generation`.
-    pub fn new(disk: Disk, folder: PathBuf, config: Config, kept: Vec<usize>, generation: usize) -> Keeper {
+impl CheckpointWriter {
+    /// Creates a writer for an existing folder with the checkpoints `kept`. The run resumes before `generation`.
+    pub fn new(disk: Disk, folder: PathBuf, config: Config, kept: Vec<usize>, generation: usize) -> CheckpointWriter {
         let last = (generation, Instant::now(), Duration::ZERO);
-        Keeper { disk, folder, config: Arc::new(config), kept, writing: None, last }
+        CheckpointWriter { disk, folder, config: Arc::new(config), kept, writing: None, last }
     }
 
-    /// Returns whether a checkpoint is due before a generation is played.
+    /// Reports whether a checkpoint is due before a generation is played.
     pub fn is_due(&self, schedule: &Schedule, generation: usize) -> bool {
         let (last, moment, cost) = self.last;
         if generation == last {
@@ -340,7 +340,7 @@ impl Keeper {
         Ok(())
     }
 
-    /// Writes a checkpoint of borrowed weights before it returns. See [`Keeper::save`].
+    /// Writes a checkpoint of borrowed weights before it returns. See [`CheckpointWriter::save`].
     ///
     /// # Errors
     /// This checkpoint or the previous one could not be written.
@@ -417,7 +417,7 @@ impl Keeper {
     }
 }
 
-impl Drop for Keeper {
+impl Drop for CheckpointWriter {
     fn drop(&mut self) {
         // Wait for the writer even after an error, because the lock of the folder is released next.
         if let Some(writing) = self.writing.take() {
@@ -430,7 +430,7 @@ impl Drop for Keeper {
 ///
 /// # Errors
 /// The folder cannot be read or written.
-pub(crate) fn tidy(disk: &Disk, folder: &Path) -> Result<Vec<usize>, RecordError> {
+pub(crate) fn remove_temporary_files(disk: &Disk, folder: &Path) -> Result<Vec<usize>, RecordError> {
     let generations = list(folder)?;
     for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
         let path = entry.path();
@@ -443,6 +443,6 @@ pub(crate) fn tidy(disk: &Disk, folder: &Path) -> Result<Vec<usize>, RecordError
 }
 
 /// Returns the path to which an unusable checkpoint is renamed.
-pub fn aside(path: &Path) -> PathBuf {
+pub(crate) fn quarantine_path(path: &Path) -> PathBuf {
     path.with_extension("safetensors.damaged")
 }

@@ -34,7 +34,7 @@ impl Verification {
         if unverified { Verification::Skipped } else { Verification::Required }
     }
 
-    /// Returns whether no file is compared.
+    /// Reports whether no file is compared.
     pub(crate) fn is_skipped(self) -> bool {
         self == Verification::Skipped
     }

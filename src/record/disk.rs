@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
-use super::beneath::{FileKind, FolderEntry, Root, is_link};
+use super::rooted_folder::{FileKind, FolderEntry, RootedFolder, is_link};
 use crate::file;
 
 /// Kind of operation on a disk.
@@ -30,20 +30,20 @@ pub enum Operation {
 }
 
 /// Called before each operation. If it returns an error, the operation fails with that error.
-pub(crate) type Gate = dyn Fn(Operation, &Path) -> io::Result<()> + Send + Sync;
+pub(crate) type FaultHook = dyn Fn(Operation, &Path) -> io::Result<()> + Send + Sync;
 
-/// The file system, optionally limited to one folder. Tests can add a gate that makes operations fail.
+/// The file system, optionally limited to one folder. Tests can add a fault_hook that makes operations fail.
 #[derive(Clone, Default)]
 pub struct Disk {
-    gate: Option<Arc<Gate>>,
-    root: Option<Arc<Root>>,
+    fault_hook: Option<Arc<FaultHook>>,
+    root: Option<Arc<RootedFolder>>,
 }
 
 impl Disk {
-    /// Returns a disk whose operations fail if `gate` returns an error. A failed write still writes the first half of
+    /// Returns a disk whose operations fail if `fault_hook` returns an error. A failed write still writes the first half of
     /// its bytes.
-    pub fn failing(gate: impl Fn(Operation, &Path) -> io::Result<()> + Send + Sync + 'static) -> Disk {
-        Disk { gate: Some(Arc::new(gate)), root: None }
+    pub fn failing(fault_hook: impl Fn(Operation, &Path) -> io::Result<()> + Send + Sync + 'static) -> Disk {
+        Disk { fault_hook: Some(Arc::new(fault_hook)), root: None }
     }
 
     /// Returns the same disk limited to a folder, which must exist. No symbolic link below the folder is followed, and
@@ -60,16 +60,16 @@ impl Disk {
             root.entry(&folder.join("x"))?;
             return Ok(self.clone());
         }
-        Ok(Disk { gate: self.gate.clone(), root: Some(Arc::new(Root::open(folder)?)) })
+        Ok(Disk { fault_hook: self.fault_hook.clone(), root: Some(Arc::new(RootedFolder::open(folder)?)) })
     }
 
     /// Returns the folder that the disk is limited to, if any.
-    pub(super) fn root(&self) -> Option<&Root> {
+    pub(super) fn root(&self) -> Option<&RootedFolder> {
         self.root.as_deref()
     }
 
-    fn pass(&self, operation: Operation, path: &Path) -> io::Result<()> {
-        self.gate.as_ref().map_or(Ok(()), |gate| gate(operation, path))
+    fn check(&self, operation: Operation, path: &Path) -> io::Result<()> {
+        self.fault_hook.as_ref().map_or(Ok(()), |fault_hook| fault_hook(operation, path))
     }
 
     /// Returns the entry of a path. Without a root folder, the path may be in any folder.
@@ -78,13 +78,13 @@ impl Disk {
             Some(root) => root.entry(path),
             None => {
                 let name = path.file_name().ok_or(io::ErrorKind::InvalidInput)?;
-                let root = Root::open(file::folder(path))?;
+                let root = RootedFolder::open(file::folder(path))?;
                 root.entry(&root.path().join(name))
             }
         }
     }
 
-    /// Returns the type of the entry at a path, or `None` if there is none. Links are not followed.
+    /// Returns the type of the entry at a path, or `None` if existing is none. Links are not followed.
     ///
     /// # Errors
     /// Returns the system's error.
@@ -106,7 +106,7 @@ impl Disk {
 
     /// Creates a folder and its missing parents.
     pub(crate) fn create_folder(&self, path: &Path) -> io::Result<()> {
-        self.pass(Operation::CreateFolder, path)?;
+        self.check(Operation::CreateFolder, path)?;
         if let Some(root) = &self.root {
             return root.create_folder(path);
         }
@@ -129,18 +129,18 @@ impl Disk {
 
     /// Creates a file. Fails if the name is taken.
     pub(crate) fn create_new(&self, path: &Path) -> io::Result<Output> {
-        self.pass(Operation::Create, path)?;
+        self.check(Operation::Create, path)?;
         let file = self.entry(path)?.create_new()?;
         Ok(Output { disk: self.clone(), path: path.into(), file })
     }
 
-    /// Opens an existing file, truncates it to `length` bytes and continues writing from there. A link is an error.
+    /// Opens an existing file, truncates it to `length` bytes and continues writing from existing. A link is an error.
     ///
     /// # Errors
     /// Returns the system's error.
     pub fn append(&self, path: &Path, length: u64) -> io::Result<Output> {
         let mut file = self.entry(path)?.write()?;
-        self.pass(Operation::Truncate, path)?;
+        self.check(Operation::Truncate, path)?;
         file.set_len(length)?;
         file.seek(SeekFrom::End(0))?;
         Ok(Output { disk: self.clone(), path: path.into(), file })
@@ -151,7 +151,7 @@ impl Disk {
     /// # Errors
     /// Returns the system's error.
     pub fn extend(&self, path: &Path, bytes: &[u8]) -> io::Result<Output> {
-        self.pass(Operation::Create, path)?;
+        self.check(Operation::Create, path)?;
         let file = self.entry(path)?.extend()?;
         let mut output = Output { disk: self.clone(), path: path.into(), file };
         output.write_all(bytes)?;
@@ -221,7 +221,7 @@ impl Disk {
 
     /// Writes a file that the user named, whole or not at all. A link to a file is followed, except on a disk that is
     /// limited to a folder. A device or a pipe, such as `/dev/stdout`, is written to directly.
-    pub(crate) fn deliver(
+    pub(crate) fn write_user_file(
         &self,
         path: &Path,
         content: impl FnOnce(&mut dyn Write) -> io::Result<()>,
@@ -233,13 +233,13 @@ impl Disk {
             }
             return self.replace_shared(path, content, || Ok(()));
         }
-        let there = fs::metadata(path);
-        if there.as_ref().is_ok_and(|there| !there.is_file() && !there.is_dir()) {
+        let existing = fs::metadata(path);
+        if existing.as_ref().is_ok_and(|existing| !existing.is_file() && !existing.is_dir()) {
             let mut output = BufWriter::new(OpenOptions::new().write(true).open(path)?);
             content(&mut output)?;
             return output.flush();
         }
-        if there.is_ok() {
+        if existing.is_ok() {
             // A file without write permission must not be replaced.
             OpenOptions::new().write(true).open(path)?;
         }
@@ -247,12 +247,12 @@ impl Disk {
         if !file::folder(path).is_dir() {
             return Err(file::no_folder(path));
         }
-        self.pass(Operation::Create, path)?;
+        self.check(Operation::Create, path)?;
         // A random name, because the folder may contain any files of the user.
         let mut builder = tempfile::Builder::new();
         #[cfg(unix)]
-        builder.permissions(match &there {
-            Ok(there) => there.permissions(),
+        builder.permissions(match &existing {
+            Ok(existing) => existing.permissions(),
             Err(_) => std::os::unix::fs::PermissionsExt::from_mode(0o666),
         });
         let temporary = builder.prefix(".flotilla-").suffix(".tmp").tempfile_in(file::folder(path));
@@ -260,7 +260,7 @@ impl Disk {
         let mut output = BufWriter::with_capacity(1 << 20, temporary.as_file());
         content(&mut output)?;
         output.into_inner().map_err(|error| error.into_error())?.sync_all()?;
-        self.pass(Operation::Rename, path)?;
+        self.check(Operation::Rename, path)?;
         temporary.persist(path).map_err(|error| error.error)?;
         self.sync_folder(file::folder(path))
     }
@@ -270,10 +270,10 @@ impl Disk {
     /// # Errors
     /// Returns the system's error.
     pub(crate) fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
-        self.pass(Operation::Rename, to)?;
+        self.check(Operation::Rename, to)?;
         let target = self.entry(to)?;
         self.entry(from)?.rename(&target)?;
-        self.pass(Operation::Flush, file::folder(to))?;
+        self.check(Operation::Flush, file::folder(to))?;
         target.sync_folder()
     }
 
@@ -285,7 +285,7 @@ impl Disk {
         if self.kind(path)?.is_none() {
             return Ok(());
         }
-        self.pass(Operation::Remove, path)?;
+        self.check(Operation::Remove, path)?;
         self.entry(path)?.remove()
     }
 
@@ -307,8 +307,8 @@ impl Disk {
 
     /// Flushes the names in a folder to the disk, if the system can.
     fn sync_folder(&self, path: &Path) -> io::Result<()> {
-        self.pass(Operation::Flush, path)?;
-        Root::open(path)?.entry(&path.join("x"))?.sync_folder()
+        self.check(Operation::Flush, path)?;
+        RootedFolder::open(path)?.entry(&path.join("x"))?.sync_folder()
     }
 }
 
@@ -345,7 +345,7 @@ impl Output {
     /// # Errors
     /// Returns the system's error.
     pub fn sync(&self) -> io::Result<()> {
-        self.disk.pass(Operation::Flush, &self.path)?;
+        self.disk.check(Operation::Flush, &self.path)?;
         self.file.sync_all()
     }
 
@@ -365,7 +365,7 @@ impl Output {
 
 impl Write for Output {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        if let Err(error) = self.disk.pass(Operation::Write, &self.path) {
+        if let Err(error) = self.disk.check(Operation::Write, &self.path) {
             self.file.write_all(&bytes[..bytes.len() / 2])?;
             return Err(error);
         }

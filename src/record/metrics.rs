@@ -158,7 +158,7 @@ fn shared(row: &Row) -> String {
     format!("{trial},{generation},{best_g},{mean_g},{champion_g}")
 }
 
-/// Returns whether a file starts like a metrics file. The header may be incomplete.
+/// Reports whether a file starts like a metrics file. The header may be incomplete.
 ///
 /// # Errors
 /// Returns the system's error.

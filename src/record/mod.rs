@@ -2,7 +2,7 @@
 //!
 //! | module | contents |
 //! |---|---|
-//! | [`beneath`] | access to a folder and the entries below it without following links |
+//! | [`rooted_folder`] | access to a folder and the entries below it without following links |
 //! | [`disk`] | atomic replacement of files; all writes use it, so that tests can make any write fail |
 //! | [`tensors`] | safetensors files with a checksum |
 //! | [`policies`] | `policies.safetensors` |
@@ -30,7 +30,6 @@ use crate::escape::{self, PathExt};
 use crate::file::{self, TextError};
 
 pub mod archive;
-pub(crate) mod beneath;
 pub mod checkpoint;
 pub mod digests;
 pub mod disk;
@@ -40,6 +39,7 @@ pub mod folder;
 pub mod metrics;
 pub mod ownership;
 pub mod policies;
+pub(crate) mod rooted_folder;
 pub mod runs;
 pub mod tensors;
 
@@ -103,14 +103,14 @@ pub enum RecordError {
         path: PathBuf,
     },
     /// The run has more generations than requested.
-    #[error("{path} is a run of {there} generations, which cannot become one of {here}", path = path.escaped())]
+    #[error("{path} is a run of {existing} generations, which cannot become one of {requested}", path = path.escaped())]
     Shorter {
         /// Path of the folder.
         path: PathBuf,
         /// Generations of the run.
-        there: usize,
+        existing: usize,
         /// Requested generations.
-        here: usize,
+        requested: usize,
     },
     /// Another process already trains in the folder.
     #[error("another process is training in {path}", path = path.escaped())]
@@ -119,22 +119,22 @@ pub enum RecordError {
         path: PathBuf,
     },
     /// The run started from other policies than those given, so it cannot be resumed with them.
-    #[error("{path} {}, so it cannot continue as a run {}", started(there), started_from(here), path = path.escaped())]
+    #[error("{path} {}, so it cannot continue as a run {}", started(existing), started_from(requested), path = path.escaped())]
     InitDiffers {
         /// Path of the folder.
         path: PathBuf,
         /// [`policies::Init::digest`] of the policies that the run started from. `None` for a random start.
-        there: Option<String>,
+        existing: Option<String>,
         /// Digest of the given policies.
-        here: String,
+        requested: String,
     },
     /// The run has no usable checkpoint, so it needs the policies that it started from.
-    #[error("{path} {}, and has no checkpoint yet: it can only start again from these", started(&Some(there.clone())), path = path.escaped())]
+    #[error("{path} {}, and has no checkpoint yet: it can only start again from these", started(&Some(existing.clone())), path = path.escaped())]
     InitNeeded {
         /// Path of the folder.
         path: PathBuf,
         /// [`policies::Init::digest`] of these policies.
-        there: String,
+        existing: String,
     },
     /// It is not known which policies the run started from.
     #[error("{path}: its run.json is missing or damaged, so it is not known what policies this run started from")]
@@ -158,7 +158,7 @@ pub enum RecordError {
     #[error(
         "{path}: it was written by {}, in a format that is newer than this version ({}) reads",
         by(version),
-        crate::VERSION
+        crate::version::VERSION
     )]
     Newer {
         /// Path of the file.
@@ -225,7 +225,7 @@ fn read_text(path: &Path, most: u64) -> Result<String, RecordError> {
 
 /// Keys of later versions with their default values. A config's digest omits these lines, so that runs of earlier
 /// versions can be resumed.
-const LATER: [&str; 16] = [
+const DEFAULTS_ADDED_LATER: [&str; 16] = [
     "observers = \"all\"\n",
     "windows = []\n",
     "after = []\n",
@@ -247,7 +247,7 @@ const LATER: [&str; 16] = [
 /// Returns the SHA-256 of the part of a config that affects results.
 pub fn config_digest(config: &Config) -> String {
     let text = without_checkpoint(config).to_toml();
-    let lines: String = text.split_inclusive('\n').filter(|line| !LATER.contains(line)).collect();
+    let lines: String = text.split_inclusive('\n').filter(|line| !DEFAULTS_ADDED_LATER.contains(line)).collect();
     hex(&Sha256::digest(lines))
 }
 

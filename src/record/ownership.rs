@@ -31,7 +31,7 @@ pub const METRICS: &str = "metrics.csv";
 /// Policies that the run learned. See [`super::policies`].
 pub const POLICIES: &str = "policies.safetensors";
 /// Folder of the [`super::checkpoint`]s.
-pub const CHECKPOINTS: &str = "checkpoints";
+pub(crate) const CHECKPOINTS: &str = "checkpoints";
 /// File that marks a folder as the folder of a paper.
 pub(crate) const PAPER: &str = "paper.toml";
 /// Folder of the runs of a paper.
@@ -43,7 +43,7 @@ pub(crate) const RESULTS: &str = "results.csv";
 /// Points of a sweep, one per line.
 pub(crate) const POINTS: &str = "points.csv";
 /// Training curves in the folder of a run.
-pub const CURVES: &str = "curves.svg";
+pub(crate) const CURVES: &str = "curves.svg";
 /// Replay page in the folder of a run.
 pub(crate) const REPLAY: &str = "replay.html";
 /// List of the files made from runs. Each line has SHA-256 and name, in the format of `sha256sum`.
@@ -58,7 +58,7 @@ const MAX_LIST_BYTES: u64 = 1 << 24;
 ///
 /// # Errors
 /// The folder cannot be opened, or it belongs to another user and was not named.
-pub fn open_output_folder(disk: &Disk, folder: &Path, named: bool) -> Result<Disk, RecordError> {
+pub(crate) fn open_output_folder(disk: &Disk, folder: &Path, named: bool) -> Result<Disk, RecordError> {
     let inside = disk.within(folder).map_err(RecordError::write(folder))?;
     let owners = inside.root().map_or(Ok(None), |root| root.owners()).map_err(RecordError::write(folder))?;
     match owners {
@@ -69,7 +69,16 @@ pub fn open_output_folder(disk: &Disk, folder: &Path, named: bool) -> Result<Dis
     }
 }
 
-/// Returns whether a user may write in the folder of an owner.
+/// Creates a folder if it is missing, and prepares it as [`open_output_folder`] does.
+///
+/// # Errors
+/// The folder cannot be created, or see [`open_output_folder`].
+pub(crate) fn create_output_folder(disk: &Disk, folder: &Path, named: bool) -> Result<Disk, RecordError> {
+    disk.create_folder(folder).map_err(RecordError::write(folder))?;
+    open_output_folder(disk, folder, named)
+}
+
+/// Reports whether a user may write in the folder of an owner.
 pub fn may_write(owner: u32, user: u32, named: bool) -> bool {
     named || owner == user
 }
@@ -83,18 +92,18 @@ struct RunMark {
     seed: u64,
 }
 
-/// Returns whether a folder holds a run, shown by a `run.json`, a checkpoint or leftover files of a run of this config.
+/// Reports whether a folder holds a run, shown by a `run.json`, a checkpoint or leftover files of a run of this config.
 ///
 /// # Errors
 /// The folder has a file that a run would replace but holds no run, or it cannot be read.
 pub(crate) fn holds_run(folder: &Path, config: &Config) -> Result<bool, RecordError> {
-    let there = |name: &str| {
+    let existing = |name: &str| {
         let path = folder.join(name);
-        let there = file::exists(&path).map_err(RecordError::read(&path))?;
-        Ok::<_, RecordError>(there.then_some(path))
+        let exists = file::exists(&path).map_err(RecordError::read(&path))?;
+        Ok::<_, RecordError>(exists.then_some(path))
     };
     let refuse = |path: PathBuf| Err(RecordError::NotOurs { path });
-    let run = there(RUN)?;
+    let run = existing(RUN)?;
     if let Some(path) = &run {
         match read_text(path, MAX_RUN_BYTES) {
             Ok(text) if serde_json::from_str::<RunMark>(&text).is_ok() => return Ok(true),
@@ -108,26 +117,26 @@ pub(crate) fn holds_run(folder: &Path, config: &Config) -> Result<bool, RecordEr
     if paths().any(|path| tensors::open(&path).is_ok_and(|file| file.kind().is_some())) {
         return Ok(true);
     }
-    let no_folder = there(CHECKPOINTS)?.filter(|path| !path.is_dir());
+    let no_folder = existing(CHECKPOINTS)?.filter(|path| !path.is_dir());
     if let Some(path) = run.or_else(|| paths().next()).or(no_folder) {
         return refuse(path);
     }
-    if let Some(path) = there(CONFIG)? {
+    if let Some(path) = existing(CONFIG)? {
         // A run may start from a config with the same content.
         match Config::load(&path) {
-            Ok(there) if without_checkpoint(&there) == without_checkpoint(config) => {}
+            Ok(existing) if without_checkpoint(&existing) == without_checkpoint(config) => {}
             _ => return refuse(path),
         }
     }
     let mut left = false;
-    if let Some(path) = there(METRICS)? {
+    if let Some(path) = existing(METRICS)? {
         if !metrics::begins(&path).map_err(RecordError::read(&path))? {
             return refuse(path);
         }
         left = true;
     }
-    if let Some(path) = there(POLICIES)? {
-        if !policies::are_of(&path, config) {
+    if let Some(path) = existing(POLICIES)? {
+        if !policies::belongs_to(&path, config) {
             return refuse(path);
         }
         left = true;
@@ -170,7 +179,7 @@ pub fn check<P: AsRef<Path>>(disk: &Disk, paths: impl IntoIterator<Item = P>) ->
 ///
 /// # Errors
 /// A file of that name was not created by flotilla or has changed, or the file cannot be written.
-pub fn publish(
+pub(crate) fn publish(
     disk: &Disk,
     path: &Path,
     content: impl FnOnce(&mut dyn Write) -> io::Result<()>,
@@ -205,7 +214,7 @@ pub(crate) fn remove_published(disk: &Disk, path: &Path) -> Result<(), RecordErr
     }
 }
 
-/// Returns whether the content of a file is an SVG or PNG that flotilla drew.
+/// Reports whether the content of a file is an SVG or PNG that flotilla drew.
 pub(crate) fn is_drawing(path: &Path) -> bool {
     let mut start = Vec::new();
     let read = file::open(path).and_then(|file| file.take(1 << 12).read_to_end(&mut start));
@@ -245,11 +254,11 @@ fn digest(disk: &Disk, path: &Path) -> Result<Option<String>, RecordError> {
         return Ok(None);
     }
     // A link, a folder or a pipe is an error, because it could not be replaced either.
-    let mut there = disk.read(path).map_err(RecordError::write(path))?;
+    let mut file = disk.read(path).map_err(RecordError::write(path))?;
     let mut hash = Sha256::new();
     let mut chunk = vec![0; 1 << 16];
     loop {
-        match there.read(&mut chunk).map_err(RecordError::read(path))? {
+        match file.read(&mut chunk).map_err(RecordError::read(path))? {
             0 => return Ok(Some(hex(&hash.finalize()))),
             read => hash.update(&chunk[..read]),
         }

@@ -17,7 +17,7 @@ use sha2::{Digest, Sha256};
 use super::RecordError;
 use super::disk::Disk;
 use super::tensors::{self, Tensor, TensorFile};
-use crate::config::{Config, MAX_POPULATION};
+use crate::config::{Config, MAX_POPULATION, Sharing};
 use crate::escape;
 use crate::evolve::{MAX_WEIGHT, admit};
 
@@ -30,8 +30,10 @@ pub(super) const CONFIG: &str = "config";
 /// Policies of one trial.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Policies {
-    /// Number of policies per leader.
+    /// Number of policies per population.
     pub policies: usize,
+    /// Whether all leaders share a policy.
+    pub sharing: Sharing,
     /// Parameters, `[leaders][policies][parameters]`, or `[1][policies][parameters]` if all leaders share a policy.
     pub weights: Vec<f32>,
 }
@@ -58,13 +60,13 @@ pub fn write(disk: &Disk, path: &Path, config: &Config, trials: &[impl AsRef<[f3
     Ok(checksum)
 }
 
-/// Returns whether a file can be read and belongs to a run of this config.
-pub(crate) fn are_of(path: &Path, config: &Config) -> bool {
-    mark(path).0 == Some(super::config_digest(config))
+/// Reports whether a file can be read and belongs to a run of this config.
+pub(crate) fn belongs_to(path: &Path, config: &Config) -> bool {
+    digests_in(path).0 == Some(super::config_digest(config))
 }
 
 /// Returns the config digest and the checksum in a file. Each is `None` if it is missing or the file cannot be read.
-pub fn mark(path: &Path) -> (Option<String>, Option<String>) {
+pub(crate) fn digests_in(path: &Path) -> (Option<String>, Option<String>) {
     let Ok(file) = tensors::open(path) else { return (None, None) };
     (file.metadata(CONFIG).map(String::from), file.checksum().map(String::from))
 }
@@ -146,7 +148,7 @@ impl Write for HashWriter<'_> {
 pub fn read_all(path: &Path, config: &Config) -> Result<Vec<Vec<f32>>, RecordError> {
     let mut file = tensors::open(path)?;
     let trial = |trial| {
-        let Policies { policies, weights } = from_file(&mut file, config, &[config.populations()], Some(trial))?;
+        let Policies { policies, weights, .. } = from_file(&mut file, config, &[config.populations()], Some(trial))?;
         let population = config.learning.population;
         match policies == population {
             true => Ok(weights),
@@ -219,5 +221,7 @@ pub(crate) fn from_file(
             weights[index]
         ));
     }
-    Ok(Policies { policies: shape[1], weights })
+    // A single leader shares its policy with nobody.
+    let sharing = if shape[0] == config.learners() { Sharing::PerLeader } else { Sharing::Shared };
+    Ok(Policies { policies: shape[1], sharing, weights })
 }

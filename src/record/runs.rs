@@ -18,13 +18,13 @@ pub enum ReadError {
     /// The path does not exist.
     #[error("{}: no such folder", .0.escaped())]
     Missing(PathBuf),
-    /// The path is a file instead of a directory.
+    /// The path is a file instead of a folder.
     #[error("{} is a file; name the folder of a run", .0.escaped())]
     NoFolder(PathBuf),
-    /// The directory is not a run.
+    /// The folder is not a run.
     #[error("{folder}: not a run directory (it has no {name})", folder = folder.escaped())]
     Foreign {
-        /// The given directory.
+        /// The given folder.
         folder: PathBuf,
         /// The missing file that every run has.
         name: &'static str,
@@ -32,15 +32,15 @@ pub enum ReadError {
     /// The run's config is invalid.
     #[error("{folder}: {error}", folder = folder.escaped())]
     Config {
-        /// The given directory.
+        /// The given folder.
         folder: PathBuf,
         /// The error in the config.
         error: ConfigError,
     },
-    /// The directory contains several runs.
+    /// The folder contains several runs.
     #[error("{folder} holds {what}; name one of the runs in it, as {folder}/{example}", folder = folder.escaped())]
     Collection {
-        /// The given directory.
+        /// The given folder.
         folder: PathBuf,
         /// The kind of its contents, such as "a sweep".
         what: &'static str,
@@ -50,7 +50,7 @@ pub enum ReadError {
     /// The run lacks the requested data.
     #[error("{folder}: {reason}", folder = folder.escaped())]
     Unfinished {
-        /// The given directory.
+        /// The given folder.
         folder: PathBuf,
         /// The missing data.
         reason: String,
@@ -63,7 +63,7 @@ pub enum ReadError {
 /// Reads a run's config.
 ///
 /// # Errors
-/// The directory does not exist, is not a run, or its config is damaged or was changed after the run.
+/// The folder does not exist, is not a run, or its config is damaged or was changed after the run.
 pub fn config(folder: &Path, verification: Verification) -> Result<Config, ReadError> {
     let kind = std::fs::metadata(folder).map_err(|error| match error.kind() {
         ErrorKind::NotFound => ReadError::Missing(folder.into()),
@@ -73,7 +73,7 @@ pub fn config(folder: &Path, verification: Verification) -> Result<Config, ReadE
         return Err(ReadError::NoFolder(folder.into()));
     }
     let path = folder.join(CONFIG);
-    if !seen(&path)? {
+    if !exists(&path)? {
         if let Some(what) = folder::collection(folder) {
             let example = if what == "a sweep" { "points/0000" } else { "arms/chaotic-leader-follower-Df" };
             return Err(ReadError::Collection { folder: folder.into(), what, example });
@@ -86,8 +86,8 @@ pub fn config(folder: &Path, verification: Verification) -> Result<Config, ReadE
 }
 
 /// Reports whether a file exists.
-fn seen(path: &Path) -> Result<bool, RecordError> {
-    file::exists(path).map_err(|error| RecordError::Read { path: path.into(), error })
+pub(crate) fn exists(path: &Path) -> Result<bool, RecordError> {
+    file::exists(path).map_err(RecordError::read(path))
 }
 
 /// Calls `each` with every complete row of a run's metrics. A partial last line is ignored, because it is still being
@@ -106,7 +106,7 @@ pub fn metrics(
     // The digests are read before the metrics, because the run may finish in between.
     let digests = Digests::read(folder, verification)?;
     let unfinished = |reason: String| ReadError::Unfinished { folder: folder.into(), reason };
-    if !seen(&path)? {
+    if !exists(&path)? {
         return Err(unfinished(format!("it has no {METRICS} yet")));
     }
     let damaged = |reason: String| ReadError::Record(RecordError::Damaged { path: path.clone(), reason });

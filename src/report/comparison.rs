@@ -31,7 +31,7 @@ pub struct Trial {
     /// The run's seed and the trial's number. Trials of two arms with the same key form a pair.
     pub key: (u64, usize),
     /// G of the best team and of the champion, `[generations]`.
-    pub course: Vec<[f64; 2]>,
+    pub scores: Vec<[f64; 2]>,
     /// The first generation of the run's last stage; 0 without stages.
     pub from: usize,
 }
@@ -45,13 +45,9 @@ impl Cohort {
         let mut arm = Cohort { name, folders, planned: 0, trials: vec![] };
         for folder in &arm.folders {
             let config = runs::config(folder, verification)?;
-            let courses = runs::trials(folder, &config, verification)?.into_iter().enumerate();
+            let trials = runs::trials(folder, &config, verification)?.into_iter().enumerate();
             let from = config.last_from();
-            arm.trials.extend(courses.map(|(trial, course)| Trial {
-                key: (config.learning.seed, trial),
-                course,
-                from,
-            }));
+            arm.trials.extend(trials.map(|(trial, scores)| Trial { key: (config.learning.seed, trial), scores, from }));
             arm.planned = arm.planned.max(config.learning.generations);
         }
         Ok(arm)
@@ -59,20 +55,20 @@ impl Cohort {
 
     /// Returns the arm's name and its directories, for messages.
     fn described(&self) -> String {
-        const MOST: usize = 3;
+        const MAX_NAMED_FOLDERS: usize = 3;
         let folders: Vec<String> = self.folders.iter().map(|folder| folder.escaped().to_string()).collect();
-        match folders.len().checked_sub(MOST) {
+        match folders.len().checked_sub(MAX_NAMED_FOLDERS) {
             _ if folders == [&*self.name] || self.name.ends_with(&format!("({})", folders.concat())) => {
                 self.name.clone()
             }
             None | Some(0) => format!("{} ({})", self.name, folders.join(", ")),
-            Some(more) => format!("{} ({} and {more} more)", self.name, folders[..MOST].join(", ")),
+            Some(more) => format!("{} ({} and {more} more)", self.name, folders[..MAX_NAMED_FOLDERS].join(", ")),
         }
     }
 
     /// Returns the last generation that all its trials have reached, if any.
     fn last(&self) -> Option<usize> {
-        self.trials.iter().map(|trial| trial.course.len()).min()?.checked_sub(1)
+        self.trials.iter().map(|trial| trial.scores.len()).min()?.checked_sub(1)
     }
 
     fn keys(&self) -> Vec<(u64, usize)> {
@@ -162,13 +158,13 @@ pub enum Measure {
 }
 
 impl Measure {
-    /// Returns the measured value of a trial, or none if the trial's course does not determine it.
+    /// Returns the measured value of a trial, or none if the trial's scores does not determine it.
     fn of(self, trial: &Trial) -> Option<f64> {
         match self {
-            Measure::BestG { generation } => Some(trial.course[generation][0]),
-            Measure::ChampionG { generation } => Some(trial.course[generation][1]),
+            Measure::BestG { generation } => Some(trial.scores[generation][0]),
+            Measure::ChampionG { generation } => Some(trial.scores[generation][1]),
             Measure::GenerationsToReach { reach, generation } => {
-                let reached = (trial.from..=generation).find(|&at| trial.course[at][0] >= reach);
+                let reached = (trial.from..=generation).find(|&at| trial.scores[at][0] >= reach);
                 Some(reached.unwrap_or(generation + 1) as f64)
             }
             Measure::Played { .. } => None,

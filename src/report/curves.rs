@@ -272,7 +272,7 @@ impl Figure {
     fn description(&self) -> String {
         let mut text = format!("Learning curves, on an axis from 0 to {}.", number(self.y_max));
         for panel in &self.panels {
-            let course = |(index, curve): &(usize, Curve)| {
+            let summary = |(index, curve): &(usize, Curve)| {
                 let label = self.legend.iter().chain(&self.references).nth(*index)?;
                 let last = curve.mean.len().checked_sub(1)?;
                 let [from, to] = [0, last].map(|at| (curve.generation[at], number(curve.mean[at])));
@@ -287,9 +287,9 @@ impl Figure {
                     from.1, from.0, to.1, to.0
                 ))
             };
-            let courses: Vec<_> = panel.curves.iter().filter_map(course).collect();
+            let summaries: Vec<_> = panel.curves.iter().filter_map(summary).collect();
             let title = if panel.title.is_empty() { String::new() } else { format!("{}: ", panel.title) };
-            text += &format!(" {title}{}.", courses.join("; "));
+            text += &format!(" {title}{}.", summaries.join("; "));
             let stages = panel.stages.iter().enumerate();
             text.extend(stages.map(|(index, from)| format!(" Stage {} begins at generation {from}.", index + 1)));
         }

@@ -12,7 +12,7 @@ use crate::trainer::Row;
 /// Characters per curve. With the longest name and the value, a line fits the usual 80 columns.
 const CURVE: usize = 24;
 /// Maximum number of curves on a terminal.
-const MOST: usize = 24;
+const MAX_BARS: usize = 24;
 /// Interval between lines without a terminal. The next one is the interval between redraws on a terminal.
 const LINES: Duration = Duration::from_secs(10);
 const DRAWS: Duration = Duration::from_millis(100);
@@ -105,8 +105,8 @@ impl Meter {
 }
 
 /// Shows the training progress of several arms on standard error.
-pub(crate) struct Board {
-    arms: Vec<Growing>,
+pub(crate) struct ProgressBars {
+    arms: Vec<GrowingBar>,
     last: usize,
     /// The generation at which this session started.
     from: usize,
@@ -121,7 +121,7 @@ struct Terminal {
 }
 
 /// One arm's curve so far: for each part of the run, the sum of the best teams' G and the number of rows.
-struct Growing {
+struct GrowingBar {
     name: String,
     /// Number of POIs. None if stages differ in it.
     pois: Option<usize>,
@@ -138,7 +138,7 @@ struct Newest {
     trials: u32,
 }
 
-impl Growing {
+impl GrowingBar {
     fn add(&mut self, row: &Row, last: usize) {
         let part = (row.generation * self.parts.len() / (last + 1)).min(self.parts.len() - 1);
         self.parts[part].0 += row.best_g;
@@ -175,19 +175,19 @@ impl Growing {
     }
 }
 
-impl Board {
-    /// Starts a board for arms, each with its name and number of POIs (none if that changes during the run).
+impl ProgressBars {
+    /// Starts the bars of experiments, each with its name and number of POIs (none if that changes during the run).
     ///
     /// The arms train up to generation `last`. This session starts at generation `from`.
-    pub fn new(arms: Vec<(String, Option<usize>)>, from: usize, last: usize, quiet: bool) -> Board {
+    pub fn new(arms: Vec<(String, Option<usize>)>, from: usize, last: usize, quiet: bool) -> ProgressBars {
         let parts = vec![(0.0, 0); CURVE.min(last + 1)];
-        let arms: Vec<Growing> = arms
+        let arms: Vec<GrowingBar> = arms
             .into_iter()
-            .map(|(name, pois)| Growing { name, pois, parts: parts.clone(), newest: Newest::default() })
+            .map(|(name, pois)| GrowingBar { name, pois, parts: parts.clone(), newest: Newest::default() })
             .collect();
         let pace = Pace::new(quiet);
         let terminal = pace.terminal.then(|| Terminal::new(&arms, from, last));
-        Board { arms, last, from, pace, terminal }
+        ProgressBars { arms, last, from, pace, terminal }
     }
 
     /// Adds complete rows. `next` is the generation that plays next.
@@ -232,16 +232,16 @@ impl Board {
 }
 
 impl Terminal {
-    fn new(arms: &[Growing], from: usize, last: usize) -> Terminal {
+    fn new(arms: &[GrowingBar], from: usize, last: usize) -> Terminal {
         let all = MultiProgress::with_draw_target(ProgressDrawTarget::stderr());
         let style = |template| ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar());
         let width = arms.iter().map(|arm| arm.name.chars().count()).max().unwrap_or(0);
-        let curve = |arm: &Growing| {
+        let curve = |arm: &GrowingBar| {
             let bar =
                 all.add(ProgressBar::new(1)).with_style(style(if width == 0 { "{msg}" } else { "{prefix}  {msg}" }));
             bar.with_prefix(format!("{:width$}", arm.name))
         };
-        let curves = arms.iter().take(MOST).map(curve).collect();
+        let curves = arms.iter().take(MAX_BARS).map(curve).collect();
         let generation = all.add(ProgressBar::new(last as u64));
         generation.set_style(style("{bar:32} generation {pos}/{len}  {msg}  {eta} left"));
         Terminal { curves, generation: generation.with_position(from as u64), all }

@@ -76,7 +76,7 @@ impl std::str::FromStr for TeamKind {
 
 /// A run's metrics by generation, as shares of the POIs averaged over trials.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(crate) struct Courses {
+pub(crate) struct RunMetrics {
     /// G of the best team.
     pub best: Vec<Average>,
     /// G of the mean team.
@@ -85,7 +85,7 @@ pub(crate) struct Courses {
     pub champion: Vec<Average>,
 }
 
-impl Courses {
+impl RunMetrics {
     /// Returns G of one kind of team.
     pub fn of(&self, kind: TeamKind) -> &[Average] {
         match kind {
@@ -99,20 +99,19 @@ impl Courses {
     ///
     /// # Errors
     /// See [`metrics()`].
-    pub fn read(folder: &Path, config: &Config, verification: Verification) -> Result<Courses, ReadError> {
-        let mut courses = Courses::default();
-        metrics(folder, config, verification, |row| courses.add(row))?;
-        Ok(courses)
+    pub fn read(folder: &Path, config: &Config, verification: Verification) -> Result<RunMetrics, ReadError> {
+        let mut run = RunMetrics::default();
+        metrics(folder, config, verification, |row| run.add(row))?;
+        Ok(run)
     }
 
     fn add(&mut self, row: &Row) {
-        let courses =
-            [(&mut self.best, row.best_g), (&mut self.mean, row.mean_g), (&mut self.champion, row.champion_g)];
-        for (course, g) in courses {
-            if course.len() <= row.generation {
-                course.resize(row.generation + 1, Average::default());
+        let added = [(&mut self.best, row.best_g), (&mut self.mean, row.mean_g), (&mut self.champion, row.champion_g)];
+        for (averages, g) in added {
+            if averages.len() <= row.generation {
+                averages.resize(row.generation + 1, Average::default());
             }
-            course[row.generation].add(g);
+            averages[row.generation].add(g);
         }
     }
 }
@@ -151,7 +150,7 @@ pub fn figure(
     verification: Verification,
 ) -> Result<Figure, ReadError> {
     let configs = folders.iter().map(|folder| config(folder, verification)).collect::<Result<Vec<_>, _>>()?;
-    let all = folders.iter().zip(&configs).map(|(folder, config)| Courses::read(folder, config, verification));
+    let all = folders.iter().zip(&configs).map(|(folder, config)| RunMetrics::read(folder, config, verification));
     let all = all.collect::<Result<Vec<_>, _>>()?;
     let shown = Figure {
         band,
@@ -160,32 +159,32 @@ pub fn figure(
             _ => None,
         },
         warning: verification.is_skipped().then(|| UNVERIFIED.into()),
-        ..of_courses(&all, &configs, || labels(folders, &configs), measure)
+        ..figure_of_runs(&all, &configs, || labels(folders, &configs), measure)
     };
     Ok(shown)
 }
 
 /// Returns the learning curves of one run as [`figure`] does, from its rows and its digest.
-pub fn figure_of<'a>(config: &Config, rows: impl Iterator<Item = &'a Row>, digest: &str) -> Figure {
-    let mut courses = Courses::default();
-    rows.for_each(|row| courses.add(row));
-    let figure = of_courses(&[courses], std::slice::from_ref(config), Vec::new, None);
+pub(crate) fn figure_of<'a>(config: &Config, rows: impl Iterator<Item = &'a Row>, digest: &str) -> Figure {
+    let mut run = RunMetrics::default();
+    rows.for_each(|row| run.add(row));
+    let figure = figure_of_runs(&[run], std::slice::from_ref(config), Vec::new, None);
     Figure { source: Some(digest.into()), ..figure }
 }
 
-fn of_courses(
-    all: &[Courses],
+fn figure_of_runs(
+    all: &[RunMetrics],
     configs: &[Config],
     labels: impl FnOnce() -> Vec<String>,
     measure: Option<TeamKind>,
 ) -> Figure {
     let (legend, curves): (Vec<String>, Vec<Curve>) = match (all, measure) {
-        ([courses], None) => {
-            TeamKind::ALL.into_iter().map(|kind| (kind.name().to_string(), Curve::new(courses.of(kind)))).unzip()
+        ([run], None) => {
+            TeamKind::ALL.into_iter().map(|kind| (kind.name().to_string(), Curve::new(run.of(kind)))).unzip()
         }
-        ([courses], Some(kind)) => (vec![kind.name().to_string()], vec![Curve::new(courses.of(kind))]),
+        ([run], Some(kind)) => (vec![kind.name().to_string()], vec![Curve::new(run.of(kind))]),
         (all, kind) => {
-            let curves = all.iter().map(|courses| Curve::new(courses.of(kind.unwrap_or_default())));
+            let curves = all.iter().map(|run| Curve::new(run.of(kind.unwrap_or_default())));
             labels().into_iter().zip(curves).unzip()
         }
     };
@@ -229,7 +228,8 @@ pub fn paired(folders: &[PathBuf], verification: Verification) -> Result<bool, R
 
 /// Labels runs by the config keys that differ between them, or by their directories if none differ.
 pub fn labels(folders: &[PathBuf], configs: &[Config]) -> Vec<String> {
-    let tables: Vec<toml::Table> = configs.iter().map(|config| config.to_toml().parse().unwrap_or_default()).collect();
+    let table = |config: &Config| toml::Table::try_from(config).unwrap_or_default();
+    let tables: Vec<toml::Table> = configs.iter().map(table).collect();
     let Some(first) = tables.first() else { return vec![] };
     let value = |table: &toml::Table, section: &str, key: &str| {
         let text = table.get(section).and_then(|section| section.get(key)).map_or("-".into(), toml::Value::to_string);

@@ -11,13 +11,13 @@ use std::time::Duration;
 use crc::{CRC_32_ISCSI, Crc};
 
 use crate::host::{self, Instant};
-use crate::record::beneath::FileKind;
 use crate::record::disk::Disk;
 use crate::record::metrics;
+use crate::record::rooted_folder::FileKind;
 use crate::trainer::Row;
 
 /// Number of buffered bytes of a trial above which they are flushed.
-const MOST: usize = 1 << 16;
+const MAX_BUFFERED_BYTES: usize = 1 << 16;
 /// Interval between flushes.
 const FLUSH: Duration = Duration::from_secs(2);
 /// The part of a file name by which TensorBoard recognises event files.
@@ -38,9 +38,9 @@ pub(crate) struct Events {
 }
 
 impl Events {
-    /// Creates event files in `folder/trial-N`, one directory per trial, with all rows of `metrics` so far.
+    /// Creates event files in `folder/trial-N`, one folder per trial, with all rows of `metrics` so far.
     ///
-    /// The new files replace those of earlier sessions. `disk` is limited to the run directory.
+    /// The new files replace those of earlier sessions. `disk` is limited to the run's folder.
     ///
     /// # Errors
     /// The files cannot be written.
@@ -60,7 +60,7 @@ impl Events {
         let start = now() - rows()?.last().map_or(0.0, |(_, seconds)| seconds);
         for (row, seconds) in rows()? {
             events.add_at(&row, start + seconds);
-            if events.new.get(row.trial).is_some_and(|new| new.len() > MOST) {
+            if events.new.get(row.trial).is_some_and(|new| new.len() > MAX_BUFFERED_BYTES) {
                 events.flush()?;
             }
         }
@@ -129,7 +129,7 @@ fn new_file(disk: &Disk, folder: &Path, mut seconds: u64) -> io::Result<PathBuf>
     }
 }
 
-/// Returns the paths in a directory; none if it does not exist.
+/// Returns the paths in a folder; none if it does not exist.
 fn names(folder: &Path) -> io::Result<Vec<PathBuf>> {
     match fs::read_dir(folder) {
         Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => Ok(vec![]),

@@ -6,7 +6,7 @@ use super::{Results, RunError};
 use crate::config::{self, Config};
 use crate::host::Instant;
 use crate::memory;
-use crate::record::checkpoint::{Checkpoint, Keeper, Schedule};
+use crate::record::checkpoint::{Checkpoint, CheckpointWriter, Schedule};
 use crate::record::disk::Disk;
 use crate::record::folder::{self, FileSums, Folder, METRICS, Note, POLICIES, Run, RunSums, Start, StartFrom, Status};
 use crate::record::metrics::{self, Extent};
@@ -30,7 +30,7 @@ pub(super) struct Unfinished {
     /// Index of its experiment in the trainer.
     pub(super) experiment: usize,
     pub(super) metrics: metrics::Writer,
-    pub(super) keeper: Keeper,
+    pub(super) checkpoints: CheckpointWriter,
     /// Extent of the metrics before the rows of the last generation.
     pub(super) ending: Option<Extent>,
 }
@@ -79,9 +79,14 @@ impl Member {
         };
         let generation = if let InitialState::Checkpoint(snapshot) = &from { snapshot.generation } else { 0 };
         let checkpoints = member.folder.file(folder::CHECKPOINTS);
-        let keeper =
-            Keeper::new(member.folder.disk.clone(), checkpoints, member.config.clone(), found.kept, generation);
-        let unfinished = Some(Unfinished { experiment: 0, metrics, keeper, ending: None });
+        let checkpoints = CheckpointWriter::new(
+            member.folder.disk.clone(),
+            checkpoints,
+            member.config.clone(),
+            found.kept,
+            generation,
+        );
+        let unfinished = Some(Unfinished { experiment: 0, metrics, checkpoints, ending: None });
         Ok((Member { unfinished, before, ..member }, from, found.notes))
     }
 
@@ -91,18 +96,18 @@ impl Member {
     }
 
     pub(super) fn poll(&mut self) -> Result<(), RunError> {
-        Ok(self.unfinished.as_mut().map_or(Ok(()), |unfinished| unfinished.keeper.poll())?)
+        Ok(self.unfinished.as_mut().map_or(Ok(()), |unfinished| unfinished.checkpoints.poll())?)
     }
 
     pub(super) fn wait(&mut self) -> Result<(), RunError> {
-        Ok(self.unfinished.as_mut().map_or(Ok(()), |unfinished| unfinished.keeper.wait())?)
+        Ok(self.unfinished.as_mut().map_or(Ok(()), |unfinished| unfinished.checkpoints.wait())?)
     }
 
     pub(super) fn is_due(&self, next: usize) -> bool {
         let config::CheckpointConfig { generations, seconds } = self.config.checkpoint;
         self.unfinished
             .as_ref()
-            .is_some_and(|unfinished| unfinished.keeper.is_due(&Schedule { generations, seconds }, next))
+            .is_some_and(|unfinished| unfinished.checkpoints.is_due(&Schedule { generations, seconds }, next))
     }
 
     /// Adds complete rows.
@@ -122,9 +127,9 @@ impl Member {
     /// large checkpoint is written before training continues, because there may not be memory for any copy.
     pub(super) fn save(&mut self, trainer: &mut Trainer, next: usize, seconds: f64) -> Result<(), RunError> {
         let failed = self.metrics_failed();
-        let Some(Unfinished { experiment, metrics, keeper, .. }) = &mut self.unfinished else { return Ok(()) };
-        keeper.wait()?;
-        if keeper.newest() == Some(next) {
+        let Some(Unfinished { experiment, metrics, checkpoints, .. }) = &mut self.unfinished else { return Ok(()) };
+        checkpoints.wait()?;
+        if checkpoints.newest() == Some(next) {
             return Ok(());
         }
         let since = Instant::now();
@@ -132,18 +137,22 @@ impl Member {
         let (config, init, seconds) = (config_digest(&self.config), self.run.init.clone(), self.before + seconds);
         if !memory::copies_checkpoint([&self.config]) {
             let snapshot = trainer.view(*experiment).map_err(RunError::Fetch)?;
-            return Ok(keeper.save_now(&Checkpoint { config, init, seconds, metrics, snapshot }, &output, since)?);
+            return Ok(checkpoints.save_now(
+                &Checkpoint { config, init, seconds, metrics, snapshot },
+                &output,
+                since,
+            )?);
         }
         let bytes = self.config.policy_bytes();
         let of_snapshot = |error| RunError::of_snapshot(error, "a checkpoint beside training", bytes);
         let snapshot = trainer.snapshot(*experiment).map_err(of_snapshot)?;
-        Ok(keeper.save(Checkpoint { config, init, seconds, metrics, snapshot }, output, since)?)
+        Ok(checkpoints.save(Checkpoint { config, init, seconds, metrics, snapshot }, output, since)?)
     }
 
     /// Writes the results in an order that leaves a usable checkpoint at any moment.
     pub(super) fn finish(&mut self, policies: &[&[f32]], end: Snapshot<&[f32]>, seconds: f64) -> Result<(), RunError> {
         let failed = self.metrics_failed();
-        let Some(Unfinished { metrics, keeper, ending, .. }) = &mut self.unfinished else { return Ok(()) };
+        let Some(Unfinished { metrics, checkpoints, ending, .. }) = &mut self.unfinished else { return Ok(()) };
         let since = Instant::now();
         let (mark, output) = metrics.mark().map_err(failed)?;
         let (init, in_all) = (self.run.init.clone(), self.before + seconds);
@@ -155,19 +164,19 @@ impl Member {
             let memory = |_| RunError::Memory { what: "the scores of the last generation", bytes };
             let snapshot = last.snapshot.copy().map_err(memory)?;
             let Checkpoint { config, init, seconds, metrics, .. } = last;
-            keeper.save(Checkpoint { config, init, seconds, metrics, snapshot }, output, since)?;
+            checkpoints.save(Checkpoint { config, init, seconds, metrics, snapshot }, output, since)?;
         } else {
-            keeper.save_now(&last, &output, since)?;
+            checkpoints.save_now(&last, &output, since)?;
         }
         let path = self.folder.file(POLICIES);
         if path.exists() {
             // The old checkpoints of an extended run need the old policies. The new checkpoint must be complete before
             // the policies are replaced.
-            keeper.wait()?;
+            checkpoints.wait()?;
         }
         let checksum = policies::write(&self.folder.disk, &path, &self.config, policies)?;
         let (rows, RunSums { run: digest, metrics }) = self.folder.digest(&self.config, policies)?;
-        keeper.wait()?;
+        checkpoints.wait()?;
         self.run.files = Some(FileSums { metrics, policies: checksum });
         self.write_run(Status::Done, next, seconds, Some(digest.clone()))?;
         self.results = Some(Results { rows, digest });

@@ -15,7 +15,7 @@ use std::sync::atomic::AtomicBool;
 use std::sync::{Mutex, PoisonError};
 
 pub use session::Session;
-pub use twin::{Twin, record_twins};
+pub(crate) use twin::{Twin, record_twins};
 
 use crate::backend::{BackendError, OpenBackend};
 use crate::config::ConfigError;
@@ -66,7 +66,7 @@ pub enum RunError {
 
 impl RunError {
     /// Converts the error of a snapshot of `bytes` bytes of policies.
-    pub fn of_snapshot(error: SnapshotError, what: &'static str, bytes: u64) -> RunError {
+    pub(crate) fn of_snapshot(error: SnapshotError, what: &'static str, bytes: u64) -> RunError {
         match error {
             SnapshotError::Memory(_) => RunError::Memory { what, bytes },
             SnapshotError::Backend(error) => RunError::Fetch(error),

@@ -96,7 +96,7 @@ impl Session {
             let fits = match snapshot {
                 InitialState::Checkpoint(snapshot) => trainer.restore(unfinished.experiment, snapshot),
                 InitialState::Policies(Init { trials, .. }) => {
-                    (trials.into_iter().enumerate()).all(|(trial, Policies { policies, weights })| {
+                    (trials.into_iter().enumerate()).all(|(trial, Policies { policies, weights, .. })| {
                         trainer.start_from(unfinished.experiment, trial, policies, &weights)
                     })
                 }
@@ -110,7 +110,7 @@ impl Session {
         Ok((Session { members, generations, trainer, runs_of_experiments, since: Instant::now() }, notes))
     }
 
-    /// Returns whether all runs are finished.
+    /// Reports whether all runs are finished.
     pub fn is_done(&self) -> bool {
         self.members.iter().all(|member| member.unfinished.is_none())
     }
@@ -223,10 +223,10 @@ impl Session {
     pub fn end(&mut self) -> Result<usize, RunError> {
         let mut last = 0;
         for member in &mut self.members {
-            if let Some(Unfinished { experiment, keeper, .. }) = &mut member.unfinished {
+            if let Some(Unfinished { experiment, checkpoints, .. }) = &mut member.unfinished {
                 let shorter = checkpoint::of_length(&member.config, self.trainer.end(*experiment));
                 if shorter != member.config {
-                    keeper.shorten(&shorter)?;
+                    checkpoints.shorten(&shorter)?;
                     member.folder.write_config(&shorter)?;
                     member.run.origin = Some(Origin::of(&shorter));
                     member.config = shorter;
@@ -246,7 +246,7 @@ impl Session {
     fn record_machine(&mut self, (backend, machine): &OpenBackend) {
         for run in self.members.iter_mut().filter(|member| member.unfinished.is_some()).map(|member| &mut member.run) {
             let Machine { backend: kind, adapter, driver, threads } = machine.clone();
-            let (version, commit) = (crate::VERSION.into(), crate::COMMIT.map(String::from));
+            let (version, commit) = (crate::version::VERSION.into(), crate::version::COMMIT.map(String::from));
             let description = backend.describe();
             *run = Run { version, commit, description, backend: kind, adapter, driver, threads, ..run.clone() };
         }
@@ -279,7 +279,7 @@ impl Session {
         on_threads(ends, |(member, (policies, end))| member.finish(&policies, end, seconds)).map(drop)
     }
 
-    /// Returns whether any run is due for a checkpoint. All runs then write one.
+    /// Reports whether any run is due for a checkpoint. All runs then write one.
     fn is_due(&self) -> bool {
         self.members.iter().zip(&self.generations).any(|(member, &next)| member.is_due(next))
     }
@@ -308,7 +308,7 @@ impl Session {
         let seconds = self.seconds();
         for run in self.unfinished().collect::<Vec<_>>() {
             let member = &mut self.members[run];
-            let first = member.unfinished.as_ref().is_some_and(|unfinished| unfinished.keeper.newest().is_none());
+            let first = member.unfinished.as_ref().is_some_and(|unfinished| unfinished.checkpoints.newest().is_none());
             if member.run.init.is_some() && first && self.generations[run] == 0 {
                 member.save(&mut self.trainer, 0, seconds)?;
             }

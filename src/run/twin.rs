@@ -10,7 +10,7 @@ use crate::record::folder::{self, FileSums, Folder, METRICS, Origin, POLICIES, R
 use crate::record::policies;
 
 /// A run with the same training as another run but with another config.
-pub struct Twin {
+pub(crate) struct Twin {
     /// Folder of the other run, which is finished.
     pub of: PathBuf,
     /// Config of the other run.
@@ -26,7 +26,7 @@ pub struct Twin {
 ///
 /// # Errors
 /// A folder cannot be used (see [`Folder::open`]), read or written.
-pub fn record_twins(twins: Vec<Twin>, start: Start, disk: &Disk) -> Result<(), RunError> {
+pub(crate) fn record_twins(twins: Vec<Twin>, start: Start, disk: &Disk) -> Result<(), RunError> {
     on_threads(twins, |twin| twin.record(start, disk)).map(drop)
 }
 
@@ -35,8 +35,8 @@ impl Twin {
         let Twin { of, of_config, folder, config } = self;
         let run = Run::read(&of.join(folder::RUN))?;
         let (folder, found) = Folder::open(&folder, start, &config, StartFrom::Random, disk.clone())?;
-        let there = found.run.filter(|_| found.finished.is_some());
-        if there.is_some_and(|there| there.digest == run.digest) {
+        let existing = found.run.filter(|_| found.finished.is_some());
+        if existing.is_some_and(|existing| existing.digest == run.digest) {
             return Ok(());
         }
         let (from, path) = (of.join(METRICS), folder.file(METRICS));

@@ -89,7 +89,7 @@ fn count(value: &Value) -> Option<usize> {
     usize::try_from(value.as_integer()?).ok()
 }
 
-/// Returns whether the sweep sets this key.
+/// Reports whether the sweep sets this key.
 fn sets(grid: &Grid, base: &Table, key: &str) -> bool {
     let (section, leaf) = key.split_once('.').unwrap_or((key, ""));
     base.get(section).and_then(|section| section.get(leaf)).is_some()

@@ -2,7 +2,7 @@
 //!
 //! A sweep file is a config with a section `[grid]`. Its keys are dotted config keys with lists of values, or the
 //! special axes of [`layout`]. Every combination of values is a [`Point`]: one config, trained as a run in
-//! `points/NNNN`. Its results do not depend on the points that train beside it.
+//! `points/NNNN`. Its results do not depend on the points that train at the same time.
 //!
 //! The keys of a section `[vary]` change one at a time. Every combination of `[grid]` has a point with the file's
 //! values, and one for each value of each key of `[vary]`.
@@ -25,7 +25,9 @@ use std::path::Path;
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
 
-use crate::config::{self, Config, ConfigError, GENERATIONS, GRID, Override, Problem, STAGES, VARY, read_file};
+use crate::config::{
+    self, Config, ConfigError, GENERATIONS, GRID, Override, Problem, STAGES, VARY, ValidConfig, read_file,
+};
 use crate::escape;
 use crate::file;
 use crate::reader::Document;
@@ -106,7 +108,7 @@ pub struct Point {
     /// The index of its value on each axis.
     pub values: Vec<usize>,
     /// The config.
-    pub config: Config,
+    pub config: ValidConfig,
 }
 
 impl Sweep {
@@ -129,7 +131,7 @@ impl Sweep {
     pub fn read(text: &str, name: &str, flags: &[Override], skip: bool) -> Result<Sweep, ConfigError> {
         let document = Document::parse(text);
         let Ok(mut base) = text.parse::<Table>() else {
-            Config::read_document(&document, name, &[GRID, VARY], &[])?;
+            Config::read_noted(&document, name, &[GRID, VARY], &[])?;
             return Err(invalid(name, vec![problem(None, "", "it is not TOML")]));
         };
         let sections = [GRID, VARY].map(|section| base.remove(section));
@@ -169,8 +171,8 @@ impl Sweep {
             .map(|index| {
                 let values = grid.values(index);
                 let overrides = [flags, &grid.overrides(&values), &layout.overrides(&grid, &values)].concat();
-                let config = Config::read_document(&document, name, &[GRID, VARY], &overrides);
-                Tried { index, values, config }
+                let config = Config::read_noted(&document, name, &[GRID, VARY], &overrides);
+                Tried { index, values, config: config.map(|(config, _)| config) }
             })
             .collect();
         let mut problems = grid.problems(&tried, skip);
@@ -196,7 +198,7 @@ impl Sweep {
 struct Tried {
     index: usize,
     values: Vec<usize>,
-    config: Result<Config, ConfigError>,
+    config: Result<ValidConfig, ConfigError>,
 }
 
 fn describe<'a>(axes: impl Iterator<Item = &'a Axis>, values: &[usize]) -> String {
@@ -452,7 +454,7 @@ impl Grid {
 /// Returns the value of a dotted key in a config.
 fn value_of(config: &Config, key: &str) -> Option<Value> {
     let (section, leaf) = key.split_once('.')?;
-    config.to_toml().parse::<Table>().ok()?.get(section)?.get(leaf).cloned()
+    Table::try_from(config).ok()?.get(section)?.get(leaf).cloned()
 }
 
 /// Returns a text that is the same for equal values only.

@@ -19,17 +19,17 @@ const MAX_PANELS: usize = 48;
 /// Maximum number of values of all varied keys together.
 const MAX_ROWS: usize = 100;
 /// Maximum length of a label, in millimetres.
-const LONGEST: f64 = 36.0;
+const MAX_LABEL_WIDTH: f64 = 36.0;
 
 /// A finished point with its results, or none.
-type Spot<'a> = Option<(&'a Point, &'a Outcome)>;
+type PointResult<'a> = Option<(&'a Point, &'a Outcome)>;
 
 /// The points by the values of two axes, with one panel for each combination of the other axes.
-struct Facets<'a> {
+struct PanelGrid<'a> {
     x: &'a Axis,
     y: Option<&'a Axis>,
     /// The title, and the points `[y][x]` with their results.
-    panels: Vec<(String, Vec<Spot<'a>>)>,
+    panels: Vec<(String, Vec<PointResult<'a>>)>,
 }
 
 /// The names of the figures. `final` shows the final G. For grids, `reach` shows the generations to reach a G, and
@@ -56,11 +56,11 @@ pub fn draw(
     let scenes = if sweep.axes.iter().any(|axis| axis.varied) {
         dots(sweep, outcomes, options).map(|dots| vec![(FIGURES[0], dots.scene())])
     } else {
-        let of_grid = |grid: Facets<'_>| {
+        let of_grid = |grid: PanelGrid<'_>| {
             let (last, reach) = (grid.last(options).scene(), grid.reach(options).scene());
             FIGURES.into_iter().zip([last, reach, grid.curves(sweep, options).scene()]).collect()
         };
-        Facets::new(sweep, outcomes, axes).map(of_grid)
+        PanelGrid::new(sweep, outcomes, axes).map(of_grid)
     };
     let scenes = match scenes {
         Ok(scenes) => scenes,
@@ -75,7 +75,7 @@ pub fn draw(
         for kind in Format::ALL {
             let name = format!("{name}.{}", kind.extension());
             let path = out.join(&name);
-            let bytes = scene.file(kind, PRINT).map_err(|error| RecordError::Write { path: path.clone(), error })?;
+            let bytes = scene.file(kind, PRINT).map_err(RecordError::write(&path))?;
             ownership::publish(&disk, &path, |output| output.write_all(&bytes))?;
             names.push(name);
         }
@@ -129,9 +129,13 @@ fn group(axis: &Axis) -> (String, Vec<String>) {
     (format!("{label} ({})", values[0]), values[1..].to_vec())
 }
 
-impl<'a> Facets<'a> {
+impl<'a> PanelGrid<'a> {
     /// Arranges the points by the requested axes, or by the first two with more than one value.
-    fn new(sweep: &'a Sweep, outcomes: &'a [Result<Outcome, Missing>], asked: &[usize]) -> Result<Facets<'a>, String> {
+    fn new(
+        sweep: &'a Sweep,
+        outcomes: &'a [Result<Outcome, Missing>],
+        asked: &[usize],
+    ) -> Result<PanelGrid<'a>, String> {
         let varied = (0..sweep.axes.len()).filter(|&axis| sweep.axes[axis].values.len() > 1 && !asked.contains(&axis));
         let wanted = if asked.is_empty() { 2 } else { asked.len() };
         let mut axes: Vec<usize> = asked.iter().copied().chain(varied).take(wanted).collect();
@@ -171,7 +175,7 @@ impl<'a> Facets<'a> {
             let panel = others.iter().fold(0, |panel, &axis| panel * counts(axis) + point.values[axis]);
             panels[panel].1[y.map_or(0, |y| point.values[y]) * counts(x) + point.values[x]] = Some((point, outcome));
         }
-        Ok(Facets { x: &sweep.axes[x], y: y.map(|y| &sweep.axes[y]), panels })
+        Ok(PanelGrid { x: &sweep.axes[x], y: y.map(|y| &sweep.axes[y]), panels })
     }
 
     fn heat_map(
@@ -180,7 +184,7 @@ impl<'a> Facets<'a> {
         (key, key_label): (Vec<(f64, String)>, [String; 2]),
         cell: impl Fn(&Point, &Outcome) -> Cell,
     ) -> HeatMap {
-        let cells = |points: &Vec<Spot<'_>>| {
+        let cells = |points: &Vec<PointResult<'_>>| {
             points.iter().map(|at| at.map_or(Cell::Empty, |(point, outcome)| cell(point, outcome))).collect()
         };
         HeatMap {
@@ -246,7 +250,7 @@ impl<'a> Facets<'a> {
         let mut panels = Vec::new();
         for row in 0..self.y.map_or(1, |y| y.values.len()) {
             for (title, points) in &self.panels {
-                let curve = |(value, at): (usize, &Spot<'_>)| {
+                let curve = |(value, at): (usize, &PointResult<'_>)| {
                     let outcome = (*at)?.1;
                     Some((value, Curve::at(outcome.curve.iter().map(|(generation, average)| (*generation, average)))))
                 };
@@ -269,5 +273,5 @@ impl<'a> Facets<'a> {
 
 fn scale(axis: &Axis) -> Scale {
     let values: Vec<String> = (0..axis.values.len()).map(|value| axis.label(value)).collect();
-    Scale { label: axis.leaf().replace('_', " "), values: distinct(&values, LONGEST, SMALL) }
+    Scale { label: axis.leaf().replace('_', " "), values: distinct(&values, MAX_LABEL_WIDTH, SMALL) }
 }

@@ -6,7 +6,7 @@ use std::sync::atomic::Ordering::Relaxed;
 use super::Point;
 use super::results::point_folder;
 use crate::backend::OpenBackend;
-use crate::config::Config;
+use crate::config::{Config, ValidConfig};
 use crate::record::disk::Disk;
 use crate::record::folder::{self, Note, Start};
 use crate::run::{self, RunError, Session, SessionEnd};
@@ -51,9 +51,9 @@ pub struct SweepProgress {
 
 /// Returns the bytes for training a point: its policies three times (this generation, the next, a checkpoint) and its
 /// scores.
-pub fn bytes(config: &Config) -> usize {
+pub fn bytes(config: &ValidConfig) -> usize {
     let learning = &config.learning;
-    let episodes = config.staged().iter().map(|(_, config)| config.learning.episodes_per_team).max().unwrap_or(1);
+    let episodes = config.stages().iter().map(|(_, config)| config.learning.episodes_per_team).max().unwrap_or(1);
     let scores = learning.trials * config.max_teams() * (config.learners() + 1) * (episodes + 2);
     let champions = learning.trials * config.populations() * config.parameters() * (1 + learning.hall_of_fame);
     let bytes = 3 * config.policy_bytes() + ((3 * champions + scores) * size_of::<f32>()) as u64;
@@ -61,13 +61,12 @@ pub fn bytes(config: &Config) -> usize {
 }
 
 /// Returns the team-steps of a point.
-fn team_steps(config: &Config) -> u128 {
-    let of_stage = |config: Config| {
-        let learning = &config.learning;
-        let teams = learning.trials * config.max_teams() * learning.episodes_per_team;
-        teams as u128 * config.world.steps as u128 * (learning.generations + 1) as u128
+fn team_steps(config: &ValidConfig) -> u128 {
+    let of_stage = |(generations, config): (usize, &Config)| {
+        let teams = config.learning.trials * config.max_teams() * config.learning.episodes_per_team;
+        teams as u128 * config.world.steps as u128 * generations as u128
     };
-    config.shares().into_iter().map(of_stage).sum()
+    config.stage_lengths().map(of_stage).sum()
 }
 
 /// Splits points into batches that fit in memory, in order. A point that does not fit is a batch of its own.
@@ -94,7 +93,7 @@ pub fn batches<'a>(points: &'a [&'a Point], memory: usize) -> Vec<&'a [&'a Point
 pub fn run(
     points: &[&Point],
     out: &Path,
-    player: &mut OpenBackend,
+    backend: &mut OpenBackend,
     options: &mut SweepOptions<'_>,
 ) -> Result<SessionEnd, RunError> {
     let total = points.iter().map(|point| team_steps(&point.config)).sum();
@@ -103,13 +102,13 @@ pub fn run(
     // All folders are checked first, so that no batch trains before a later one is refused.
     let folders: Vec<PathBuf> = points.iter().map(|point| point_folder(out, point)).collect();
     let disk = options.disk;
-    let configs = points.iter().map(|point| &point.config);
+    let configs = points.iter().map(|point| &*point.config);
     folder::check(disk, folders.iter().map(|path| &**path).zip(configs), options.start)?;
     for batch in batches(points, options.memory) {
         if options.runs.stop.load(Relaxed) {
             return Ok(SessionEnd::Stopped);
         }
-        let runs = batch.iter().map(|point| (point.config.clone(), point_folder(out, point))).collect();
+        let runs = batch.iter().map(|point| (Config::clone(&point.config), point_folder(out, point))).collect();
         let (mut session, notes) = Session::open(runs, options.start, disk)?;
         notes.iter().for_each(|(run, note)| (options.note)(batch[*run], note));
         // Steps of earlier sessions do not count.
@@ -130,7 +129,7 @@ pub fn run(
         let mut watch = |now: &run::Progress<'_>| tell(now.generations);
         let run::Options { command, stop, save, ref mut fallback, ref mut on_recovery, .. } = options.runs;
         let mut runs = run::Options { command, stop, save, fallback, on_recovery, watch: &mut watch };
-        if !session.is_done() && session.train(player, &mut runs)? == SessionEnd::Stopped {
+        if !session.is_done() && session.train(backend, &mut runs)? == SessionEnd::Stopped {
             return Ok(SessionEnd::Stopped);
         }
     }

@@ -78,15 +78,15 @@ impl Shard {
         shard.map(Some).map_err(|error| format!("{names}: {error}; say --shard I/N where the array has gaps"))
     }
 
-    /// Returns the points of this shard in order, see [`deal`].
+    /// Returns the points of this shard in order, see [`assign_to_shards`].
     pub fn take<'a>(&self, points: &'a [Point]) -> Vec<&'a Point> {
-        let of = deal(points, self.count);
+        let of = assign_to_shards(points, self.count);
         points.iter().zip(of).filter(|(_, of)| *of == self.index).map(|(point, _)| point).collect()
     }
 }
 
 /// Assigns each point to one of `count` shards, from 1: in order of decreasing cost, each to the least loaded shard.
-pub(crate) fn deal(points: &[Point], count: usize) -> Vec<usize> {
+pub(crate) fn assign_to_shards(points: &[Point], count: usize) -> Vec<usize> {
     let mut order: Vec<(u128, usize)> = points.iter().map(cost).zip(0..).collect();
     order.sort_by_key(|&(cost, at)| (Reverse(cost), points[at].index));
     let mut loads: BinaryHeap<_> = (1..=count).map(|shard| Reverse((0, shard))).collect();
@@ -120,17 +120,14 @@ impl Display for Shard {
 /// Estimates the number of operations of a point: teams × steps × operations per step (networks, pairs of agents,
 /// sensing, coupling).
 pub fn cost(point: &Point) -> u128 {
-    point.config.shares().iter().map(cost_of_stage).sum()
+    point.config.stage_lengths().map(cost_of_stage).sum()
 }
 
-fn cost_of_stage(config: &Config) -> u128 {
+fn cost_of_stage((generations, config): (usize, &Config)) -> u128 {
     let learning = &config.learning;
     let world = World::new(config);
     let wide = |count: usize| count as u128;
-    let teams = wide(learning.trials)
-        * wide(learning.generations + 1)
-        * wide(config.max_teams())
-        * wide(learning.episodes_per_team);
+    let teams = wide(learning.trials) * wide(generations) * wide(config.max_teams()) * wide(learning.episodes_per_team);
     let (agents, leaders, pois) = (wide(world.agents()), wide(world.leaders()), wide(world.pois.len()));
     let step = leaders * (2 * wide(world.parameters()) + 25 * pois) + agents * (4 * agents + 6 * pois + 100);
     teams * wide(world.steps()) * step

@@ -42,7 +42,7 @@ impl Trainer {
     ///
     /// # Errors
     /// The backend failed.
-    pub fn play_candidates(&mut self, experiment: usize, backend: &mut dyn Backend) -> Result<(), BackendError> {
+    pub(crate) fn play_candidates(&mut self, experiment: usize, backend: &mut dyn Backend) -> Result<(), BackendError> {
         let level = self.level;
         scope(|_| {
             let experiment = &mut self.experiments[experiment];
@@ -56,7 +56,7 @@ impl Trainer {
 
     /// Returns the world of the next generation and its number of teams, without the champions' team. The number is 0
     /// if only the champions still have to play.
-    pub fn candidates_world(&self, experiment: usize) -> (&World, usize) {
+    pub(crate) fn candidates_world(&self, experiment: usize) -> (&World, usize) {
         let experiment = &self.experiments[experiment];
         let stage = experiment.stage();
         (&stage.world, if experiment.only_champions_left() { 0 } else { experiment.teams() })

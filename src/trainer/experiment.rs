@@ -1,4 +1,4 @@
-//! One experiment of a trainer: its trials, and how far they are.
+//! The state of one experiment of a trainer and its trials.
 
 use std::ops::Range;
 
@@ -19,7 +19,7 @@ pub(super) struct Experiment {
     pub trials: Vec<TrialState>,
     /// The schedules of the generation that plays, one per trial.
     pub schedules: Vec<TeamSchedule>,
-    /// The schedules of the generation after it, drawn meanwhile if a backend holds the populations; else empty.
+    /// The schedules of the next generation, drawn while a backend that holds the populations plays. Otherwise empty.
     pub next_schedules: Vec<TeamSchedule>,
     /// The generation that plays next, two past the last when all is done. The populations are of an earlier generation
     /// after a device lost them.
@@ -29,13 +29,14 @@ pub(super) struct Experiment {
 
 /// One trial's populations, and scratch memory for its generations.
 ///
-/// A population has more slots than policies, see [`Learning::slots`]. The one after the policies is that of the
-/// champion, which plays along as one more team.
+/// A population has more slots than policies, see [`Learning::slots`]. The slot after the policies holds the previous
+/// champion, which plays in an additional team.
 pub(super) struct TrialState {
     /// The trial's number within its config.
     pub index: usize,
-    /// This generation, `[populations][slots][parameters]`, and memory for the next.
+    /// This generation, `[populations][slots][parameters]`.
     pub weights: Vec<f32>,
+    /// Memory for the next generation, of the same size.
     pub children: Vec<f32>,
     /// The scores of the generation that played, `[episodes]`. The last team is the champion's, if it played there.
     pub scores: Vec<GroupScores>,
@@ -108,7 +109,7 @@ impl Experiment {
         pairs.for_each(|(schedule, trial)| schedule.draw(level, stages, trial.index, generation));
     }
 
-    /// Draws the next generation's schedules, beside those of the one that plays.
+    /// Draws the next generation's schedules. Those of the generation that plays stay.
     pub fn prepare_next(&self, level: Level, next: &mut Vec<TeamSchedule>) {
         if self.only_champions_left() {
             return;

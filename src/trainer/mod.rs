@@ -2,15 +2,15 @@
 //!
 //! A generation is: draw the team schedules, play them, collect the results, plan the next generation, breed it.
 //!
-//! | file | holds |
+//! | file | contents |
 //! |---|---|
-//! | `experiment` | one experiment's trials, and how far they are |
+//! | `experiment` | the state of one experiment and its trials |
 //! | `stages` | the stages of a curriculum |
 //! | `schedule` | who plays with whom in a generation, and from where |
 //! | `residency` | where populations are: on the host or on a device |
 //! | `populations` | moving populations between the two, and breeding them |
 //! | `results` | playing a generation, and its rows and fitness |
-//! | `size` | bytes that all this takes |
+//! | `size` | estimates of the memory that a trainer needs |
 
 use std::collections::TryReserveError;
 use std::time::Duration;
@@ -42,7 +42,7 @@ use schedule::TeamSchedule;
 pub struct Trainer {
     experiments: Vec<Experiment>,
     level: Level,
-    times: Times,
+    times: GenerationTimes,
     recovered_error: Option<BackendError>,
 }
 
@@ -82,7 +82,7 @@ pub struct Snapshot<N = Vec<f32>> {
     pub pending: Vec<Option<Row>>,
 }
 
-/// State from which a finished experiment is extended, beside its rows and policies.
+/// State from which a finished experiment is extended, in addition to its rows and policies.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Ending {
     /// A trial's weights after the last generation, as in [`Snapshot`]. Empty if the policies and their fitness are
@@ -112,7 +112,7 @@ impl Snapshot<&[f32]> {
 
 /// The time that generations took, by phase.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Times {
+pub struct GenerationTimes {
     /// Drawing team schedules, unless that was done while others played.
     pub prepare: Duration,
     /// Rollouts and scores.
@@ -146,14 +146,14 @@ impl Trainer {
         let level = Level::new();
         let experiment = |config: ValidConfig| Experiment::new(&config, 0..config.learning.trials, level);
         let experiments = configs.into_iter().map(experiment).collect();
-        Trainer { experiments, level, times: Times::default(), recovered_error: None }
+        Trainer { experiments, level, times: GenerationTimes::default(), recovered_error: None }
     }
 
     /// Creates random populations for one trial of a config. Its rows are the same as among the other trials.
     pub fn of_trial(config: &ValidConfig, trial: usize) -> Trainer {
         let level = Level::new();
         let experiments = vec![Experiment::new(config, trial..trial + 1, level)];
-        Trainer { experiments, level, times: Times::default(), recovered_error: None }
+        Trainer { experiments, level, times: GenerationTimes::default(), recovered_error: None }
     }
 
     /// Returns the generation that an experiment plays next: two past its last when it is done.
@@ -163,7 +163,7 @@ impl Trainer {
 
     /// Makes the generation that an experiment plays next its last, unless an earlier one is. Returns the last.
     ///
-    /// The results are those of a config with so many generations.
+    /// The results are those of a config with that number of generations.
     pub fn end(&mut self, experiment: usize) -> usize {
         let Experiment { stages, generation, .. } = &mut self.experiments[experiment];
         stages.last_generation = stages.last_generation.min(*generation);
@@ -177,7 +177,7 @@ impl Trainer {
     }
 
     /// Returns and resets the times of generations.
-    pub fn take_times(&mut self) -> Times {
+    pub fn take_times(&mut self) -> GenerationTimes {
         std::mem::take(&mut self.times)
     }
 
@@ -189,14 +189,14 @@ impl Trainer {
     /// Plays, scores and breeds one generation of every experiment that has one left.
     ///
     /// Returns the rows that became complete, by experiment, trial and generation. A generation's champion plays with
-    /// the next generation, and by itself after the last.
+    /// the next generation. The last champion plays alone.
     ///
     /// A backend may hold the populations. If it loses them, the trainer replays generations from its last copy.
     ///
     /// # Errors
     /// The backend failed. The trainer is then still before this generation.
     pub fn advance(&mut self, backend: &mut dyn Backend) -> Result<Vec<Row>, BackendError> {
-        // Enters the thread pool once: a small generation is over sooner than a thread wakes up.
+        // Enters the thread pool once, because waking a thread takes longer than a small generation.
         scope(|_| match self.replay_and_play(backend) {
             // A device may have room for the populations or for the episodes, but not for both.
             Err(error) if self.release_all() => {
@@ -348,8 +348,8 @@ impl Trainer {
         Ok(self.view(experiment)?.copy()?)
     }
 
-    /// Puts given policies, `[populations][policies][parameters]`, into the first slots of a trial's populations, in
-    /// their order and as many as fit. The other slots keep their random policies.
+    /// Copies given policies, `[populations][policies][parameters]`, into the first slots of a trial's populations, in
+    /// order, until the slots are full. The other slots keep their random policies.
     ///
     /// Returns false, and changes nothing, if the experiment has played or the sizes do not match.
     #[must_use]

@@ -36,7 +36,7 @@ impl Experiment {
         Ok(())
     }
 
-    /// Copies the populations to the host, those of all trials or none, unless the host's are current.
+    /// Copies the populations of all trials to the host, unless the host's are current. An error copies none.
     pub fn fetch(&mut self) -> Result<(), BackendError> {
         if self.residency.host_is_current() {
             return Ok(());
@@ -51,7 +51,7 @@ impl Experiment {
         Ok(())
     }
 
-    /// Takes the populations back from the backend. After an error the host's last copy is all there is.
+    /// Takes the populations back from the backend. After an error, only the host's last copy is left.
     pub fn release(&mut self) -> Result<(), BackendError> {
         let fetched = self.fetch();
         self.residency.lose();
@@ -70,12 +70,12 @@ impl Experiment {
         fetched
     }
 
-    /// Makes the next generation: plans each slot's parent and whether it mutates, and carries that out where the
-    /// populations are. After the last generation the policies stay, and the champion gets its slot.
+    /// Breeds the next generation, on the host or on the device that holds the populations. After the last generation,
+    /// all policies stay, and the champion is copied to its slot.
     ///
     /// # Errors
-    /// The backend that holds the populations failed. The results of this generation are known by then. The next
-    /// generation replays what was lost, or fails.
+    /// The backend that holds the populations failed. The results of this generation are already known. The next call
+    /// replays the lost generations, or fails.
     pub fn breed(&mut self, level: Level) -> Result<(), BackendError> {
         if !self.residency.is_on_device() {
             self.breed_on_host(level);
@@ -108,7 +108,7 @@ impl Experiment {
         })
     }
 
-    /// Breeds populations that the host has, which cannot fail.
+    /// Breeds populations that the host holds. This cannot fail.
     pub fn breed_on_host(&mut self, level: Level) {
         match self.strategy(level) {
             None => self.select(level),
@@ -122,7 +122,7 @@ impl Experiment {
         self.residency.bred();
     }
 
-    /// Breeds on from the last generation of a shorter run, whose champions are known.
+    /// Breeds the first additional generation of an extended run, whose champions are known.
     pub fn breed_beyond_the_last(&mut self, level: Level) {
         match self.strategy(level) {
             None => self.select(level),
@@ -131,7 +131,7 @@ impl Experiment {
         self.residency.bred();
     }
 
-    /// Returns the evolution strategy of the present stage. `None` stands for tournaments.
+    /// Returns the evolution strategy of the present stage. `None` means tournaments.
     fn strategy(&self, level: Level) -> Option<Strategy> {
         let Stage { config, world, .. } = self.stage();
         Strategy::of(level, &config.learning, world.parameters())
@@ -199,7 +199,7 @@ impl Experiment {
             plans.zip(populations).enumerate().for_each(|(leader, ((fitness, parents), (policies, children)))| {
                 plan(level, learning, tournaments, (generation, last), leader, fitness, parents);
                 let tasks = children.par_chunks_mut(SLOTS_PER_TASK * parameters);
-                // Small tasks, so that no thread is left with a long one at the end.
+                // Small tasks end at about the same time on all threads.
                 tasks.with_max_len(4).enumerate().for_each(|(index, children)| {
                     let first = index * SLOTS_PER_TASK;
                     let offspring = evolve::Offspring { key, generation, population: leader, first, parents, policies };

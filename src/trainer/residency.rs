@@ -83,11 +83,16 @@ impl Residency {
         }
     }
 
-    /// Drops the device's copy. The host's, which may be older, is then all there is.
+    /// Drops the device's copy. Only the host's copy is left, which may be older.
     pub fn lose(&mut self) {
         if let Residency::Device { host_generation, .. } = *self {
             *self = Residency::Host { generation: host_generation, declined: true };
         }
+    }
+
+    /// Records that the last generation is over. The host's weights are current, and the device's copy is dropped.
+    pub fn moved_to_host(&mut self) {
+        *self = Residency::Host { generation: self.generation() + 1, declined: true };
     }
 
     /// Records that the populations, wherever they are, became the next generation.

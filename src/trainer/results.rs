@@ -73,8 +73,8 @@ impl Experiment {
     }
 
     /// Turns a generation's scores into fitness, and returns the rows that its champions complete. `index` is the
-    /// experiment's in its trainer. `told` replaces the scores, `[trials][teams][leaders]`.
-    pub fn collect_results(&mut self, index: usize, told: Option<&[f32]>) -> Vec<Row> {
+    /// experiment's in its trainer. `given_scores` replaces the scores, `[trials][teams][leaders]`.
+    pub fn collect_results(&mut self, index: usize, given_scores: Option<&[f32]>) -> Vec<Row> {
         let (generation, size) = (self.residency.generation(), self.teams() * self.stage().world.leaders());
         let Experiment { stages, trials, schedules, .. } = self;
         let Stage { config, world, .. } = stages.of(generation);
@@ -87,8 +87,8 @@ impl Experiment {
             rows.extend(trial.pending.map(|row| Row { champion_g: trial.champion_g(pois_before), ..row }));
             trial.pending =
                 Some(Row { experiment: index, trial: trial.index, generation, best_g, mean_g, champion_g: 0.0 });
-            let score = |place: usize| match told {
-                Some(told) => told[number * size + place],
+            let score = |place: usize| match given_scores {
+                Some(given_scores) => given_scores[number * size + place],
                 None => mean_score(&trial.scores, place),
             };
             match config.learning.sharing {
@@ -110,8 +110,7 @@ impl Experiment {
         };
         let rows = self.trials.iter_mut().filter_map(row).collect();
         // The weights were fetched before.
-        self.residency.lose();
-        self.residency.bred();
+        self.residency.moved_to_host();
         rows
     }
 }

@@ -1,17 +1,17 @@
 //! Bytes that a trainer allocates, for estimates before a run.
 
-use crate::config::Config;
+use crate::config::{Config, ValidConfig};
 
 /// Bytes per episode of a batch, on any backend.
 const EPISODE: u64 = 40;
 
-/// Returns the bytes that the trials of a valid config take on any backend, in the stage that takes most.
-pub fn bytes(config: &Config) -> u64 {
+/// Returns the bytes that the trials of a config take on any backend, in the stage that takes most.
+pub fn bytes(config: &ValidConfig) -> u64 {
     max_over_stages(config, bytes_of_stage) + previous_stage_bytes(config)
 }
 
 /// Returns the bytes of the next generation's schedules, drawn while a backend that holds the populations plays.
-pub fn next_bytes(config: &Config) -> u64 {
+pub fn next_bytes(config: &ValidConfig) -> u64 {
     max_over_stages(config, schedule_bytes) + previous_stage_bytes(config)
 }
 
@@ -21,8 +21,8 @@ pub fn snapshot_bytes(config: &Config) -> u64 {
     4 * trials * populations * (slots * parameters + policies)
 }
 
-fn max_over_stages(config: &Config, bytes: fn(&Config) -> u64) -> u64 {
-    config.staged().iter().map(|(_, config)| bytes(config)).max().unwrap_or(0)
+fn max_over_stages(config: &ValidConfig, bytes: fn(&Config) -> u64) -> u64 {
+    config.stages().iter().map(|(_, config)| bytes(config)).max().unwrap_or(0)
 }
 
 fn bytes_of_stage(config: &Config) -> u64 {
@@ -39,8 +39,8 @@ fn bytes_of_stage(config: &Config) -> u64 {
         + schedule_bytes(config)
 }
 
-/// Start positions of the previous stage's champions, kept beside those of the stage that begins.
-fn previous_stage_bytes(config: &Config) -> u64 {
+/// Start positions of the previous stage's champions, kept while the next stage begins.
+fn previous_stage_bytes(config: &ValidConfig) -> u64 {
     if config.stages.is_empty() { 0 } else { max_over_stages(config, start_bytes) }
 }
 

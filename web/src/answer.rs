@@ -2,7 +2,7 @@
 
 use std::fmt::Display;
 
-use flotilla::config::{Config, ConfigError, Problem};
+use flotilla::config::{Config, ConfigError, Problem, ValidConfig};
 use flotilla::model::start;
 use serde_json::{Value, json};
 
@@ -43,9 +43,9 @@ pub fn floats(bytes: &[u8]) -> Vec<f32> {
 
 /// Returns a config as TOML and as JSON, with its number of POIs (null if stages differ), parameters per policy, and
 /// start.
-pub fn described(config: &Config) -> Value {
+pub fn described(config: &ValidConfig) -> Value {
     let (toml, pois, parameters) = (config.to_toml(), config.pois(), config.parameters());
-    let mut words = json!({ "toml": toml, "config": config, "pois": pois, "parameters": parameters });
+    let mut words = json!({ "toml": toml, "config": **config, "pois": pois, "parameters": parameters });
     // JavaScript numbers cannot represent every 64-bit seed.
     words["config"]["learning"]["seed"] = config.learning.seed.to_string().into();
     words["start"] = start_of(config);

@@ -1,4 +1,4 @@
-//! Exports and imports runs as zip archives of a run directory, in the format of `flotilla train`.
+//! Exports and imports runs as zip archives of a run's folder, in the format of `flotilla train`.
 
 use std::io::{self, Cursor, Read};
 use std::ops::Range;
@@ -20,7 +20,7 @@ use zip::{ZipArchive, ZipWriter, write::SimpleFileOptions};
 use crate::answer::{Answer, Refusal, described, floats, refuse};
 
 /// Maximum bytes read from one file of an archive.
-const MOST: u64 = 1 << 30;
+const MAX_FILE_BYTES: u64 = 1 << 30;
 
 /// Describes a finished run to export.
 ///
@@ -42,7 +42,7 @@ pub struct Recorded {
     rows: usize,
 }
 
-/// Returns the digest of a finished run, and its directory as a zip archive.
+/// Returns the digest of a finished run, and its folder as a zip archive.
 pub fn write(recorded: &Recorded, bytes: &[u8]) -> Result<Answer, Refusal> {
     let config = Config::parse(&recorded.text, "the config")?;
     let (trials, last) = (config.learning.trials, config.learning.generations);
@@ -130,11 +130,11 @@ pub fn read(text: Option<&str>, bytes: &[u8]) -> Result<Answer, Refusal> {
         let found = found.ok_or_else(|| refuse(format!("the archive has no {name}: it is no run's")))?;
         let mut content = Vec::new();
         let file = zip.by_name(found).map_err(refuse)?;
-        file.take(MOST).read_to_end(&mut content).map_err(refuse)?;
+        file.take(MAX_FILE_BYTES).read_to_end(&mut content).map_err(refuse)?;
         Ok(content)
     };
     let text = String::from_utf8(file(folder::CONFIG)?).map_err(|_| refuse("config.toml is not UTF-8 text"))?;
-    let config = Config::parse(&text, "config.toml")?;
+    let config = Config::parse(&text, "config.toml")?.validate()?;
     let (metrics, weights) = (file(folder::METRICS)?, file(folder::POLICIES)?);
     let run = Run::parse(&String::from_utf8_lossy(&file(folder::RUN)?))
         .map_err(|error| refuse(format!("run.json: {error}")))?;
@@ -180,7 +180,8 @@ pub fn read(text: Option<&str>, bytes: &[u8]) -> Result<Answer, Refusal> {
 ///
 /// `weights` are `[leaders][policies][parameters]`, or `[1][policies][parameters]` if all leaders share a policy.
 pub fn play(config: &Config, policies: usize, mut weights: Vec<f32>) -> Result<Value, Refusal> {
-    let config = &config.at(config.learning.generations);
+    let config = config.validate()?;
+    let config = config.at(config.learning.generations);
     let world = World::new(config);
     let (leaders, numbers) = (world.leaders(), policies.saturating_mul(world.parameters()));
     let fits = policies > 0 && [numbers, numbers.saturating_mul(leaders)].contains(&weights.len());

@@ -16,10 +16,10 @@ use serde_json::{Value, json};
 
 use crate::answer::{Answer, Refusal, described, floats, refuse};
 use crate::archive::{self, Recorded};
-use crate::arms;
 use crate::baseline::{self, Random};
 use crate::drive::Drive;
 use crate::edit;
+use crate::experiments;
 use crate::train::{Chosen, Training};
 
 /// A request of the page.
@@ -32,9 +32,12 @@ enum Ask {
     Edit { text: String, changes: Vec<(String, String)> },
     /// Returns G of the best constant action.
     Constant { text: String },
-    /// Returns learning curves with their intervals, and the comparison of arms. The numbers are G, see
-    /// [`arms::compare`].
-    Compare { arms: Vec<arms::Arm> },
+    /// Returns learning curves with their intervals, and the comparison of experiments. The numbers are G, see
+    /// [`experiments::compare`].
+    Compare {
+        #[serde(rename = "arms")]
+        experiments: Vec<experiments::Experiment>,
+    },
     /// Names runs by what differs between their configs, or by their files.
     Labels { texts: Vec<String>, names: Vec<String> },
     /// Starts the baseline of random networks.
@@ -56,7 +59,7 @@ enum Ask {
     Best { run: usize, trial: usize, generation: Option<usize> },
     /// Returns the results of a run's finished trials. The numbers are policies and fitness.
     Ends { run: usize },
-    /// Returns a finished run's directory as an archive, made from its rows, policies and fitness.
+    /// Returns a finished run's folder as an archive, made from its rows, policies and fitness.
     Record(Recorded),
     /// Reads an archive or a file of policies, see [`archive::read`].
     Read { text: Option<String> },
@@ -102,7 +105,7 @@ pub fn answer(session: &mut Session, text: &str, bytes: &[u8]) -> Result<Answer,
         Ask::Resolve { text, name, changes } => words(resolve(&text, &name, changes)?),
         Ask::Edit { text, changes } => words(json!({ "text": edit::set(&text, &changes).map_err(refuse)? })),
         Ask::Constant { text } => words(baseline::constant(parse(&text)?)?),
-        Ask::Compare { arms } => words(arms::compare(arms, bytes)?),
+        Ask::Compare { experiments } => words(experiments::compare(experiments, bytes)?),
         Ask::Labels { texts, names } => {
             let configs = texts.iter().map(|text| parse(text)).collect::<Result<Vec<_>, _>>()?;
             let names: Vec<PathBuf> = names.into_iter().map(PathBuf::from).collect();
@@ -158,7 +161,7 @@ pub fn answer(session: &mut Session, text: &str, bytes: &[u8]) -> Result<Answer,
 fn resolve(text: &str, name: &str, changes: Vec<(String, String)>) -> Result<Value, Refusal> {
     let change = |(key, text): (String, String)| Override { name: key.clone(), key, text };
     let changes: Vec<Override> = changes.into_iter().map(change).collect();
-    let config = Config::read(text, name, &[], &changes)?;
+    let config = Config::read(text, name, &[], &changes)?.validate()?;
     let mut words = described(&config);
     // Besides training itself, snapshots are kept, and packing the archive copies all policies.
     words["bytes"] = (flotilla::memory::Peaks::of([&config], 1).host + 5 * config.policy_bytes()).into();

@@ -17,7 +17,7 @@ const EPISODES: u32 = 20;
 /// The backend fails.
 pub fn constant(mut config: Config) -> Result<Value, Refusal> {
     let learning = &mut config.learning;
-    // Constant actions need no population. Without jitter, all generations and trials are alike.
+    // Constant actions need no population. Without jitter, all generations and trials are equal.
     learning.population = 2;
     if learning.start_jitter == 0.0 && learning.poi_jitter == 0.0 {
         (learning.generations, learning.trials) = (0, 1);

@@ -16,11 +16,11 @@ use wasm_bindgen::prelude::*;
 
 mod answer;
 mod archive;
-mod arms;
 mod ask;
 mod baseline;
 mod drive;
 mod edit;
+mod experiments;
 mod train;
 
 use answer::Answer;

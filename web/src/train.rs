@@ -26,8 +26,8 @@ const KEPT_BYTES: usize = 48 << 20;
 /// Trials that advance together: all trials of several configs, or a single trial.
 struct Batch {
     trainer: Trainer,
-    /// Per arm, the index of its run, and the trial if the arm is a single trial.
-    arms: Vec<(usize, Option<usize>)>,
+    /// Per experiment of the trainer, the index of its run, and the trial if it is a single one.
+    experiments: Vec<(usize, Option<usize>)>,
 }
 
 /// Snapshots of single trials, by run, trial and generation.
@@ -40,7 +40,7 @@ struct Kept {
 /// The training of one worker.
 #[derive(Default)]
 pub struct Training {
-    configs: Vec<Config>,
+    configs: Vec<ValidConfig>,
     batches: Vec<Batch>,
     kept: Kept,
 }
@@ -53,22 +53,21 @@ impl Default for Kept {
 
 impl Training {
     pub fn new(runs: Vec<Chosen>) -> Result<Training, Refusal> {
-        let parse = |chosen: &Chosen| Ok(Config::parse(&chosen.text, "the config")?);
+        let parse = |chosen: &Chosen| Ok(Config::parse(&chosen.text, "the config")?.validate()?);
         let configs = runs.iter().map(parse).collect::<Result<Vec<_>, Refusal>>()?;
-        let valid = ValidConfig::all(&configs)?;
         let mut batches = Vec::new();
         let whole: Vec<usize> = (0..runs.len()).filter(|&run| runs[run].trials.is_none()).collect();
         if !whole.is_empty() {
-            let trainer = Trainer::new(whole.iter().map(|&run| valid[run].clone()));
-            batches.push(Batch { trainer, arms: whole.into_iter().map(|run| (run, None)).collect() });
+            let trainer = Trainer::new(whole.iter().map(|&run| configs[run].clone()));
+            batches.push(Batch { trainer, experiments: whole.into_iter().map(|run| (run, None)).collect() });
         }
         for (run, chosen) in runs.iter().enumerate() {
             for &trial in chosen.trials.iter().flatten() {
                 if trial >= configs[run].learning.trials {
                     return Err(refuse(format!("no trial {trial}")));
                 }
-                let trainer = Trainer::of_trial(&valid[run], trial);
-                batches.push(Batch { trainer, arms: vec![(run, Some(trial))] });
+                let trainer = Trainer::of_trial(&configs[run], trial);
+                batches.push(Batch { trainer, experiments: vec![(run, Some(trial))] });
             }
         }
         let mut training = Training { configs, batches, kept: Kept::default() };
@@ -82,11 +81,18 @@ impl Training {
     pub fn advance(&mut self, backend: &mut dyn Backend, most: usize, time: f64) -> Result<Answer, Refusal> {
         let (start, mut rows, mut played) = (Instant::now(), Vec::new(), 0);
         while played < most && !self.is_done() && (played == 0 || start.elapsed().as_secs_f64() * 1000.0 < time) {
-            for Batch { trainer, arms } in self.batches.iter_mut().filter(|batch| !batch.trainer.is_done()) {
-                for Row { experiment: arm, trial, generation, best_g, mean_g, champion_g } in
+            for Batch { trainer, experiments } in self.batches.iter_mut().filter(|batch| !batch.trainer.is_done()) {
+                for Row { experiment, trial, generation, best_g, mean_g, champion_g } in
                     trainer.advance(backend).map_err(refuse)?
                 {
-                    rows.extend([arms[arm].0 as f64, trial as f64, generation as f64, best_g, mean_g, champion_g]);
+                    rows.extend([
+                        experiments[experiment].0 as f64,
+                        trial as f64,
+                        generation as f64,
+                        best_g,
+                        mean_g,
+                        champion_g,
+                    ]);
                 }
             }
             played += 1;
@@ -105,11 +111,11 @@ impl Training {
     /// Keeps snapshots of the trials whose generation is due. Above [`KEPT_BYTES`], drops every second generation.
     fn keep(&mut self) -> Result<(), Refusal> {
         for batch in &mut self.batches {
-            for arm in 0..batch.arms.len() {
-                let generation = batch.trainer.generation(arm);
-                let last = self.configs[batch.arms[arm].0].learning.generations;
+            for experiment in 0..batch.experiments.len() {
+                let generation = batch.trainer.generation(experiment);
+                let last = self.configs[batch.experiments[experiment].0].learning.generations;
                 if generation.is_multiple_of(self.kept.every) && generation <= last {
-                    batch.keep(arm, &mut self.kept)?;
+                    batch.keep(experiment, &mut self.kept)?;
                 }
             }
         }
@@ -135,14 +141,14 @@ impl Training {
             return Err(refuse(format!("no trial {trial}")));
         }
         let is_of = |&(of, alone): &(usize, Option<usize>)| of == run && alone.is_none_or(|alone| alone == trial);
-        let batch = self.batches.iter_mut().find_map(|batch| Some((batch.arms.iter().position(is_of)?, batch)));
+        let batch = self.batches.iter_mut().find_map(|batch| Some((batch.experiments.iter().position(is_of)?, batch)));
         let last = config.learning.generations;
-        let at_hand = batch.as_ref().map_or(last, |(arm, batch)| batch.trainer.generation(*arm));
+        let at_hand = batch.as_ref().map_or(last, |(experiment, batch)| batch.trainer.generation(*experiment));
         let generation = generation.unwrap_or(at_hand).min(last);
-        if let Some((arm, batch)) = batch.filter(|_| at_hand == generation) {
-            batch.keep(arm, &mut self.kept)?;
+        if let Some((experiment, batch)) = batch.filter(|_| at_hand == generation) {
+            batch.keep(experiment, &mut self.kept)?;
         }
-        let mut trainer = Trainer::of_trial(&config.validate()?, trial);
+        let mut trainer = Trainer::of_trial(config, trial);
         let before = self.kept.snapshots.range((run, trial, 0)..=(run, trial, generation)).next_back();
         if let Some((_, snapshot)) = before {
             // The sizes always match. If they did not, training from the start would give the same result.
@@ -161,7 +167,7 @@ impl Training {
             // Then followers are drawn with the leader that they saw most.
             played.led.clear();
         }
-        Ok(replay::detailed("", &config, &[played]))
+        Ok(replay::detailed("", config, &[played]))
     }
 
     /// Returns the results of a run's trials that this worker has finished.
@@ -170,13 +176,14 @@ impl Training {
     /// needed, as f32.
     pub fn ends(&mut self, run: usize) -> Result<Answer, Refusal> {
         let (mut words, mut numbers) = (Vec::new(), Vec::<u8>::new());
-        for Batch { trainer, arms } in self.batches.iter_mut().filter(|batch| batch.trainer.is_done()) {
-            let own: Vec<usize> = (0..arms.len()).filter(|&arm| arms[arm].0 == run).collect();
-            for ((policies, end), &arm) in trainer.ends(&own).into_iter().zip(&own) {
+        for Batch { trainer, experiments } in self.batches.iter_mut().filter(|batch| batch.trainer.is_done()) {
+            let own: Vec<usize> =
+                (0..experiments.len()).filter(|&experiment| experiments[experiment].0 == run).collect();
+            for ((policies, end), &experiment) in trainer.ends(&own).into_iter().zip(&own) {
                 for (trial, (policies, fitness)) in policies.iter().zip(&end.fitness).enumerate() {
                     let weights = end.weights.get(trial).copied().unwrap_or_default();
                     words.push(json!({
-                        "trial": arms[arm].1.unwrap_or(trial),
+                        "trial": experiments[experiment].1.unwrap_or(trial),
                         "policies": policies.len(),
                         "numbers": policies.len() + fitness.len() + weights.len(),
                     }));
@@ -191,10 +198,11 @@ impl Training {
 }
 
 impl Batch {
-    /// Keeps a snapshot of each trial of an arm.
-    fn keep(&mut self, arm: usize, kept: &mut Kept) -> Result<(), Refusal> {
-        let (run, alone) = self.arms[arm];
-        let Snapshot { generation, last, weights, fitness, pending } = self.trainer.snapshot(arm).map_err(refuse)?;
+    /// Keeps a snapshot of each trial of an experiment.
+    fn keep(&mut self, experiment: usize, kept: &mut Kept) -> Result<(), Refusal> {
+        let (run, alone) = self.experiments[experiment];
+        let Snapshot { generation, last, weights, fitness, pending } =
+            self.trainer.snapshot(experiment).map_err(refuse)?;
         for (trial, ((weights, fitness), pending)) in weights.into_iter().zip(fitness).zip(pending).enumerate() {
             let snapshot =
                 Snapshot { generation, last, weights: vec![weights], fitness: vec![fitness], pending: vec![pending] };

@@ -13,9 +13,10 @@ use std::path::{Path, PathBuf};
 
 use super::checkpoint::{self, Checkpoint};
 use super::disk::Disk;
+pub(crate) use super::ownership::CHECKPOINTS;
 use super::ownership::{self, CURVES, REPLAY};
 pub(crate) use super::ownership::{ARMS, PAPER, POINTS, RESULTS};
-pub use super::ownership::{CHECKPOINTS, CONFIG, METRICS, POLICIES, RUN, SWEEP};
+pub use super::ownership::{CONFIG, METRICS, POLICIES, RUN, SWEEP};
 use super::{RecordError, metrics, read_text};
 use crate::config::Config;
 use crate::file;
@@ -24,8 +25,8 @@ mod paths;
 mod resume;
 mod run;
 
-pub use paths::{around, collection, latest, owner};
-pub(crate) use paths::{holds_run, next_free};
+pub use paths::{around, collection, owner};
+pub(crate) use paths::{holds_run, latest, next_free};
 pub use resume::{FirstAndLastRows, differences};
 pub(crate) use run::RunSums;
 pub use run::{FileSums, Origin, Run, Status, now};
@@ -42,11 +43,11 @@ const MAX_KEPT_BYTES: u64 = 1 << 20;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Start {
-    /// Fail.
+    /// Fails if the folder holds a run.
     Fresh,
-    /// Replace the run.
+    /// Replaces the run.
     Force,
-    /// Resume the run, or start one if there is none.
+    /// Resumes the run, or starts one if there is none.
     Resume,
 }
 
@@ -119,7 +120,7 @@ pub enum Note {
 }
 
 impl Note {
-    /// Returns whether the user must be warned. The other notes are normal for a resumed run.
+    /// Reports whether the user must be warned. The other notes are normal for a resumed run.
     pub fn is_damage(&self) -> bool {
         matches!(self, Note::SetAside(_) | Note::Rewritten(_) | Note::StartingOver | Note::NotLocked)
     }
@@ -181,13 +182,13 @@ impl Folder {
         }
         let lock = lock(&disk, path)?;
         // Another process may have written here before the lock was taken, so the check is repeated.
-        let there = holds_run()?;
+        let holds_run = holds_run()?;
         let folder = Folder { path: path.into(), disk, lock };
         let mut found = Resumed { checkpoint: None, kept: vec![], run: None, finished: None, notes: vec![] };
         found.notes.extend(folder.lock.is_none().then_some(Note::NotLocked));
         let interrupted = Run::read(&folder.file(RUN)).ok().filter(|run| run.state == Status::Replacing);
         match (start, interrupted) {
-            (Start::Force, _) if there => {
+            (Start::Force, _) if holds_run => {
                 folder.clear(&Run { init: from.digest(), ..Run::new(config) }, config, &mut found)?;
             }
             (Start::Resume, Some(run)) => {
@@ -219,10 +220,10 @@ impl Folder {
     /// Records in `run.json` what a run starts from. A finished run that is extended is marked as running, so that its
     /// files are no longer compared with outdated digests.
     fn record_origin(&self, config: &Config, from: StartFrom<'_>, found: &mut Resumed) -> Result<(), RecordError> {
-        let there = found.checkpoint.as_ref().and_then(|(checkpoint, _)| checkpoint.init.clone());
+        let init = found.checkpoint.as_ref().and_then(|(checkpoint, _)| checkpoint.init.clone());
         let before = found.run.clone();
         let mut run = before.clone().unwrap_or_else(|| Run::new(config));
-        run.init = from.digest().or(there).or(run.init);
+        run.init = from.digest().or(init).or(run.init);
         if run.state == Status::Done {
             run = Run { state: Status::Running, digest: None, files: None, ..run };
         }
@@ -257,7 +258,7 @@ impl Folder {
                 return Ok(Some(path));
             }
             // An interrupted session already made this copy.
-            if read_text(&path, MAX_KEPT_BYTES).is_ok_and(|there| there == text) {
+            if read_text(&path, MAX_KEPT_BYTES).is_ok_and(|existing| existing == text) {
                 return Ok(Some(path));
             }
         }
@@ -269,7 +270,7 @@ impl Folder {
     fn clear(&self, by: &Run, config: &Config, found: &mut Resumed) -> Result<(), RecordError> {
         self.write_run(&Run { state: Status::Replacing, ..by.clone() })?;
         let checkpoints = self.file(CHECKPOINTS);
-        let generations = checkpoint::tidy(&self.disk, &checkpoints)?;
+        let generations = checkpoint::remove_temporary_files(&self.disk, &checkpoints)?;
         let old = generations.into_iter().map(|generation| checkpoint::path(&checkpoints, generation));
         for path in old.chain([METRICS, POLICIES].map(|name| self.file(name))) {
             self.disk.remove(&path).map_err(RecordError::write(&path))?;
@@ -359,7 +360,7 @@ pub(crate) fn lock(disk: &Disk, path: &Path) -> Result<Option<File>, RecordError
     }
 }
 
-/// Returns whether the file system does not support locks. NFS without its lock service returns `ENOLCK`.
+/// Reports whether the file system does not support locks. NFS without its lock service returns `ENOLCK`.
 fn has_no_locks(error: &io::Error) -> bool {
     const ENOLCK: i32 = if cfg!(target_os = "linux") { 37 } else { 77 };
     error.kind() == ErrorKind::Unsupported || cfg!(unix) && error.raw_os_error() == Some(ENOLCK)

@@ -8,7 +8,7 @@ use super::{ARMS, CHECKPOINTS, CONFIG, LOCK, METRICS, PAPER, POINTS, POLICIES, R
 use crate::file;
 use crate::record::RecordError;
 
-/// Returns whether a folder contains any file of a run.
+/// Reports whether a folder contains any file of a run.
 pub(crate) fn holds_run(path: &Path) -> Result<bool, RecordError> {
     for name in [CONFIG, RUN, METRICS, POLICIES, CHECKPOINTS] {
         let name = path.join(name);
@@ -77,7 +77,7 @@ pub(crate) fn next_free(parent: &Path, stem: &str) -> Result<PathBuf, RecordErro
 }
 
 /// Returns the last existing path of `stem`, `stem-2`, …, or `stem` if none exists.
-pub fn latest(parent: &Path, stem: &str) -> PathBuf {
+pub(crate) fn latest(parent: &Path, stem: &str) -> PathBuf {
     numbered(parent, stem, newest(parent, stem).max(1))
 }
 

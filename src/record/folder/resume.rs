@@ -29,7 +29,7 @@ impl Folder {
         let (checkpoints, init) = (self.file(CHECKPOINTS), from.digest());
         let init = init.as_deref();
         self.refuse_newer(&checkpoints)?;
-        let mut kept = checkpoint::tidy(&self.disk, &checkpoints)?;
+        let mut kept = checkpoint::remove_temporary_files(&self.disk, &checkpoints)?;
         let before = self.compare(config, found, !kept.is_empty())?;
         match Run::read(&self.file(RUN)) {
             Ok(run) => found.run = Some(run),
@@ -40,14 +40,14 @@ impl Folder {
         found.finished = found.run.as_ref().map_or(Ok(None), |run| self.finished(run, config))?;
         let began = found.run.as_ref().map(|run| run.init.clone());
         if found.finished.is_some() {
-            return began.map_or(Ok(()), |there| self.started_alike(there, init));
+            return began.map_or(Ok(()), |existing| self.check_init(existing, init));
         }
         // If the config file agrees with the given config but the origin does not, then the file was edited.
         let edited = || {
             let origin = found.run.as_ref()?.origin.as_ref().filter(|origin| !origin.allows(config))?;
-            let (path, there, here) = (self.path.clone(), origin.generations, config.learning.generations);
-            Some(match there > here {
-                true => RecordError::Shorter { path, there, here },
+            let (path, existing, requested) = (self.path.clone(), origin.generations, config.learning.generations);
+            Some(match existing > requested {
+                true => RecordError::Shorter { path, existing, requested },
                 false if before.is_some() => RecordError::Edited { path: self.file(CONFIG) },
                 false => {
                     let differences = vec![format!("  {} has another digest", self.file(RUN).display())];
@@ -62,7 +62,7 @@ impl Folder {
             // Checkpoints of earlier versions lack the number of generations. The config in the folder has it.
             let reason = match checkpoint::read(&path, &self.file(POLICIES), before.as_ref().unwrap_or(config)) {
                 Ok(Some(checkpoint)) if checkpoint.is_of(config) => {
-                    self.started_alike(checkpoint.init.clone(), init)?;
+                    self.check_init(checkpoint.init.clone(), init)?;
                     let metrics = self.file(METRICS);
                     let resumed = metrics::Writer::resume(&self.disk, &metrics, &checkpoint.metrics, config);
                     match resumed.map_err(RecordError::write(&metrics))? {
@@ -90,8 +90,8 @@ impl Folder {
                 Err(error) => return Err(error),
             };
             found.notes.push(Note::SetAside(reason));
-            let aside = checkpoint::aside(&path);
-            self.disk.rename(&path, &aside).map_err(RecordError::write(&aside))?;
+            let damaged = checkpoint::quarantine_path(&path);
+            self.disk.rename(&path, &damaged).map_err(RecordError::write(&damaged))?;
             kept.pop();
         }
         if let Some(edited) = edited.filter(|_| found.checkpoint.is_none()) {
@@ -103,10 +103,10 @@ impl Folder {
                 return Err(RecordError::OriginUnknown { path: self.path.clone() });
             }
         }
-        if let Some(there) = began.filter(|_| found.checkpoint.is_none()) {
-            self.started_alike(there.clone(), init)?;
-            if let Some(there) = there.filter(|_| init.is_none()) {
-                return Err(RecordError::InitNeeded { path: self.path.clone(), there });
+        if let Some(existing) = began.filter(|_| found.checkpoint.is_none()) {
+            self.check_init(existing.clone(), init)?;
+            if let Some(existing) = existing.filter(|_| init.is_none()) {
+                return Err(RecordError::InitNeeded { path: self.path.clone(), existing });
             }
         }
         found.notes.push(match &found.checkpoint {
@@ -133,10 +133,10 @@ impl Folder {
     }
 
     /// Fails if the given policies are not those that the run started from.
-    fn started_alike(&self, there: Option<String>, here: Option<&str>) -> Result<(), RecordError> {
-        match here {
-            Some(here) if there.as_deref() != Some(here) => {
-                Err(RecordError::InitDiffers { path: self.path.clone(), there, here: here.into() })
+    fn check_init(&self, existing: Option<String>, requested: Option<&str>) -> Result<(), RecordError> {
+        match requested {
+            Some(requested) if existing.as_deref() != Some(requested) => {
+                Err(RecordError::InitDiffers { path: self.path.clone(), existing, requested: requested.into() })
             }
             _ => Ok(()),
         }
@@ -148,13 +148,13 @@ impl Folder {
         let path = self.file(CONFIG);
         match Config::load(&path) {
             Ok(before) => {
-                let (there, here) = (before.learning.generations, config.learning.generations);
+                let (existing, requested) = (before.learning.generations, config.learning.generations);
                 let mut as_long = before.clone();
-                as_long.learning.generations = here;
-                if there > here && differences(&as_long, config).is_empty() {
-                    return Err(RecordError::Shorter { path: self.path.clone(), there, here });
+                as_long.learning.generations = requested;
+                if existing > requested && differences(&as_long, config).is_empty() {
+                    return Err(RecordError::Shorter { path: self.path.clone(), existing, requested });
                 }
-                let differences = differences(if there < here { &as_long } else { &before }, config);
+                let differences = differences(if existing < requested { &as_long } else { &before }, config);
                 if !differences.is_empty() {
                     return Err(RecordError::ConfigDiffers { path: self.path.clone(), differences });
                 }
@@ -224,7 +224,7 @@ impl Folder {
         }
         let path = self.file(POLICIES);
         let policies = policies::read_all(&path, config);
-        let (of_config, checksum) = policies::mark(&path);
+        let (of_config, checksum) = policies::digests_in(&path);
         if policies.is_ok() && of_config != Some(config_digest(config)) {
             return Ok(None);
         }
@@ -263,10 +263,14 @@ pub fn differences(old: &Config, new: &Config) -> Vec<String> {
     for index in 0..MAX_STAGES {
         match [stage(&old, index), stage(&new, index)] {
             [None, None] => break,
-            [there, here] if there == here => {}
-            [there, here] => {
+            [existing, requested] if existing == requested => {}
+            [existing, requested] => {
                 let describe = |stage: Option<toml::Value>| stage.as_ref().map_or("nothing".into(), shorten);
-                differences.push(format!("  stages[{index}]: {} there, {} here", describe(there), describe(here)));
+                differences.push(format!(
+                    "  stages[{index}]: {} there, {} here",
+                    describe(existing),
+                    describe(requested)
+                ));
             }
         }
     }

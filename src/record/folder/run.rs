@@ -73,7 +73,7 @@ impl Origin {
         Origin { config: config_digest(config), generations: config.learning.generations }
     }
 
-    /// Returns whether a run with this origin may be resumed with a config.
+    /// Reports whether a run with this origin may be resumed with a config.
     pub(super) fn allows(&self, config: &Config) -> bool {
         self.generations <= config.learning.generations
             && self.config == config_digest(&checkpoint::of_length(config, self.generations))
@@ -172,7 +172,7 @@ fn newer_version(text: &str) -> Option<String> {
         version.split(['-', '+']).next()?.split('.').map(|number| number.parse().ok()).collect()
     };
     let version = serde_json::from_str::<serde_json::Value>(text).ok()?.get("version")?.as_str()?.to_string();
-    (numbers(&version)? > numbers(crate::VERSION)?).then_some(version)
+    (numbers(&version)? > numbers(crate::version::VERSION)?).then_some(version)
 }
 
 /// Returns the current time in UTC, such as "2026-01-31T23:59:59Z".

@@ -2,7 +2,7 @@
 
 use glam::DVec2;
 
-use super::{Legend, Marker, Poi, Team, Viewport, count, poi_label};
+use super::{Legend, Marker, Poi, Team, Viewport, counted, poi_label};
 use crate::config::{Config, Observers};
 use crate::model::rule::Rule;
 use crate::report::scene::{Anchor, BLACK, Scene};
@@ -47,7 +47,7 @@ pub fn layout(name: &str, config: &Config) -> Scene {
         }
         (_, Some(_)) => format!("number at a POI: agents it needs, within {radius} of it"),
         (Some(&needed), None) if alike => {
-            format!("each POI needs {} within {radius} of it", count(needed as usize, "agent"))
+            format!("each POI needs {} within {radius} of it", counted(needed as usize, "agent"))
         }
         _ => format!("what each POI needs has no room here; it counts within {radius} of it"),
     };
@@ -62,8 +62,12 @@ pub fn layout(name: &str, config: &Config) -> Scene {
     let room = whole - 2.0 * EDGE;
     let mut scene = Scene::new(whole, HEAD + height + 9.5 + legend.height(room) + 0.5);
     let followers = world.followers();
-    let described =
-        format!("{}, {}, {}", count(leaders, "leader"), count(followers, "follower"), count(team.pois.len(), "POI"));
+    let described = format!(
+        "{}, {}, {}",
+        counted(leaders, "leader"),
+        counted(followers, "follower"),
+        counted(team.pois.len(), "POI")
+    );
     scene.bold([EDGE, 4.2], described.clone(), 3.0, Anchor::Start, BLACK);
     view.draw(&mut scene, &team);
     view.rule(&mut scene);
@@ -71,7 +75,7 @@ pub fn layout(name: &str, config: &Config) -> Scene {
     scene.title = format!("The layout of {name}: {described}");
     let couplings = match (world.coupling.iter().min(), world.coupling.iter().max()) {
         (Some(least), Some(most)) if least == most => {
-            format!("Each POI needs {} near at once", count(*least as usize, "agent"))
+            format!("Each POI needs {} near at once", counted(*least as usize, "agent"))
         }
         (Some(least), Some(most)) => format!("A POI needs {least} to {most} agents near at once"),
         _ => String::new(),

@@ -63,9 +63,10 @@ const DASHES: [&[f64]; 3] = [&[], &[0.9, 0.5], &[0.3, 0.35]];
 /// Dashes of the circle around a POI that cannot be observed now.
 const CLOSED: &[f64] = &[0.3, 1.2];
 
-/// Font sizes of labels, in millimetres: the usual one and the smallest.
+/// Usual font size of labels, in millimetres.
 const LABEL: f64 = 2.4;
-const LEAST: f64 = 1.9;
+/// Minimum font size of labels, in millimetres.
+const MIN_LABEL: f64 = 1.9;
 const PALE: Color = [250, 250, 250];
 /// Colour of secondary text.
 pub(crate) const FAINT: Color = [95, 95, 95];
@@ -254,7 +255,7 @@ impl Viewport {
 
     /// Returns each POI label's position and font size, or none if labels would overlap.
     fn poi_labels(&self, team: &Team) -> Option<Vec<([f64; 2], f64)>> {
-        [LABEL, LEAST].into_iter().find_map(|size| {
+        [LABEL, MIN_LABEL].into_iter().find_map(|size| {
             let crosses: Vec<_> = team.pois.iter().map(|poi| around(self.at(poi.place), 0.8)).collect();
             let mut taken: Vec<[f64; 4]> = Vec::new();
             let whole = self.whole();
@@ -282,14 +283,14 @@ impl Viewport {
         })
     }
 
-    /// Draws the leaders' numbers beside their arrows, as far as there is room.
+    /// Draws the leaders' numbers beside their arrows, if there is room.
     fn numbers(&self, scene: &mut Scene, team: &Team, mut taken: Vec<[f64; 4]>) {
         // More numbers than this never fit, and trying takes time.
-        const MOST: usize = 256;
+        const MAX_NUMBERS: usize = 256;
         let arrow = self.agent_size(team) * 1.35;
-        let leaders = &team.agents[..team.leaders.min(MOST)];
+        let leaders = &team.agents[..team.leaders.min(MAX_NUMBERS)];
         let arrows: Vec<_> = leaders.iter().map(|leader| around(self.at(leader.place), arrow * 0.6)).collect();
-        let size = if team.leaders > 20 { LEAST } else { LABEL };
+        let size = if team.leaders > 20 { MIN_LABEL } else { LABEL };
         for (number, leader) in leaders.iter().enumerate() {
             let [x, y] = self.at(leader.place);
             let text = number.to_string();
@@ -342,7 +343,7 @@ impl Viewport {
 }
 
 /// Formats a count as "1 leader" or "2 leaders".
-pub fn count(number: usize, what: &str) -> String {
+pub(crate) fn counted(number: usize, what: &str) -> String {
     format!("{number} {what}{}", if number == 1 { "" } else { "s" })
 }
 

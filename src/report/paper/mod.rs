@@ -151,7 +151,7 @@ impl Experiment {
 }
 
 /// Returns the configs to play baselines of, one per layout and paradigm. The fitness does not matter for them.
-pub fn grounds(arms: &[Experiment]) -> Vec<Config> {
+pub fn baseline_configs(arms: &[Experiment]) -> Vec<Config> {
     let firsts = arms.iter().filter(|arm| arm.fitness == FITNESSES[0] && !arm.selects);
     firsts.map(|arm| arm.config.clone()).collect()
 }
@@ -161,7 +161,7 @@ pub fn grounds(arms: &[Experiment]) -> Vec<Config> {
 pub struct Evidence<'a> {
     /// The experiments of [`arms()`], with their results.
     pub arms: &'a [Experiment],
-    /// The baselines of [`grounds`].
+    /// The baselines of [`baseline_configs`].
     pub baselines: &'a [Baseline],
 }
 
@@ -201,7 +201,7 @@ impl std::fmt::Display for Source {
 
 /// The results of one source for one layout and paradigm.
 #[derive(Clone, Copy, Debug)]
-pub struct Course<'a> {
+pub struct TrialCurves<'a> {
     /// G of the champion, `[trials][generations + 1]`. For baselines, the same as `best`.
     pub champion: &'a [Vec<f64>],
     /// G of the best team, `[trials][generations + 1]`.
@@ -214,13 +214,13 @@ pub struct Course<'a> {
 
 impl Evidence<'_> {
     /// Returns the results of a source on one of [`LAYOUTS`]. None if there are no such arms.
-    pub fn course(&self, layout: usize, paradigm: Paradigm, source: Source) -> Option<Course<'_>> {
+    pub fn curves(&self, layout: usize, paradigm: Paradigm, source: Source) -> Option<TrialCurves<'_>> {
         let name = LAYOUTS.get(layout)?.name;
         let is_here = |arm: &&Experiment| (arm.layout.name, arm.paradigm, arm.selects) == (name, paradigm, false);
         let mut here = self.arms.iter().filter(is_here);
         let pois = here.clone().next()?.pois();
-        let ground = PARADIGMS.len() * layout + PARADIGMS.iter().position(|&other| other == paradigm)?;
-        let baseline = self.baselines.get(ground);
+        let index = PARADIGMS.len() * layout + PARADIGMS.iter().position(|&other| other == paradigm)?;
+        let baseline = self.baselines.get(index);
         let (champion, best) = match source {
             Source::Constant => (&baseline?.constant, &baseline?.constant),
             Source::Actions => (&baseline?.actions, &baseline?.actions),
@@ -231,18 +231,18 @@ impl Evidence<'_> {
         };
         // The paper's starts are fixed. If starts or POIs move, results depend on the trial.
         let certain = source == Source::Constant && best.windows(2).all(|pair| pair[0] == pair[1]);
-        Some(Course { champion, best, pois, certain })
+        Some(TrialCurves { champion, best, pois, certain })
     }
 
     /// Returns the results of all-leaders teams on one of [`LAYOUTS`] that choose among known behaviours.
-    pub(crate) fn selecting(&self, layout: usize, fitness: Fitness) -> Option<Course<'_>> {
+    pub(crate) fn selecting(&self, layout: usize, fitness: Fitness) -> Option<TrialCurves<'_>> {
         let name = LAYOUTS.get(layout)?.name;
         let arm = self.arms.iter().find(|arm| (arm.layout.name, arm.selects, arm.fitness) == (name, true, fitness))?;
-        Some(Course { champion: &arm.champion, best: &arm.best, pois: arm.pois(), certain: false })
+        Some(TrialCurves { champion: &arm.champion, best: &arm.best, pois: arm.pois(), certain: false })
     }
 }
 
-impl Course<'_> {
+impl TrialCurves<'_> {
     /// Returns the POIs that the champion observed, per trial. None if the run is shorter.
     pub fn observed(&self, generation: usize) -> Option<Vec<f64>> {
         self.champion.iter().map(|trial| Some(trial.get(generation)? * self.pois as f64)).collect()
@@ -292,13 +292,13 @@ pub fn figure(results: Evidence<'_>, layout: usize) -> Figure {
         title: format!("({letter}) {}", title(paradigm)),
         curves: sources
             .iter()
-            .filter_map(|&source| results.course(layout, paradigm, source))
-            .map(|course| course.curve())
+            .filter_map(|&source| results.curves(layout, paradigm, source))
+            .map(|curves| curves.curve())
             .enumerate()
             .collect(),
         stages: vec![],
     };
-    let pois = |paradigm| results.course(layout, paradigm, evolved[0]).map_or(1.0, |course| course.pois as f64);
+    let pois = |paradigm| results.curves(layout, paradigm, evolved[0]).map_or(1.0, |curves| curves.pois as f64);
     Figure {
         panels: ["a", "b"].into_iter().zip(PARADIGMS).map(panel).collect(),
         legend: evolved.map(|source| source.to_string()).to_vec(),
@@ -373,8 +373,8 @@ impl Trajectory {
     /// Returns every curve by layout, paradigm and source. The curves of teams that choose among behaviours follow.
     pub fn all(results: Evidence<'_>) -> Vec<Trajectory> {
         let mut all = Vec::new();
-        let mut add = |layout: usize, paradigm, source: Source, selects, course: Option<Course<'_>>| {
-            let Some(course) = course else { return };
+        let mut add = |layout: usize, paradigm, source: Source, selects, curves: Option<TrialCurves<'_>>| {
+            let Some(curves) = curves else { return };
             let fitness = if let Source::Evolved(fitness) = source { Some(fitness) } else { None };
             all.push(Trajectory {
                 layout: LAYOUTS[layout].name,
@@ -382,16 +382,20 @@ impl Trajectory {
                 source: source.to_string(),
                 fitness,
                 selects,
-                pois: course.pois,
-                curve: course.curve(),
-                deviation: course.tallies().iter().map(Average::deviation).collect(),
-                best_mean: Course { champion: course.best, ..course }.tallies().iter().map(Average::mean).collect(),
+                pois: curves.pois,
+                curve: curves.curve(),
+                deviation: curves.tallies().iter().map(Average::deviation).collect(),
+                best_mean: TrialCurves { champion: curves.best, ..curves }
+                    .tallies()
+                    .iter()
+                    .map(Average::mean)
+                    .collect(),
             });
         };
         for layout in 0..LAYOUTS.len() {
             for paradigm in PARADIGMS {
                 for source in SOURCES {
-                    add(layout, paradigm, source, false, results.course(layout, paradigm, source));
+                    add(layout, paradigm, source, false, results.curves(layout, paradigm, source));
                 }
             }
         }

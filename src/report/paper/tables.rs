@@ -25,26 +25,26 @@ pub fn without_learning(results: Evidence<'_>) -> String {
     for (layout, name) in LAYOUTS.iter().enumerate() {
         for paradigm in PARADIGMS {
             let name = format!("{}, {paradigm}", name.name);
-            let course = |source| results.course(layout, paradigm, source);
-            let pois = course(SOURCES[0]).map_or(0, |course| course.pois);
+            let curves = |source| results.curves(layout, paradigm, source);
+            let pois = curves(SOURCES[0]).map_or(0, |curves| curves.pois);
             let mut row = vec![name.clone(), pois.to_string()];
             row.extend(SOURCES.map(|source| {
-                let Some((course, observed)) = course(source).and_then(|c| Some((c, c.observed(last)?))) else {
+                let Some((curves, observed)) = curves(source).and_then(|c| Some((c, c.observed(last)?))) else {
                     return String::new();
                 };
-                let best = course.observed_by_best(last).filter(|_| matches!(source, Source::Evolved(_)));
+                let best = curves.observed_by_best(last).filter(|_| matches!(source, Source::Evolved(_)));
                 let best = best.map(|best| format!(" ({:.2})", best.iter().collect::<Average>().mean()));
                 let champion = match statistics::mean(&observed, 1.0).map(|mean| mean.within(0.0, pois as f64)) {
-                    Some(mean) if !course.certain => format!("{:.2} [{:.2}, {:.2}]", mean.value, mean.low, mean.high),
+                    Some(mean) if !curves.certain => format!("{:.2} [{:.2}, {:.2}]", mean.value, mean.low, mean.high),
                     _ => observed.first().map_or(String::new(), |pois| format!("{pois:.2}")),
                 };
                 champion + &best.unwrap_or_default()
             }));
             rows.push(row);
-            let random = course(Source::Random).and_then(|course| course.observed_by_any(last)).unwrap_or_default();
+            let random = curves(Source::Random).and_then(|curves| curves.observed_by_any(last)).unwrap_or_default();
             let mut race = vec![name.clone()];
             race.extend(SOURCES[3..].iter().map(|&source| {
-                let evolved = course(source).and_then(|course| course.observed_by_any(last)).unwrap_or_default();
+                let evolved = curves(source).and_then(|curves| curves.observed_by_any(last)).unwrap_or_default();
                 let lead: Vec<f64> = evolved.iter().zip(&random).map(|(evolved, random)| evolved - random).collect();
                 let within = |mean: statistics::Estimate| mean.within(-(pois as f64), pois as f64);
                 let Some(mean) = statistics::mean(&lead, 1.0).map(within) else { return "open: takes 2 trials".into() };
@@ -56,7 +56,7 @@ pub fn without_learning(results: Evidence<'_>) -> String {
                 format!("{word}: {:+.2} [{:.2}, {:.2}]", mean.value, mean.low, mean.high).replace('-', "−")
             }));
             races.push(race);
-            let constant = course(Source::Constant).and_then(|course| course.observed(last)).unwrap_or_default();
+            let constant = curves(Source::Constant).and_then(|curves| curves.observed(last)).unwrap_or_default();
             if !constant.is_empty() && constant.iter().all(|&observed| observed >= pois as f64) {
                 solved.push(name);
             }

@@ -53,12 +53,13 @@ impl Replayed {
 
     /// Describes the state after a step in a sentence.
     fn say(&self, step: usize) -> String {
-        const MOST: usize = 12;
+        const MAX_LISTED_TIMES: usize = 12;
         let (world, pois) = (&self.world, self.world.pois.len());
         let times = self.observed.iter().enumerate().filter_map(|(poi, observed)| Some((poi, (*observed)?)));
         let times: Vec<_> = times.filter(|&(_, observed)| observed <= step).collect();
-        let list: Vec<_> = times.iter().take(MOST).map(|(poi, step)| format!("POI {poi} at step {step}")).collect();
-        let more = if times.len() > MOST { " and more" } else { "" };
+        let list: Vec<_> =
+            times.iter().take(MAX_LISTED_TIMES).map(|(poi, step)| format!("POI {poi} at step {step}")).collect();
+        let more = if times.len() > MAX_LISTED_TIMES { " and more" } else { "" };
         format!(
             "{} of {}, step {step} of {}: {} of {pois} POIs observed{}{}{more}, by a team of {} and {}.",
             self.name(),
@@ -67,8 +68,8 @@ impl Replayed {
             times.len(),
             if list.is_empty() { "" } else { ": " },
             list.join(", "),
-            map::count(world.leaders(), "leader"),
-            map::count(world.followers(), "follower"),
+            map::counted(world.leaders(), "leader"),
+            map::counted(world.followers(), "follower"),
         )
     }
 }
@@ -177,9 +178,10 @@ pub struct Film {
     pub fps: u32,
 }
 
-/// Default number of frames per second. The next one is the longest film in seconds; longer episodes play faster.
+/// Default number of frames per second.
 pub(crate) const FPS: u32 = 20;
-const LONGEST: f64 = 15.0;
+/// Maximum length of a film. Longer episodes play faster.
+const MAX_FILM_SECONDS: f64 = 15.0;
 
 /// The frames of a film.
 pub(crate) struct Frames<'a> {
@@ -195,7 +197,10 @@ impl<'a> Frames<'a> {
         let steps = played.first().map_or(0, |first| first.world.steps()) as f64;
         let seconds = steps * config.world.dt;
         let times = [1.0, 2.0, 4.0, 5.0, 8.0, 10.0, 16.0, 20.0, 32.0, 50.0];
-        let faster = times.into_iter().find(|times| seconds / times <= LONGEST).unwrap_or((seconds / LONGEST).ceil());
+        let faster = times
+            .into_iter()
+            .find(|times| seconds / times <= MAX_FILM_SECONDS)
+            .unwrap_or((seconds / MAX_FILM_SECONDS).ceil());
         let each = faster / (f64::from(motion.fps) * config.world.dt);
         let places = (0..).map(|frame| f64::from(frame) * each).take_while(|&place| place < steps - 1e-6);
         let places: Vec<f64> = places.chain([steps]).collect();

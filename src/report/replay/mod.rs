@@ -42,7 +42,7 @@ pub enum ReplayError {
     /// The run has no such trial.
     #[error("{folder} has no trial {trial}: its config has {}", numbered(*trials, "trial"))]
     NoTrial {
-        /// The run directory.
+        /// The run's folder.
         folder: String,
         /// The requested trial, from 0.
         trial: usize,
@@ -55,7 +55,7 @@ pub enum ReplayError {
         newest.map_or(String::new(), |newest| format!("; the newest is {newest}: choose one up to that"))
     )]
     NoGeneration {
-        /// The run directory.
+        /// The run's folder.
         folder: String,
         /// The requested trial, from 0.
         trial: usize,
@@ -78,7 +78,7 @@ pub enum ReplayError {
          generation {generation}"
     )]
     NoStart {
-        /// The run directory.
+        /// The run's folder.
         folder: String,
         /// The requested generation, from 0.
         generation: usize,
@@ -90,7 +90,7 @@ pub enum ReplayError {
          replay it"
     )]
     Differs {
-        /// The run directory.
+        /// The run's folder.
         folder: String,
         /// Whose G differs: "best team" or "champion".
         who: &'static str,
@@ -110,7 +110,7 @@ pub enum ReplayError {
 
 /// Formats a count and its indices as "3 trials, 0 to 2" or "1 trial, 0".
 pub(crate) fn numbered(count: usize, what: &str) -> String {
-    format!("{}, {}", map::count(count, what), places(count))
+    format!("{}, {}", map::counted(count, what), places(count))
 }
 
 /// Formats the indices of a count as "0 to 2" or "0".
@@ -267,7 +267,7 @@ pub fn replay(
     watch: &mut dyn FnMut(usize) -> bool,
 ) -> Result<Vec<Replayed>, ReplayError> {
     let name = || folder.escaped().to_string();
-    let config = runs::config(folder, verification)?;
+    let config = runs::config(folder, verification)?.validate().map_err(BackendError::from)?;
     let trials = config.learning.trials;
     if trial >= trials {
         return Err(ReplayError::NoTrial { folder: name(), trial, trials });
@@ -288,7 +288,7 @@ pub fn replay(
     let mut order: Vec<usize> = (0..generations.len()).collect();
     order.sort_by_key(|&index| generations[index]);
     let mut played: Vec<Option<Replayed>> = generations.iter().map(|_| None).collect();
-    let mut trainer = Trainer::of_trial(&config.validate().map_err(BackendError::from)?, trial);
+    let mut trainer = Trainer::of_trial(&config, trial);
     for index in order {
         let generation = generations[index];
         // The champion is in its slot only after its generation is over.
@@ -309,11 +309,11 @@ pub fn replay(
         }
         let (found, g) = match which {
             Which::Champion => {
-                let found = champion(&config.at(generation), &mut trainer, trial, backend)?;
+                let found = champion(config.at(generation), &mut trainer, trial, backend)?;
                 let g = found.team_g;
                 (found, g)
             }
-            _ => team(&config.at(generation), &mut trainer, trial, which, backend)?,
+            _ => team(config.at(generation), &mut trainer, trial, which, backend)?,
         };
         let expected = rows.get(generation, which).unwrap_or(f64::NAN);
         if g != expected {

@@ -151,7 +151,7 @@ impl Study {
         let Some((source, places)) = self.warm_from else { return vec![] };
         let run = |(at, &(index, from)): (usize, &(usize, &'static str))| Warm {
             from,
-            config: point.config.clone(),
+            config: Config::clone(&point.config),
             folder: out.join(self.name).join("warm").join(format!("{:04}-{at}", point.index)),
             policies: out.join(source).join("points").join(format!("{index:04}")).join(POLICIES),
         };
@@ -219,7 +219,7 @@ impl Study {
                     comparison::compare(&place, &arms, &comparison::Question { at, reach, paired: false })?
                 }
             };
-            rows.push(OfPlace { panel, name, comparison });
+            rows.push(AnswerRow { panel, name, comparison });
         }
         Ok(Answer { part: *self, rows })
     }
@@ -296,7 +296,7 @@ pub fn champions(path: &Path, config: &Config) -> Result<Vec<f32>, RecordError> 
     let (leaders, trials, parameters) = (config.learners(), config.learning.trials, config.parameters());
     let mut champions = vec![0.0; leaders * trials * parameters];
     for trial in 0..trials {
-        let Policies { policies, weights } = policies::read(path, config, Some(trial))?;
+        let Policies { policies, weights, .. } = policies::read(path, config, Some(trial))?;
         for (leader, population) in weights.chunks(policies * parameters).enumerate() {
             champions[(leader * trials + trial) * parameters..][..parameters]
                 .copy_from_slice(&population[..parameters]);
@@ -308,11 +308,11 @@ pub fn champions(path: &Path, config: &Config) -> Result<Vec<f32>, RecordError> 
 /// The results of a study.
 pub struct Answer {
     part: Study,
-    rows: Vec<OfPlace>,
+    rows: Vec<AnswerRow>,
 }
 
 /// The comparison of the arms at one combination of the other axes.
-struct OfPlace {
+struct AnswerRow {
     panel: Option<String>,
     name: String,
     comparison: Comparison,
@@ -346,7 +346,7 @@ impl Answer {
             head.extend(
                 self.part.pairs.iter().map(|&[one, other]| format!("{} − {}", arms[one].name, arms[other].name)),
             );
-            let rows = self.rows.iter().map(|OfPlace { panel, name, comparison }| {
+            let rows = self.rows.iter().map(|AnswerRow { panel, name, comparison }| {
                 let Measured { arms, pairs, .. } = &comparison.measures[at];
                 let place: Vec<&str> =
                     panel.iter().chain(Some(name).filter(|name| !name.is_empty())).map(|word| &**word).collect();
@@ -387,7 +387,7 @@ impl Answer {
     pub fn scene(&self) -> Scene {
         let reported: Vec<_> = self.reported().into_iter().filter(|(_, measure)| measure.digits() > 1).collect();
         let mut groups: Vec<(String, Vec<String>)> = Vec::new();
-        for OfPlace { name, comparison, .. } in &self.rows {
+        for AnswerRow { name, comparison, .. } in &self.rows {
             if !groups.iter().any(|(other, _)| other == name) {
                 groups.push((name.clone(), comparison.arms.iter().map(|arm| arm.name.clone()).collect()));
             }

@@ -1,11 +1,11 @@
 //! The paper's claims, layout by layout, as data: a sentence, what represents it, and the criterion.
 
-use super::{Band, Course, Criterion, END, FEW, Lookup, SMALL, SOURCES, Source, Test, less};
+use super::{ALMOST_NEVER, Band, Criterion, END, Lookup, SMALL, SOURCES, Source, Test, TrialCurves, less};
 use crate::statistics;
 
 const ABOVE_0: Band = [f64::MIN_POSITIVE, f64::INFINITY];
 const BELOW_0: Band = [f64::NEG_INFINITY, 0.0];
-const MOST: Band = [0.5 + f64::EPSILON, f64::INFINITY];
+const IN_MOST_TRIALS: Band = [0.5 + f64::EPSILON, f64::INFINITY];
 
 /// Returns a claim about every source on the paper's own experiments, which needs all generations.
 const fn claim(
@@ -84,7 +84,7 @@ const MORE_RELIABLY: Test = claim(
         let (led, all) = (view.led()?.observed(END)?, view.all()?.observed(END)?);
         let pairs = || led.iter().zip(&all).map(|(led, all)| (*led >= pois, *all >= pois));
         let odd = pairs().filter(|(led, all)| led != all).count();
-        Some(Criterion::Share(pairs().filter(|pair| *pair == (true, false)).count(), odd, MOST))
+        Some(Criterion::Share(pairs().filter(|pair| *pair == (true, false)).count(), odd, IN_MOST_TRIALS))
     },
 );
 
@@ -112,7 +112,7 @@ const FASTER_THAN_SELECTING: Test =
 ///
 /// If a side observes all in fewer than half of its trials, most of its times are censored. The sign test then replaces
 /// the mean.
-fn sooner(one: Course<'_>, other: Course<'_>, factor: usize) -> Option<Criterion> {
+fn sooner(one: TrialCurves<'_>, other: TrialCurves<'_>, factor: usize) -> Option<Criterion> {
     let (one, other) = (one.solved(END)?, other.solved(END)?);
     let censored = |times: &[Option<usize>]| 2 * times.iter().flatten().count() < times.len();
     let time = |solved: Option<usize>| solved.unwrap_or(END + 1);
@@ -120,7 +120,7 @@ fn sooner(one: Course<'_>, other: Course<'_>, factor: usize) -> Option<Criterion
     if censored(&one) || censored(&other) {
         let untied = pairs().filter(|(one, other)| one != other);
         let sooner = untied.clone().filter(|&(one, other)| one.is_some() && factor * time(one) <= time(other));
-        return Some(Criterion::Share(sooner.count(), untied.count(), MOST));
+        return Some(Criterion::Share(sooner.count(), untied.count(), IN_MOST_TRIALS));
     }
     let less = |(one, other): (Option<usize>, Option<usize>)| match one.or(other) {
         None => 0.0,
@@ -200,7 +200,7 @@ pub(super) const TESTS: &[(usize, &[Test])] = &[
                 |view| {
                     let all = view.all()?;
                     let any = all.observed_by(END)?.iter().filter(|&&pois| pois > 0.0).count();
-                    Some(Criterion::Share(any, all.trials(), [0.0, FEW]))
+                    Some(Criterion::Share(any, all.trials(), [0.0, ALMOST_NEVER]))
                 },
             )
             .about(ALONE),
@@ -269,7 +269,7 @@ pub(super) const TESTS: &[(usize, &[Test])] = &[
                     Some(Criterion::Share(
                         all.observed_by_best(0)?.iter().filter(|&&pois| pois > 0.0).count(),
                         all.trials(),
-                        MOST,
+                        IN_MOST_TRIALS,
                     ))
                 },
             )
@@ -279,7 +279,13 @@ pub(super) const TESTS: &[(usize, &[Test])] = &[
                 "Fig. 6",
                 "all-leaders: “able to solve the problem some of the time”",
                 "all-leaders, trials that ever observe all 4 up to generation 100: 1 in 10 to 9 in 10",
-                |view| Some(Criterion::Share(view.all()?.count_solved(END)?, view.all()?.trials(), [FEW, 1.0 - FEW])),
+                |view| {
+                    Some(Criterion::Share(
+                        view.all()?.count_solved(END)?,
+                        view.all()?.trials(),
+                        [ALMOST_NEVER, 1.0 - ALMOST_NEVER],
+                    ))
+                },
             )
             .about(ALONE),
             claim(
@@ -311,7 +317,7 @@ pub(super) const TESTS: &[(usize, &[Test])] = &[
                 "distance of a trial's POIs at generation 100 from the median trial's, leader-follower less \
                   all-leaders, by pair (Brown-Forsythe): below 0",
                 |view| {
-                    let distances = |course: Course<'_>| Some(statistics::distances(&course.observed(END)?));
+                    let distances = |curves: TrialCurves<'_>| Some(statistics::distances(&curves.observed(END)?));
                     Some(Criterion::Difference(less(&distances(view.led()?)?, &distances(view.all()?)?), BELOW_0))
                 },
             ),

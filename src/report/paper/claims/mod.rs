@@ -2,7 +2,7 @@
 //!
 //! Each claim has one measure and, for each source of policies, a verdict. It is *yes* if the interval lies within what
 //! the words allow, *no* if it lies outside, and *not decided* if it contains the threshold. If the paper gives no
-//! number, [`SMALL`] and [`FEW`] replace its words.
+//! number, [`SMALL`] and [`ALMOST_NEVER`] replace its words.
 //!
 //! All measures are of champions, unless a claim is about random teams. The paper's curves are averages over trials, so
 //! claims about curves are judged by averages. The verdicts on evolved teams are corrected for each other using Holm's
@@ -12,7 +12,7 @@
 
 use serde::Serialize;
 
-use super::{Course, Evidence, LAYOUTS, SOURCES, Source};
+use super::{Evidence, LAYOUTS, SOURCES, Source, TrialCurves};
 use crate::config::Paradigm;
 use crate::statistics::{self, Estimate};
 
@@ -21,7 +21,7 @@ mod list;
 /// Maximum difference, as a share of the POIs, that counts as "about similar", "comparable" or "slight".
 pub(crate) const SMALL: f64 = 0.1;
 /// Maximum share of trials that counts as "almost never". A larger share is "some of the time".
-pub(crate) const FEW: f64 = 0.1;
+pub(crate) const ALMOST_NEVER: f64 = 0.1;
 /// The generation at which the paper judges results: "After 100 generations".
 pub const END: usize = 100;
 
@@ -190,18 +190,18 @@ struct Lookup<'a> {
 }
 
 impl<'a> Lookup<'a> {
-    fn course(&'a self, paradigm: Paradigm) -> Option<Course<'a>> {
-        self.results.course(self.layout, paradigm, self.source)
+    fn curves(&'a self, paradigm: Paradigm) -> Option<TrialCurves<'a>> {
+        self.results.curves(self.layout, paradigm, self.source)
     }
 
     /// Returns the results of all-leaders teams.
-    fn all(&'a self) -> Option<Course<'a>> {
-        self.course(Paradigm::AllLeaders)
+    fn all(&'a self) -> Option<TrialCurves<'a>> {
+        self.curves(Paradigm::AllLeaders)
     }
 
     /// Returns the results of leader-follower teams.
-    fn led(&'a self) -> Option<Course<'a>> {
-        self.course(Paradigm::LeaderFollower)
+    fn led(&'a self) -> Option<TrialCurves<'a>> {
+        self.curves(Paradigm::LeaderFollower)
     }
 
     /// Returns the POIs observed by leader-follower teams minus those by all-leaders teams at generation [`END`], per
@@ -213,19 +213,19 @@ impl<'a> Lookup<'a> {
     /// Returns the difference of a measure between two sources of leader-follower teams at generation [`END`], per
     /// pair.
     fn between(&self, by: Source, other: Source, measure: fn(&[f64]) -> Vec<f64>) -> Option<Vec<f64>> {
-        let course = |source| self.results.course(self.layout, Paradigm::LeaderFollower, source)?.observed(END);
-        Some(less(&measure(&course(by)?), &measure(&course(other)?)))
+        let curves = |source| self.results.curves(self.layout, Paradigm::LeaderFollower, source)?.observed(END);
+        Some(less(&measure(&curves(by)?), &measure(&curves(other)?)))
     }
 
     /// Returns the results of all-leaders teams that choose among known behaviours.
-    fn selecting(&'a self) -> Option<Course<'a>> {
+    fn selecting(&'a self) -> Option<TrialCurves<'a>> {
         let Source::Evolved(fitness) = self.source else { return None };
         self.results.selecting(self.layout, fitness)
     }
 
     /// Returns a share of the POIs as a number of POIs.
     fn pois(&self, share: f64) -> f64 {
-        share * self.led().map_or(0, |course| course.pois) as f64
+        share * self.led().map_or(0, |curves| curves.pois) as f64
     }
 }
 
@@ -234,7 +234,7 @@ fn less(values: &[f64], others: &[f64]) -> Vec<f64> {
     values.iter().zip(others).map(|(value, other)| value - other).collect()
 }
 
-impl Course<'_> {
+impl TrialCurves<'_> {
     /// Returns the first generation at which each trial's champion observes every POI. None within a trial means never
     /// up to `last`.
     fn solved(&self, last: usize) -> Option<Vec<Option<usize>>> {
@@ -296,7 +296,7 @@ impl Test {
     fn finding(&self, view: Lookup<'_>) -> Option<Finding> {
         let source = view.source;
         let column = SOURCES.iter().position(|&other| other == source)?;
-        let course = view.led()?;
+        let curves = view.led()?;
         let of = match self.sources {
             list::EVOLVED => format!("{source} − {}", list::next(source)),
             [list::G, list::D] | [list::G] => format!("{} − {source}", list::DF),
@@ -305,13 +305,13 @@ impl Test {
         let without = |verdict, measured: String| {
             Some(Finding { column, of: of.clone(), verdict, measured, estimate: None, p: None, p_holm: None })
         };
-        if course.champion.iter().any(|trial| trial.len() <= self.needs) {
+        if curves.champion.iter().any(|trial| trial.len() <= self.needs) {
             return without(Verdict::Open, format!("takes {} generations", self.needs));
         }
-        if course.trials() < 2 && !course.certain {
+        if curves.trials() < 2 && !curves.certain {
             return without(Verdict::Open, "takes 2 trials".into());
         }
-        let found = (self.find)(view)?.find(column, of.clone(), course.certain, course.pois as f64);
+        let found = (self.find)(view)?.find(column, of.clone(), curves.certain, curves.pois as f64);
         found.or_else(|| without(Verdict::Undecided, "no pair differs".into()))
     }
 }

@@ -1,4 +1,4 @@
-//! Compares arms: what was trained, or runs that were opened.
+//! Compares experiments: those that were trained, or runs that were opened.
 
 use std::path::PathBuf;
 
@@ -14,9 +14,9 @@ use crate::answer::{Refusal, refuse};
 /// G whose first generation is compared, as in `flotilla compare`.
 const REACH: f64 = 0.75;
 
-/// An arm of a comparison.
+/// An experiment of a comparison.
 #[derive(Deserialize)]
-pub struct Arm {
+pub struct Experiment {
     name: String,
     text: String,
     /// The number of generations that each trial has played, including generation 0.
@@ -25,23 +25,23 @@ pub struct Arm {
 
 /// Returns the curves of the best teams with their 95 % intervals, and the tables of `flotilla compare`.
 ///
-/// `bytes` are G of the best team and of the champion as f64, `[arms][trials][generations][2]`. If the arms cannot be
+/// `bytes` are G of the best team and of the champion as f64, `[experiments][trials][generations][2]`. If they cannot be
 /// compared, `refused` says why, and there are no tables.
-pub fn compare(arms: Vec<Arm>, bytes: &[u8]) -> Result<Value, Refusal> {
+pub fn compare(experiments: Vec<Experiment>, bytes: &[u8]) -> Result<Value, Refusal> {
     let numbers: Vec<f64> = bytemuck::pod_collect_to_vec(&bytes[..bytes.len() / 8 * 8]);
     let mut pairs = numbers.as_chunks::<2>().0;
     let (mut cohorts, mut curves) = (Vec::new(), Vec::new());
-    for Arm { name, text, lengths } in arms {
+    for Experiment { name, text, lengths } in experiments {
         let config = Config::parse(&text, "the config")?;
         // A training that was stopped may have played some trials further than others.
         let shared = lengths.iter().copied().min().unwrap_or(0);
         let (mut trials, mut best) = (Vec::new(), vec![Average::default(); shared]);
         for (trial, length) in lengths.into_iter().enumerate() {
-            let (course, rest) = pairs.split_at_checked(length).ok_or_else(|| refuse("the rows are incomplete"))?;
+            let (scores, rest) = pairs.split_at_checked(length).ok_or_else(|| refuse("the rows are incomplete"))?;
             pairs = rest;
-            best.iter_mut().zip(course).for_each(|(best, [g, _])| best.add(*g));
+            best.iter_mut().zip(scores).for_each(|(best, [g, _])| best.add(*g));
             let key = (config.learning.seed, trial);
-            trials.push(Trial { key, course: course.to_vec(), from: config.last_from() });
+            trials.push(Trial { key, scores: scores.to_vec(), from: config.last_from() });
         }
         let (curve, _) = Curve::new(&best).thinned();
         let band = curve.outline(Band::Interval, 1.0);

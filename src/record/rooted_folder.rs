@@ -9,7 +9,7 @@ use std::io::{self, ErrorKind};
 use std::path::{Component, Path, PathBuf};
 
 /// A folder that is kept open.
-pub struct Root {
+pub struct RootedFolder {
     path: PathBuf,
     handle: Handle,
 }
@@ -34,10 +34,10 @@ pub(crate) struct FolderEntry {
     path: PathBuf,
 }
 
-impl Root {
+impl RootedFolder {
     /// Opens a folder. Links in its path are followed.
-    pub fn open(path: &Path) -> io::Result<Root> {
-        Ok(Root { path: path.into(), handle: system::open(path)? })
+    pub fn open(path: &Path) -> io::Result<RootedFolder> {
+        Ok(RootedFolder { path: path.into(), handle: system::open(path)? })
     }
 
     /// Returns the path of the folder as it was given.
