@@ -9,7 +9,7 @@ use crate::backend::gpu::device::Traffic;
 use crate::backend::gpu::episode::{GpuBackend, Stages};
 use crate::backend::{Backend, BackendError, Group, Weights};
 use crate::config::{Config, Coupling};
-use crate::evolve::{Key, Purpose, random_policy, teams_of};
+use crate::evolve::{Key, Purpose, random_policy, contemporary_teams};
 use crate::host::Instant;
 use crate::sweep::layout::{self, MAX_FOLLOWERS, MAX_GROUPS};
 use crate::trainer::{Times, Trainer};
@@ -237,7 +237,7 @@ fn rollout(
     }
     // Teams with past champions take as long as others, which stand in for them.
     let count = config.max_teams() - 1;
-    let teams: Vec<u32> = teams_of(&config.learning, 0, 0, leaders).into_iter().cycle().take(count * leaders).collect();
+    let teams: Vec<u32> = contemporary_teams(&config.learning, 0, 0, leaders).into_iter().cycle().take(count * leaders).collect();
     // If generations play from the device's memory, so do these rollouts.
     let held = backend.hold(&weights, [config.populations(), population, world.parameters()])?;
     let played = held.as_deref().map_or(weights[..].into(), Weights::OnDevice);
