@@ -361,13 +361,14 @@ fn a_recovered_error_is_reported_once() {
 fn populations_too_large_for_the_device_stay_on_the_host() {
     for (request, info) in support::adapters("populations_too_large_for_the_device_stay_on_the_host") {
         let gpu = gpu::open(device::Request { default_limits: true, ..request }).unwrap();
-        // The smallest size above WebGPU's 128 MiB. The weights can be empty, because they are not read.
+        // The smallest size above WebGPU's 128 MiB.
         let sizes = [1, (128 << 20) / 4 / 112 + 1, 112];
+        let large = vec![0.0; sizes.iter().product()];
         let open = |holding| GpuBackend::new(gpu.clone()).unwrap().with_residency(holding);
-        assert!(open(ResidencyPolicy::From(1)).hold(&[], sizes).unwrap().is_none(), "{info}");
-        let error = open(ResidencyPolicy::Always).hold(&[], sizes).unwrap_err().to_string();
+        assert!(open(ResidencyPolicy::From(1)).hold(&large, sizes).unwrap().is_none(), "{info}");
+        let error = open(ResidencyPolicy::Always).hold(&large, sizes).unwrap_err().to_string();
         assert!(error.contains("134217") && error.contains("breed on the host"), "{info}: {error}");
-        assert!(open(ResidencyPolicy::Never).hold(&[], [1, 2, 1]).unwrap().is_none(), "{info}");
+        assert!(open(ResidencyPolicy::Never).hold(&[0.0; 2], [1, 2, 1]).unwrap().is_none(), "{info}");
         // The default policy holds populations from `HELD_FROM` bytes on, except on software renderers.
         let weights = vec![0.0; HELD_FROM as usize / 4];
         let mut backend = GpuBackend::new(gpu.clone()).unwrap();
