@@ -216,7 +216,7 @@ impl<'a> MutationList<'a> {
         let mut fields = scratch.chunks_exact_mut(room);
         let mut field = || fields.next().expect("there is room for eight");
         let (masks, indices, positions, bits) = (field(), field(), field(), field());
-        let keys = std::array::from_fn(|_| field());
+        let keys = [field(), field(), field(), field()];
         MutationList { parameters, masks, count: 0, indices, positions, bits, keys }
     }
 
