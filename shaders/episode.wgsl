@@ -49,7 +49,7 @@ struct Agent {
     hx: f32,
     hy: f32,
     speed: f32,
-    next: Course,
+    next: Steering,
     // The number of steps at which it saw each leader.
     seen: array<u32, SIGHTS>,
     // For the trace: a leader's inputs and outputs, or a follower's force.
@@ -120,7 +120,7 @@ fn lead(task: Task, first: u32, me: ptr<function, Agent>) {
         (*me).outputs = outputs;
     }
     let heading = turn(hx, hy, wanted_turn(outputs.x));
-    (*me).next = Course(heading.x, heading.y, wanted_speed(outputs.y));
+    (*me).next = Steering(heading.x, heading.y, wanted_speed(outputs.y));
 }
 
 // Returns the index in the record of a follower's count of a leader.
@@ -148,11 +148,11 @@ fn follow(task: Task, first: u32, me: ptr<function, Agent>) {
             influence(place.x - x, place.y - y, &sums);
         }
     }
-    let pull = force(sums, x, y);
+    let force = force(sums, x, y);
     if TRACE {
-        (*me).force = vec2(pull.x, pull.y);
+        (*me).force = vec2(force.x, force.y);
     }
-    (*me).next = steer(pull, sizes(pull), (*me).hx, (*me).hy, (*me).speed);
+    (*me).next = steer(force, sizes(force), (*me).hx, (*me).hy, (*me).speed);
 }
 
 // Moves the agent.
@@ -170,7 +170,7 @@ fn move_agent(me: ptr<function, Agent>) {
 
 // Records the agents at each POI after a step, from positions that start at `now`. One thread per POI, word and team,
 // from the last thread on, because followers finish before leaders.
-fn couple(task: Task, step: u32, now: u32, thread: u32) {
+fn record_poi_sets(task: Task, step: u32, now: u32, thread: u32) {
     let rows = shape.pois * shape.words;
     for (var item = WORKGROUP - 1u - thread; item < rows * shape.teams; item += WORKGROUP) {
         let team = item % shape.teams;
@@ -191,7 +191,7 @@ fn couple(task: Task, step: u32, now: u32, thread: u32) {
 
 // Records which leaders each follower sees before a step, from positions that start at `now`. One thread per follower,
 // word and team.
-fn watch(task: Task, step: u32, now: u32, thread: u32) {
+fn record_sightings(task: Task, step: u32, now: u32, thread: u32) {
     let followers = shape.agents - shape.leaders;
     let words = (shape.leaders + 31u) / 32u;
     let rows = followers * words;
@@ -298,7 +298,7 @@ fn episode(
     for (var step = task.first; step < task.end; step++) {
         let next = SHARED - now;
         if SIGHTED {
-            watch(task, step, now, thread);
+            record_sightings(task, step, now, thread);
         }
         for (var slot = 0u; slot < SLOTS; slot++) {
             var me = agents[slot];
@@ -317,7 +317,7 @@ fn episode(
             agents[slot] = me;
         }
         workgroupBarrier();
-        couple(task, step, next, thread);
+        record_poi_sets(task, step, next, thread);
         now = next;
     }
     for (var slot = 0u; slot < SLOTS; slot++) {

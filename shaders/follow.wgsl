@@ -12,18 +12,18 @@ struct Sums {
 }
 
 // A heading and the wanted speed along it.
-struct Course {
+struct Steering {
     hx: f32,
     hy: f32,
     speed: f32,
 }
 
-// Returns whether a follower sees the agent at offset (`dx`, `dy`): it is within the attraction radius.
+// Reports whether a follower sees the agent at offset (`dx`, `dy`): it is within the attraction radius.
 fn sees(dx: f32, dy: f32) -> bool {
     return within(dx, dy, world.attraction_radius2);
 }
 
-// Adds the agent at offset (`dx`, `dy`), and returns whether the follower sees it.
+// Adds the agent at offset (`dx`, `dy`), and reports whether the follower sees it.
 fn influence(dx: f32, dy: f32, sums: ptr<function, Sums>) -> bool {
     let seen = within(dx, dy, world.attraction_radius2);
     if seen {
@@ -71,8 +71,8 @@ fn force(sums: Sums, x: f32, y: f32) -> SteeringForce {
 }
 
 // Returns the squared size of a force, and the inverse of its size.
-fn sizes(pull: SteeringForce) -> vec2<f32> {
-    let force2 = pull.x * pull.x + pull.y * pull.y;
+fn sizes(force: SteeringForce) -> vec2<f32> {
+    let force2 = force.x * force.x + force.y * force.y;
     return vec2(force2, rsqrt(force2));
 }
 
@@ -80,25 +80,25 @@ fn sizes(pull: SteeringForce) -> vec2<f32> {
 //
 // No angle is computed. The sine or cosine shows whether the force's direction is within the maximum turn. If so, it
 // becomes the heading. Otherwise the heading turns by the maximum, to the side of the force.
-fn steer(pull: SteeringForce, sizes: vec2<f32>, hx: f32, hy: f32, speed: f32) -> Course {
+fn steer(force: SteeringForce, sizes: vec2<f32>, hx: f32, hy: f32, speed: f32) -> Steering {
     let force2 = sizes.x;
     let inverse = sizes.y;
-    let ux = pull.x * inverse;
-    let uy = pull.y * inverse;
+    let ux = force.x * inverse;
+    let uy = force.y * inverse;
     let along = hx * ux + hy * uy;
     let across = hx * uy - hy * ux;
     let sine = select(0.0 - world.max_turn_sin, world.max_turn_sin, across >= 0.0);
     let turned = rotate(hx, hy, world.max_turn_cos, sine);
-    let pulled = force2 > 0.0;
+    let has_force = force2 > 0.0;
     // A cosine near 1 cannot resolve small angles, and a sine near 1 cannot resolve large ones. Without a force,
     // `along` is 0.
-    var reached = along >= world.max_turn_cos && pulled;
+    var reached = along >= world.max_turn_cos && has_force;
     if variant.by_sine != 0u {
         reached = along > 0.0 && abs(across) <= world.max_turn_sin;
     }
-    let next_x = select(select(hx, turned.x, pulled), ux, reached);
-    let next_y = select(select(hy, turned.y, pulled), uy, reached);
+    let next_x = select(select(hx, turned.x, has_force), ux, reached);
+    let next_y = select(select(hy, turned.y, has_force), uy, reached);
     let ahead = select(world.min_speed, force2 * inverse, along > 0.0);
-    let wanted = select(speed, select(0.0, ahead, pulled), pull.influenced);
-    return Course(next_x, next_y, wanted);
+    let wanted = select(speed, select(0.0, ahead, has_force), force.influenced);
+    return Steering(next_x, next_y, wanted);
 }

@@ -23,19 +23,19 @@ struct Packed {
 @group(0) @binding(3) var<storage, read> least: array<u32>;
 @group(0) @binding(4) var<storage, read_write> packed: Packed;
 
-// Rows per team, and their offsets, or NOWHERE if they do not fit.
+// Rows per team, and the offsets of their sets, or NOWHERE if these do not fit.
 var<workgroup> rows: array<atomic<u32>, TEAMS>;
-var<workgroup> homes: array<u32, TEAMS>;
+var<workgroup> offsets: array<u32, TEAMS>;
 
-// Returns how many sets of one POI of one team are kept. Unless `home` is NOWHERE, writes them there, and empty sets up
-// to `all` rows.
-fn keep(task: Task, sizes: Sizes, team: u32, poi: u32, home: u32, all: u32) -> u32 {
+// Returns how many sets of one POI of one team are kept. Unless `offset` is NOWHERE, writes them there, and empty sets
+// up to `all` rows.
+fn keep(task: Task, sizes: Sizes, team: u32, poi: u32, offset: u32, all: u32) -> u32 {
     let row = sizes.pois * sizes.words * task.teams;
     let first = task.sets + poi * sizes.words * task.teams + team;
     let enough = least[task.least + poi];
     var kept = 0u;
     // The offset of the set that is kept unless the next one contains it.
-    var held = NOWHERE;
+    var candidate = NOWHERE;
     for (var step = 0u; step < sizes.steps; step++) {
         var size = 0u;
         var more = 0u;
@@ -43,8 +43,8 @@ fn keep(task: Task, sizes: Sizes, team: u32, poi: u32, home: u32, all: u32) -> u
         for (var word = 0u; word < sizes.words; word++) {
             let now = record[first + step * row + word * task.teams];
             var before = 0u;
-            if held != NOWHERE {
-                before = record[first + held + word * task.teams];
+            if candidate != NOWHERE {
+                before = record[first + candidate + word * task.teams];
             }
             size += countOneBits(now);
             more |= now & ~before;
@@ -52,31 +52,31 @@ fn keep(task: Task, sizes: Sizes, team: u32, poi: u32, home: u32, all: u32) -> u
         }
         if size >= enough && more != 0u {
             if less != 0u {
-                if home != NOWHERE {
-                    copy(task, sizes, first + held, home + (kept * sizes.pois + poi) * sizes.words);
+                if offset != NOWHERE {
+                    copy(task, sizes, first + candidate, offset + (kept * sizes.pois + poi) * sizes.words);
                 }
                 kept += 1u;
             }
-            held = step * row;
+            candidate = step * row;
         }
     }
-    if held != NOWHERE {
-        if home != NOWHERE {
-            copy(task, sizes, first + held, home + (kept * sizes.pois + poi) * sizes.words);
+    if candidate != NOWHERE {
+        if offset != NOWHERE {
+            copy(task, sizes, first + candidate, offset + (kept * sizes.pois + poi) * sizes.words);
         }
         kept += 1u;
     }
-    for (var empty = kept; home != NOWHERE && empty < all; empty++) {
+    for (var empty = kept; offset != NOWHERE && empty < all; empty++) {
         for (var word = 0u; word < sizes.words; word++) {
-            packed.words[home + (empty * sizes.pois + poi) * sizes.words + word] = 0u;
+            packed.words[offset + (empty * sizes.pois + poi) * sizes.words + word] = 0u;
         }
     }
     return kept;
 }
 
-fn copy(task: Task, sizes: Sizes, place: u32, home: u32) {
+fn copy(task: Task, sizes: Sizes, place: u32, offset: u32) {
     for (var word = 0u; word < sizes.words; word++) {
-        packed.words[home + word] = record[place + word * task.teams];
+        packed.words[offset + word] = record[place + word * task.teams];
     }
 }
 
@@ -137,19 +137,19 @@ fn pack(
         for (var team = 0u; team < task.teams; team++) {
             size += atomicLoad(&rows[team]) * row;
         }
-        var home = atomicAdd(&packed.used, size);
-        let fits = home + size <= packed.room;
+        var offset = atomicAdd(&packed.used, size);
+        let fits = offset + size <= packed.room;
         for (var team = 0u; team < task.teams; team++) {
-            homes[team] = select(NOWHERE, home, fits);
-            packed.words[task.table + team] = home;
-            home += atomicLoad(&rows[team]) * row;
+            offsets[team] = select(NOWHERE, offset, fits);
+            packed.words[task.table + team] = offset;
+            offset += atomicLoad(&rows[team]) * row;
         }
-        packed.words[task.table + task.teams] = home;
+        packed.words[task.table + task.teams] = offset;
     }
     workgroupBarrier();
     for (var item = thread; item < items; item += WORKGROUP) {
         let team = item % task.teams;
-        keep(task, sizes, team, item / task.teams, homes[team], atomicLoad(&rows[team]));
+        keep(task, sizes, team, item / task.teams, offsets[team], atomicLoad(&rows[team]));
     }
     let nobody = select(0xffffu, 0xffu, sizes.leaders < 255u);
     let bits = select(16u, 8u, sizes.leaders < 255u);

@@ -1,5 +1,5 @@
-// Populations that stay on the device. `breed` makes a leader's next generation from the CPU's plan; `gather` lays out
-// the weights of a batch's teams for the episode. One buffer holds one leader's policies, `[slots][parameters]`.
+// Populations that stay on the device. `breed` makes a population's next generation from the host's plan; `gather` lays
+// out the weights of a batch's teams for the episode. One buffer holds one population, `[slots][parameters]`.
 //
 // The host prepends:
 //   WORKGROUP            threads per workgroup, a multiple of TILE
@@ -16,7 +16,7 @@ const UNCHANGED: u32 = 0x80000000u;
 @group(0) @binding(2) var<storage, read> plan: array<u32>;
 @group(0) @binding(3) var<storage, read> policies: array<f32>;
 @group(0) @binding(4) var<storage, read_write> children: array<f32>;
-// Per leader the number of workgroups that finished, over all generations.
+// Per population the number of workgroups that finished, over all generations.
 @group(0) @binding(5) var<storage, read_write> finished: array<atomic<u32>>;
 
 @group(0) @binding(1) var<storage, read> job: GatherJob;
@@ -24,7 +24,7 @@ const UNCHANGED: u32 = 0x80000000u;
 @group(0) @binding(2) var<storage, read> choices: array<u32>;
 // Per task `[fours of a policy's weights][leaders][teams]`.
 @group(0) @binding(4) var<storage, read_write> weights: array<vec4<f32>>;
-// The policies of the leaders after the first.
+// The populations of the leaders after the first.
 @group(0) @binding(5) var<storage, read> policies_1: array<f32>;
 @group(0) @binding(6) var<storage, read> policies_2: array<f32>;
 @group(0) @binding(7) var<storage, read> policies_3: array<f32>;
@@ -64,7 +64,7 @@ fn breed(
     }
     storageBarrier();
     if thread == 0u {
-        atomicAdd(&finished[breed_job.leader], 1u);
+        atomicAdd(&finished[breed_job.population], 1u);
     }
 }
 

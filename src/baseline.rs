@@ -330,7 +330,7 @@ impl Setting {
     fn start(&mut self, generation: usize) {
         for Trial { index, starts, observed, .. } in &mut self.trials {
             for (episode, starts) in starts.iter_mut().enumerate() {
-                evolve::places(&self.config.learning, *index, generation, episode, &self.world, starts);
+                evolve::episode_positions(&self.config.learning, *index, generation, episode, &self.world, starts);
             }
             observed.clear();
         }
@@ -396,7 +396,14 @@ impl Setting {
         let mut starts = vec![vec![]; episodes as usize];
         for (episode, starts) in starts.iter_mut().enumerate() {
             // No training plays this generation's starts.
-            evolve::places(&self.config.learning, trial.index, generations + 2, episode, &self.world, starts);
+            evolve::episode_positions(
+                &self.config.learning,
+                trial.index,
+                generations + 2,
+                episode,
+                &self.world,
+                starts,
+            );
         }
         let candidates = [&all[..], &actions, &networks].concat();
         let mut weights = Vec::new();

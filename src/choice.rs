@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use crate::backend::cpu::Cpu;
-use crate::backend::gpu::device::{self, AdapterInfo, DeviceError, Wanted};
+use crate::backend::gpu::device::{self, AdapterChoice, AdapterInfo, DeviceError};
 use crate::backend::gpu::episode::{GpuBackend, ResidencyPolicy};
 use crate::backend::{Backend, BackendError};
 use crate::config::Config;
@@ -147,7 +147,7 @@ pub fn find(
             return Ok(Chosen::cpu(choice.reason));
         }
         let found = device::adapters();
-        measured = device::position(&Wanted::Real, &found).ok().and_then(|index| recall(&found[index]));
+        measured = device::position(&AdapterChoice::Real, &found).ok().and_then(|index| recall(&found[index]));
         let choice = measured.and_then(|measured| choose(work, threads, Some(measured)));
         if let Some(choice) = choice.filter(|choice| !choice.gpu) {
             return Ok(Chosen::cpu(choice.reason));

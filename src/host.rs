@@ -1,10 +1,9 @@
-//! The clock, blocking waits, threads and the cache. No other module uses the system's directly.
+//! The clock, blocking waits, threads and the cache. Only this module asks the system for them.
 //!
-//! Native programs use the system's. WebAssembly has neither, so its embedder provides them with `install`. Without a
-//! clock, time stands still there. Without a way to park, waiting polls in a loop.
+//! WebAssembly has no clock and cannot block, so its embedder provides both with `install`. Without that, time stands
+//! still, and waiting polls in a loop.
 
-/// Asks the processor to load numbers into its cache, and does not wait for them. A no-op on processors other than
-/// x86-64.
+/// Asks the processor to load numbers into its cache, without waiting for them. A no-op except on x86-64.
 #[inline(always)]
 pub(crate) fn prefetch(numbers: &[f32]) {
     #[cfg(target_arch = "x86_64")]
@@ -52,7 +51,7 @@ mod embedded {
 
     /// The functions of an embedder.
     pub struct Host {
-        /// Returns the time since a fixed moment, and never less than before.
+        /// Returns the time since a fixed moment. It never decreases.
         pub now: fn() -> Duration,
         /// Returns the time since the start of 1970.
         pub since_1970: fn() -> Duration,
@@ -98,7 +97,7 @@ mod embedded {
         }
     }
 
-    /// Waits until a future is ready, and parks meanwhile as the host does.
+    /// Blocks until a future is ready, using the embedder's `park`.
     #[cfg(feature = "gpu")]
     pub fn wait<F: Future>(future: F) -> F::Output {
         use std::sync::Arc;
@@ -134,17 +133,17 @@ mod threads {
     use std::sync::{OnceLock, mpsc};
     use std::{io, thread};
 
-    /// How many threads a process asked for, and how many it has.
+    /// The threads that a process asked for and has.
     #[derive(Clone, Copy, Debug, PartialEq, Eq)]
     pub struct Threads {
-        /// How many it asked for.
+        /// The number that was asked for.
         pub wanted: usize,
-        /// How many the system let it start; with 0, all work is done by the thread that asked.
+        /// The number that could be started. If it is 0, the thread that asked does all work.
         pub started: usize,
     }
 
     impl Threads {
-        /// Whether there are fewer threads than were asked for.
+        /// Reports whether there are fewer threads than were asked for.
         pub(crate) fn is_short(&self) -> bool {
             self.started < self.wanted
         }
@@ -161,11 +160,11 @@ mod threads {
         }
     }
 
-    /// Starts the threads of this process: so many, or one per core (or what `RAYON_NUM_THREADS` says). Only the first
-    /// call does anything; later calls return what it returned.
+    /// Starts the threads of this process. The default is `RAYON_NUM_THREADS`, or else one per core. Only the first call
+    /// does anything; later calls return what it returned.
     ///
-    /// rayon cannot be asked again after a thread could not be started. So the threads are started first, and rayon
-    /// gets those that there are.
+    /// If rayon fails to start a thread, it cannot be set up again. So this starts the threads first, and rayon gets
+    /// those that could be started.
     pub fn start(threads: Option<usize>) -> Threads {
         static STARTED: OnceLock<Threads> = OnceLock::new();
         *STARTED.get_or_init(|| start_now(threads.unwrap_or_else(usual)))
@@ -191,7 +190,7 @@ mod threads {
         (0..wanted).map_while(|_| spawn().ok()).collect()
     }
 
-    /// Returns what makes threads that wait into threads of a pool.
+    /// Returns a function that turns one waiting thread at a time into a thread of rayon's pool.
     fn hand_over(workers: Vec<Worker>) -> impl FnMut(rayon::ThreadBuilder) -> io::Result<()> {
         let mut workers = workers.into_iter();
         move |thread| {
@@ -210,7 +209,7 @@ mod threads {
         };
         match built {
             Ok(()) => Threads { wanted, started },
-            // The process has started its own threads before.
+            // The process has already started a pool.
             Err(_) => Threads { wanted: rayon::current_num_threads(), started: rayon::current_num_threads() },
         }
     }

@@ -2,6 +2,8 @@
 //!
 //! Results do not depend on the number of threads, because parallel tasks write to disjoint memory.
 
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
 #[cfg(feature = "parallel")]
 pub(crate) use rayon::{current_num_threads, join, prelude::*, scope};
 
@@ -11,39 +13,46 @@ pub use crate::host::{Threads, start};
 #[cfg(not(feature = "parallel"))]
 pub(crate) use sequential::*;
 
-/// Work that a thread of its own does, or where none can be started this one.
+/// Locks a mutex, also after another thread panicked while it held the lock.
+pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Work on a thread of its own. If no thread can be started, [`BackgroundTask::start`] does the work itself.
 #[cfg(feature = "record")]
-pub(crate) enum Aside<T> {
+pub(crate) enum BackgroundTask<T> {
     Running(std::thread::JoinHandle<T>),
     Done(T),
 }
 
 #[cfg(feature = "record")]
-impl<T: Send + 'static> Aside<T> {
-    /// Starts the work; without another thread, comes back when it is done.
-    pub(crate) fn start<W: FnOnce() -> T + Send + 'static>(work: W) -> Aside<T> {
-        use std::sync::{Arc, Mutex, PoisonError};
-        // A thread that cannot be started takes along what it was given, so it only gets a share.
-        let place = Arc::new(Mutex::new(Some(work)));
-        let take = |place: &Mutex<Option<W>>| place.lock().unwrap_or_else(PoisonError::into_inner).take();
-        let shared = place.clone();
-        match std::thread::Builder::new().spawn(move || take(&shared).expect("nobody else takes it")()) {
-            Ok(thread) => Aside::Running(thread),
-            Err(_) => Aside::Done(take(&place).expect("no thread took it")()),
+impl<T: Send + 'static> BackgroundTask<T> {
+    /// Starts the work on another thread. If none can be started, returns after the work is done.
+    pub(crate) fn start<W: FnOnce() -> T + Send + 'static>(work: W) -> BackgroundTask<T> {
+        // A thread that fails to start drops its closure, and `work` with it. So the closure only shares `work`.
+        let shared = std::sync::Arc::new(Mutex::new(Some(work)));
+        let of_thread = shared.clone();
+        let run = move || (lock(&of_thread).take().expect("only one thread takes it"))();
+        match std::thread::Builder::new().spawn(run) {
+            Ok(thread) => BackgroundTask::Running(thread),
+            Err(_) => {
+                let work = lock(&shared).take().expect("no thread took it");
+                BackgroundTask::Done(work())
+            }
         }
     }
 
-    /// Whether [`Aside::finish`] comes back at once.
+    /// Reports whether [`BackgroundTask::finish`] returns without waiting.
     pub(crate) fn is_finished(&self) -> bool {
         match self {
-            Aside::Running(thread) => thread.is_finished(),
-            Aside::Done(_) => true,
+            BackgroundTask::Running(thread) => thread.is_finished(),
+            BackgroundTask::Done(_) => true,
         }
     }
 
-    /// Waits for the work, whatever comes of it.
+    /// Waits for the work, and ignores its result and whether it panicked.
     pub(crate) fn end(self) {
-        if let Aside::Running(thread) = self {
+        if let BackgroundTask::Running(thread) = self {
             let _ = thread.join();
         }
     }
@@ -51,8 +60,8 @@ impl<T: Send + 'static> Aside<T> {
     /// Waits for the work, and returns its result.
     pub(crate) fn finish(self) -> T {
         match self {
-            Aside::Running(thread) => thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)),
-            Aside::Done(result) => result,
+            BackgroundTask::Running(thread) => thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)),
+            BackgroundTask::Done(result) => result,
         }
     }
 }

@@ -109,7 +109,7 @@ proptest! {
         let mut order: Vec<usize> = (0..scores.len()).collect();
         // A stable sort keeps the order of ties.
         order.sort_by(|&a, &b| scores[b].partial_cmp(&scores[a]).unwrap());
-        prop_assert_eq!(evolve::best(&scores, count), &order[..count]);
+        prop_assert_eq!(evolve::top_indices(&scores, count), &order[..count]);
     }
 
     #[test]
@@ -211,7 +211,8 @@ fn a_tournament_draws_every_pair_of_policies_with_the_same_probability() {
 fn a_policy_has_different_partners_in_every_round() {
     let learning = config(CHAOTIC, |config| (config.learning.partners, config.learning.population) = (3, 20)).learning;
     let single = Learning { partners: 1, ..learning.clone() };
-    let (all_rounds, first_round) = (evolve::teams_of(&learning, 1, 5, 4), evolve::teams_of(&single, 1, 5, 4));
+    let (all_rounds, first_round) =
+        (evolve::contemporary_teams(&learning, 1, 5, 4), evolve::contemporary_teams(&single, 1, 5, 4));
     assert_eq!((all_rounds.len(), learning.teams()), (3 * 20 * 4, 60));
     assert_eq!(all_rounds[..20 * 4], first_round, "the first round equals that with a single partner");
     let mut teams: Vec<&[u32]> = all_rounds.chunks(4).collect();

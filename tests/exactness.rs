@@ -8,7 +8,7 @@ mod support;
 
 use std::path::{Path, PathBuf};
 
-use flotilla::backend::gpu::device::{self, AdapterInfo, Binding, DeviceError, Kind, Request, Wanted};
+use flotilla::backend::gpu::device::{self, AdapterChoice, AdapterInfo, Binding, DeviceError, Kind, Request};
 use flotilla::backend::gpu::episode::{self, Kernel};
 use flotilla::backend::gpu::exact::{self, Pass, ShaderError};
 use flotilla::backend::gpu::{self, self_test, shaders};
@@ -520,15 +520,15 @@ fn a_shader_over_the_devices_limits_is_refused() {
 
 #[test]
 fn the_error_about_an_unknown_adapter_lists_all_adapters() {
-    let error = gpu::open(Wanted::Named("no such adapter".into())).expect_err("there is no such adapter");
+    let error = gpu::open(AdapterChoice::Named("no such adapter".into())).expect_err("there is no such adapter");
     let message = flotilla::cli::Error::from(error).to_string();
     assert!(message.contains("no such adapter") && message.contains("--backend cpu") || !device::adapters().is_empty());
     for info in device::adapters() {
         assert!(message.contains(&info.name), "{message}");
     }
     for (request, info) in support::adapters("the_error_about_an_unknown_adapter_lists_all_adapters") {
-        let by_name = Wanted::Named(info.name.to_uppercase());
-        let gpu = gpu::open(Request { choice: by_name, ..request }).unwrap_or_else(|error| panic!("{error}"));
+        let by_name = AdapterChoice::Named(info.name.to_uppercase());
+        let gpu = gpu::open(Request { adapter: by_name, ..request }).unwrap_or_else(|error| panic!("{error}"));
         assert_eq!(gpu.adapter.name, info.name);
     }
 }
@@ -546,7 +546,7 @@ fn two_adapters() -> Vec<AdapterInfo> {
 
 #[test]
 fn adapters_are_found_by_index_or_by_part_of_the_name() {
-    let find = |name: &str| device::position(&Wanted::Named(name.into()), &two_adapters());
+    let find = |name: &str| device::position(&AdapterChoice::Named(name.into()), &two_adapters());
     for (name, index) in [("0", 0), ("1", 1), ("rtx 4090", 0), ("LLVM", 1), ("LLVM 15", 1)] {
         assert_eq!(find(name).expect(name), index, "{name}");
     }
@@ -559,19 +559,19 @@ fn adapters_are_found_by_index_or_by_part_of_the_name() {
 #[test]
 fn a_software_renderer_is_used_only_by_name() {
     let software = &two_adapters()[1..];
-    let error = device::position(&Wanted::Real, software).expect_err("there is no GPU");
+    let error = device::position(&AdapterChoice::Real, software).expect_err("there is no GPU");
     let error = flotilla::cli::Error::from(error).to_string();
     assert!(
         error.contains("0: llvmpipe") && error.contains("--adapter 0") && error.contains("--backend cpu"),
         "{error}"
     );
-    assert_eq!(device::position(&Wanted::Real, &two_adapters()).unwrap(), 0);
-    assert!(matches!(device::position(&Wanted::Real, &[]), Err(DeviceError::NoAdapter)));
+    assert_eq!(device::position(&AdapterChoice::Real, &two_adapters()).unwrap(), 0);
+    assert!(matches!(device::position(&AdapterChoice::Real, &[]), Err(DeviceError::NoAdapter)));
 }
 
 #[test]
 fn a_real_gpu_is_never_a_software_renderer() {
-    match gpu::open(Wanted::Real) {
+    match gpu::open(AdapterChoice::Real) {
         Ok(gpu) => assert!(gpu.adapter.kind.is_real(), "{}", gpu.adapter),
         Err(DeviceError::NoRealAdapter { found }) => assert!(found.iter().all(|info| !info.kind.is_real())),
         Err(DeviceError::NoAdapter) => assert!(device::adapters().is_empty()),

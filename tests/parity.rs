@@ -28,7 +28,11 @@ const KERNELS: [Kernel; 2] = [Kernel::Generic, Kernel::Specialised];
 /// Opens a GPU that holds all populations and packs all records.
 fn open(request: &Request, pass: Pass, kernel: Kernel) -> GpuBackend {
     let gpu = gpu::open(Request { pass: Some(pass), ..request.clone() }).unwrap();
-    GpuBackend::new(gpu).unwrap().playing(kernel).holding(ResidencyPolicy::Always).with_records(Records::Packed)
+    GpuBackend::new(gpu)
+        .unwrap()
+        .with_kernel(kernel)
+        .with_residency(ResidencyPolicy::Always)
+        .with_records(Records::Packed)
 }
 
 /// Returns a group of teams with separate policies per leader, scored by every fitness.
@@ -63,8 +67,8 @@ fn checked_shaders_and_default_limits_agree() {
         {
             for (kernel, seeds) in KERNELS.into_iter().zip([100..112, 100..102]) {
                 let gpu = gpu::open(request.clone()).unwrap();
-                let backend = GpuBackend::new(gpu).unwrap().playing(kernel);
-                let backend = backend.holding(ResidencyPolicy::Always).with_records(Records::Packed);
+                let backend = GpuBackend::new(gpu).unwrap().with_kernel(kernel);
+                let backend = backend.with_residency(ResidencyPolicy::Always).with_records(Records::Packed);
                 assert_eq!(check(&Plan::random(seeds, 5), backend).mismatch, None, "{info}, {kernel}, {request:?}");
             }
         }
@@ -153,7 +157,7 @@ fn long_episodes_agree() {
     for (request, info) in support::adapters("long_episodes_agree") {
         for kernel in KERNELS {
             let plan = Plan { worlds: vec![("long".into(), config.clone())], teams: 9, seed: 0, generations: 0 };
-            let backend = GpuBackend::new(gpu::open(request.clone()).unwrap()).unwrap().playing(kernel);
+            let backend = GpuBackend::new(gpu::open(request.clone()).unwrap()).unwrap().with_kernel(kernel);
             let backend = backend.with_records(Records::Packed);
             assert_eq!(check(&plan, backend).mismatch, None, "{info}, {kernel}");
         }
@@ -173,7 +177,11 @@ fn small_batches_give_the_same_scores() {
     for (request, info) in support::adapters("small_batches_give_the_same_scores") {
         for bytes in [1 << 12, 1 << 15, 1 << 28] {
             let backend = GpuBackend::new(gpu::open(request.clone()).unwrap()).unwrap();
-            assert_eq!(backend.batched(bytes).play(&[group]).unwrap(), expected, "{info}, batches of {bytes} bytes");
+            assert_eq!(
+                backend.with_batch_bytes(bytes).play(&[group]).unwrap(),
+                expected,
+                "{info}, batches of {bytes} bytes"
+            );
         }
     }
 }
@@ -295,7 +303,9 @@ fn inconsistent_input_is_an_error_on_every_backend() {
     ];
     let mut backends: Vec<Box<dyn Backend>> = vec![Box::new(Cpu::default())];
     for (request, _) in support::adapters("inconsistent_input_is_an_error_on_every_backend") {
-        backends.push(Box::new(GpuBackend::new(gpu::open(request).unwrap()).unwrap().holding(ResidencyPolicy::Always)));
+        backends.push(Box::new(
+            GpuBackend::new(gpu::open(request).unwrap()).unwrap().with_residency(ResidencyPolicy::Always),
+        ));
     }
     for backend in &mut backends {
         for (group, named) in &bad {
@@ -354,11 +364,11 @@ fn kernels_are_compiled_for_few_worlds_and_shared() {
     });
     let (gains, sizes): (Vec<_>, Vec<_>) = (gains.collect(), sizes.collect());
     for (request, info) in support::adapters("kernels_are_compiled_for_few_worlds_and_shared") {
-        let mut backend = GpuBackend::new(gpu::open(request).unwrap()).unwrap().playing(Kernel::Best);
+        let mut backend = GpuBackend::new(gpu::open(request).unwrap()).unwrap().with_kernel(Kernel::Best);
         assert_eq!(play(&mut backend, &gains), [0, 1], "{info}: only the numbers differ");
         assert_eq!(play(&mut backend, &sizes), [1, 16], "{info}: the other worlds share the generic kernel");
         assert_eq!(play(&mut backend, &sizes), [1, 16], "{info}: nothing is compiled twice");
-        backend = backend.playing(Kernel::Generic);
+        backend = backend.with_kernel(Kernel::Generic);
         assert_eq!(play(&mut backend, &gains), [1, 16], "{info}: compiled kernels are used");
     }
 }
@@ -387,7 +397,8 @@ fn the_number_of_kernels_is_limited_without_changing_scores() {
     for (request, info) in support::adapters("the_number_of_kernels_is_limited_without_changing_scores") {
         for most in [1, 2, 64] {
             let gpu = gpu::open(request.clone()).unwrap();
-            let mut backend = GpuBackend::new(gpu).unwrap().playing(Kernel::Specialised).keeping(most, 1000);
+            let mut backend =
+                GpuBackend::new(gpu).unwrap().with_kernel(Kernel::Specialised).with_kernel_cache(most, 1000);
             for _ in 0..2 {
                 assert_eq!(play(&mut backend, &groups), expected, "{info}, {most} kernels");
                 assert_eq!(backend.compiled(), [0, most.min(5)], "{info}");
@@ -395,7 +406,7 @@ fn the_number_of_kernels_is_limited_without_changing_scores() {
         }
         // Kernels that two rollouts in a row did not use are evicted.
         let gpu = gpu::open(request.clone()).unwrap();
-        let mut backend = GpuBackend::new(gpu).unwrap().playing(Kernel::Best).keeping(64, 2);
+        let mut backend = GpuBackend::new(gpu).unwrap().with_kernel(Kernel::Best).with_kernel_cache(64, 2);
         assert_eq!(play(&mut backend, &groups), expected, "{info}");
         for (world, left) in [(0, 5), (0, 5), (1, 2), (0, 2), (0, 2), (0, 1)] {
             assert_eq!(play(&mut backend, &groups[world..][..1]), expected[world..][..1], "{info}");
@@ -443,7 +454,7 @@ fn own_headings_and_ranges_of_zero_agree() {
     for (request, info) in support::adapters("own_headings_and_ranges_of_zero_agree") {
         for kernel in KERNELS {
             let plan = Plan { worlds: worlds.clone(), teams: 9, seed: 3, generations: 2 };
-            let backend = GpuBackend::new(gpu::open(request.clone()).unwrap()).unwrap().playing(kernel);
+            let backend = GpuBackend::new(gpu::open(request.clone()).unwrap()).unwrap().with_kernel(kernel);
             assert_eq!(check(&plan, backend.with_records(Records::Packed)).mismatch, None, "{info}, {kernel}");
         }
     }

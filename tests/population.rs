@@ -30,10 +30,10 @@ fn learning() -> Learning {
     support::layout("generally_forward").learning
 }
 
-/// Returns random weights `[leaders][slots][parameters]`. Some are zero or have the largest or smallest magnitude.
-fn population([leaders, slots, parameters]: [usize; 3], seed: u64) -> Vec<f32> {
+/// Returns random weights `[populations][slots][parameters]`. Some are zero or have the largest or smallest magnitude.
+fn population([populations, slots, parameters]: [usize; 3], seed: u64) -> Vec<f32> {
     let key = Key::new(seed, 0, Purpose::Weights);
-    let mut weights = vec![0.0; leaders * slots * parameters];
+    let mut weights = vec![0.0; populations * slots * parameters];
     for (policy, weights) in weights.chunks_exact_mut(parameters).enumerate() {
         evolve::random_policy(Level::new(), key.at(0, policy / slots, policy % slots), weights);
         for (index, weight) in weights.iter_mut().enumerate() {
@@ -61,7 +61,7 @@ fn parents([leaders, slots, _]: [usize; 3], generation: usize) -> Vec<u32> {
 #[test]
 fn breeding_gives_the_same_bits_as_on_the_host() {
     for (request, info) in support::adapters("breeding_gives_the_same_bits_as_on_the_host") {
-        let mut backend = GpuBackend::new(gpu::open(request).unwrap()).unwrap().holding(ResidencyPolicy::Always);
+        let mut backend = GpuBackend::new(gpu::open(request).unwrap()).unwrap().with_residency(ResidencyPolicy::Always);
         let mut mutated = 0;
         for sizes in [[1, 2, 1], [3, 5, 97], [4, 51, 112], [2, 301, 64], [2, 17, 1000], [1, 300, 65], [257, 2, 18]] {
             for (case, probability) in [0.0, 0.1, 0.999, 1.0].into_iter().enumerate() {
@@ -174,12 +174,30 @@ fn reference() -> (Outcome, Vec<Vec<Snapshot>>) {
 }
 
 #[test]
+fn populations_of_wrong_sizes_are_refused() {
+    for (request, info) in support::adapters("populations_of_wrong_sizes_are_refused") {
+        for residency in [ResidencyPolicy::Always, ResidencyPolicy::Never] {
+            let mut backend = GpuBackend::new(gpu::open(request.clone()).unwrap()).unwrap().with_residency(residency);
+            let weights = vec![0.0; 24];
+            for (count, sizes) in [(23, [2, 3, 4]), (24, [2, 3, 5]), (0, [0, 3, 4]), (0, [2, 0, 4]), (0, [2, 3, 0])] {
+                let error = backend.hold(&weights[..count], sizes).expect_err("the sizes do not match");
+                assert!(matches!(&error, BackendError::InvalidInput(_)), "{info}, {sizes:?}: {error}");
+                assert!(error.to_string().contains(&format!("{count} weights for {}", sizes[0])), "{info}: {error}");
+            }
+            // The device still works.
+            let held = backend.hold(&weights, [2, 3, 4]).unwrap();
+            assert_eq!(held.is_some(), residency == ResidencyPolicy::Always, "{info}");
+        }
+    }
+}
+
+#[test]
 fn training_is_the_same_wherever_populations_are_stored() {
     let (expected, snapshots) = reference();
     assert!(expected.rows.iter().any(|row| row.best_g > 0.0), "no POI was observed");
     for (request, info) in support::adapters("training_is_the_same_wherever_populations_are_stored") {
         let gpu = gpu::open(request).unwrap();
-        let open = |holding| GpuBackend::new(gpu.clone()).unwrap().holding(holding);
+        let open = |holding| GpuBackend::new(gpu.clone()).unwrap().with_residency(holding);
         // Some populations are larger than this limit, others smaller.
         let some = ResidencyPolicy::From(4 * 30 * 112 * 4);
         for holding in [ResidencyPolicy::Always, ResidencyPolicy::Never, some] {
@@ -190,7 +208,7 @@ fn training_is_the_same_wherever_populations_are_stored() {
             );
         }
         // A batch has only some of the teams.
-        let mut small = open(ResidencyPolicy::Always).batched(1 << 14);
+        let mut small = open(ResidencyPolicy::Always).with_batch_bytes(1 << 14);
         assert_eq!(
             train(&mut Trainer::new(ValidConfig::all(&experiments()).unwrap()), &mut small),
             expected,
@@ -285,7 +303,7 @@ fn stages_and_early_ends_apply_wherever_populations_are_stored() {
         assert_eq!(outcome(&mut FakeDevice::failing_at(0, false), end), expected, "ended at {end}");
         for (request, info) in &adapters {
             let mut gpu =
-                GpuBackend::new(gpu::open(request.clone()).unwrap()).unwrap().holding(ResidencyPolicy::Always);
+                GpuBackend::new(gpu::open(request.clone()).unwrap()).unwrap().with_residency(ResidencyPolicy::Always);
             assert_eq!(outcome(&mut gpu, end), expected, "{info}, ended at {end}");
         }
         assert!(
@@ -343,13 +361,14 @@ fn a_recovered_error_is_reported_once() {
 fn populations_too_large_for_the_device_stay_on_the_host() {
     for (request, info) in support::adapters("populations_too_large_for_the_device_stay_on_the_host") {
         let gpu = gpu::open(device::Request { default_limits: true, ..request }).unwrap();
-        // The smallest size above WebGPU's 128 MiB. The weights can be empty, because they are not read.
+        // The smallest size above WebGPU's 128 MiB.
         let sizes = [1, (128 << 20) / 4 / 112 + 1, 112];
-        let open = |holding| GpuBackend::new(gpu.clone()).unwrap().holding(holding);
-        assert!(open(ResidencyPolicy::From(1)).hold(&[], sizes).unwrap().is_none(), "{info}");
-        let error = open(ResidencyPolicy::Always).hold(&[], sizes).unwrap_err().to_string();
+        let large = vec![0.0; sizes.iter().product()];
+        let open = |holding| GpuBackend::new(gpu.clone()).unwrap().with_residency(holding);
+        assert!(open(ResidencyPolicy::From(1)).hold(&large, sizes).unwrap().is_none(), "{info}");
+        let error = open(ResidencyPolicy::Always).hold(&large, sizes).unwrap_err().to_string();
         assert!(error.contains("134217") && error.contains("breed on the host"), "{info}: {error}");
-        assert!(open(ResidencyPolicy::Never).hold(&[], [1, 2, 1]).unwrap().is_none(), "{info}");
+        assert!(open(ResidencyPolicy::Never).hold(&[0.0; 2], [1, 2, 1]).unwrap().is_none(), "{info}");
         // The default policy holds populations from `HELD_FROM` bytes on, except on software renderers.
         let weights = vec![0.0; HELD_FROM as usize / 4];
         let mut backend = GpuBackend::new(gpu.clone()).unwrap();

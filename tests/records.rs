@@ -105,7 +105,7 @@ fn status(workgroups: u64) -> u64 {
 
 /// Returns the bytes copied from the device since the last call.
 fn downloaded(backend: &mut GpuBackend) -> u64 {
-    backend.take_stages().traffic.down
+    backend.take_times().traffic.down
 }
 
 fn config(text: &str) -> Config {
@@ -155,7 +155,7 @@ fn scores_are_the_same_from_whole_and_packed_records() {
         for (first, expected) in expected.iter().enumerate() {
             for (records, bytes) in [(Records::Whole, 1 << 28), (Records::Packed, 1 << 28), (Records::Packed, 1 << 15)]
             {
-                let mut backend = open(&request, records).batched(bytes).playing(Kernel::Generic);
+                let mut backend = open(&request, records).with_batch_bytes(bytes).with_kernel(Kernel::Generic);
                 let actual = scores(&mut backend, &batch, first);
                 assert!(
                     actual == *expected,
@@ -207,7 +207,7 @@ fn dense_and_empty_records_give_the_same_scores() {
     assert!(all_observed(&for_dense, 1) && all_observed(&for_empty, 0));
     let (whole, table) = (dense[0].unpacked_bytes(), 501 * 4);
     for (request, info) in support::adapters("dense_and_empty_records_give_the_same_scores") {
-        let mut backend = open(&request, Records::PackedFrom(0)).playing(Kernel::Generic);
+        let mut backend = open(&request, Records::PackedFrom(0)).with_kernel(Kernel::Generic);
         let mut play = |batch: &[Teams], expected: &[GroupScores]| {
             assert!(scores(&mut backend, batch, 0) == *expected, "{info}");
             downloaded(&mut backend)
@@ -236,13 +236,13 @@ fn very_long_episodes_and_small_batches_are_copied_whole() {
     let (short, long, longest) = (teams_with_steps(100), teams_with_steps(3000), teams_with_steps(10_000));
     let [for_short, for_long, for_longest] = [&short, &long, &longest].map(|teams| expected(teams, 0));
     for (request, info) in support::adapters("very_long_episodes_and_small_batches_are_copied_whole") {
-        let mut backend = open(&request, Records::PackedFrom(0)).playing(Kernel::Generic);
+        let mut backend = open(&request, Records::PackedFrom(0)).with_kernel(Kernel::Generic);
         // This episode takes several dispatches and is still packed.
         assert!(scores(&mut backend, &long, 0) == for_long, "{info}");
         assert!(downloaded(&mut backend) < long[0].unpacked_bytes(), "{info}: 3000 steps");
         assert!(scores(&mut backend, &longest, 0) == for_longest, "{info}");
         assert_eq!(downloaded(&mut backend), longest[0].unpacked_bytes() + status(2), "{info}: 10 000 steps");
-        let mut small = open(&request, Records::PackedFrom(1 << 20)).playing(Kernel::Generic);
+        let mut small = open(&request, Records::PackedFrom(1 << 20)).with_kernel(Kernel::Generic);
         assert!(scores(&mut small, &short, 0) == for_short, "{info}");
         assert_eq!(downloaded(&mut small), short[0].unpacked_bytes() + status(2), "{info}: not worth packing");
     }
@@ -257,12 +257,12 @@ fn a_generation_moves_less_than_95_bytes_per_team() {
     (config.learning.trials, config.learning.population, config.learning.generations) = (1, teams, 60);
     config.learning.fitness = Fitness::Df;
     for (request, info) in support::adapters("a_generation_moves_less_than_95_bytes_per_team") {
-        let mut backend = open(&request, Records::PackedFrom(0)).holding(ResidencyPolicy::Always);
+        let mut backend = open(&request, Records::PackedFrom(0)).with_residency(ResidencyPolicy::Always);
         let mut trainer = Trainer::new([config.validate().unwrap()]);
         let mut before = backend.gpu().traffic();
         for generation in 0..=50 {
             let rows = trainer.advance(&mut backend).unwrap();
-            let (total, played) = (backend.gpu().traffic(), backend.take_stages().traffic);
+            let (total, played) = (backend.gpu().traffic(), backend.take_times().traffic);
             let held = (teams as u64 + 1) * 4 * 112 * 4;
             let traffic = total - std::mem::replace(&mut before, total);
             // The populations are uploaded once, in generation 0.
@@ -306,7 +306,7 @@ fn records_are_not_packed_if_times_matter() {
             let batch = teams_with(change);
             let expected = expected(&batch, 0);
             assert!(!all_observed(&expected, 0), "{name}: nothing is observed");
-            let mut backend = open(&request, Records::PackedFrom(0)).playing(Kernel::Generic);
+            let mut backend = open(&request, Records::PackedFrom(0)).with_kernel(Kernel::Generic);
             assert!(scores(&mut backend, &batch, 0) == expected, "{info}, {name}");
             let bytes = downloaded(&mut backend);
             assert_eq!(bytes < batch[0].unpacked_bytes() / 2, packed, "{info}, {name}: {bytes} bytes");
@@ -357,8 +357,10 @@ fn compiling() {
     for (request, info) in support::adapters("compiling") {
         for (name, configs) in &cases {
             let backend = || GpuBackend::new(gpu::open(request.clone()).unwrap()).unwrap();
-            let gpu =
-                backend().playing(Kernel::Best).holding(ResidencyPolicy::Always).with_records(Records::PackedFrom(0));
+            let gpu = backend()
+                .with_kernel(Kernel::Best)
+                .with_residency(ResidencyPolicy::Always)
+                .with_records(Records::PackedFrom(0));
             for (setup, mut backend) in [("by default", backend()), ("as on a GPU", gpu)] {
                 let mut trainer = Trainer::new(ValidConfig::all(configs).unwrap());
                 let mut seconds = || {
@@ -396,7 +398,7 @@ fn the_cpus_part_of_a_generation() {
     // A leader's population has to fit into one buffer, which lavapipe limits to 128 MiB. The CPU moves no weights.
     config.policy.hidden = vec![];
     for (request, info) in support::adapters("the_cpus_part_of_a_generation") {
-        let backend = open(&request, Records::PackedFrom(0)).holding(ResidencyPolicy::Always);
+        let backend = open(&request, Records::PackedFrom(0)).with_residency(ResidencyPolicy::Always);
         // SAFETY: the edit only shortens a loop.
         #[expect(unsafe_code, reason = "edited shaders are compiled without bounds checks")]
         let mut backend = unsafe { backend.edited(short) };
@@ -405,11 +407,11 @@ fn the_cpus_part_of_a_generation() {
         for _ in 0..3 {
             trainer.advance(&mut backend).unwrap();
         }
-        (_, _) = (trainer.take_times(), backend.take_stages());
+        (_, _) = (trainer.take_times(), backend.take_times());
         for _ in 0..generations {
             trainer.advance(&mut backend).unwrap();
         }
-        let (times, stages) = (trainer.take_times(), backend.take_stages());
+        let (times, stages) = (trainer.take_times(), backend.take_times());
         println!("{info}, {teams} teams, {} threads, ms per generation:", rayon::current_num_threads());
         for (name, time) in [
             ("prepare", times.prepare),

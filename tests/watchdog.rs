@@ -56,7 +56,7 @@ const MODES: [(ResidencyPolicy, Records); 4] = [
 ];
 
 fn backend(gpu: Gpu, (holding, records): (ResidencyPolicy, Records)) -> GpuBackend {
-    GpuBackend::new(gpu).unwrap().playing(Kernel::Generic).holding(holding).with_records(records)
+    GpuBackend::new(gpu).unwrap().with_kernel(Kernel::Generic).with_residency(holding).with_records(records)
 }
 
 /// Trains to the end, on the CPU once the device is lost. Returns the rows, the policies, and how often it was lost.
@@ -245,7 +245,7 @@ fn no_submission_is_long_enough_for_a_watchdog() {
             assert_eq!(result.unwrap(), rows, "{info}");
             // The speed is unknown at the first trial, so it may take longer than the intended 0.1 s.
             assert!(longest <= 0.25, "{info}: a submission takes {longest} s");
-            let stages = device.take_stages();
+            let stages = device.take_times();
             assert!(stages.longest.as_secs_f64() <= 0.25 && !stages.longest.is_zero(), "{:?}", stages.longest);
         }
     }
@@ -287,7 +287,7 @@ fn check_stall() {
     for (request, info) in support::adapters("a_stalled_device_is_reported_and_counts_as_lost") {
         let faults = Arc::new(Stalled(AtomicUsize::new(0)));
         let wait_limit = WaitLimit { wait: Duration::from_millis(20), waits: 3 };
-        let result = train(backend(with_faults(&open_gpu(&request), &faults).waiting(wait_limit), MODES[0]));
+        let result = train(backend(with_faults(&open_gpu(&request), &faults).with_wait_limit(wait_limit), MODES[0]));
         assert_eq!((result.0, result.1, result.2), (rows.clone(), policies.clone(), 1), "{info}");
         assert_eq!(faults.0.load(SeqCst), 3);
         let reported = REPORTED.lock().unwrap().split_off(0);
@@ -386,12 +386,13 @@ fn the_faster_workgroup_size_is_kept_and_results_do_not_change() {
         {
             let case = format!("{info}, {faster} teams per workgroup, {records:?}");
             let device = GpuBackend::new(with_faults(&gpu, &Arc::new(FasterWith(faster)))).unwrap();
-            let mut device = device.playing(Kernel::Specialised).with_records(records).with_teams_per_workgroup(None);
+            let mut device =
+                device.with_kernel(Kernel::Specialised).with_records(records).with_teams_per_workgroup(None);
             // These teams are too few to compare speeds.
             assert_eq!(device.trace(&few).unwrap(), trace, "{case}");
-            assert_eq!(device.packed(), None, "{case}");
+            assert_eq!(device.teams_per_workgroup(), None, "{case}");
             assert_eq!(device.play(&[group]).unwrap(), scores, "{case}");
-            assert_eq!(device.packed(), Some(faster), "{case}");
+            assert_eq!(device.teams_per_workgroup(), Some(faster), "{case}");
             assert_eq!(device.trace(&few).unwrap(), trace, "{case}");
         }
     }

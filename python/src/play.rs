@@ -242,7 +242,7 @@ pub fn forward(
     }
     let (mut weights, inputs) = (policies.as_slice()?.to_vec(), inputs.as_slice()?);
     let outputs = outputs.as_slice_mut()?;
-    if let Some(place) = evolve::admit(&mut weights) {
+    if let Some(place) = evolve::flush_and_validate(&mut weights) {
         let (policy, parameter) = (place / parameters as usize, place % parameters as usize);
         let value = weights[place];
         let text =

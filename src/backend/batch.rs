@@ -1,4 +1,4 @@
-//! The input of a backend, groups of teams to play, and their scores.
+//! The input of a backend: groups of teams to play.
 
 use glam::Vec2;
 
@@ -102,15 +102,6 @@ impl<'a> Group<'a> {
             )),
         }
     }
-}
-
-/// The scores of one group's teams.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct GroupScores {
-    /// POIs observed, `[teams]`.
-    pub observed: Vec<u32>,
-    /// The leaders' scores, `[teams][fitnesses][leaders]`.
-    pub scores: Vec<f32>,
 }
 
 /// The policies of a group, `[populations][policies][parameters]`. Each number is 0, or of size 2^-30 to 2^20.

@@ -1,15 +1,24 @@
-//! Scores of a batch, computed by the threads that play it.
+//! The output of a backend: scores, computed by the threads that play.
 
 use std::cell::RefCell;
 use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
-use super::{Group, GroupScores};
+use super::Group;
 use crate::config::Fitness;
 use crate::credit::{Credit, Episode};
 use crate::parallel::*;
 
 /// Minimum number of scores per rayon task that sets them to zero.
 const ZEROED_TOGETHER: usize = 1 << 16;
+
+/// The scores of one group's teams.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct GroupScores {
+    /// POIs observed, `[teams]`.
+    pub observed: Vec<u32>,
+    /// The leaders' scores, `[teams][fitnesses][leaders]`.
+    pub scores: Vec<f32>,
+}
 
 /// The scores of the groups of a batch. Several threads may write at a time; each team is scored once.
 pub(crate) struct ScoreTable<'a> {

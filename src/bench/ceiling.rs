@@ -18,7 +18,7 @@ const CHAINS: usize = if cfg!(target_arch = "aarch64") { 14 } else { 7 };
 /// Links of every chain between two readings of the clock.
 const LINKS: usize = 20_000;
 /// Minimum time of a measurement.
-const LEAST: Duration = Duration::from_millis(20);
+const MIN_TIME: Duration = Duration::from_millis(20);
 
 /// Returns lane operations per second, of all threads of the current rayon pool.
 pub(crate) fn measure(level: Level) -> f64 {
@@ -28,7 +28,7 @@ pub(crate) fn measure(level: Level) -> f64 {
 /// Returns lane operations per second of one thread.
 fn thread<S: Simd>(simd: S) -> f64 {
     let (start, mut links) = (Instant::now(), 0);
-    while links == 0 || start.elapsed() < LEAST {
+    while links == 0 || start.elapsed() < MIN_TIME {
         chains(simd);
         links += LINKS;
     }

@@ -21,7 +21,7 @@ pub(crate) struct Ceiling {
     gpu: Gpu,
     pipeline: wgpu::ComputePipeline,
     buffers: wgpu::BindGroup,
-    turns: wgpu::Buffer,
+    iterations: wgpu::Buffer,
     workgroups: u32,
     operations: f64,
 }
@@ -35,21 +35,21 @@ impl Ceiling {
         let layout = gpu.layout("ceiling", &[Binding::Read, Binding::Read, Binding::Write])?;
         let pipeline = gpu.own_pipeline("ceiling", CEILING, "ceiling", &layout)?;
         let numbers = gpu.upload("ceiling's numbers", &[1.000_000_1f32, 0.25, -1.0, 0.0], BufferUsages::STORAGE)?;
-        let turns = gpu.upload("ceiling's turns", &[0u32; 4], BufferUsages::STORAGE)?;
+        let iterations = gpu.upload("ceiling's iterations", &[0u32; 4], BufferUsages::STORAGE)?;
         let result = gpu.buffer("ceiling's result", (WORKGROUP * size_of::<f32>()) as u64, BufferUsages::STORAGE)?;
-        let bound = [&numbers, &turns, &result].map(|buffer| buffer.as_entire_buffer_binding());
+        let bound = [&numbers, &iterations, &result].map(|buffer| buffer.as_entire_buffer_binding());
         let buffers = gpu.bind("ceiling", &layout, &bound)?;
-        let mut ceiling = Ceiling { gpu: gpu.clone(), pipeline, buffers, turns, workgroups: 0, operations: 0.0 };
+        let mut ceiling = Ceiling { gpu: gpu.clone(), pipeline, buffers, iterations, workgroups: 0, operations: 0.0 };
         // As many threads as fill any GPU several times. More iterations, then more threads, until it takes long
         // enough.
-        let (mut turns, mut workgroups) = (64, 4096);
+        let (mut iterations, mut workgroups) = (64, 4096);
         loop {
-            ceiling.set(turns, workgroups)?;
+            ceiling.set(iterations, workgroups)?;
             let seconds = ceiling.operations / ceiling.measure()?;
             if seconds >= MIN_TIME.as_secs_f64() {
                 return Ok(ceiling);
-            } else if turns < MAX_ITERATIONS {
-                turns *= 2;
+            } else if iterations < MAX_ITERATIONS {
+                iterations *= 2;
             } else if workgroups * 2 <= gpu.limits.max_compute_workgroups_per_dimension {
                 workgroups *= 2;
             } else {
@@ -58,17 +58,17 @@ impl Ceiling {
         }
     }
 
-    fn set(&mut self, turns: u32, workgroups: u32) -> Result<(), DeviceError> {
-        let words = [turns; 4];
-        self.gpu.scoped("ceiling's turns", || {
-            self.gpu.write(&self.turns, 0, bytemuck::cast_slice(&words));
+    fn set(&mut self, iterations: u32, workgroups: u32) -> Result<(), DeviceError> {
+        let words = [iterations; 4];
+        self.gpu.scoped("ceiling's iterations", || {
+            self.gpu.write(&self.iterations, 0, bytemuck::cast_slice(&words));
         })?;
         self.workgroups = workgroups;
-        self.operations = f64::from(turns) * OPERATIONS_PER_ITERATION * f64::from(workgroups) * WORKGROUP as f64;
+        self.operations = f64::from(iterations) * OPERATIONS_PER_ITERATION * f64::from(workgroups) * WORKGROUP as f64;
         Ok(())
     }
 
-    /// Returns lane operations per second.
+    /// Reiterations lane operations per second.
     ///
     /// # Errors
     /// The device failed.

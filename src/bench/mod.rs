@@ -6,16 +6,16 @@ use fearless_simd::Level;
 
 use crate::backend::cpu::Cpu;
 use crate::backend::gpu::device::Traffic;
-use crate::backend::gpu::episode::{GpuBackend, Stages};
+use crate::backend::gpu::episode::{GpuBackend, PhaseTimes};
 use crate::backend::{Backend, BackendError, Group, Weights};
 use crate::config::{Config, Coupling};
-use crate::evolve::{Key, Purpose, random_policy, teams_of};
+use crate::evolve::{Key, Purpose, contemporary_teams, random_policy};
 use crate::host::Instant;
 use crate::sweep::layout::{self, MAX_FOLLOWERS, MAX_GROUPS};
 use crate::trainer::{GenerationTimes, Trainer};
 use crate::world::World;
 
-pub mod ceiling;
+mod ceiling;
 mod gpu_ceiling;
 pub mod operations;
 
@@ -23,10 +23,10 @@ use operations::Reach;
 
 /// Timed repeats, of which the median counts, and the minimum time of each.
 const REPEATS: usize = 5;
-const LEAST: Duration = Duration::from_millis(200);
+const MIN_REPEAT_TIME: Duration = Duration::from_millis(200);
 /// Repeats of anything that takes longer than this.
 const FEW_REPEATS: usize = 3;
-const LONG: Duration = Duration::from_secs(2);
+const MAX_TIME_OF_REPEATS: Duration = Duration::from_secs(2);
 /// Reads of a clock after which it counts as standing still. They take longer than any clock needs to advance.
 const CLOCK_READS: usize = 1 << 22;
 /// Teams that are traced to count neighbours, and the maximum number of pairs in that trace, beyond the first team.
@@ -34,7 +34,7 @@ const TRACED_TEAMS: usize = 64;
 const TRACED_PAIRS: usize = 1 << 28;
 
 /// The hardware that is measured.
-pub enum Subject {
+pub(crate) enum Subject {
     /// The CPU, with an instruction set.
     Cpu(Cpu, Level),
     /// A GPU.
@@ -68,7 +68,7 @@ impl Subject {
 type Peak = dyn FnMut() -> Result<f64, BackendError>;
 
 /// The measurements of one config.
-pub struct Timing {
+pub(crate) struct Timing {
     /// Teams that play at once.
     pub teams: usize,
     /// Leaders per team.
@@ -87,7 +87,7 @@ pub struct Timing {
     pub profile: Option<Profile>,
     /// Mean G of the random teams of the rollout.
     pub mean_g: f64,
-    /// Who was in reach of whom, on which the operations depend.
+    /// The numbers of entities in reach of agents. The operations depend on them.
     pub reach: Reach,
     /// Lane operations per team-step.
     pub operations: f64,
@@ -96,20 +96,20 @@ pub struct Timing {
 }
 
 /// The time of some generations by phase.
-pub struct Profile {
+pub(crate) struct Profile {
     /// The number of these generations.
     pub generations: usize,
     /// The trainer's phases.
     pub times: GenerationTimes,
     /// The phases of a GPU's rollouts.
-    pub stages: Option<Stages>,
+    pub gpu_times: Option<PhaseTimes>,
     /// Bytes over the bus, in rollouts and between them.
     pub traffic: Traffic,
 }
 
 /// The measurements of whole generations.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Generations {
+pub(crate) enum Generations {
     /// Nothing: only rollouts.
     LeftOut,
     /// The time of a generation.
@@ -208,11 +208,11 @@ fn generations(config: &Config, player: &mut Subject) -> Result<(f64, Profile), 
     let mut trainer = Trainer::new([config.validate()?]);
     trainer.advance(player.backend())?;
     let take = |trainer: &mut Trainer, player: &mut Subject| {
-        let (stages, traffic) = match player {
+        let (gpu_times, traffic) = match player {
             Subject::Cpu(..) => (None, Traffic::default()),
-            Subject::Gpu(gpu) => (Some(gpu.take_stages()), gpu.gpu().traffic()),
+            Subject::Gpu(gpu) => (Some(gpu.take_times()), gpu.gpu().traffic()),
         };
-        Profile { generations: trainer.generation(0), times: trainer.take_times(), stages, traffic }
+        Profile { generations: trainer.generation(0), times: trainer.take_times(), gpu_times, traffic }
     };
     let before = take(&mut trainer, player);
     let [seconds, _] = time(|| trainer.advance(player.backend()).map(drop), || Ok(0.0))?;
@@ -222,7 +222,7 @@ fn generations(config: &Config, player: &mut Subject) -> Result<(f64, Profile), 
 }
 
 /// Returns seconds per rollout of random policies, scored as in training, and the arithmetic ceiling measured in
-/// between; the mean G; and who was in reach of whom.
+/// between; the mean G; and the entities in reach of agents.
 fn rollout(
     config: &Config,
     world: &World,
@@ -237,7 +237,8 @@ fn rollout(
     }
     // Teams with past champions take as long as others, which stand in for them.
     let count = config.max_teams() - 1;
-    let teams: Vec<u32> = teams_of(&config.learning, 0, 0, leaders).into_iter().cycle().take(count * leaders).collect();
+    let teams: Vec<u32> =
+        contemporary_teams(&config.learning, 0, 0, leaders).into_iter().cycle().take(count * leaders).collect();
     // If generations play from the device's memory, so do these rollouts.
     let held = backend.hold(&weights, [config.populations(), population, world.parameters()])?;
     let played = held.as_deref().map_or(weights[..].into(), Weights::OnDevice);
@@ -265,31 +266,31 @@ fn rollout(
     Ok((times, mean_g, Reach::of(world, &trace)))
 }
 
-/// Returns whether the system's clock advances. No measurement would end without that.
+/// Reports whether the system's clock advances. No measurement would end without that.
 pub(crate) fn has_clock() -> bool {
     advances(Instant::now)
 }
 
-/// Returns whether a clock advances while it is read many times.
+/// Reports whether a clock advances while it is read many times.
 fn advances<T: PartialEq>(now: impl Fn() -> T) -> bool {
     let start = now();
     (0..CLOCK_READS).any(|_| now() != start)
 }
 
 /// Returns medians over a few repeats: seconds per call, and the measurement between repeats, so that a slow phase of
-/// the machine affects both. Each repeat takes at least [`LEAST`].
+/// the machine affects both. Each repeat takes at least [`MIN_REPEAT_TIME`].
 fn time<E>(
     mut call: impl FnMut() -> Result<(), E>,
     mut between: impl FnMut() -> Result<f64, E>,
 ) -> Result<[f64; 2], E> {
     let start = Instant::now();
     call()?;
-    let repeats = if start.elapsed() > LONG { FEW_REPEATS } else { REPEATS };
+    let repeats = if start.elapsed() > MAX_TIME_OF_REPEATS { FEW_REPEATS } else { REPEATS };
     let (mut seconds, mut others) = (Vec::with_capacity(repeats), Vec::with_capacity(repeats));
     for _ in 0..repeats {
         others.push(between()?);
         let (start, mut calls) = (Instant::now(), 0);
-        while calls == 0 || start.elapsed() < LEAST {
+        while calls == 0 || start.elapsed() < MIN_REPEAT_TIME {
             call()?;
             calls += 1;
         }

@@ -1,9 +1,10 @@
-//! The minimum number of lane operations per team-step, counted from the formulas and from who is in reach of whom.
+//! The minimum number of lane operations per team-step, counted from the formulas and from a trace of random teams.
 //!
-//! Counted is what any implementation of [`crate::model`] has to compute: each f32 or integer operation, comparison and
-//! selection is one. Constants and moves are free, and what two formulas share counts once. An entity counts if it is
-//! in reach of an agent of its own team, in a trace of random teams. Not counted is what an implementation adds:
-//! testing pairs that are out of reach, idle lanes, loads and stores, scoring.
+//! | counted | not counted |
+//! |---|---|
+//! | each f32 or integer operation, comparison and selection of [`crate::model`] | constants and moves |
+//! | what two formulas share, once | idle lanes, loads and stores, scoring |
+//! | entities in reach of an agent of their team | tests of pairs that are out of reach |
 
 use crate::backend::Trace;
 use crate::model::Constants;
@@ -11,7 +12,7 @@ use crate::model::policy::{Actions, PolicyConstants};
 use crate::model::sense::Density;
 use crate::world::{INPUTS, World};
 
-/// Who is in reach of whom, as means over a trace's teams and steps.
+/// Numbers of entities in reach of agents, as means over a trace's teams and steps.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Reach {
     /// POIs within the range of a leader, summed over leaders.
@@ -75,9 +76,10 @@ mod kernel {
     pub(crate) const SQRT: u32 = 12;
     /// [`recip`](crate::kernels::math::recip).
     pub(crate) const RECIP: u32 = 8;
-    /// A clamp, a square, 5 and 3 for numerator and denominator; their squares' sum, its rough reciprocal (4) and 6
-    /// more.
-    pub(crate) const TANH: u32 = CLAMP + 1 + 5 + 3 + 3 + 4 + 6;
+    /// [`limit_tanh`](crate::kernels::math::limit_tanh) and [`half_tanh`](crate::kernels::math::half_tanh).
+    pub(crate) const TANH: u32 = CLAMP + 1 // the square
+        + 5 + 3 // numerator and denominator
+        + 3 + 4 + 6; // the sum of their squares, its rough reciprocal, the quotient
     /// [`sin_cos`](crate::kernels::math::sin_cos).
     pub(crate) const SIN_COS: u32 = 26;
     /// [`flush`](crate::kernels::math::flush).
@@ -91,50 +93,65 @@ mod kernel {
 }
 use kernel::*;
 
-/// A leader weights its 8 sums.
-const WEIGHT_INPUTS: u32 = INPUTS as u32;
-/// A leader turns: clamp, sine and cosine, rotation.
+/// A leader scales its 8 sums.
+const SCALE_INPUTS: u32 = INPUTS as u32;
+/// A leader turns.
 const TURN: u32 = CLAMP + SIN_COS + ROTATE;
-/// An agent moves: the heading is renormalized (its square 3, a scale 2, 2 products, 2 flushes), the speed changed
-/// within 2 clamps, and on each axis a step (after one common product) rounded to the grid (4) and clamped to the map.
-const MOVE: u32 = 3 + 2 + 2 + 2 * FLUSH + (2 + 2 * CLAMP) + 1 + 2 * (2 + 4 + CLAMP);
-/// A leader chooses a behaviour: 4 comparisons with 2 selections each; per kind of entity 3 such, the opposite quadrant
-/// (a comparison, a selection, a sum) and whether there is any (2); then kind, direction and the two actions.
-const CHOOSE: u32 = 4 * 3 + 2 * (3 * 3 + 3 + 2) + 8;
-/// A follower meets an agent within the attraction radius: 2 tests and their difference, 4 selections, 4 sums, 2
-/// counts.
-const INFLUENCE: u32 = SQUARED_DISTANCE + 3 + 4 + 4 + 2;
+/// An agent moves.
+const MOVE: u32 = 3 + 2 + 2 + 2 * FLUSH // heading: square, scale, 2 products, 2 flushes
+    + 2 + 2 * CLAMP // speed: a change within limits
+    + 1 // a product that both axes share
+    + 2 * (2 + 4 + CLAMP); // position, per axis: step, rounding to the grid, map
+/// A leader chooses a behaviour.
+const CHOOSE: u32 = 4 * 3 // the largest output: 4 comparisons with 2 selections each
+    + 2 * (3 * 3 + 3 + 2) // per kind of entity: the largest quadrant, the opposite one, whether there is any
+    + 8; // kind, direction, the two actions
+/// A follower meets an agent within the attraction radius.
+const INFLUENCE: u32 = SQUARED_DISTANCE + 3 // 2 tests and their difference
+    + 4 + 4 // 4 selections, 4 sums
+    + 2; // 2 counts
 /// A follower counts a leader that it sees.
 const SEE: u32 = 1;
 /// A follower steers, whoever it met.
 const FOLLOW: u32 = FORCE + INFLUENCED + STEER;
-/// The force: 2 means (a reciprocal of a count of at least 1, scaled), and on each axis the two weighted sums (4), the
-/// walls (3 differences, 2 maxima, a difference, a gain) and a flush.
-const FORCE: u32 = 2 * (RECIP + 3) + 2 * (4 + 7 + FLUSH);
-/// Whether anything is near: the counts' sum and test, the nearest of 4 walls and its test, and their union.
-const INFLUENCED: u32 = 2 + 3 + 1 + 1;
-/// Steering: the force's square and direction (3, an inverse root, 2), along and across (6), the maximum turn to its
-/// side (2 and a rotation), whether the force is within it, 4 selections of the heading, the speed ahead (2) and 3
-/// selections of the speed, 2 tests of the force.
-const STEER: u32 = 3 + RSQRT + 2 + 6 + 2 + ROTATE + WITHIN + 4 + 2 + 3 + 2;
-/// A test of the sine and its size, combined with one that is counted already.
+/// The force on a follower.
+const FORCE: u32 = 2 * (RECIP + 3) // means: the reciprocal of a count of at least 1, scaled
+    + 2 * 4 // per axis: the two weighted sums
+    + 2 * (3 + 2 + 1 + 1) // per axis, walls: 3 differences, 2 maxima, a difference, a gain
+    + 2 * FLUSH;
+/// The test whether anything is near.
+const INFLUENCED: u32 = 2 // the sum of the counts, its test
+    + 3 + 1 // the nearest of 4 walls, its test
+    + 1; // either of them
+/// A follower turns towards the force.
+const STEER: u32 = 3 + RSQRT + 2 // the force's square and direction
+    + 6 // along and across the heading
+    + 2 + ROTATE // the maximum turn to the force's side
+    + WITHIN + 4 // the new heading: 4 selections
+    + 2 + 3 // the speed ahead, 3 selections of the speed
+    + 2; // 2 tests of the force
+/// The test whether the force is within the maximum turn: the sine, its size, and a test that is already counted.
 const WITHIN: u32 = 3;
 /// An agent is tested for a POI and added to its set: a test, a selection, a union.
 const OBSERVE: u32 = SQUARED_DISTANCE + 3;
 
-/// Returns the operations of a leader that senses one entity: the test of the range and a selection, the quadrant's 4
-/// tests and their combination (4), 2 selections by side and 4 by front, 4 sums; and the density: a root, scaled and
-/// subtracted from 1, or an inverse root of at least 1.
+/// Returns the operations of a leader that senses one entity.
 fn sense(density: Density) -> u32 {
     let density = match density {
+        // A root, scaled and subtracted from 1.
         Density::Linear => SQRT + 2,
+        // An inverse root of at least 1.
         Density::Inverse => RSQRT + 2,
     };
-    SQUARED_DISTANCE + ROTATE + 2 + 4 + 4 + 2 + 4 + 4 + density
+    SQUARED_DISTANCE + ROTATE
+        + 2 // the range: a test, a selection
+        + 4 + 4 // the quadrant: 4 tests, their combinations
+        + 2 + 4 + 4 // 2 selections by side, 4 by front, 4 sums
+        + density
 }
 
-/// Returns the operations of one leader's policy: a product and a sum per weight (the bias starts a sum), every unit's
-/// activation, and the outputs' conversion to a wanted turn and speed.
+/// Returns the operations of one leader's policy: a product and a sum per weight, an activation per unit, and the
+/// conversion of the outputs to a wanted turn and speed. A bias starts a sum.
 fn decide(policy: &PolicyConstants) -> u32 {
     let layers = policy.widths[..=policy.layers as usize].windows(2);
     let chosen = if policy.actions() == Some(Actions::Behaviours) { CHOOSE } else { 0 };
@@ -149,7 +166,7 @@ pub fn per_team_step(world: &World, reach: &Reach) -> f64 {
     let met = reach.drawn * f64::from(INFLUENCE) + reach.seen * f64::from(SEE);
     sensed
         + met
-        + count(world.leaders(), WEIGHT_INPUTS + decide(&policy) + TURN)
+        + count(world.leaders(), SCALE_INPUTS + decide(&policy) + TURN)
         + count(world.followers(), FOLLOW)
         + count(world.agents(), MOVE)
         + count(world.agents() * world.pois.len(), OBSERVE)

@@ -200,7 +200,7 @@ fn line(measure: &Timing) -> String {
             let name = format!("{}{}", if part { "  of it, " } else { "" }, name.replace('_', " "));
             let _ = writeln!(line, "{:>8} {name:<24} {ms:>12.4} ms {:>5.1}%", "", 100.0 * ms / whole);
         }
-        if let Some(stages) = &profile.stages {
+        if let Some(stages) = &profile.gpu_times {
             let ms = 1e3 * stages.longest.as_secs_f64();
             let _ = writeln!(line, "{:>8} {:<24} {ms:>12.4} ms", "", "longest submission");
         }
@@ -214,7 +214,7 @@ fn line(measure: &Timing) -> String {
 
 /// Returns the stages of a generation in order, each with its time in ms. `true` marks a part of the rollout before it.
 fn stages(profile: &Profile) -> Vec<(&'static str, bool, f64)> {
-    let Profile { generations, times, stages, .. } = profile;
+    let Profile { generations, times, gpu_times: stages, .. } = profile;
     let mut rows = vec![("teams_and_starts", false, times.prepare), ("rollout_and_scores", false, times.play)];
     if let Some(stages) = stages {
         rows.extend([
@@ -236,7 +236,7 @@ fn stages(profile: &Profile) -> Vec<(&'static str, bool, f64)> {
 /// Returns the bytes per generation that cross a GPU's bus, in both directions. `true` marks the rollout's part of the
 /// total before it.
 fn traffic(profile: &Profile) -> Vec<(&'static str, bool, f64)> {
-    let Profile { generations, stages, traffic, .. } = profile;
+    let Profile { generations, gpu_times: stages, traffic, .. } = profile;
     let rows = stages.iter().flat_map(|stages| {
         let rollouts = stages.traffic;
         [
@@ -279,7 +279,7 @@ fn json(measure: &Timing) -> serde_json::Value {
     if let Some(profile) = &measure.profile {
         let stages = stages(profile).into_iter().map(|(name, _, ms)| (format!("{name}_ms"), json!(ms)));
         let traffic = traffic(profile).into_iter().map(|(name, _, bytes)| (format!("{name}_bytes"), json!(bytes)));
-        let longest = profile.stages.map(|stages| 1e3 * stages.longest.as_secs_f64());
+        let longest = profile.gpu_times.map(|stages| 1e3 * stages.longest.as_secs_f64());
         let longest = longest.map(|ms| ("longest_submission_ms".to_string(), json!(ms)));
         object["profile"] = serde_json::Value::Object(stages.chain(longest).chain(traffic).collect());
     }

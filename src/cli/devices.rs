@@ -6,7 +6,7 @@ use super::{Error, backend, print, print_json};
 use crate::backend::Backend;
 use crate::backend::cpu::Cpu;
 use crate::backend::gpu;
-use crate::backend::gpu::device::{self, DeviceError, Gpu, Wanted};
+use crate::backend::gpu::device::{self, AdapterChoice, DeviceError, Gpu};
 use crate::host::Instant;
 use crate::ops::advice_on_device;
 
@@ -25,7 +25,7 @@ pub fn run(args: Args) -> Result<(), Error> {
         .enumerate()
         .map(|(index, info)| {
             let start = Instant::now();
-            let opened = gpu::open(Wanted::Named(index.to_string()));
+            let opened = gpu::open(AdapterChoice::Named(index.to_string()));
             (index, info, opened, start.elapsed().as_secs_f64())
         })
         .collect();

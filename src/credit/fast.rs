@@ -11,8 +11,8 @@ impl Credit {
         each_set(&episode.sets, world, sets, |poi| world.coupling[poi], |poi, _, _| observed[poi] = true);
     }
 
-    /// Finds the leaders without whom a POI is lost: those in every large enough set, if none of these sets had an
-    /// agent to spare.
+    /// Finds the leaders without whom a POI is lost. Such a leader is in every set with enough agents, and no such set
+    /// has an agent to spare.
     pub(super) fn lose_leaders(&mut self, episode: &Episode<'_>, world: &World) {
         self.all_critical(world);
         let Credit { observed, critical, sets, .. } = self;
@@ -23,8 +23,8 @@ impl Credit {
         });
     }
 
-    /// Finds the leaders without whose group a POI is lost: every large enough set had more members of the group than
-    /// agents to spare.
+    /// Finds the leaders without whose group a POI is lost. Every set with enough agents has more members of the group
+    /// than agents to spare.
     pub(super) fn lose_groups(&mut self, episode: &Episode<'_>, world: &World) {
         self.all_critical(world);
         let Credit { observed, critical, owner, groups, sets, .. } = self;
@@ -58,9 +58,9 @@ impl Credit {
     pub(super) fn add_copies(&mut self, episode: &Episode<'_>, world: &World) {
         self.all_critical(world);
         let leaders = world.leaders();
-        self.company.clear();
-        self.company.resize(world.pois.len() * leaders, 0);
-        let Credit { observed, critical, company, sets, .. } = self;
+        self.largest_set_with.clear();
+        self.largest_set_with.resize(world.pois.len() * leaders, 0);
+        let Credit { observed, critical, largest_set_with, sets, .. } = self;
         each_set(
             &episode.sets,
             world,
@@ -72,7 +72,7 @@ impl Credit {
                     narrow(&mut critical[poi * set.len()..][..set.len()], set, size == world.coupling[poi]);
                 } else if !observed[poi] {
                     for leader in bits(set).take_while(|&agent| agent < leaders) {
-                        let most = &mut company[poi * leaders + leader];
+                        let most = &mut largest_set_with[poi * leaders + leader];
                         *most = size.max(*most);
                     }
                 }
@@ -87,9 +87,9 @@ impl Credit {
         self.completed.resize(most as usize + 1, 0);
         let mut at_most = 0u32;
         for (poi, &coupling) in world.coupling.iter().enumerate() {
-            let company = self.company[poi * world.leaders() + leader];
-            if !self.observed[poi] && company > 0 {
-                self.completed[(coupling - company) as usize] += 1;
+            let largest_set_with = self.largest_set_with[poi * world.leaders() + leader];
+            if !self.observed[poi] && largest_set_with > 0 {
+                self.completed[(coupling - largest_set_with) as usize] += 1;
                 at_most += 1;
             }
         }

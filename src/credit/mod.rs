@@ -57,14 +57,15 @@ pub struct Credit {
     /// The agents of each leader's group, `[leaders][words]`; empty until needed.
     groups: Vec<u32>,
     /// The largest set at the POI that has the leader in it, `[pois][leaders]`.
-    company: Vec<u32>,
+    largest_set_with: Vec<u32>,
     /// Unobserved POIs that this number of copies of one leader would complete, `[copies]`.
     completed: Vec<u32>,
     /// One set, and the set of the step before, `[2][words]`.
     sets: Vec<u32>,
-    /// The step at which each POI was observed, and would be without some agents, `[pois]`. Used by [`Credit::replay`].
+    /// The step at which each POI was observed, and would be observed with other agents, `[pois]`. Used by
+    /// [`Credit::replay`].
     observed_at: Vec<u32>,
-    otherwise: Vec<u32>,
+    counterfactual: Vec<u32>,
     /// The output of [`lead`].
     led: Vec<u32>,
 }

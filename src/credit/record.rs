@@ -16,9 +16,9 @@ pub struct Episode<'a> {
 }
 
 impl<'a> Episode<'a> {
-    /// Returns the whole record of a team that nothing else is interleaved with.
+    /// Returns the record of a team whose words are not interleaved with those of other teams.
     pub fn whole(sets: &'a [u32], counts: &'a [u32], sights: &'a [u32]) -> Episode<'a> {
-        let [sets, counts, sights] = [sets, counts, sights].map(|words| Strided { words, stride: 1, offset: 0 });
+        let [sets, counts, sights] = [sets, counts, sights].map(Strided::contiguous);
         Episode { sets, seen: Seen::Counts(counts), sights }
     }
 }
@@ -88,7 +88,12 @@ pub struct Strided<'a> {
 
 impl<'a> Strided<'a> {
     /// An empty view.
-    pub const NONE: Strided<'static> = Strided { words: &[], stride: 1, offset: 0 };
+    pub const NONE: Strided<'static> = Strided::contiguous(&[]);
+
+    /// Returns the view of an array that has the words of only one team.
+    pub const fn contiguous(words: &'a [u32]) -> Strided<'a> {
+        Strided { words, stride: 1, offset: 0 }
+    }
 
     /// Returns all words of this team.
     pub fn iter(self) -> impl Iterator<Item = u32> + 'a {

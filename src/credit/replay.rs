@@ -12,7 +12,7 @@ use crate::world::World;
 impl Credit {
     /// Computes [`Credit::score`] by each fitness's definition.
     pub(super) fn replay(&mut self, episode: &Episode<'_>, world: &World, fitness: Fitness, scores: &mut [f32]) -> u32 {
-        let Credit { owner, groups, observed_at, otherwise, led, .. } = self;
+        let Credit { owner, groups, observed_at, counterfactual, led, .. } = self;
         let (pois, words, leaders) = (world.pois.len(), world.constants.words as usize, world.leaders());
         let replay = Replay { sets: episode.sets, world };
         replay.observe(observed_at);
@@ -34,7 +34,7 @@ impl Credit {
                 match taken {
                     Fitness::Df => {
                         let group = &groups[leader * words..][..words];
-                        replay.observe_without(observed_at, |_, word, agents| agents & !group[word], otherwise);
+                        replay.observe_without(observed_at, |_, word, agents| agents & !group[word], counterfactual);
                     }
                     Fitness::Dt => {
                         let stay = |step, word, agents| {
@@ -44,11 +44,11 @@ impl Credit {
                             });
                             follow.map(|bit| 1 << bit).sum()
                         };
-                        replay.observe_without(observed_at, stay, otherwise);
+                        replay.observe_without(observed_at, stay, counterfactual);
                     }
-                    _ => replay.observe_without(observed_at, alone, otherwise),
+                    _ => replay.observe_without(observed_at, alone, counterfactual),
                 }
-                observed - count(otherwise)
+                observed - count(counterfactual)
             };
             *score = match fitness {
                 Fitness::G => share(observed, pois),
@@ -56,8 +56,8 @@ impl Credit {
                 Fitness::Dpp => {
                     let (lost, most) = (lost(), world.coupling.iter().copied().max().unwrap_or(0));
                     let mut gain = |copies| {
-                        replay.observe_with(observed_at, leader, copies, otherwise);
-                        count(otherwise) - observed
+                        replay.observe_with(observed_at, leader, copies, counterfactual);
+                        count(counterfactual) - observed
                     };
                     stepping_stone(lost, most, gain(most), pois, gain)
                 }
@@ -76,20 +76,20 @@ struct Replay<'a> {
 
 impl Replay<'_> {
     /// Counts the observers at a POI after a step. `stay` masks each word of the set.
-    fn near(&self, poi: usize, step: u32, stay: impl Fn(usize, u32) -> u32) -> u32 {
+    fn count_observers(&self, poi: usize, step: u32, stay: impl Fn(usize, u32) -> u32) -> u32 {
         let Replay { sets, world } = self;
         let words = world.constants.words as usize;
         let first = ((step as usize - 1) * world.pois.len() + poi) * words;
         world.rule.count((0..words).map(|word| stay(word, sets.get(first + word))))
     }
 
-    /// Writes the step at which each POI is observed: the first step with enough agents, `near(poi, step)`, among the
-    /// steps that are `worth` testing of those at which the rule allows it.
-    fn play(
+    /// Writes the step at which each POI is observed: the first of the steps to test, `steps_to_test(poi, open)`, with
+    /// enough observers, `observers(poi, step)`. The rule allows it at the `open` steps.
+    fn apply_rule(
         &self,
         observed_at: &mut Vec<u32>,
-        worth: impl Fn(usize, RangeInclusive<u32>) -> RangeInclusive<u32>,
-        near: impl Fn(usize, u32) -> u32,
+        steps_to_test: impl Fn(usize, RangeInclusive<u32>) -> RangeInclusive<u32>,
+        observers: impl Fn(usize, u32) -> u32,
     ) {
         let Replay { sets, world } = self;
         let pois = world.pois.len();
@@ -97,27 +97,29 @@ impl Replay<'_> {
         observed_at.resize(pois, NEVER);
         let steps = sets.len() / (pois * world.constants.words as usize);
         world.rule.observe(steps as u32, observed_at, |poi, open| {
-            worth(poi, open).find(|&step| near(poi, step) >= world.coupling[poi])
+            steps_to_test(poi, open).find(|&step| observers(poi, step) >= world.coupling[poi])
         });
     }
 
     /// Replays the episode as it was.
     fn observe(&self, observed_at: &mut Vec<u32>) {
-        self.play(observed_at, |_, open| open, |poi, step| self.near(poi, step, |_, agents| agents));
+        self.apply_rule(observed_at, |_, open| open, |poi, step| self.count_observers(poi, step, |_, agents| agents));
     }
 
     /// Replays the episode without some agents, by step and word. No POI is observed sooner than it was.
     fn observe_without(&self, was: &[u32], stay: impl Fn(u32, usize, u32) -> u32, observed_at: &mut Vec<u32>) {
         let later = |poi: usize, open: RangeInclusive<u32>| was[poi].max(*open.start())..=*open.end();
-        self.play(observed_at, later, |poi, step| self.near(poi, step, |word, agents| stay(step, word, agents)));
+        self.apply_rule(observed_at, later, |poi, step| {
+            self.count_observers(poi, step, |word, agents| stay(step, word, agents))
+        });
     }
 
     /// Replays the episode with more copies of an agent. No POI is observed later than it was.
     fn observe_with(&self, was: &[u32], agent: usize, copies: u32, observed_at: &mut Vec<u32>) {
         let sooner = |poi: usize, open: RangeInclusive<u32>| *open.start()..=was[poi].min(*open.end());
-        self.play(observed_at, sooner, |poi, step| {
-            let copied = self.near(poi, step, |word, agents| agents & alone(agent, word));
-            self.near(poi, step, |_, agents| agents) + copies * copied
+        self.apply_rule(observed_at, sooner, |poi, step| {
+            let copied = self.count_observers(poi, step, |word, agents| agents & alone(agent, word));
+            self.count_observers(poi, step, |_, agents| agents) + copies * copied
         });
     }
 }

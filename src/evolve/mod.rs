@@ -4,16 +4,21 @@
 //! Every random number is a pure function of counters ([`random`]). Results therefore do not depend on threads, batch
 //! size, backend, or on interruptions.
 
-pub mod mutation;
-pub mod random;
-pub mod schedule;
-pub mod selection;
-pub mod strategy;
-pub mod weights;
+mod mutation;
+mod random;
+mod schedule;
+mod selection;
+mod strategy;
+mod weights;
 
-pub use mutation::{Breeding, InvalidInput, Offspring, breed, mutate, mutation_threshold};
-pub use random::{Key, Purpose, noise};
-pub use schedule::{aligned_teams, form_teams, jitter_pois, jitter_starts, past_champions, places, shuffle, teams_of};
-pub use selection::{Selection, UNCHANGED, best, draw_parents, keep_parents, tournament};
+pub use mutation::{Breeding, InvalidInput, mutate};
+pub(crate) use mutation::{Offspring, breed, mutation_threshold};
+pub(crate) use random::noise;
+pub use random::{Key, Purpose};
+pub(crate) use schedule::shuffle;
+pub use schedule::{
+    aligned_teams, contemporary_teams, episode_positions, form_teams, jitter_pois, jitter_starts, past_champions,
+};
+pub use selection::{Selection, UNCHANGED, draw_parents, keep_parents, top_indices, tournament};
 pub use strategy::{Samples, Strategy};
-pub use weights::{MAX_WEIGHT, MIN_WEIGHT, admit, is_weight, random_policy};
+pub use weights::{MAX_WEIGHT, MIN_WEIGHT, flush_and_validate, is_weight, random_policy};

@@ -21,11 +21,11 @@ pub fn mutate(level: Level, key: Key, learning: &Learning, weights: &mut [f32], 
 
 #[inline(always)]
 fn mutate_lanes<S: Simd>(simd: S, key: Key, learning: &Learning, weights: &mut [f32], scratch: &mut Vec<u32>) {
-    let mut chosen = Chosen::new(scratch, 1, weights.len());
-    chosen.choose(simd, 0, key, learning.mutation_probability);
-    let listed = chosen.list(0);
-    chosen.address(simd, 0, listed, key.fork());
-    chosen.mutate(simd, learning, weights);
+    let mut mutations = MutationList::new(scratch, 1, weights.len());
+    mutations.mark(simd, 0, key, learning.mutation_probability);
+    let listed = mutations.collect_indices(0);
+    mutations.fill_positions(simd, 0, listed, key.fork());
+    mutations.mutate(simd, learning, weights);
 }
 
 /// A breeding plan that does not match the populations it is applied to.
@@ -52,10 +52,10 @@ impl Breeding<'_> {
     ///
     /// # Errors
     /// The plan has too few or too many entries, or a parent that does not exist.
-    pub fn check(&self, [leaders, slots, _]: [usize; 3]) -> Result<(), InvalidInput> {
+    pub fn check(&self, [populations, slots, _]: [usize; 3]) -> Result<(), InvalidInput> {
         let invalid = |text: String| Err(InvalidInput(text));
-        if self.parents.len() != leaders * slots {
-            return invalid(format!("{} parents for {leaders} populations of {slots}", self.parents.len()));
+        if self.parents.len() != populations * slots {
+            return invalid(format!("{} parents for {populations} populations of {slots}", self.parents.len()));
         }
         // The largest number is found by vectors.
         if self.parents.iter().map(|planned| planned & !UNCHANGED).max().is_none_or(|parent| (parent as usize) < slots)
@@ -82,11 +82,11 @@ impl Breeding<'_> {
         let [_, slots, parameters] = sizes;
         let (mut children, mut scratch) = (Vec::with_capacity(weights.len()), Vec::new());
         for (place, planned) in self.parents.iter().enumerate() {
-            let (leader, slot, first) = (place / slots, place % slots, children.len());
-            let parent = leader * slots + (planned & !UNCHANGED) as usize;
+            let (population, slot, first) = (place / slots, place % slots, children.len());
+            let parent = population * slots + (planned & !UNCHANGED) as usize;
             children.extend_from_slice(&weights[parent * parameters..(parent + 1) * parameters]);
             if planned & UNCHANGED == 0 {
-                let key = self.key.at(self.generation, leader, slot);
+                let key = self.key.at(self.generation, population, slot);
                 mutate(Level::new(), key, self.learning, &mut children[first..], &mut scratch);
             }
         }
@@ -96,7 +96,7 @@ impl Breeding<'_> {
 
 /// Some slots of one population, to be filled according to a plan.
 #[derive(Clone, Copy, Debug)]
-pub struct Offspring<'a> {
+pub(crate) struct Offspring<'a> {
     /// The trial's key of [`Purpose::Mutation`](super::Purpose::Mutation).
     pub key: Key,
     /// The generation that ends.
@@ -112,7 +112,7 @@ pub struct Offspring<'a> {
 }
 
 /// Fills slots, `[slots][parameters]`: copies each one's parent and [`mutate`]s it. `scratch` may hold anything.
-pub fn breed(
+pub(crate) fn breed(
     level: Level,
     learning: &Learning,
     offspring: Offspring<'_>,
@@ -121,7 +121,7 @@ pub fn breed(
 ) {
     let parameters = offspring.policies.len() / offspring.parents.len();
     // As many policies as fit into the first-level cache.
-    let together = (BRED_TOGETHER / parameters).clamp(1, WIDEST);
+    let together = (BRED_TOGETHER / parameters).clamp(1, MAX_LANES);
     for (batch, children) in children.chunks_mut(together * parameters).enumerate() {
         let batch = Offspring { first: offspring.first + batch * together, ..offspring };
         dispatch!(level, simd => mutate_offspring(simd, learning, batch, children, scratch));
@@ -142,7 +142,7 @@ fn mutate_offspring<S: Simd>(
     let parameters = offspring.policies.len() / offspring.parents.len();
     let policy = |parent: u32| &offspring.policies[(parent & !UNCHANGED) as usize * parameters..][..parameters];
     let (parents, later) = offspring.parents[offspring.first..].split_at(children.len() / parameters);
-    let mut chosen = Chosen::new(scratch, parents.len(), parameters);
+    let mut mutations = MutationList::new(scratch, parents.len(), parameters);
     for (batch, parents) in parents.chunks(S::f32s::LEN).enumerate() {
         let first = batch * S::f32s::LEN;
         let slots = S::u32s::from_fn(simd, |lane| (offspring.first + first + lane) as u32);
@@ -161,21 +161,21 @@ fn mutate_offspring<S: Simd>(
             if parent & UNCHANGED != 0 {
                 continue;
             }
-            chosen.choose(simd, first + lane, key(&keys, lane), learning.mutation_probability);
+            mutations.mark(simd, first + lane, key(&keys, lane), learning.mutation_probability);
         }
-        let mut listed = [(0, 0); WIDEST];
+        let mut listed = [(0, 0); MAX_LANES];
         for lane in mutating() {
-            listed[lane] = chosen.list(first + lane);
+            listed[lane] = mutations.collect_indices(first + lane);
         }
         for lane in mutating() {
-            chosen.address(simd, first + lane, listed[lane], key(&forks, lane));
+            mutations.fill_positions(simd, first + lane, listed[lane], key(&forks, lane));
         }
     }
-    chosen.mutate(simd, learning, children);
+    mutations.mutate(simd, learning, children);
 }
 
 /// Lanes of the widest vectors.
-const WIDEST: usize = 16;
+const MAX_LANES: usize = 16;
 
 /// Copies a policy with vector loads and stores.
 #[inline(always)]
@@ -190,33 +190,34 @@ fn copy<S: Simd>(simd: S, from: &[f32], to: &mut [f32]) {
 }
 
 /// The weights that mutate, of one policy or several, collected so that no lane is idle.
-struct Chosen<'a> {
+struct MutationList<'a> {
     /// Weights per policy.
     parameters: usize,
-    /// One bit per weight, set if it mutates; see [`Chosen::words`].
+    /// One bit per weight, set if it mutates; see [`MutationList::words`].
     masks: &'a mut [u32],
     /// The number of weights listed.
     count: usize,
     /// Per listed weight: its index in its policy, its index among all weights, its bits, and the key of its noise.
     indices: &'a mut [u32],
-    places: &'a mut [u32],
+    positions: &'a mut [u32],
     bits: &'a mut [u32],
     keys: [&'a mut [u32]; 4],
 }
 
-impl<'a> Chosen<'a> {
+impl<'a> MutationList<'a> {
     /// Returns an empty list for a number of policies.
     #[inline(always)]
-    fn new(scratch: &'a mut Vec<u32>, policies: usize, parameters: usize) -> Chosen<'a> {
+    fn new(scratch: &'a mut Vec<u32>, policies: usize, parameters: usize) -> MutationList<'a> {
         // Whole vectors are stored at unaligned positions.
-        let room = policies * parameters.next_multiple_of(64) + WIDEST;
+        let room = policies * parameters.next_multiple_of(64) + MAX_LANES;
         if scratch.len() < 8 * room {
             scratch.resize(8 * room, 0);
         }
         let mut fields = scratch.chunks_exact_mut(room);
         let mut field = || fields.next().expect("there is room for eight");
-        let (masks, indices, places, bits) = (field(), field(), field(), field());
-        Chosen { parameters, masks, count: 0, indices, places, bits, keys: [field(), field(), field(), field()] }
+        let (masks, indices, positions, bits) = (field(), field(), field(), field());
+        let keys = [field(), field(), field(), field()];
+        MutationList { parameters, masks, count: 0, indices, positions, bits, keys }
     }
 
     /// Returns the range of a policy's masks.
@@ -226,11 +227,11 @@ impl<'a> Chosen<'a> {
         policy * words..(policy + 1) * words
     }
 
-    /// Chooses which weights of a policy mutate. Each has a random word of its own; a draw makes four words.
+    /// Marks the weights of a policy that mutate. Each has a random word of its own; a draw makes four words.
     ///
     /// Weight `64·block + 16·word + place` uses the word of counter `16·block + place`, whatever the number of lanes.
     #[inline(always)]
-    fn choose<S: Simd>(&mut self, simd: S, policy: usize, key: Key, probability: f64) {
+    fn mark<S: Simd>(&mut self, simd: S, policy: usize, key: Key, probability: f64) {
         let threshold = mutation_threshold(probability);
         let words = self.words(policy);
         let lanes = S::u32s::from_fn(simd, |lane| lane as u32);
@@ -253,9 +254,9 @@ impl<'a> Chosen<'a> {
         }
     }
 
-    /// Lists the chosen weights of a policy, and returns the range of their entries.
+    /// Lists the marked weights of a policy, and returns the range of their entries.
     #[inline(always)]
-    fn list(&mut self, policy: usize) -> (usize, usize) {
+    fn collect_indices(&mut self, policy: usize) -> (usize, usize) {
         let before = self.count;
         let mut count = before;
         for (word, &mask) in (0..).step_by(32).zip(&self.masks[self.words(policy)]) {
@@ -273,15 +274,15 @@ impl<'a> Chosen<'a> {
 
     /// Fills in the positions and noise keys of a policy's listed weights.
     ///
-    /// This is separate from [`Chosen::list`], because a vector load right after narrow stores to the same bytes would
-    /// stall.
+    /// This is separate from [`MutationList::collect_indices`], because a vector load right after narrow stores to the
+    /// same bytes would stall.
     #[inline(always)]
-    fn address<S: Simd>(&mut self, simd: S, policy: usize, (first, end): (usize, usize), noises: Key) {
-        let place = (policy * self.parameters) as u32;
+    fn fill_positions<S: Simd>(&mut self, simd: S, policy: usize, (first, end): (usize, usize), noises: Key) {
+        let first_weight = (policy * self.parameters) as u32;
         for at in (first..end).step_by(S::f32s::LEN) {
             let vector = at..at + S::f32s::LEN;
             let index = S::u32s::from_slice(simd, &self.indices[vector.clone()]);
-            (index + place).store_slice(&mut self.places[vector.clone()]);
+            (index + first_weight).store_slice(&mut self.positions[vector.clone()]);
             for (to, word) in self.keys.iter_mut().zip(noises.0) {
                 S::u32s::simd_from(simd, word).store_slice(&mut to[vector.clone()]);
             }
@@ -291,10 +292,10 @@ impl<'a> Chosen<'a> {
     /// Adds its noise to each listed weight.
     #[inline(always)]
     fn mutate<S: Simd>(self, simd: S, learning: &Learning, weights: &mut [f32]) {
-        let Chosen { count, indices, places, bits, keys: [x, y, z, w], .. } = self;
+        let MutationList { count, indices, positions, bits, keys: [x, y, z, w], .. } = self;
         let sigma = learning.mutation_sigma as f32;
-        for (bits, &place) in bits[..count].iter_mut().zip(&*places) {
-            *bits = weights[place as usize].to_bits();
+        for (bits, &position) in bits[..count].iter_mut().zip(&*positions) {
+            *bits = weights[position as usize].to_bits();
         }
         let vectors = || (0..count).step_by(S::f32s::LEN).map(|at| at..at + S::f32s::LEN);
         let load = |from: &[u32]| S::u32s::from_slice(simd, from);
@@ -318,14 +319,14 @@ impl<'a> Chosen<'a> {
             let mutated: S::u32s = within_limits(simd, weight + noise).bitcast();
             mutated.store_slice(&mut bits[at]);
         }
-        for (&bits, &place) in bits[..count].iter().zip(&*places) {
-            weights[place as usize] = f32::from_bits(bits);
+        for (&bits, &position) in bits[..count].iter().zip(&*positions) {
+            weights[position as usize] = f32::from_bits(bits);
         }
     }
 }
 
 /// Returns the threshold below which a weight's random word makes it mutate, or `None` if every weight mutates.
-pub fn mutation_threshold(probability: f64) -> Option<u32> {
+pub(crate) fn mutation_threshold(probability: f64) -> Option<u32> {
     (probability < 1.0).then_some((probability * (1u64 << 32) as f64) as u32)
 }
 

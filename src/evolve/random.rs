@@ -53,7 +53,7 @@ impl Key {
     }
 
     /// Returns the state of [`Key::at`] before the slot is xored into its third word.
-    pub fn of_population(self, generation: usize, population: usize) -> [u32; 4] {
+    pub(crate) fn of_population(self, generation: usize, population: usize) -> [u32; 4] {
         let Key([x, y, z, w]) = self;
         [x ^ generation as u32, y ^ population as u32, z, w]
     }
@@ -91,13 +91,13 @@ impl Key {
 /// Returns the noise on one leader's turn and speed at one step: two standard normal deviates, one team per lane. `key`
 /// is of [`Purpose::Exploration`].
 #[inline(always)]
-pub fn noise<S: Simd>(key: Key, step: usize, leader: usize, team: S::u32s) -> [S::f32s; 2] {
+pub(crate) fn noise<S: Simd>(key: Key, step: usize, leader: usize, team: S::u32s) -> [S::f32s; 2] {
     let [a, b, c, d] = key.at_lanes::<S>(step, leader, team);
     let [a, b, c, d] = math::pcg4d::<S>(a, b, c, d);
     [math::normal::<S>(a, b), math::normal::<S>(c, d)]
 }
 
-/// Maps a random word to a number in `0..below`.
-pub(super) fn pick(word: u32, below: usize) -> usize {
+/// Maps a random word to an index in `0..below`.
+pub(super) fn index_below(word: u32, below: usize) -> usize {
     ((word as u64 * below as u64) >> 32) as usize
 }

@@ -3,7 +3,7 @@
 use fearless_simd::{Level, Simd, dispatch, prelude::*};
 use glam::Vec2;
 
-use super::random::{Key, Purpose, pick};
+use super::random::{Key, Purpose, index_below};
 use crate::config::{Learning, Sharing};
 use crate::world::{World, on_grid};
 
@@ -21,7 +21,7 @@ pub fn form_teams(key: Key, generation: usize, round: usize, leaders: usize, tea
 
 /// Returns the teams of contemporaries in one generation of a trial, `[teams][leaders]`, round by round. With a shared
 /// population, team `t` is policy `t`; otherwise see [`form_teams`].
-pub fn teams_of(learning: &Learning, trial: usize, generation: usize, leaders: usize) -> Vec<u32> {
+pub fn contemporary_teams(learning: &Learning, trial: usize, generation: usize, leaders: usize) -> Vec<u32> {
     let mut teams = aligned_teams(learning.population, leaders);
     if learning.sharing == Sharing::PerLeader {
         let key = Key::new(learning.seed, trial, Purpose::Teams);
@@ -48,12 +48,12 @@ pub fn past_champions(learning: &Learning, trial: usize, generation: usize) -> O
         return None;
     }
     let [word, ..] = Key::new(seed, trial, Purpose::HallOfFame).at(generation, 0, 0).draw(0);
-    let past = generation - 1 - pick(word, kept);
+    let past = generation - 1 - index_below(word, kept);
     Some(population + 1 + past % hall_of_fame)
 }
 
 /// Writes one population's policy in each team of a round, `[teams]`, see [`form_teams`].
-pub fn shuffle(level: Level, key: Key, generation: usize, round: usize, population: usize, order: &mut [u32]) {
+pub(crate) fn shuffle(level: Level, key: Key, generation: usize, round: usize, population: usize, order: &mut [u32]) {
     let key = key.at(generation, population, round);
     dispatch!(level, simd => shuffle_lanes(simd, key, order));
 }
@@ -65,7 +65,7 @@ fn shuffle_lanes<S: Simd>(simd: S, key: Key, order: &mut [u32]) {
         for (newcomer, &word) in (first..order.len()).zip(words.as_slice()) {
             // Fisher-Yates shuffle, inside out: the new element takes a random position, and the element there moves to
             // the end.
-            let place = pick(word, newcomer + 1);
+            let place = index_below(word, newcomer + 1);
             order[newcomer] = order[place];
             order[place] = newcomer as u32;
         }
@@ -74,19 +74,19 @@ fn shuffle_lanes<S: Simd>(simd: S, key: Key, order: &mut [u32]) {
 
 /// Writes the positions of one episode of a trial's generation, as [`Group::starts`](crate::backend::Group::starts) has
 /// them: the agents' starts, then the POIs if they move.
-pub fn places(
+pub fn episode_positions(
     learning: &Learning,
     trial: usize,
     generation: usize,
     episode: usize,
     world: &World,
-    places: &mut Vec<Vec2>,
+    positions: &mut Vec<Vec2>,
 ) {
     let key = Key::new(learning.seed, trial, Purpose::Starts);
-    jitter_starts(key, generation, episode, world, learning.start_jitter, places);
+    jitter_starts(key, generation, episode, world, learning.start_jitter, positions);
     if learning.poi_jitter > 0.0 {
         let key = Key::new(learning.seed, trial, Purpose::Pois);
-        jitter_pois(key, generation, episode, world, learning.poi_jitter, places);
+        jitter_pois(key, generation, episode, world, learning.poi_jitter, positions);
     }
 }
 
@@ -99,24 +99,24 @@ pub fn jitter_starts(key: Key, generation: usize, episode: usize, world: &World,
 
 /// Appends the POI positions of one episode, `[pois]`, moved the same way. Appends nothing if `jitter` is 0. `key` is
 /// of [`Purpose::Pois`] or [`Purpose::HeldOutPois`].
-pub fn jitter_pois(key: Key, generation: usize, episode: usize, world: &World, jitter: f64, places: &mut Vec<Vec2>) {
+pub fn jitter_pois(key: Key, generation: usize, episode: usize, world: &World, jitter: f64, positions: &mut Vec<Vec2>) {
     if jitter > 0.0 {
-        let first = places.len();
-        places.extend(&world.pois);
-        scatter(key.at(generation, episode, 0), world.map(), jitter, &mut places[first..]);
+        let first = positions.len();
+        positions.extend(&world.pois);
+        scatter(key.at(generation, episode, 0), world.map(), jitter, &mut positions[first..]);
     }
 }
 
 /// Moves each position by a uniform offset in `-jitter..jitter` on both axes.
-fn scatter(key: Key, map: Vec2, jitter: f64, places: &mut [Vec2]) {
+fn scatter(key: Key, map: Vec2, jitter: f64, positions: &mut [Vec2]) {
     if jitter == 0.0 {
         return;
     }
-    for (index, place) in places.iter_mut().enumerate() {
+    for (index, position) in positions.iter_mut().enumerate() {
         let [x, y, ..] = key.draw(index as u32).map(|word| {
             // In -1..1 and exact in f64. The product with `jitter` rounds in f64, and again in the conversion to f32.
             ((word as f64 / (1u64 << 32) as f64) * 2.0 - 1.0) * jitter
         });
-        *place = on_grid(*place + Vec2::new(x as f32, y as f32), map);
+        *position = on_grid(*position + Vec2::new(x as f32, y as f32), map);
     }
 }

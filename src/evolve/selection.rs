@@ -2,14 +2,14 @@
 
 use fearless_simd::{Level, Simd, dispatch, prelude::*};
 
-use super::random::{Key, pick};
+use super::random::{Key, index_below};
 use crate::config::{Learning, Parents};
 use crate::kernels::math;
 use crate::parallel::*;
 
 /// Returns the indices of the `count` best scores, best first. Ties go to the lower index.
-pub fn best(scores: &[f32], count: usize) -> Vec<usize> {
-    if count <= FEW {
+pub fn top_indices(scores: &[f32], count: usize) -> Vec<usize> {
+    if count <= MAX_SEARCHED {
         // The best so far, in order. Few scores are inserted, so that this is faster than sorting.
         let mut order: Vec<usize> = Vec::with_capacity(count + 1);
         for (index, score) in scores.iter().enumerate() {
@@ -35,8 +35,8 @@ pub fn best(scores: &[f32], count: usize) -> Vec<usize> {
     order.into_iter().map(|key| key as u32 as usize).collect()
 }
 
-/// Up to this count, [`best`] searches without sorting.
-const FEW: usize = 16;
+/// Up to this count, [`top_indices`] searches without sorting.
+const MAX_SEARCHED: usize = 16;
 
 /// Returns the winner of one slot's binary tournament: of two distinct random policies, the one with the higher score
 /// (`scores` is `[policies]`). Ties go to the lower index.
@@ -45,11 +45,11 @@ pub fn tournament(key: Key, scores: &[f32]) -> usize {
     winner(first, second, scores)
 }
 
-/// Returns the winner between the two policies that two random words pick.
+/// Returns the winner between the two policies that two random words select.
 #[inline(always)]
 fn winner(first: u32, second: u32, scores: &[f32]) -> usize {
-    let a = pick(first, scores.len());
-    let b = pick(second, scores.len() - 1);
+    let a = index_below(first, scores.len());
+    let b = index_below(second, scores.len() - 1);
     let b = if b >= a { b + 1 } else { b };
     let (low, high) = (a.min(b), a.max(b));
     if scores[high] > scores[low] { high } else { low }
@@ -91,10 +91,10 @@ pub fn draw_parents(
     parents: &mut [u32],
 ) {
     let policies = scores.len();
-    let best = best(scores, selection.elites.max(1));
+    let best = top_indices(scores, selection.elites.max(1));
     let choose = |first, second| match selection.parents {
         Parents::All => winner(first, second, scores),
-        Parents::Elites => best[pick(first, best.len())],
+        Parents::Elites => best[index_below(first, best.len())],
     };
     parents[..policies].par_chunks_mut(DRAWN_TOGETHER).enumerate().for_each(|(chunk, parents)| {
         let first = chunk * DRAWN_TOGETHER;
@@ -118,7 +118,7 @@ pub fn keep_parents(scores: &[f32], parents: &mut [u32]) {
     for (slot, parent) in parents.iter_mut().enumerate() {
         *parent = slot as u32 | UNCHANGED;
     }
-    parents[scores.len()] = best(scores, 1)[0] as u32 | UNCHANGED;
+    parents[scores.len()] = top_indices(scores, 1)[0] as u32 | UNCHANGED;
 }
 
 /// Slots per rayon task.
@@ -155,7 +155,7 @@ mod tests {
         let mut expected: Vec<usize> = (0..scores.len()).collect();
         expected.sort_by(|a, b| scores[*b].total_cmp(&scores[*a]));
         for count in 0..=scores.len() {
-            assert_eq!(best(&scores, count), expected[..count], "{count} of {}", scores.len());
+            assert_eq!(top_indices(&scores, count), expected[..count], "{count} of {}", scores.len());
         }
     }
 }

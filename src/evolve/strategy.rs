@@ -6,7 +6,7 @@
 use fearless_simd::{Level, Simd, dispatch, prelude::*};
 
 use super::random::Key;
-use super::selection::best;
+use super::selection::top_indices;
 use super::weights::{MAX_WEIGHT, MIN_WEIGHT, within_limits};
 use crate::config::{Learning, Method};
 use crate::kernels::{math, splat};
@@ -45,7 +45,7 @@ impl Strategy {
     /// Returns the utility of each policy's rank, `[policies]`, for scores `[policies]`. Policies with equal scores get
     /// the mean over their ranks.
     pub fn utilities(&self, scores: &[f32]) -> Vec<f64> {
-        let order = best(scores, scores.len());
+        let order = top_indices(scores, scores.len());
         let (mut utilities, mut rank) = (vec![0.0; scores.len()], 0);
         for tied in order.chunk_by(|&a, &b| scores[a] == scores[b]) {
             let ranks = &self.utilities[rank..rank + tied.len()];
@@ -65,7 +65,7 @@ impl Strategy {
         let (policies, search) = population.split_at_mut(scores.len() * parameters);
         let (mean, sigmas) = search.split_at_mut(parameters);
         if generation == 0 {
-            let first = best(scores, 1)[0] * parameters;
+            let first = top_indices(scores, 1)[0] * parameters;
             mean.copy_from_slice(&policies[first..first + parameters]);
             sigmas.fill(self.sigma);
             return;
@@ -181,9 +181,9 @@ fn add_moments<S: Simd>(
         let sums = first.iter_mut().zip(second.iter_mut());
         for ((&weight, &mean), (first, second)) in policy.iter().zip(mean).zip(sums) {
             let offset = f64::from(weight) - f64::from(mean);
-            let weighed = utility * offset;
-            *first += weighed;
-            *second += weighed * offset;
+            let weighted = utility * offset;
+            *first += weighted;
+            *second += weighted * offset;
         }
     }
 }

@@ -15,8 +15,9 @@ pub fn is_weight(number: f32) -> bool {
     number == 0.0 || (MIN_WEIGHT..=MAX_WEIGHT).contains(&number.abs())
 }
 
-/// Rounds weights that are too small to 0. Returns the index of the first that is too large or not a number.
-pub fn admit(weights: &mut [f32]) -> Option<usize> {
+/// Flushes weights that are too small to 0. Returns the index of the first that is too large or not a number, if any;
+/// weights after it stay unchanged.
+pub fn flush_and_validate(weights: &mut [f32]) -> Option<usize> {
     weights.iter_mut().position(|weight| {
         if weight.abs() < MIN_WEIGHT {
             *weight = 0.0;

@@ -4,7 +4,7 @@ use crate::backend::cpu::Cpu;
 #[cfg(feature = "gpu")]
 use crate::backend::gpu::{
     self,
-    device::{DeviceError, Wanted},
+    device::{AdapterChoice, DeviceError},
     episode::{GpuBackend, ResidencyPolicy},
 };
 use crate::backend::{Machine, OpenBackend};
@@ -47,14 +47,14 @@ pub struct Found {
 pub fn find_gpu(processor: &Processor, holding: Option<ResidencyPolicy>) -> Result<Found, DeviceError> {
     let choice = match processor {
         Processor::Cpu => return Ok(Found { gpu: None, passed_over: None }),
-        Processor::Auto | Processor::Gpu => Wanted::Real,
-        Processor::Adapter(name) => Wanted::Named(name.clone()),
+        Processor::Auto | Processor::Gpu => AdapterChoice::Real,
+        Processor::Adapter(name) => AdapterChoice::Named(name.clone()),
     };
     let optional = *processor == Processor::Auto && holding != Some(ResidencyPolicy::Always);
     match gpu::open(choice).and_then(GpuBackend::new) {
         Ok(gpu) => {
             let gpu = match holding {
-                Some(holding) => gpu.holding(holding),
+                Some(holding) => gpu.with_residency(holding),
                 None => gpu,
             };
             Ok(Found { gpu: Some(gpu), passed_over: None })

@@ -250,7 +250,7 @@ impl<'a> CheckedTeams<'a> {
         }
         let mut weights = Cow::Borrowed(weights);
         if !weights.iter().all(|&weight| evolve::is_weight(weight))
-            && let Some(place) = evolve::admit(weights.to_mut())
+            && let Some(place) = evolve::flush_and_validate(weights.to_mut())
         {
             let (policy, parameter, value) = (place / parameters, place % parameters, weights[place]);
             return Err(Failure::Weight { leader: policy / teams, team: policy % teams, parameter, value });

@@ -249,7 +249,7 @@ pub(super) fn start_from(
         if weights.is_empty() || Some(weights.len()) != (leaders * parameters).checked_mul(policies) {
             return Err(Failure::Weights { found: weights.len(), leaders, teams: policies, parameters });
         }
-        if let Some(place) = evolve::admit(&mut weights) {
+        if let Some(place) = evolve::flush_and_validate(&mut weights) {
             let (policy, parameter, value) = (place / parameters, place % parameters, weights[place]);
             return Err(Failure::Weight { leader: policy / policies, team: policy % policies, parameter, value });
         }

@@ -174,8 +174,8 @@ pub fn force<S: Simd>(world: &Lanes<S>, sums: &Sums<S>, x: S::f32s, y: S::f32s) 
 
 /// Returns the squared size of a force, and the inverse of its size.
 #[inline(always)]
-pub fn sizes<S: Simd>(pull: &SteeringForce<S>) -> (S::f32s, S::f32s) {
-    let force2 = pull.x * pull.x + pull.y * pull.y;
+pub fn sizes<S: Simd>(force: &SteeringForce<S>) -> (S::f32s, S::f32s) {
+    let force2 = force.x * force.x + force.y * force.y;
     (force2, rsqrt::<S>(force2))
 }
 
@@ -190,31 +190,31 @@ pub fn sizes<S: Simd>(pull: &SteeringForce<S>) -> (S::f32s, S::f32s) {
 #[inline(always)]
 pub(crate) fn steer<S: Simd, const BY_SINE: bool>(
     world: &Lanes<S>,
-    pull: &SteeringForce<S>,
+    force: &SteeringForce<S>,
     (force2, inverse): (S::f32s, S::f32s),
     hx: S::f32s,
     hy: S::f32s,
     speed: S::f32s,
 ) -> (S::f32s, S::f32s, S::f32s) {
     let zero = splat(hx.token(), 0.0);
-    let ux = pull.x * inverse;
-    let uy = pull.y * inverse;
+    let ux = force.x * inverse;
+    let uy = force.y * inverse;
     let along = hx * ux + hy * uy;
     let across = hx * uy - hy * ux;
     let sine = select::<S>(zero - world.motion.max_turn_sin, world.motion.max_turn_sin, across.simd_ge(zero));
     let (turned_x, turned_y) = rotate::<S>(hx, hy, world.motion.max_turn_cos, sine);
-    let pulled = force2.simd_gt(zero);
+    let has_force = force2.simd_gt(zero);
     // Without a force, `along` is 0.
     let reached = if BY_SINE {
         along.simd_gt(zero) & across.abs().simd_le(world.motion.max_turn_sin)
     } else {
-        along.simd_ge(world.motion.max_turn_cos) & pulled
+        along.simd_ge(world.motion.max_turn_cos) & has_force
     };
     // The order matters for speed only: with the heading selected last, the compiler would emit a slow masked store.
-    let next_x = select::<S>(select::<S>(hx, turned_x, pulled), ux, reached);
-    let next_y = select::<S>(select::<S>(hy, turned_y, pulled), uy, reached);
+    let next_x = select::<S>(select::<S>(hx, turned_x, has_force), ux, reached);
+    let next_y = select::<S>(select::<S>(hy, turned_y, has_force), uy, reached);
     let ahead = select::<S>(world.motion.min_speed, force2 * inverse, along.simd_gt(zero));
-    let wanted = select::<S>(speed, zero_unless::<S>(ahead, pulled), pull.influenced);
+    let wanted = select::<S>(speed, zero_unless::<S>(ahead, has_force), force.influenced);
     (next_x, next_y, wanted)
 }
 

@@ -7,12 +7,12 @@ use fearless_simd::Simd;
 
 use crate::gpu_struct::{Field, GpuStruct, gpu_struct};
 
-pub mod couple;
-pub mod follow;
-pub mod motion;
+pub(crate) mod couple;
+pub(crate) mod follow;
+pub(crate) mod motion;
 pub mod policy;
 pub mod rule;
-pub mod sense;
+pub(crate) mod sense;
 pub mod start;
 
 use couple::{CoupleConstants, CoupleLanes};

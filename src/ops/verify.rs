@@ -11,7 +11,7 @@ use super::{Context, Error, Event, with_remedy};
 use crate::backend::Backend;
 use crate::backend::cpu::{Cpu, level_name};
 use crate::backend::gpu;
-use crate::backend::gpu::device::{self, AdapterInfo, DeviceError, Wanted};
+use crate::backend::gpu::device::{self, AdapterChoice, AdapterInfo, DeviceError};
 use crate::backend::gpu::episode::{GpuBackend, Kernel, Records, ResidencyPolicy};
 use crate::backend::gpu::exact::Pass;
 use crate::config::{Config, Override};
@@ -150,7 +150,7 @@ const BUDGET: Duration = Duration::from_secs(60);
 
 /// A combination that is compared with the CPU.
 struct Combination<'a> {
-    choice: &'a Wanted,
+    choice: &'a AdapterChoice,
     info: &'a AdapterInfo,
     pass: Pass,
     kernel: Kernel,
@@ -286,12 +286,12 @@ fn plan(args: &Request) -> Result<(Plan, Option<Duration>), Error> {
 }
 
 /// Returns the adapters to verify, each with the request that opens it.
-fn adapters(name: Option<&str>) -> Result<Vec<(Wanted, AdapterInfo)>, Error> {
+fn adapters(name: Option<&str>) -> Result<Vec<(AdapterChoice, AdapterInfo)>, Error> {
     let found = device::adapters();
-    let all = found.iter().cloned().enumerate().map(|(index, info)| (Wanted::Named(index.to_string()), info));
+    let all = found.iter().cloned().enumerate().map(|(index, info)| (AdapterChoice::Named(index.to_string()), info));
     match name {
         Some(name) => {
-            let named = Wanted::Named(name.into());
+            let named = AdapterChoice::Named(name.into());
             let index = device::position(&named, &found).map_err(|error| match found.is_empty() {
                 true => Error::NoneToVerify(error),
                 false => error.into(),
@@ -329,8 +329,8 @@ fn verify(
     if let Some(mismatch) = gpu::self_test(&gpu)? {
         return Ok(Agreement { mismatch: Some(mismatch.to_string()), ..Agreement::default() });
     }
-    let gpu = GpuBackend::new(gpu)?.playing(combination.kernel);
-    let mut gpu = gpu.holding(ResidencyPolicy::Always).with_records(Records::Packed);
+    let gpu = GpuBackend::new(gpu)?.with_kernel(combination.kernel);
+    let mut gpu = gpu.with_residency(ResidencyPolicy::Always).with_records(Records::Packed);
     Ok(compare_within(plan, budget, |part, before| {
         compare(part, &mut Cpu::default(), &mut gpu, |now| {
             let now = Agreement { worlds: before.worlds + now.worlds, ..now.clone() };

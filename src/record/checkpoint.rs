@@ -26,7 +26,7 @@ use crate::config::Config;
 use crate::evolve;
 use crate::file;
 use crate::host::Instant;
-use crate::parallel::Aside;
+use crate::parallel::BackgroundTask;
 use crate::trainer::{Row, Snapshot};
 
 const KIND: &str = "checkpoint 1";
@@ -155,7 +155,7 @@ impl Checkpoint {
         let elsewhere = generation == last + 1 && file.info(WEIGHTS).is_none();
         let mut floats = |name: &str, shape: &[usize]| -> Result<Vec<Vec<f32>>, String> {
             let mut trials: Vec<Vec<f32>> = file.read(name, Dtype::F32, shape, shape[0])?;
-            match trials.iter_mut().any(|numbers| evolve::admit(numbers).is_some()) {
+            match trials.iter_mut().any(|numbers| evolve::flush_and_validate(numbers).is_some()) {
                 true => Err(format!("{name} has numbers out of range")),
                 false => Ok(trials),
             }
@@ -205,7 +205,7 @@ impl Checkpoint {
                 };
                 // The overall best policy is the champion.
                 put(population, &sorted[..parameters]);
-                let order = evolve::best(fitness, population);
+                let order = evolve::top_indices(fitness, population);
                 order.into_iter().zip(sorted.chunks_exact(parameters)).for_each(|(slot, policy)| put(slot, policy));
             }
             weights.push(slots);
@@ -297,7 +297,7 @@ pub struct CheckpointWriter {
     config: Arc<Config>,
     /// Generations of the complete checkpoints, oldest first.
     kept: Vec<usize>,
-    writing: Option<Aside<Result<(usize, Duration), RecordError>>>,
+    writing: Option<BackgroundTask<Result<(usize, Duration), RecordError>>>,
     /// Generation, time and cost of the last checkpoint.
     last: (usize, Instant, Duration),
 }
@@ -332,7 +332,7 @@ impl CheckpointWriter {
         self.last = (generation, Instant::now(), since.elapsed());
         let (disk, config) = (self.disk.clone(), self.config.clone());
         let path = path(&self.folder, generation);
-        self.writing = Some(Aside::start(move || {
+        self.writing = Some(BackgroundTask::start(move || {
             metrics.sync().map_err(RecordError::write(metrics.path()))?;
             checkpoint.write(&disk, &path, &config).map_err(RecordError::write(&path))?;
             Ok((generation, since.elapsed()))
@@ -408,7 +408,7 @@ impl CheckpointWriter {
     /// # Errors
     /// The last checkpoint could not be written.
     pub(crate) fn poll(&mut self) -> Result<(), RecordError> {
-        if self.writing.as_ref().is_some_and(Aside::is_finished) { self.wait() } else { Ok(()) }
+        if self.writing.as_ref().is_some_and(BackgroundTask::is_finished) { self.wait() } else { Ok(()) }
     }
 
     /// Returns the generation of the newest complete checkpoint.

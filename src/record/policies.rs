@@ -19,7 +19,7 @@ use super::disk::Disk;
 use super::tensors::{self, Tensor, TensorFile};
 use crate::config::{Config, MAX_POPULATION, Sharing};
 use crate::escape;
-use crate::evolve::{MAX_WEIGHT, admit};
+use crate::evolve::{MAX_WEIGHT, flush_and_validate};
 
 const KIND: &str = "policies 1";
 /// Name of a tensor that applies to all trials.
@@ -212,7 +212,7 @@ pub(crate) fn from_file(
     }
     let shape = info.shape.clone();
     let mut weights: Vec<f32> = file.read(&name, Dtype::F32, &shape, 1)?.pop().unwrap_or_default();
-    if let Some(index) = admit(&mut weights) {
+    if let Some(index) = flush_and_validate(&mut weights) {
         let (policy, parameter) = (index / parameters, index % parameters);
         return Err(format!(
             "{name}[{}, {}, {parameter}] is {}, allowed are numbers of size up to {MAX_WEIGHT}",

@@ -1,11 +1,11 @@
 //! The vectors of teams behind a [`Stepper`](super::Stepper).
 
-use std::sync::{Mutex, PoisonError};
+use std::sync::Mutex;
 
-use fearless_simd::{Simd, f32x4, prelude::*};
+use fearless_simd::{Simd, prelude::*};
 use glam::Vec2;
 
-use crate::backend::cpu::{Agent, Block, BlockState, transpose_rows, transpose4};
+use crate::backend::cpu::{Agent, Block, BlockState, load_pois, to_rows, transpose_rows, with_pois};
 use crate::credit::Episode;
 use crate::kernels::{clamp_to, splat};
 use crate::parallel::*;
@@ -91,7 +91,7 @@ pub(super) fn vectors<S: Simd>(simd: S, world: &World, teams: usize, record: usi
 }
 
 /// Vectors per task, so that waking a thread is worth its time.
-pub(super) const FEW: usize = 8;
+pub(super) const VECTORS_PER_TASK: usize = 8;
 
 impl<S: Simd> Vectors for TeamBlocks<S> {
     fn reset(
@@ -177,13 +177,13 @@ impl<S: Simd> TeamBlocks<S> {
     ) {
         let (simd, blocks, idle) = (self.simd, &mut self.blocks, &self.idle);
         View::new(blocks, observations).each(world, &|blocks, mut observations| {
-            let workspace = idle.lock().unwrap_or_else(PoisonError::into_inner).pop();
+            let workspace = lock(idle).pop();
             let mut workspace = workspace.unwrap_or_else(|| Box::new(Workspace::new(simd, world)));
             for block in blocks {
                 let own = observations.split(block.teams, world);
                 act(&mut workspace, block, own);
             }
-            idle.lock().unwrap_or_else(PoisonError::into_inner).push(workspace);
+            lock(idle).push(workspace);
         });
     }
 }
@@ -215,7 +215,7 @@ impl<'a, S: Simd> View<'a, S> {
     /// Calls `act` with a few vectors at a time, on all threads.
     fn each(self, world: &World, act: &(impl Fn(&'a mut [TeamBlock<S>], Slices<'a>) + Sync)) {
         let View { blocks, mut observations } = self;
-        if blocks.len() > FEW {
+        if blocks.len() > VECTORS_PER_TASK {
             let (low, high) = blocks.split_at_mut(blocks.len() / 2);
             let first = observations.split(low.len() * S::f32s::LEN, world);
             let (low, high) = (View { blocks: low, observations: first }, View { blocks: high, observations });
@@ -229,21 +229,16 @@ impl<'a, S: Simd> View<'a, S> {
 impl<'a> Slices<'a> {
     /// Splits off the first teams.
     fn split(&mut self, teams: usize, world: &World) -> Slices<'a> {
-        fn take<'a, T>(slice: &mut &'a mut [T], count: usize) -> &'a mut [T] {
-            let (taken, rest) = std::mem::take(slice).split_at_mut(count);
-            *slice = rest;
-            taken
-        }
         let (agents, pois) = (world.agents(), world.pois.len());
         Slices {
-            inputs: take(&mut self.inputs, teams * world.leaders() * INPUTS),
-            near: take(&mut self.near, teams * pois * world.constants.words as usize),
-            newly: take(&mut self.newly, teams * pois),
-            observed: take(&mut self.observed, teams * pois),
-            steps: take(&mut self.steps, teams),
-            positions: take(&mut self.positions, teams * agents * 2),
-            headings: take(&mut self.headings, teams * agents * 2),
-            speeds: take(&mut self.speeds, teams * agents),
+            inputs: self.inputs.split_off_mut(..teams * world.leaders() * INPUTS).unwrap_or_default(),
+            near: self.near.split_off_mut(..teams * pois * world.constants.words as usize).unwrap_or_default(),
+            newly: self.newly.split_off_mut(..teams * pois).unwrap_or_default(),
+            observed: self.observed.split_off_mut(..teams * pois).unwrap_or_default(),
+            steps: self.steps.split_off_mut(..teams).unwrap_or_default(),
+            positions: self.positions.split_off_mut(..teams * agents * 2).unwrap_or_default(),
+            headings: self.headings.split_off_mut(..teams * agents * 2).unwrap_or_default(),
+            speeds: self.speeds.split_off_mut(..teams * agents).unwrap_or_default(),
         }
     }
 }
@@ -270,17 +265,14 @@ impl<S: Simd> Workspace<S> {
     /// Loads the POI positions of a vector of teams.
     #[inline(always)]
     fn move_pois(&mut self, simd: S, world: &World, moved: &[Vec2], first: usize, teams: usize) {
-        self.moved.clear();
-        if moved.is_empty() {
-            return;
-        }
         let pois = world.pois.len();
-        self.moved.resize(pois, [splat(simd, 0.0); 2]);
-        for (lane, team) in lanes::<S>(teams) {
-            for ([x, y], poi) in self.moved.iter_mut().zip(&moved[(first + team) * pois..]) {
-                (x[lane], y[lane]) = (poi.x, poi.y);
-            }
-        }
+        load_pois(
+            simd,
+            world,
+            &mut self.moved,
+            #[inline(always)]
+            |lane| (!moved.is_empty()).then(|| &moved[(first + team_of(lane, teams)) * pois..][..pois]),
+        );
     }
 
     #[inline(always)]
@@ -363,31 +355,28 @@ impl<S: Simd> Workspace<S> {
         self.block.swap(state);
         self.take(simd, world, &actions[first * world.leaders() * OUTPUTS..], teams);
         if !sights.is_empty() {
-            self.watch(world, steps, sights);
+            self.record_sightings(world, steps, sights);
         }
         if playing.count_ones() as usize == teams {
-            self.block.go();
+            self.block.advance();
         } else {
             let (agents, counts) = &mut self.kept;
             agents.clone_from(&self.block.agents);
             counts.clone_from(&self.block.counts);
-            self.block.go();
+            self.block.advance();
             lanes::<S>(teams).filter(|&(_, team)| steps[team] >= last).for_each(|(lane, _)| self.keep(lane));
         }
-        if self.moved.is_empty() {
-            self.block.couple(&world.pois, &mut self.sets);
-        } else {
-            self.block.couple(&self.moved, &mut self.sets);
-        }
+        with_pois!(self.moved, world, pois => self.block.record_poi_sets(pois, &mut self.sets));
         let (pois, words) = (world.pois.len(), world.constants.words as usize);
         let width = S::f32s::LEN;
         let sets = bytemuck::cast_slice::<u32, f32>(&self.sets);
         to_rows(
             simd,
             pois * words,
+            (0, 1),
+            bytemuck::cast_slice_mut(near),
             #[inline(always)]
             |column| &sets[column * width..][..width],
-            bytemuck::cast_slice_mut(near),
         );
         // A POI that this step observes opens another one from the next step on.
         let rule = &world.rule;
@@ -418,8 +407,8 @@ impl<S: Simd> Workspace<S> {
 
     /// Records which leaders each follower sees before this step, for teams whose episode is not over.
     #[inline(always)]
-    fn watch(&mut self, world: &World, steps: &[u32], sights: &mut [u32]) {
-        self.block.watch(&mut self.sights);
+    fn record_sightings(&mut self, world: &World, steps: &[u32], sights: &mut [u32]) {
+        self.block.record_sightings(&mut self.sights);
         let size = world.followers() * world.leader_words();
         for (team, &step) in steps.iter().enumerate().filter(|(_, step)| **step < world.constants.steps) {
             let to = &mut sights[team * world.sight_words() + step as usize * size..][..size];
@@ -465,18 +454,15 @@ impl<S: Simd> Workspace<S> {
 
     #[inline(always)]
     fn sense(&mut self, simd: S, world: &World, inputs: &mut [f32]) {
-        if self.moved.is_empty() {
-            self.block.look(&world.pois);
-        } else {
-            self.block.look(&self.moved);
-        }
+        with_pois!(self.moved, world, pois => self.block.sense(pois));
         let columns = self.block.inputs.as_flattened();
         to_rows(
             simd,
             columns.len(),
+            (0, 1),
+            inputs,
             #[inline(always)]
             |column| columns[column].as_slice(),
-            inputs,
         );
     }
 }
@@ -487,23 +473,26 @@ fn show<S: Simd>(simd: S, agents: &[Agent<S>], observations: Slices<'_>) {
     to_rows(
         simd,
         2 * agents.len(),
+        (0, 1),
+        observations.positions,
         #[inline(always)]
         |column| if column % 2 == 0 { agents[column / 2].x.as_slice() } else { agents[column / 2].y.as_slice() },
-        observations.positions,
     );
     to_rows(
         simd,
         2 * agents.len(),
+        (0, 1),
+        observations.headings,
         #[inline(always)]
         |column| if column % 2 == 0 { agents[column / 2].hx.as_slice() } else { agents[column / 2].hy.as_slice() },
-        observations.headings,
     );
     to_rows(
         simd,
         agents.len(),
+        (0, 1),
+        observations.speeds,
         #[inline(always)]
         |column| agents[column].speed.as_slice(),
-        observations.speeds,
     );
 }
 
@@ -515,29 +504,4 @@ fn ones<S: Simd>(bits: S::u32s) -> S::u32s {
     let eights = (fours + (fours >> 4)) & 0x0f0f_0f0f;
     let halves = eights + (eights >> 8);
     (halves + (halves >> 16)) & 0x3f
-}
-
-/// Transposes columns, one team per lane, to one row per team. Unused lanes have no row.
-#[inline(always)]
-fn to_rows<'a, S: Simd>(simd: S, count: usize, column: impl Fn(usize) -> &'a [f32], rows: &mut [f32]) {
-    let whole = count / 4 * 4;
-    for (first, rows) in (0..).step_by(4).zip(rows.chunks_mut(count * 4)) {
-        let mut start = 0;
-        if rows.len() == count * 4 {
-            let (ab, cd) = rows.split_at_mut(count * 2);
-            let ((a, b), (c, d)) = (ab.split_at_mut(count), cd.split_at_mut(count));
-            for at in (0..whole).step_by(4) {
-                let four = |at: usize| f32x4::from_slice(simd, &column(at)[first..first + 4]);
-                let turned = transpose4([four(at), four(at + 1), four(at + 2), four(at + 3)]);
-                turned[0].store_slice(&mut a[at..at + 4]);
-                turned[1].store_slice(&mut b[at..at + 4]);
-                turned[2].store_slice(&mut c[at..at + 4]);
-                turned[3].store_slice(&mut d[at..at + 4]);
-            }
-            start = whole;
-        }
-        for at in start..count {
-            rows.chunks_exact_mut(count).zip(&column(at)[first..]).for_each(|(row, &number)| row[at] = number);
-        }
-    }
 }

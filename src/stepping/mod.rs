@@ -31,7 +31,7 @@ use crate::world::{GRID, INPUTS, OUTPUTS, World, on_grid};
 mod engine;
 mod state;
 
-use engine::{FEW, Observations, Vectors, vectors};
+use engine::{Observations, VECTORS_PER_TASK, Vectors, vectors};
 
 /// Teams of one world, each at its own step.
 ///
@@ -356,16 +356,18 @@ impl Stepper {
         thread_local! { static CREDIT: RefCell<(Credit, Vec<u32>)> = RefCell::default(); }
         let leaders = self.world.leaders();
         self.check_length("scores", "[teams][leaders]", self.teams() * leaders, scores.len())?;
-        scores.par_chunks_exact_mut(leaders).with_min_len(FEW).enumerate().try_for_each(|(team, scores)| {
-            CREDIT.with_borrow_mut(|(credit, seen)| {
-                let episode = self.vectors.episode(team, &self.world, seen).ok_or(StepError::NotRecorded)?;
-                if fitness == Fitness::Dt && self.world.followers() > 0 && episode.sights.is_empty() {
-                    return Err(StepError::NotSeen);
-                }
-                credit.score(&episode, &self.world, fitness, scores);
-                Ok(())
-            })
-        })
+        scores.par_chunks_exact_mut(leaders).with_min_len(VECTORS_PER_TASK).enumerate().try_for_each(
+            |(team, scores)| {
+                CREDIT.with_borrow_mut(|(credit, seen)| {
+                    let episode = self.vectors.episode(team, &self.world, seen).ok_or(StepError::NotRecorded)?;
+                    if fitness == Fitness::Dt && self.world.followers() > 0 && episode.sights.is_empty() {
+                        return Err(StepError::NotSeen);
+                    }
+                    credit.score(&episode, &self.world, fitness, scores);
+                    Ok(())
+                })
+            },
+        )
     }
 
     fn check_length(

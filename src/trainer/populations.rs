@@ -219,7 +219,7 @@ impl Experiment {
         let populations = weights.par_chunks_exact(self.stride());
         let sorted = policies.par_chunks_exact_mut(population * parameters);
         populations.zip(fitness.par_chunks_exact(population)).zip(sorted).for_each(|((weights, fitness), sorted)| {
-            let best = evolve::best(fitness, population);
+            let best = evolve::top_indices(fitness, population);
             for (policy, index) in sorted.chunks_exact_mut(parameters).zip(mean.into_iter().chain(best)) {
                 policy.copy_from_slice(&weights[index * parameters..(index + 1) * parameters]);
             }

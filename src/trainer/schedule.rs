@@ -107,6 +107,6 @@ fn draw_starts(stage: &Stage, trial: usize, generation: usize, episodes: &mut Ve
     let Stage { config: Config { learning, .. }, world, .. } = stage;
     episodes.resize(learning.episodes_per_team, vec![]);
     for (episode, starts) in episodes.iter_mut().enumerate() {
-        evolve::places(learning, trial, generation, episode, world, starts);
+        evolve::episode_positions(learning, trial, generation, episode, world, starts);
     }
 }

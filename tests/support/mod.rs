@@ -7,7 +7,7 @@ use std::io::Write;
 #[cfg(feature = "cli")]
 pub use commands::*;
 #[cfg(feature = "gpu")]
-use flotilla::backend::gpu::device::{self, AdapterInfo, Request, Wanted};
+use flotilla::backend::gpu::device::{self, AdapterChoice, AdapterInfo, Request};
 use flotilla::config::{Config, Paradigm};
 use flotilla::world::World;
 
@@ -255,6 +255,6 @@ pub fn adapters(test: &str) -> Vec<(Request, AdapterInfo)> {
         // Write to the stream, because the output of `eprintln!` is not shown for a passing test.
         writeln!(std::io::stderr(), "\n{message}").expect("standard error is writable");
     }
-    let request = |index: usize| Request::from(Wanted::Named(index.to_string()));
+    let request = |index: usize| Request::from(AdapterChoice::Named(index.to_string()));
     found.into_iter().enumerate().map(|(index, info)| (request(index), info)).collect()
 }

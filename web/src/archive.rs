@@ -185,7 +185,7 @@ pub fn play(config: &Config, policies: usize, mut weights: Vec<f32>) -> Result<V
     let world = World::new(config);
     let (leaders, numbers) = (world.leaders(), policies.saturating_mul(world.parameters()));
     let fits = policies > 0 && [numbers, numbers.saturating_mul(leaders)].contains(&weights.len());
-    if !fits || evolve::admit(&mut weights).is_some() {
+    if !fits || evolve::flush_and_validate(&mut weights).is_some() {
         return Err(refuse("these policies are not for this config"));
     }
     let group = Group {

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use flotilla::backend::cpu::Cpu;
-use flotilla::backend::gpu::device::{Gpu, Request, Wanted};
+use flotilla::backend::gpu::device::{AdapterChoice, Gpu, Request};
 use flotilla::backend::gpu::episode::{GpuBackend, Records, ResidencyPolicy};
 use flotilla::backend::gpu::{self, exact::Pass};
 use flotilla::backend::{Machine, OpenBackend};
@@ -179,12 +179,12 @@ fn open_gpu(pass: Option<&str>) -> Result<Gpu, Refusal> {
         let all = [Pass::NoContraction, Pass::Guarded, Pass::Plain];
         all.into_iter().find(|pass| pass.to_string() == name).ok_or_else(|| refuse(format!("no pass {name}")))
     });
-    let request = Request { pass: pass.transpose()?, ..Wanted::Named("0".into()).into() };
+    let request = Request { pass: pass.transpose()?, ..AdapterChoice::Named("0".into()).into() };
     gpu::open(request).map_err(refuse)
 }
 
 fn episodes(gpu: Gpu) -> Result<GpuBackend, Refusal> {
-    Ok(GpuBackend::new(gpu).map_err(refuse)?.batched(BATCH_BYTES))
+    Ok(GpuBackend::new(gpu).map_err(refuse)?.with_batch_bytes(BATCH_BYTES))
 }
 
 fn verify(worlds: u64, teams: usize, seed: u64, pass: Option<&str>) -> Result<Value, Refusal> {
@@ -193,7 +193,7 @@ fn verify(worlds: u64, teams: usize, seed: u64, pass: Option<&str>) -> Result<Va
     if let Some(mismatch) = gpu::self_test(&gpu).map_err(refuse)? {
         return Ok(json!({ "worlds": 0, "agent_steps": 0, "mismatch": mismatch.to_string() }));
     }
-    let mut gpu = episodes(gpu)?.holding(ResidencyPolicy::Always).with_records(Records::Packed);
+    let mut gpu = episodes(gpu)?.with_residency(ResidencyPolicy::Always).with_records(Records::Packed);
     let plan = Plan::random(seed..seed + worlds, teams);
     let told = |outcome: &verify::Agreement| {
         crate::progress(json!({ "verified": outcome.worlds, "worlds": worlds }));

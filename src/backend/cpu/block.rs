@@ -5,34 +5,13 @@ use glam::Vec2;
 
 use super::agent::Agent;
 use super::neighbours::{self, Bounds};
+use super::pois::PoiPosition;
 use crate::backend::Moment;
 use crate::config_enum::ConstDispatch;
 use crate::kernels::math::within;
 use crate::kernels::{splat, zero_unless};
 use crate::model::{Lanes, follow, motion, policy, sense};
 use crate::world::{INPUTS, OUTPUTS, World};
-
-/// The position of a POI.
-pub(crate) trait PoiPosition<S: Simd>: Copy {
-    /// Returns x and y, one team per lane.
-    fn lanes(self, simd: S) -> [S::f32s; 2];
-}
-
-/// The same position in all teams.
-impl<S: Simd> PoiPosition<S> for Vec2 {
-    #[inline(always)]
-    fn lanes(self, simd: S) -> [S::f32s; 2] {
-        [splat(simd, self.x), splat(simd, self.y)]
-    }
-}
-
-/// One position per team.
-impl<S: Simd> PoiPosition<S> for [S::f32s; 2] {
-    #[inline(always)]
-    fn lanes(self, _: S) -> [S::f32s; 2] {
-        self
-    }
-}
 
 /// The state of one vector of teams, one team per lane, with scratch memory for a step. A step reads only the
 /// previous state.
@@ -53,10 +32,10 @@ pub(crate) struct Block<S: Simd> {
     pub(super) bounds: Vec<Bounds<S>>,
 }
 
-/// The part of a [`Block`] that has to be kept between steps, after [`Block::look`].
+/// The part of a [`Block`] that the next step depends on, after [`Block::sense`].
 pub(crate) struct BlockState<S: Simd> {
     pub agents: Vec<Agent<S>>,
-    /// Empty if nobody needs them.
+    /// Empty unless scores need them.
     pub counts: Vec<S::u32s>,
     pub(super) near: Vec<u64>,
 }
@@ -64,7 +43,7 @@ pub(crate) struct BlockState<S: Simd> {
 #[derive(Clone, Copy)]
 pub(super) struct Follower<S: Simd> {
     sums: follow::Sums<S>,
-    pull: follow::SteeringForce<S>,
+    force: follow::SteeringForce<S>,
     sizes: (S::f32s, S::f32s),
 }
 
@@ -72,7 +51,7 @@ impl<S: Simd> Block<S> {
     pub fn new(simd: S, world: &World) -> Block<S> {
         let zero = splat(simd, 0.0);
         let (agents, leaders, followers) = (world.agents(), world.leaders(), world.followers());
-        let pull = follow::SteeringForce { x: zero, y: zero, influenced: S::mask32s::splat(simd, false) };
+        let force = follow::SteeringForce { x: zero, y: zero, influenced: S::mask32s::splat(simd, false) };
         Block {
             simd,
             world: Lanes::new(simd, world.constants),
@@ -80,7 +59,7 @@ impl<S: Simd> Block<S> {
             inputs: vec![[zero; INPUTS]; leaders],
             outputs: vec![[zero; OUTPUTS]; leaders],
             wanted: vec![zero; agents],
-            followers: vec![Follower { sums: follow::Sums::new(simd), pull, sizes: (zero, zero) }; followers],
+            followers: vec![Follower { sums: follow::Sums::new(simd), force, sizes: (zero, zero) }; followers],
             counts: vec![S::u32s::splat(simd, 0); followers * leaders],
             near: vec![0; agents.div_ceil(64) * agents],
             bounds: vec![Bounds::nowhere(simd); agents.div_ceil(S::f32s::LEN)],
@@ -134,25 +113,20 @@ impl<S: Simd> Block<S> {
         self.counts.iter_mut().for_each(|count| count[lane] = 0);
     }
 
-    /// Computes the inputs of the leaders' policies.
+    /// Computes the inputs of the leaders' policies: leaders sense all POIs, then the other agents, each in ascending
+    /// order.
     #[inline(always)]
-    pub fn look(&mut self, pois: &[impl PoiPosition<S>]) {
+    pub fn sense(&mut self, pois: &[impl PoiPosition<S>]) {
         neighbours::find_near(&self.world, &self.agents, &mut self.near, &mut self.bounds);
-        self.sense(pois);
+        self.world.constants.variant.density().dispatch(Sensing { block: self, pois });
     }
 
     /// Moves all agents: leaders by their policies' outputs, followers by the agents near them.
     #[inline(always)]
-    pub fn go(&mut self) {
-        self.act();
+    pub fn advance(&mut self) {
+        self.lead();
         self.follow();
-        self.advance();
-    }
-
-    /// Leaders sense all POIs, then the other agents, each in ascending order.
-    #[inline(always)]
-    fn sense(&mut self, pois: &[impl PoiPosition<S>]) {
-        self.world.constants.variant.density().dispatch(Sensing { block: self, pois });
+        self.move_agents();
     }
 
     #[inline(always)]
@@ -199,7 +173,7 @@ impl<S: Simd> Block<S> {
 
     /// Leaders turn, and set their wanted speed, by their policies' outputs.
     #[inline(always)]
-    fn act(&mut self) {
+    fn lead(&mut self) {
         let Block { world, agents, outputs, wanted, .. } = self;
         for ((agent, wanted), &[turn, speed]) in agents.iter_mut().zip(wanted).zip(&*outputs) {
             (agent.hx, agent.hy) = motion::turn::<S>(world, agent.hx, agent.hy, policy::wanted_turn::<S>(turn));
@@ -239,7 +213,7 @@ impl<S: Simd> Block<S> {
 
     /// Moves all agents along their headings.
     #[inline(always)]
-    fn advance(&mut self) {
+    fn move_agents(&mut self) {
         let world = &self.world;
         for (agent, &wanted) in self.agents.iter_mut().zip(&self.wanted) {
             (agent.hx, agent.hy) = motion::renormalize::<S>(agent.hx, agent.hy);
@@ -261,7 +235,7 @@ impl<S: Simd> Block<S> {
                 moment.outputs = self.outputs[index].map(|output| output[lane]);
             } else if sensed {
                 let follower = &self.followers[index - leaders];
-                moment.force = [follower.pull.x[lane], follower.pull.y[lane]];
+                moment.force = [follower.force.x[lane], follower.force.y[lane]];
             }
             moment.position = [agent.x[lane], agent.y[lane]];
             moment.heading = [agent.hx[lane], agent.hy[lane]];
@@ -295,15 +269,15 @@ fn steer<S: Simd, const BY_SINE: bool>(
     wanted: &mut [S::f32s],
 ) {
     for (agent, follower) in agents.iter().zip(&mut *followers) {
-        follower.pull = follow::force::<S>(world, &follower.sums, agent.x, agent.y);
+        follower.force = follow::force::<S>(world, &follower.sums, agent.x, agent.y);
     }
     for follower in &mut *followers {
-        follower.sizes = follow::sizes::<S>(&follower.pull);
+        follower.sizes = follow::sizes::<S>(&follower.force);
     }
     for ((agent, wanted), follower) in agents.iter_mut().zip(wanted).zip(followers) {
         let &mut Agent { hx, hy, speed, .. } = agent;
-        let &mut Follower { pull, sizes, .. } = follower;
-        (agent.hx, agent.hy, *wanted) = follow::steer::<S, BY_SINE>(world, &pull, sizes, hx, hy, speed);
+        let &mut Follower { force, sizes, .. } = follower;
+        (agent.hx, agent.hy, *wanted) = follow::steer::<S, BY_SINE>(world, &force, sizes, hx, hy, speed);
     }
 }
 

@@ -5,10 +5,10 @@ use std::ops::Range;
 use fearless_simd::{Simd, prelude::*};
 
 use super::batch::WorldBatch;
-use super::block::{Block, PoiPosition};
+use super::block::Block;
 use super::network::Network;
+use super::pois::{PoiPosition, load_pois, with_pois};
 use crate::credit::{Episode, Seen, Strided};
-use crate::kernels::splat;
 use crate::world::World;
 
 /// Whole episodes of one vector of teams: their state, policies and record.
@@ -53,21 +53,18 @@ impl<S: Simd> EpisodeBlock<S> {
     #[inline(always)]
     pub(super) fn load(&mut self, batch: &WorldBatch<'_>, first: usize, teams: usize) {
         let EpisodeBlock { block, network, places, moved, .. } = self;
-        moved.clear();
         places.clear();
         places.extend((0..S::f32s::LEN).map(|lane| batch.locate(first + if lane < teams { lane } else { 0 })));
         for (lane, &(group, _)) in places.iter().enumerate() {
             block.place(lane, batch.groups[group].starts, &batch.world.headings);
         }
-        if places.iter().any(|&(group, _)| batch.groups[group].moved_pois().is_some()) {
-            moved.resize(batch.world.pois.len(), [splat(block.simd, 0.0); 2]);
-            for (lane, &(group, _)) in places.iter().enumerate() {
-                let pois = batch.groups[group].moved_pois().unwrap_or(&batch.world.pois);
-                for ([x, y], poi) in moved.iter_mut().zip(pois) {
-                    (x[lane], y[lane]) = (poi.x, poi.y);
-                }
-            }
-        }
+        load_pois(
+            block.simd,
+            batch.world,
+            moved,
+            #[inline(always)]
+            |lane| batch.groups[places[lane].0].moved_pois(),
+        );
         block.start();
         network.load(batch, places);
     }
@@ -76,11 +73,11 @@ impl<S: Simd> EpisodeBlock<S> {
     #[inline(always)]
     pub(super) fn play(&mut self, world: &World, steps: Range<usize>, before: impl Fn(usize)) {
         let EpisodeBlock { block, network, moved, sets, sights, .. } = self;
-        if moved.is_empty() {
-            play(block, network, &world.pois, sets, sights, steps, before);
-        } else {
-            play(block, network, moved, sets, sights, steps, before);
-        }
+        with_pois!(moved, world, pois => for step in steps {
+            before(step);
+            sense(block, network, pois);
+            advance(block, pois, sets, sights, step);
+        });
         self.store_counts();
     }
 
@@ -92,32 +89,18 @@ impl<S: Simd> EpisodeBlock<S> {
         }
     }
 
-    /// The first half of a step: leaders sense, and their policies answer.
+    /// Plays the first half of a step, see [`sense`].
     #[inline(always)]
     pub(super) fn sense(&mut self, world: &World) {
         let EpisodeBlock { block, network, moved, .. } = self;
-        if moved.is_empty() {
-            block.look(&world.pois);
-        } else {
-            block.look(moved);
-        }
-        network.decide(&block.inputs, &mut block.outputs);
+        with_pois!(moved, world, pois => sense(block, network, pois));
     }
 
-    /// The second half of a step: all agents move, and the record is written.
+    /// Plays the second half of a step, see [`advance`].
     #[inline(always)]
     pub(super) fn advance(&mut self, world: &World, step: usize) {
         let EpisodeBlock { block, moved, sets, sights, .. } = self;
-        let (size, of_step) = (sets.len() / world.steps(), sights.len() / world.steps());
-        if of_step > 0 {
-            block.watch(&mut sights[step * of_step..]);
-        }
-        block.go();
-        if moved.is_empty() {
-            block.couple(&world.pois, &mut sets[step * size..]);
-        } else {
-            block.couple(moved, &mut sets[step * size..]);
-        }
+        with_pois!(moved, world, pois => advance(block, pois, sets, sights, step));
     }
 
     /// Returns the sets of a step, `[pois * words][lanes]`.
@@ -134,27 +117,28 @@ impl<S: Simd> EpisodeBlock<S> {
     }
 }
 
-/// Plays some steps. `sets` and `sights` are of all steps; `sights` may be empty.
+/// Plays the first half of a step: leaders sense, and their policies answer.
 #[inline(always)]
-fn play<S: Simd>(
+fn sense<S: Simd>(block: &mut Block<S>, network: &mut Network<S>, pois: &[impl PoiPosition<S>]) {
+    block.sense(pois);
+    network.decide(&block.inputs, &mut block.outputs);
+}
+
+/// Plays the second half of a step: all agents move, and the record is written. `sets` and `sights` are of all steps;
+/// `sights` may be empty.
+#[inline(always)]
+fn advance<S: Simd>(
     block: &mut Block<S>,
-    network: &mut Network<S>,
     pois: &[impl PoiPosition<S>],
     sets: &mut [u32],
     sights: &mut [u32],
-    steps: Range<usize>,
-    before: impl Fn(usize),
+    step: usize,
 ) {
-    let size = pois.len() * block.world.constants.words as usize * S::f32s::LEN;
-    let of_step = sights.len() / block.world.constants.steps as usize;
-    for step in steps {
-        before(step);
-        block.look(pois);
-        network.decide(&block.inputs, &mut block.outputs);
-        if of_step > 0 {
-            block.watch(&mut sights[step * of_step..]);
-        }
-        block.go();
-        block.couple(pois, &mut sets[step * size..]);
+    let steps = block.world.constants.steps as usize;
+    let [sets_per_step, sights_per_step] = [sets.len() / steps, sights.len() / steps];
+    if sights_per_step > 0 {
+        block.record_sightings(&mut sights[step * sights_per_step..]);
     }
+    block.advance();
+    block.record_poi_sets(pois, &mut sets[step * sets_per_step..]);
 }

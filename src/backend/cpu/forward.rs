@@ -28,7 +28,7 @@ pub fn forward(
 }
 
 /// Rows per task.
-const ROWS: usize = 1024;
+const ROWS_PER_TASK: usize = 1024;
 
 fn forward_rows<S: Simd>(
     simd: S,
@@ -38,13 +38,13 @@ fn forward_rows<S: Simd>(
     of: &(impl Fn(usize) -> usize + Sync),
     outputs: &mut [f32],
 ) {
-    outputs.par_chunks_mut(ROWS * OUTPUTS).enumerate().for_each(|(part, outputs)| {
+    outputs.par_chunks_mut(ROWS_PER_TASK * OUTPUTS).enumerate().for_each(|(part, outputs)| {
         let (width, parameters) = (S::f32s::LEN, policy.parameters as usize);
         let mut network = Network::new(simd, policy, 1);
         let mut loaded = None;
         let zero = splat(simd, 0.0);
         for (chunk, outputs) in outputs.chunks_mut(width * OUTPUTS).enumerate() {
-            let (first, rows) = (part * ROWS + chunk * width, outputs.len() / OUTPUTS);
+            let (first, rows) = (part * ROWS_PER_TASK + chunk * width, outputs.len() / OUTPUTS);
             let row = |lane: usize| first + if lane < rows { lane } else { 0 };
             let mut sensed = [[zero; INPUTS]];
             let mut answers = [[zero; OUTPUTS]];

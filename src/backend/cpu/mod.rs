@@ -21,6 +21,7 @@ mod episode;
 mod forward;
 mod neighbours;
 mod network;
+mod pois;
 mod record;
 mod steps;
 mod transpose;
@@ -30,7 +31,8 @@ pub use forward::forward;
 pub use steps::{Noise, StepArrays};
 
 pub(crate) use block::{Block, BlockState};
-pub(crate) use transpose::{transpose_rows, transpose4};
+pub(crate) use pois::{load_pois, with_pois};
+pub(crate) use transpose::{to_rows, transpose_rows};
 
 use batch::{WorldBatch, world_batches};
 use episode::{EpisodeBlock, sight_words};

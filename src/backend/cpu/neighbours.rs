@@ -7,8 +7,10 @@ use crate::kernels::math::within;
 use crate::kernels::splat;
 use crate::model::Lanes;
 
-/// Marks the pairs of agents of which one may sense or be drawn to the other, in any lane: `near` is
-/// `[words][agents]`, one bit per agent; `bounds` is scratch memory, one vector of agents each.
+/// Marks the pairs of agents that are close enough in any lane: one may sense the other, or be attracted by it.
+///
+/// Writes one bit per agent to `near`, `[words][agents]`. `bounds` is scratch memory, with one element per vector of
+/// agents.
 #[inline(always)]
 pub(super) fn find_near<S: Simd>(world: &Lanes<S>, agents: &[Agent<S>], near: &mut [u64], bounds: &mut [Bounds<S>]) {
     near.fill(0);
@@ -16,7 +18,7 @@ pub(super) fn find_near<S: Simd>(world: &Lanes<S>, agents: &[Agent<S>], near: &m
     let drawn = world.constants.follow.attraction_radius2;
     let sensed = world.constants.sense.agent_range2.max(drawn);
     let reach2 = |agent: usize| if agent < leaders { sensed } else { drawn };
-    if count > MANY {
+    if count > MAX_UNBOUNDED_AGENTS {
         let lanes = S::f32s::LEN;
         for (bounds, agents) in bounds.iter_mut().zip(agents.chunks(lanes)) {
             bounds.enclose(agents);
@@ -115,7 +117,7 @@ impl<S: Simd> Bounds<S> {
 }
 
 /// With more agents than this, pairs are first tested by their bounding boxes.
-const MANY: usize = 32;
+const MAX_UNBOUNDED_AGENTS: usize = 32;
 
 /// Calls `f` with the index and the state of each agent that may be in reach of this one, ascending.
 #[inline(always)]

@@ -3,14 +3,15 @@
 use fearless_simd::{Simd, prelude::*};
 
 use super::agent::Agent;
-use super::block::{Block, PoiPosition};
+use super::block::Block;
+use super::pois::PoiPosition;
 use crate::kernels::splat;
 use crate::model::{Lanes, couple, follow};
 
 impl<S: Simd> Block<S> {
     /// Writes which leaders each follower sees, one bit per leader, `[followers][words of leaders][lanes]`.
     #[inline(always)]
-    pub fn watch(&self, sights: &mut [u32]) {
+    pub fn record_sightings(&self, sights: &mut [u32]) {
         let Block { simd, world, agents, .. } = self;
         let (leaders, followers) = agents.split_at(world.constants.leaders as usize);
         let pairs = followers.iter().flat_map(|follower| leaders.chunks(32).map(move |leaders| (follower, leaders)));
@@ -27,7 +28,7 @@ impl<S: Simd> Block<S> {
 
     /// Writes the agents at each POI, one bit per agent, `[pois][words][lanes]`.
     #[inline(always)]
-    pub fn couple(&mut self, pois: &[impl PoiPosition<S>], mut sets: &mut [u32]) {
+    pub fn record_poi_sets(&mut self, pois: &[impl PoiPosition<S>], mut sets: &mut [u32]) {
         let (fours, rest) = pois.as_chunks::<4>();
         for pois in fours {
             sets = observe(self.simd, &self.world, &self.agents, pois, sets);

@@ -1,10 +1,10 @@
 //! Episodes whose steps are written to the caller's arrays, on all threads, with noise on the actions if wanted.
 
-use fearless_simd::{Simd, dispatch, f32x4, prelude::*};
+use fearless_simd::{Simd, dispatch, prelude::*};
 
 use super::batch::{WorldBatch, world_batches};
 use super::episode::EpisodeBlock;
-use super::transpose::transpose4;
+use super::transpose::to_rows;
 use super::{BackendError, Cpu, Group, GroupScores, ScoreTable};
 use crate::credit;
 use crate::evolve::{self, Key};
@@ -65,24 +65,18 @@ impl<'a> StepArrays<'a> {
         found.zip(sizes).position(|(found, size)| found != 0 && found != size * teams)
     }
 
-    /// Splits off the first teams.
+    /// Splits off the first teams. Empty arrays stay empty.
     fn split(&mut self, sizes: [usize; 8], teams: usize) -> StepArrays<'a> {
-        fn take<'a, T>(slice: &mut &'a mut [T], count: usize) -> &'a mut [T] {
-            let count = count.min(slice.len());
-            let (taken, rest) = std::mem::take(slice).split_at_mut(count);
-            *slice = rest;
-            taken
-        }
         let [positions, headings, speeds, inputs, outputs, actions, near, observed_at] = sizes.map(|size| size * teams);
         StepArrays {
-            positions: take(&mut self.positions, positions),
-            headings: take(&mut self.headings, headings),
-            speeds: take(&mut self.speeds, speeds),
-            inputs: take(&mut self.inputs, inputs),
-            outputs: take(&mut self.outputs, outputs),
-            actions: take(&mut self.actions, actions),
-            near: take(&mut self.near, near),
-            observed_at: take(&mut self.observed_at, observed_at),
+            positions: self.positions.split_off_mut(..positions).unwrap_or_default(),
+            headings: self.headings.split_off_mut(..headings).unwrap_or_default(),
+            speeds: self.speeds.split_off_mut(..speeds).unwrap_or_default(),
+            inputs: self.inputs.split_off_mut(..inputs).unwrap_or_default(),
+            outputs: self.outputs.split_off_mut(..outputs).unwrap_or_default(),
+            actions: self.actions.split_off_mut(..actions).unwrap_or_default(),
+            near: self.near.split_off_mut(..near).unwrap_or_default(),
+            observed_at: self.observed_at.split_off_mut(..observed_at).unwrap_or_default(),
         }
     }
 }
@@ -102,48 +96,48 @@ impl Cpu {
     ) -> Result<Vec<GroupScores>, BackendError> {
         groups.iter().try_for_each(|group| group.check().and(group.weights.on_host().map(drop)))?;
         let batches = world_batches(groups);
-        let [run] = &batches[..] else {
+        let [batch] = &batches[..] else {
             return Err(BackendError::InvalidInput("steps are recorded of groups of one world".into()));
         };
-        if let Some(index) = arrays.wrong_length(step_sizes(run.world), run.teams) {
+        if let Some(index) = arrays.wrong_length(step_sizes(batch.world), batch.teams) {
             return Err(BackendError::InvalidInput(format!("array {index} of the steps has the wrong length")));
         }
-        if noise.is_some_and(|noise| noise.deviations.len() != run.world.leaders()) {
+        if noise.is_some_and(|noise| noise.deviations.len() != batch.world.leaders()) {
             return Err(BackendError::InvalidInput("noise is of every leader".into()));
         }
         let (level, scores) = (self.level, ScoreTable::new(groups));
-        dispatch!(level, simd => record(simd, run, noise, arrays, &scores));
+        dispatch!(level, simd => record(simd, batch, noise, arrays, &scores));
         Ok(scores.finish())
     }
 }
 
 fn record<S: Simd>(
     simd: S,
-    run: &WorldBatch<'_>,
+    batch: &WorldBatch<'_>,
     noise: Option<Noise<'_>>,
     mut arrays: StepArrays<'_>,
     scores: &ScoreTable<'_>,
 ) {
-    let (width, sizes) = (S::f32s::LEN, step_sizes(run.world));
+    let (width, sizes) = (S::f32s::LEN, step_sizes(batch.world));
     let part = |first: usize| {
-        let teams = width.min(run.teams - first);
+        let teams = width.min(batch.teams - first);
         (first, teams, arrays.split(sizes, teams))
     };
-    let mut parts: Vec<(usize, usize, StepArrays<'_>)> = (0..run.teams).step_by(width).map(part).collect();
+    let mut parts: Vec<(usize, usize, StepArrays<'_>)> = (0..batch.teams).step_by(width).map(part).collect();
     // One block for several vectors, because blocks are large.
-    parts.par_chunks_mut(PARTS).for_each(|parts| {
-        let mut whole = EpisodeBlock::new(simd, run.world, run.sighted);
+    parts.par_chunks_mut(VECTORS_PER_TASK).for_each(|parts| {
+        let mut block = EpisodeBlock::new(simd, batch.world, batch.sighted);
         for (first, teams, arrays) in parts {
             simd.vectorize(
                 #[inline(always)]
-                || play(simd, &mut whole, run, noise, *first, *teams, arrays),
+                || play(simd, &mut block, batch, noise, *first, *teams, arrays),
             );
-            let mut observed_at = arrays.observed_at.chunks_exact_mut(run.world.pois.len());
+            let mut observed_at = arrays.observed_at.chunks_exact_mut(batch.world.pois.len());
             for lane in 0..*teams {
-                let ((group, team), episode) = (run.locate(*first + lane), whole.episode(lane));
-                scores.score(run.first + group, team, &episode);
+                let ((group, team), episode) = (batch.locate(*first + lane), block.episode(lane));
+                scores.score(batch.first + group, team, &episode);
                 if let Some(to) = observed_at.next() {
-                    let steps = credit::observed_at(episode.sets, run.world);
+                    let steps = credit::observed_at(episode.sets, batch.world);
                     to.iter_mut().zip(steps).for_each(|(to, step)| *to = step.unwrap_or(0) as u32);
                 }
             }
@@ -152,30 +146,29 @@ fn record<S: Simd>(
 }
 
 /// Vectors of teams per task.
-const PARTS: usize = 8;
+const VECTORS_PER_TASK: usize = 8;
 
 #[inline(always)]
 fn play<S: Simd>(
     simd: S,
-    whole: &mut EpisodeBlock<S>,
-    run: &WorldBatch<'_>,
+    episode: &mut EpisodeBlock<S>,
+    batch: &WorldBatch<'_>,
     noise: Option<Noise<'_>>,
     first: usize,
     teams: usize,
     arrays: &mut StepArrays<'_>,
 ) {
-    let world = run.world;
-    let (agents, leaders, steps) = (world.agents(), world.leaders(), world.steps());
+    let world = batch.world;
+    let (leaders, steps) = (world.leaders(), world.steps());
     let sets = world.pois.len() * world.constants.words as usize;
-    whole.load(run, first, teams);
-    write_states(simd, whole, arrays, agents, steps, 0);
+    episode.load(batch, first, teams);
+    write_states(simd, episode, arrays, (0, steps + 1));
     for step in 0..steps {
-        whole.sense(world);
-        let (block, columns) = (&mut whole.block, leaders * OUTPUTS);
-        rows(simd, leaders * INPUTS, steps, step, arrays.inputs, |column| {
-            block.inputs.as_flattened()[column].as_slice()
-        });
-        rows(simd, columns, steps, step, arrays.outputs, |column| block.outputs.as_flattened()[column].as_slice());
+        episode.sense(world);
+        let (block, columns) = (&mut episode.block, leaders * OUTPUTS);
+        let row = (step, steps);
+        to_rows(simd, leaders * INPUTS, row, arrays.inputs, |column| block.inputs.as_flattened()[column].as_slice());
+        to_rows(simd, columns, row, arrays.outputs, |column| block.outputs.as_flattened()[column].as_slice());
         if let Some(Noise { key, deviations, first: number }) = noise {
             let teams = S::u32s::from_fn(simd, |lane| number.wrapping_add((first + lane) as u32));
             for (leader, (outputs, deviations)) in block.outputs.iter_mut().zip(deviations).enumerate() {
@@ -185,81 +178,30 @@ fn play<S: Simd>(
                 }
             }
         }
-        rows(simd, columns, steps, step, arrays.actions, |column| block.outputs.as_flattened()[column].as_slice());
+        to_rows(simd, columns, row, arrays.actions, |column| block.outputs.as_flattened()[column].as_slice());
         if noise.is_some() {
             for output in block.outputs.as_flattened_mut() {
                 *output = clamp_to::<S>(*output, splat(simd, -1.0), splat(simd, 1.0));
             }
         }
-        whole.advance(world, step);
-        write_states(simd, whole, arrays, agents, steps, step + 1);
+        episode.advance(world, step);
+        write_states(simd, episode, arrays, (step + 1, steps + 1));
         let near = bytemuck::cast_slice_mut(arrays.near);
-        let taken = bytemuck::cast_slice::<u32, f32>(whole.sets_of(step, sets));
-        rows(simd, sets, steps, step, near, |column| &taken[column * S::f32s::LEN..][..S::f32s::LEN]);
+        let taken = bytemuck::cast_slice::<u32, f32>(episode.sets_of(step, sets));
+        to_rows(simd, sets, row, near, |column| &taken[column * S::f32s::LEN..][..S::f32s::LEN]);
     }
-    whole.store_counts();
+    episode.store_counts();
 }
 
-/// Writes positions, headings and speeds after a step.
+/// Writes positions, headings and speeds after a step to this row of all rows.
 #[inline(always)]
-fn write_states<S: Simd>(
-    simd: S,
-    whole: &EpisodeBlock<S>,
-    arrays: &mut StepArrays<'_>,
-    agents: usize,
-    steps: usize,
-    step: usize,
-) {
-    let all = &whole.block.agents;
-    rows(simd, agents * 2, steps + 1, step, arrays.positions, |column| {
+fn write_states<S: Simd>(simd: S, episode: &EpisodeBlock<S>, arrays: &mut StepArrays<'_>, row: (usize, usize)) {
+    let (all, agents) = (&episode.block.agents, episode.block.agents.len());
+    to_rows(simd, agents * 2, row, arrays.positions, |column| {
         if column % 2 == 0 { all[column / 2].x.as_slice() } else { all[column / 2].y.as_slice() }
     });
-    rows(simd, agents * 2, steps + 1, step, arrays.headings, |column| {
+    to_rows(simd, agents * 2, row, arrays.headings, |column| {
         if column % 2 == 0 { all[column / 2].hx.as_slice() } else { all[column / 2].hy.as_slice() }
     });
-    rows(simd, agents, steps + 1, step, arrays.speeds, |column| all[column].speed.as_slice());
-}
-
-/// Transposes `count` columns, one team per lane, into row `step` of each team's `steps` rows. Does nothing without an
-/// array.
-#[inline(always)]
-fn rows<'a, S: Simd>(
-    simd: S,
-    count: usize,
-    steps: usize,
-    step: usize,
-    array: &mut [f32],
-    column: impl Fn(usize) -> &'a [f32],
-) {
-    if array.is_empty() {
-        return;
-    }
-    let size = count * steps;
-    let whole = count / 4 * 4;
-    for (first, teams) in (0..).step_by(4).zip(array.chunks_mut(size * 4)) {
-        let mut start = 0;
-        if teams.len() == size * 4 {
-            let (ab, cd) = teams.split_at_mut(size * 2);
-            let ((a, b), (c, d)) = (ab.split_at_mut(size), cd.split_at_mut(size));
-            let [a, b, c, d] = [a, b, c, d].map(|row| &mut row[step * count..(step + 1) * count]);
-            for at in (0..whole).step_by(4) {
-                let fours = [
-                    f32x4::from_slice(simd, &column(at)[first..first + 4]),
-                    f32x4::from_slice(simd, &column(at + 1)[first..first + 4]),
-                    f32x4::from_slice(simd, &column(at + 2)[first..first + 4]),
-                    f32x4::from_slice(simd, &column(at + 3)[first..first + 4]),
-                ];
-                let turned = transpose4(fours);
-                turned[0].store_slice(&mut a[at..at + 4]);
-                turned[1].store_slice(&mut b[at..at + 4]);
-                turned[2].store_slice(&mut c[at..at + 4]);
-                turned[3].store_slice(&mut d[at..at + 4]);
-            }
-            start = whole;
-        }
-        for at in start..count {
-            let lanes = &column(at)[first..];
-            teams.chunks_exact_mut(size).zip(lanes).for_each(|(team, &number)| team[step * count + at] = number);
-        }
-    }
+    to_rows(simd, agents, row, arrays.speeds, |column| all[column].speed.as_slice());
 }

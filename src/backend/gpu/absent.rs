@@ -20,7 +20,7 @@ pub(super) fn reasons() -> String {
     }
 }
 
-/// Returns the same for a message that goes on, empty if nothing is known.
+/// Returns the same reasons as the end of a message, each after a semicolon. Empty if none is known.
 pub(super) fn hints() -> String {
     found().into_iter().map(|reason| format!("; {reason}")).collect()
 }

@@ -7,7 +7,7 @@ use std::time::Duration;
 pub trait Faults: Send + Sync {
     /// Reports whether a submission is dropped although the driver reports it as done. `iterations` is its estimated
     /// work.
-    fn drops(&self, _what: &str, _turns: u64) -> bool {
+    fn drops(&self, _what: &str, _iterations: u64) -> bool {
         false
     }
 
@@ -27,7 +27,7 @@ pub trait Faults: Send + Sync {
     }
 
     /// Returns how long a submission seems to take, if not as long as it does.
-    fn takes(&self, _turns: u64) -> Option<Duration> {
+    fn takes(&self, _iterations: u64) -> Option<Duration> {
         None
     }
 

@@ -1,4 +1,4 @@
-//! Populations that stay on the device. The CPU plans who is copied from whom; the device copies and mutates.
+//! Populations that stay on the device. The host plans the parent of each slot; the device copies and mutates.
 
 use std::fmt;
 use std::ops::Range;
@@ -18,12 +18,12 @@ const WORKGROUP: usize = 256;
 /// Rows and columns of the tile that a workgroup of `gather` transposes (`TILE` in the shader).
 const TILE: usize = 32;
 /// Leaders per gather dispatch. With three other storage buffers they stay below the 8 that every WebGPU device allows.
-pub(super) const TOGETHER: usize = 4;
+pub(super) const LEADERS_PER_GATHER: usize = 4;
 /// Bytes per transfer, so that little memory is needed besides the populations.
-const PIECE: usize = 64 << 20;
+const MAX_TRANSFER: usize = 64 << 20;
 
 gpu_struct! {
-    /// How to breed one leader's next generation.
+    /// How to breed one population's next generation.
     pub struct BreedJob {
         /// The slots' key before the slot is xored in, see [`Key::of_population`](crate::evolve::Key::of_population).
         pub key: [u32; 4],
@@ -31,9 +31,9 @@ gpu_struct! {
         pub slots: u32,
         /// Weights per policy.
         pub parameters: u32,
-        /// The leader, in `0..leaders`.
-        pub leader: u32,
-        /// The offset of the leader's parents in the plan.
+        /// The index of the population.
+        pub population: u32,
+        /// The offset of its parents in the plan.
         pub parents: u32,
         /// A weight mutates if its random word is below this threshold.
         pub threshold: u32,
@@ -51,7 +51,7 @@ gpu_struct! {
         pub leaders: u32,
         /// The first leader to gather.
         pub first: u32,
-        /// Leaders to gather, up to 4 (`TOGETHER`).
+        /// Leaders to gather, up to 4 (`LEADERS_PER_GATHER`).
         pub count: u32,
         /// Weights per policy.
         pub parameters: u32,
@@ -81,7 +81,7 @@ pub(super) struct Kernels {
 }
 
 /// A pipeline, its bindings and its workgroups.
-pub(super) type Dispatch<'a> = (&'a wgpu::ComputePipeline, wgpu::BindGroup, [u32; 3]);
+pub(super) type Dispatch = (wgpu::ComputePipeline, wgpu::BindGroup, [u32; 3]);
 
 impl fmt::Debug for Kernels {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -106,41 +106,39 @@ impl Kernels {
         Ok(Kernels { breed, gather, gpu })
     }
 
-    /// Copies the populations of a trial, `[leaders][slots][parameters]`, to the device. Each leader's must fit into
-    /// one buffer.
+    /// Copies the populations of a trial, `[populations][slots][parameters]`, to the device. Each must fit into one
+    /// buffer.
     ///
     /// # Errors
     /// They do not fit the device.
-    pub(super) fn hold(
-        self: &Arc<Kernels>,
-        weights: &[f32],
-        [leaders, slots, parameters]: [usize; 3],
-    ) -> Result<Population, DeviceError> {
+    pub(super) fn hold(self: &Arc<Kernels>, weights: &[f32], sizes: [usize; 3]) -> Result<Population, DeviceError> {
         use wgpu::BufferUsages as Usage;
+        let [populations, slots, parameters] = sizes;
         let size = slots * parameters;
         let (gpu, usage) = (&self.gpu, Usage::STORAGE | Usage::COPY_SRC | Usage::COPY_DST);
         let buffer = |_| gpu.buffer("a population", (size * size_of::<f32>()) as u64, usage);
-        let buffers = (0..=leaders).map(buffer).collect::<Result<Vec<_>, _>>()?;
+        let buffers = (0..=populations).map(buffer).collect::<Result<Vec<_>, _>>()?;
         let input = Usage::STORAGE | Usage::COPY_DST;
-        let breed_jobs = gpu.buffer("the breeding jobs", (leaders * BINDING_ALIGNMENT) as u64, input)?;
-        let plan = gpu.buffer("the parents", (leaders * slots * size_of::<u32>()) as u64, input)?;
+        let breed_jobs = gpu.buffer("the breeding jobs", (populations * BINDING_ALIGNMENT) as u64, input)?;
+        let plan = gpu.buffer("the parents", (populations * slots * size_of::<u32>()) as u64, input)?;
         let pieces = weights.chunks_exact(size).zip(&buffers).flat_map(|(weights, buffer)| {
-            weights.chunks(PIECE / size_of::<f32>()).enumerate().map(move |(index, piece)| (buffer, index, piece))
+            let pieces = weights.chunks(MAX_TRANSFER / size_of::<f32>()).enumerate();
+            pieces.map(move |(index, piece)| (buffer, index, piece))
         });
-        let mut done = vec![0; leaders];
-        let words = leaders + leaders * size.div_ceil(PIECE / size_of::<f32>());
+        let mut done = vec![0; populations];
+        let words = populations + populations * size.div_ceil(MAX_TRANSFER / size_of::<f32>());
         let status = gpu.buffer("the status of a population", (words * size_of::<u32>()) as u64, usage)?;
         for (buffer, index, piece) in pieces {
             let nonce = gpu.nonces(1);
             let writes: [(_, _, &[u8]); 2] = [
-                (buffer, index * PIECE, bytemuck::cast_slice(piece)),
+                (buffer, index * MAX_TRANSFER, bytemuck::cast_slice(piece)),
                 (&status, done.len() * size_of::<u32>(), &nonce.to_ne_bytes()),
             ];
             gpu.scoped("a population", || gpu.submit_writes("a population", &writes))?;
             gpu.wait()?;
             done.push(nonce);
         }
-        Ok(Population { kernels: self.clone(), buffers, breed_jobs, plan, status, done, leaders, slots, parameters })
+        Ok(Population { kernels: self.clone(), buffers, breed_jobs, plan, status, done, sizes })
     }
 
     /// Returns the dispatch that gathers the policies of a job. The job is an aligned element of a buffer, `(buffer,
@@ -155,9 +153,9 @@ impl Kernels {
         choices: &wgpu::Buffer,
         population: &Population,
         weights: &wgpu::Buffer,
-    ) -> Result<Dispatch<'_>, DeviceError> {
+    ) -> Result<Dispatch, DeviceError> {
         // With fewer leaders, the remaining bindings are not read.
-        let last = population.leaders - 1;
+        let last = population.sizes[0] - 1;
         let leader = |index: u32| {
             let leader = (job.first + index.min(job.count - 1)) as usize;
             // All leaders may share one population.
@@ -167,7 +165,7 @@ impl Kernels {
         let (choices, weights) = (choices.as_entire_buffer_binding(), weights.as_entire_buffer_binding());
         let buffers = [part_of::<GatherJob>(jobs, part), choices, first, weights, second, third, fourth];
         let group = self.gpu.bind("gather", &self.gather.1, &buffers)?;
-        Ok((&self.gather.0, group, grid(job.tiles(), &self.gpu.limits)))
+        Ok((self.gather.0.clone(), group, grid(job.tiles(), &self.gpu.limits)))
     }
 }
 
@@ -189,18 +187,17 @@ fn part_of<T>(buffer: &wgpu::Buffer, part: usize) -> wgpu::BufferBinding<'_> {
 #[derive(Debug)]
 pub(super) struct Population {
     kernels: Arc<Kernels>,
-    /// One buffer per leader, `[slots][parameters]`, and one more for the children of the first.
+    /// One buffer per population, `[slots][parameters]`, and one more for the children of the first.
     buffers: Vec<wgpu::Buffer>,
     breed_jobs: wgpu::Buffer,
     plan: wgpu::Buffer,
-    /// Per leader the number of workgroups that have bred, then the nonces of the pieces that were copied to the
+    /// Per population the number of workgroups that have bred, then the nonces of the pieces that were copied to the
     /// device.
     status: wgpu::Buffer,
     /// The content of `status` if everything was done that was submitted.
     done: Vec<u32>,
-    leaders: usize,
-    slots: usize,
-    parameters: usize,
+    /// `[populations, slots, parameters]`.
+    sizes: [usize; 3],
 }
 
 impl Population {
@@ -214,8 +211,8 @@ impl Population {
     /// # Errors
     /// The sizes differ.
     pub(super) fn check(&self, sizes: [usize; 3]) -> Result<(), BackendError> {
-        let own = [self.leaders, self.slots, self.parameters];
-        let text = || format!("populations of sizes {own:?} (populations, policies, weights) instead of {sizes:?}");
+        let own = self.sizes;
+        let text = || format!("populations of sizes {own:?} (populations, slots, parameters) instead of {sizes:?}");
         if own == sizes { Ok(()) } else { Err(BackendError::InvalidInput(text())) }
     }
 
@@ -224,40 +221,47 @@ impl Population {
         (&self.status, &self.done)
     }
 
-    /// Returns the byte ranges in which one leader's policies are transferred.
+    /// Returns the weights per population.
+    fn population_len(&self) -> usize {
+        let [_, slots, parameters] = self.sizes;
+        slots * parameters
+    }
+
+    /// Returns the byte ranges in which one population is transferred.
     fn pieces(&self) -> impl Iterator<Item = Range<usize>> + use<> {
-        let size = self.slots * self.parameters * size_of::<f32>();
-        (0..size).step_by(PIECE).map(move |start| start..size.min(start + PIECE))
+        let size = self.population_len() * size_of::<f32>();
+        (0..size).step_by(MAX_TRANSFER).map(move |start| start..size.min(start + MAX_TRANSFER))
     }
 }
 
 impl DevicePopulation for Population {
     fn breed(&mut self, breeding: &Breeding<'_>) -> Result<(), BackendError> {
-        breeding.check([self.leaders, self.slots, self.parameters])?;
+        breeding.check(self.sizes)?;
+        let [populations, slots, parameters] = self.sizes;
         let Kernels { gpu, breed: (pipeline, layout), .. } = &*self.kernels;
         let Breeding { parents, key, generation, learning } = *breeding;
         let threshold = evolve::mutation_threshold(learning.mutation_probability);
-        let breed_jobs: Vec<BreedJob> = (0..self.leaders)
-            .map(|leader| BreedJob {
-                key: key.of_population(generation, leader),
-                slots: self.slots as u32,
-                parameters: self.parameters as u32,
-                leader: leader as u32,
-                parents: (leader * self.slots) as u32,
+        let breed_jobs: Vec<BreedJob> = (0..populations)
+            .map(|population| BreedJob {
+                key: key.of_population(generation, population),
+                slots: slots as u32,
+                parameters: parameters as u32,
+                population: population as u32,
+                parents: (population * slots) as u32,
                 threshold: threshold.unwrap_or_default(),
                 all: u32::from(threshold.is_none()),
                 scaled: u32::from(learning.mutation == Mutation::Scaled),
                 sigma: learning.mutation_sigma as f32,
             })
             .collect();
-        let threads = self.slots * self.parameters.div_ceil(64) * 16;
+        let threads = slots * parameters.div_ceil(64) * 16;
         let [x, y, z] = grid(threads.div_ceil(WORKGROUP), &gpu.limits);
-        // A leader's children replace the parents of the leader before it. The first one's go to the additional buffer.
-        let homes = std::iter::once(&self.buffers[self.leaders]).chain(&self.buffers);
-        let mut groups = Vec::with_capacity(self.leaders);
-        for (leader, (policies, children)) in self.buffers[..self.leaders].iter().zip(homes).enumerate() {
+        // A population's children replace the parents of the one before it. Those of the first go to the spare buffer.
+        let destinations = std::iter::once(&self.buffers[populations]).chain(&self.buffers);
+        let mut groups = Vec::with_capacity(populations);
+        for (index, (policies, children)) in self.buffers[..populations].iter().zip(destinations).enumerate() {
             let buffers = [
-                part_of::<BreedJob>(&self.breed_jobs, leader),
+                part_of::<BreedJob>(&self.breed_jobs, index),
                 self.plan.as_entire_buffer_binding(),
                 policies.as_entire_buffer_binding(),
                 children.as_entire_buffer_binding(),
@@ -279,12 +283,12 @@ impl DevicePopulation for Population {
             gpu.submit_commands("breeding", 0, encoder);
         })?;
         self.buffers.rotate_right(1);
-        self.done[..self.leaders].iter_mut().for_each(|workgroups| *workgroups = workgroups.wrapping_add(x * y * z));
+        self.done[..populations].iter_mut().for_each(|workgroups| *workgroups = workgroups.wrapping_add(x * y * z));
         Ok(())
     }
 
     fn fetch(&self, weights: &mut [f32]) -> Result<(), BackendError> {
-        let policies = weights.chunks_exact_mut(self.slots * self.parameters);
+        let policies = weights.chunks_exact_mut(self.population_len());
         for (buffer, policies) in self.buffers.iter().zip(policies) {
             for bytes in self.pieces() {
                 let gpu = &self.kernels.gpu;

@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 use std::collections::BTreeSet;
 use std::fmt;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 
 use glam::Vec2;
 use wgpu::BufferUsages;
@@ -18,6 +18,7 @@ use crate::backend::{Backend, BackendError, DevicePopulation, Group, Weights};
 use crate::config::{Config, Fitness, Learning, Sharing};
 use crate::credit::{Episode, Seen};
 use crate::evolve::{Breeding, Key, Purpose};
+use crate::parallel::lock;
 use crate::sample;
 use crate::world::World;
 
@@ -64,7 +65,7 @@ const ALL: &[Probe] = &[arithmetic, episode, breeding, training];
 /// There is no such adapter, it cannot be opened, or it is not exact under any pass.
 pub fn open(request: impl Into<Request>) -> Result<Gpu, DeviceError> {
     let request = request.into();
-    let (adapter, info) = device::choose(&request.choice)?;
+    let (adapter, info) = device::choose(&request.adapter)?;
     let (passthrough, timestamps) = (wgpu::Features::PASSTHROUGH_SHADERS, wgpu::Features::TIMESTAMP_QUERY);
     let features = adapter.features() & (passthrough | timestamps);
     let own = adapter.get_info().backend == wgpu::Backend::Vulkan && features.contains(passthrough);
@@ -200,7 +201,7 @@ fn episode(gpu: &Gpu) -> Result<Option<Deviation>, DeviceError> {
     let expected = Cpu::default().trace(&group).map_err(traced)?;
     let mut episodes = GpuBackend::new(gpu.clone())?;
     if gpu.adapter.kind != Kind::Software {
-        episodes = episodes.playing(Kernel::Specialised);
+        episodes = episodes.with_kernel(Kernel::Specialised);
     }
     let found = episodes.trace(&group).map_err(traced)?;
     Ok(first_mismatch(&world, &expected, &found).map(|mismatch| Deviation {
@@ -264,22 +265,22 @@ fn training(gpu: &Gpu) -> Result<Option<Deviation>, DeviceError> {
     let failed = |error| refused(gpu, error);
     let trace = Cpu::default().trace(&group).map_err(failed)?;
     let expected: Vec<_> = (0..TEAMS).map(|team| what_scores_depend_on(&world, &trace.episode(&world, team))).collect();
-    // Software renderers play by the generic kernel, see [`GpuBackend::playing`].
+    // Software renderers play by the generic kernel, see [`GpuBackend::with_kernel`].
     let kernels = [Kernel::Generic, Kernel::Specialised];
     let kernels = if gpu.adapter.kind == Kind::Software { &kernels[..1] } else { &kernels };
     for &kernel in kernels {
-        let backend = GpuBackend::new(gpu.clone())?.playing(kernel);
-        let mut backend = backend.holding(ResidencyPolicy::Always).with_records(Records::Packed);
+        let backend = GpuBackend::new(gpu.clone())?.with_kernel(kernel);
+        let mut backend = backend.with_residency(ResidencyPolicy::Always).with_records(Records::Packed);
         let held = backend.hold(&weights, [leaders, TEAMS, parameters]).map_err(failed)?;
         let held = held.expect("the device holds all populations");
         let group = Group { weights: Weights::OnDevice(&*held), ..group };
         let found = Mutex::new(vec![Vec::new(); TEAMS]);
         let note = |_, team: usize, episode: &Episode<'_>| {
             let words = what_scores_depend_on(&world, episode);
-            found.lock().unwrap_or_else(PoisonError::into_inner)[team] = words;
+            lock(&found)[team] = words;
         };
         backend.visit(&[group], &note).map_err(failed)?;
-        let found = found.into_inner().unwrap_or_else(PoisonError::into_inner);
+        let found = lock(&found);
         if let Some(team) = (0..TEAMS).find(|&team| expected[team] != found[team]) {
             let word = |words: &[u32]| words.iter().fold(0u32, |sum, word| sum.rotate_left(5) ^ word);
             return Ok(Some(Deviation {

@@ -375,7 +375,7 @@ fn team(
 ) -> Result<(Replayed, f64), BackendError> {
     let learning = &config.learning;
     let (generation, world) = (trainer.generation(0), trainer.world(0).clone());
-    let teams = evolve::teams_of(learning, trial, generation, world.leaders());
+    let teams = evolve::contemporary_teams(learning, trial, generation, world.leaders());
     let episodes = Episodes::new(config, &world, trial, generation, trainer.weights(0, 0)?, &teams);
     let g = episodes.play(backend)?;
     let first_best = (0..g.len()).reduce(|a, b| if g[b] > g[a] { b } else { a }).unwrap_or(0);
@@ -423,7 +423,7 @@ impl<'a> Episodes<'a> {
     ) -> Episodes<'a> {
         let starts = |episode| {
             let mut starts = Vec::new();
-            evolve::places(&config.learning, trial, generation, episode, world, &mut starts);
+            evolve::episode_positions(&config.learning, trial, generation, episode, world, &mut starts);
             starts
         };
         let starts = (0..config.learning.episodes_per_team).map(starts).collect();

@@ -138,18 +138,18 @@ pub fn compiler(backend: &str) -> String {
 
 /// Selects the adapter to open.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Wanted {
+pub enum AdapterChoice {
     /// A GPU, never a software renderer.
     Real,
     /// By its index in [`adapters`] if this is a number, else by a part of its name, in any case. The first match wins.
     Named(String),
 }
 
-/// A request to open a device. Only tests and `verify` need more than a [`Wanted`].
+/// A request to open a device. Only tests and `verify` need more than an [`AdapterChoice`].
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Request {
     /// The adapter.
-    pub choice: Wanted,
+    pub adapter: AdapterChoice,
     /// Only this pass, instead of the first exact one. [`Pass::Plain`] is not tested.
     pub pass: Option<Pass>,
     /// Use WebGPU's default limits instead of the adapter's own.
@@ -158,14 +158,14 @@ pub struct Request {
     pub checked: bool,
 }
 
-impl From<Wanted> for Request {
-    fn from(choice: Wanted) -> Self {
-        Request { choice, pass: None, default_limits: false, checked: false }
+impl From<AdapterChoice> for Request {
+    fn from(adapter: AdapterChoice) -> Self {
+        Request { adapter, pass: None, default_limits: false, checked: false }
     }
 }
 
 /// Returns the adapter of a choice.
-pub(in crate::backend::gpu) fn choose(choice: &Wanted) -> Result<(wgpu::Adapter, AdapterInfo), DeviceError> {
+pub(in crate::backend::gpu) fn choose(choice: &AdapterChoice) -> Result<(wgpu::Adapter, AdapterInfo), DeviceError> {
     let mut found = found();
     let infos: Vec<_> = found.iter().map(|(_, info)| info.clone()).collect();
     Ok(found.swap_remove(position(choice, &infos)?))
@@ -175,9 +175,9 @@ pub(in crate::backend::gpu) fn choose(choice: &Wanted) -> Result<(wgpu::Adapter,
 ///
 /// # Errors
 /// There is no adapter, none that is a GPU, or none with that name or number.
-pub fn position(choice: &Wanted, infos: &[AdapterInfo]) -> Result<usize, DeviceError> {
+pub fn position(choice: &AdapterChoice, infos: &[AdapterInfo]) -> Result<usize, DeviceError> {
     match choice {
-        Wanted::Named(name) => {
+        AdapterChoice::Named(name) => {
             let part = name.trim().to_lowercase();
             let found = match is_index(&part) {
                 true => part.parse().ok().filter(|&index: &usize| index < infos.len()),
@@ -188,11 +188,11 @@ pub fn position(choice: &Wanted, infos: &[AdapterInfo]) -> Result<usize, DeviceE
             found.ok_or_else(|| DeviceError::UnknownAdapter { name: name.clone(), found: infos.to_vec() })
         }
         // The first adapter is the preferred one.
-        Wanted::Real if infos.first().is_some_and(|info| !info.kind.is_real()) => {
+        AdapterChoice::Real if infos.first().is_some_and(|info| !info.kind.is_real()) => {
             Err(DeviceError::NoRealAdapter { found: infos.to_vec() })
         }
-        Wanted::Real if infos.is_empty() => Err(DeviceError::NoAdapter),
-        Wanted::Real => Ok(0),
+        AdapterChoice::Real if infos.is_empty() => Err(DeviceError::NoAdapter),
+        AdapterChoice::Real => Ok(0),
     }
 }
 

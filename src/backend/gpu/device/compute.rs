@@ -1,12 +1,12 @@
 //! Pipelines and dispatches.
 
 use std::borrow::Cow;
-use std::sync::PoisonError;
 use std::time::Duration;
 
 use super::{Compiled, DeviceError, Gpu};
 use crate::backend::gpu::exact;
 use crate::host::Instant;
+use crate::parallel::lock;
 
 /// Offsets of bindings are multiples of this on every WebGPU device.
 pub(in crate::backend::gpu) const BINDING_ALIGNMENT: usize = 256;
@@ -98,7 +98,7 @@ impl Gpu {
         layout: &Bindings,
     ) -> Result<wgpu::ComputePipeline, DeviceError> {
         let key = (self.text(wgsl).into_owned(), entry.to_owned(), self.pass);
-        let kept = |key: &Compiled| self.kept.lock().unwrap_or_else(PoisonError::into_inner).get(key).cloned();
+        let kept = |key: &Compiled| lock(&self.kept).get(key).cloned();
         if let Some(pipeline) = kept(&key) {
             return Ok(pipeline);
         }
@@ -107,7 +107,7 @@ impl Gpu {
         #[expect(unsafe_code, reason = "shaders of the crate's own are compiled without bounds checks")]
         let pipeline = unsafe { self.pipeline(label, &key.0, entry, layout) }?;
         if self.keeps {
-            self.kept.lock().unwrap_or_else(PoisonError::into_inner).insert(key, pipeline.clone());
+            lock(&self.kept).insert(key, pipeline.clone());
         }
         Ok(pipeline)
     }
@@ -235,7 +235,7 @@ impl Gpu {
     }
 
     /// Reports whether the device has a clock.
-    pub fn has_clock(&self) -> bool {
+    pub(crate) fn has_clock(&self) -> bool {
         self.device.features().contains(wgpu::Features::TIMESTAMP_QUERY)
     }
 

@@ -13,7 +13,7 @@
 use std::collections::HashMap;
 use std::fmt;
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use wgpu::util::DeviceExt;
@@ -21,6 +21,7 @@ use wgpu::util::DeviceExt;
 use super::exact::Pass;
 use super::faults::Faults;
 use crate::host;
+use crate::parallel::lock;
 
 mod adapter;
 mod buffers;
@@ -29,7 +30,7 @@ mod error;
 mod waiting;
 
 pub(super) use adapter::choose;
-pub use adapter::{AdapterInfo, Kind, Request, Wanted, adapters, compiler, position};
+pub use adapter::{AdapterChoice, AdapterInfo, Kind, Request, adapters, compiler, position};
 pub use buffers::Traffic;
 pub(super) use compute::{BINDING_ALIGNMENT, Stopwatch, grid, timed};
 pub use compute::{Binding, Bindings};
@@ -110,11 +111,11 @@ impl Gpu {
         let noted = errors.clone();
         device.set_device_lost_callback(move |reason, message| {
             let reason = if message.is_empty() { format!("{reason:?}") } else { message };
-            noted.lock().unwrap_or_else(PoisonError::into_inner).lost.get_or_insert(reason);
+            lock(&noted).lost.get_or_insert(reason);
         });
         let noted = errors.clone();
         device.on_uncaptured_error(Arc::new(move |error| {
-            noted.lock().unwrap_or_else(PoisonError::into_inner).error.get_or_insert(chain(&error));
+            lock(&noted).error.get_or_insert(chain(&error));
         }));
         let guard = device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
             label: Some("guard"),
@@ -168,7 +169,7 @@ impl Gpu {
 
     /// Records that the device was lost, so that every later call fails, and returns that error.
     pub(super) fn lose(&self, reason: &str) -> DeviceError {
-        let mut errors = self.errors.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut errors = lock(&self.errors);
         let reason = errors.lost.get_or_insert_with(|| reason.into()).clone();
         DeviceError::Lost { adapter: self.adapter.to_string(), reason }
     }
@@ -196,7 +197,7 @@ impl Gpu {
     /// # Errors
     /// The device was lost, or a command failed.
     pub fn check(&self) -> Result<(), DeviceError> {
-        let mut errors = self.errors.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut errors = lock(&self.errors);
         if let Some(reason) = &errors.lost {
             return Err(DeviceError::Lost { adapter: self.adapter.to_string(), reason: reason.clone() });
         }

@@ -20,9 +20,9 @@ pub struct WaitLimit {
 impl WaitLimit {
     /// The limit for GPUs: a message after 10 s, and an error after 2 minutes. No submission takes longer than a
     /// second.
-    pub const WITH_GPUS: WaitLimit = WaitLimit { wait: Duration::from_secs(10), waits: 12 };
+    pub(super) const WITH_GPUS: WaitLimit = WaitLimit { wait: Duration::from_secs(10), waits: 12 };
     /// The limit for software renderers: an hour, because they wait for the processor like other programs.
-    pub const WITH_SOFTWARE: WaitLimit = WaitLimit { wait: Duration::from_secs(10), waits: 360 };
+    pub(super) const WITH_SOFTWARE: WaitLimit = WaitLimit { wait: Duration::from_secs(10), waits: 360 };
 }
 
 /// Reports a device without progress to people, see [`report_stalls`].
@@ -36,7 +36,7 @@ pub fn report_stalls(report: fn(&str)) {
 
 impl Gpu {
     /// Sets how long to wait for a device that makes no progress.
-    pub fn waiting(self, wait_limit: WaitLimit) -> Gpu {
+    pub fn with_wait_limit(self, wait_limit: WaitLimit) -> Gpu {
         Gpu { wait_limit, ..self }
     }
 

@@ -18,7 +18,7 @@
 //! GPU keeps the record and returns only what the scores depend on, see [`Records`].
 
 use std::collections::HashMap;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use bytemuck::Zeroable;
@@ -29,10 +29,11 @@ use super::population::Kernels;
 use crate::backend::scores::ScoreTable;
 use crate::backend::{
     BATCH_BYTES, Backend, BackendError, DevicePopulation, FOUR, Group, GroupScores, HELD_FROM, Moment, PACKED_FROM,
-    Trace,
+    Trace, check_sizes,
 };
 use crate::credit::{Episode, Seen, Strided};
 use crate::host::Instant;
+use crate::parallel::lock;
 
 mod flight;
 mod pace;
@@ -48,7 +49,7 @@ pub use planner::{State, Task};
 pub use shape::Kernel;
 pub use source::{WorkgroupBuffers, shader_of, shaders, workgroup_of};
 
-use flight::{Buffers, KEPT_SHARE};
+use flight::{Flight, KEPT_SHARE};
 use pace::Pace;
 use pipelines::{Compiled, IDLE_PLAYS, KEPT_KERNELS};
 use planner::{NOWHERE, owner_words, plan};
@@ -99,13 +100,13 @@ pub struct GpuBackend {
     pipelines: HashMap<Shape, Compiled>,
     /// How fast the device plays each shape.
     paces: HashMap<Shape, Pace>,
-    /// When the last batch was done.
+    /// When the last batch finished.
     done_at: Option<Instant>,
     /// Whether rollouts are timed by the device's clock.
     clock: bool,
-    /// The number of calls of `play_tasks`.
+    /// The number of rollouts so far.
     plays: u64,
-    holding: ResidencyPolicy,
+    residency: ResidencyPolicy,
     records: Records,
     /// Compiled when first needed.
     pack: Option<(wgpu::ComputePipeline, Bindings)>,
@@ -114,19 +115,19 @@ pub struct GpuBackend {
     /// Compiled when populations are first held.
     kernels: Option<Arc<Kernels>>,
     /// Two sets of buffers, so that one batch plays while the other is read.
-    flights: [Buffers; 2],
+    flights: [Flight; 2],
     /// Weights to be copied to the device.
     staging: Vec<[f32; FOUR]>,
     /// Target bytes of one buffer of a batch.
     batch_bytes: u64,
     kept_kernels: usize,
     idle_plays: u64,
-    stages: Stages,
+    times: PhaseTimes,
 }
 
-/// The time that rollouts took, by phase. The CPU's phases follow each other; the GPU works at the same time.
+/// The time that rollouts took, by phase. The CPU's phases do not overlap; the GPU works at the same time.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Stages {
+pub struct PhaseTimes {
     /// Planning batches and gathering weights.
     pub gather: Duration,
     /// Copying inputs to the driver and submitting.
@@ -165,7 +166,7 @@ impl GpuBackend {
             done_at: None,
             clock: false,
             plays: 0,
-            holding: if software { ResidencyPolicy::Never } else { ResidencyPolicy::From(HELD_FROM) },
+            residency: if software { ResidencyPolicy::Never } else { ResidencyPolicy::From(HELD_FROM) },
             records: if software { Records::Whole } else { Records::PackedFrom(PACKED_FROM) },
             pack: None,
             kept_share: KEPT_SHARE,
@@ -175,18 +176,18 @@ impl GpuBackend {
             batch_bytes: BATCH_BYTES,
             kept_kernels: KEPT_KERNELS,
             idle_plays: IDLE_PLAYS,
-            stages: Stages::default(),
+            times: PhaseTimes::default(),
         })
     }
 
     /// Sets the target bytes of a batch's buffers. Results do not depend on it.
-    pub fn batched(self, bytes: u64) -> GpuBackend {
+    pub fn with_batch_bytes(self, bytes: u64) -> GpuBackend {
         GpuBackend { batch_bytes: bytes, ..self }
     }
 
     /// Chooses kernels. The default is [`Kernel::Best`], and [`Kernel::Generic`] on software renderers, whose compilers
     /// take about a second for each specialised kernel.
-    pub fn playing(self, kernel: Kernel) -> GpuBackend {
+    pub fn with_kernel(self, kernel: Kernel) -> GpuBackend {
         GpuBackend { kernel, ..self }
     }
 
@@ -198,13 +199,13 @@ impl GpuBackend {
     }
 
     /// Returns the maximum teams per workgroup of specialised kernels, or `None` if it is yet to be measured.
-    pub fn packed(&self) -> Option<usize> {
+    pub fn teams_per_workgroup(&self) -> Option<usize> {
         self.teams_per_workgroup
     }
 
     /// Sets the maximum number of kernels per batch and kept between batches, at least one, and the number of rollouts
     /// after which an unused kernel is evicted. Results do not depend on it.
-    pub fn keeping(self, kernels: usize, plays: u64) -> GpuBackend {
+    pub fn with_kernel_cache(self, kernels: usize, plays: u64) -> GpuBackend {
         GpuBackend { kept_kernels: kernels.max(1), idle_plays: plays, ..self }
     }
 
@@ -215,8 +216,8 @@ impl GpuBackend {
     }
 
     /// Chooses which populations the device holds.
-    pub fn holding(self, holding: ResidencyPolicy) -> GpuBackend {
-        GpuBackend { holding, ..self }
+    pub fn with_residency(self, residency: ResidencyPolicy) -> GpuBackend {
+        GpuBackend { residency, ..self }
     }
 
     /// Chooses how records are copied to the host.
@@ -243,13 +244,13 @@ impl GpuBackend {
     }
 
     /// Starts to time rollouts by the GPU's clock, if it has one.
-    pub fn use_clock(&mut self) {
+    pub(crate) fn use_clock(&mut self) {
         self.clock = self.gpu.has_clock();
     }
 
     /// Returns and resets the times of rollouts.
-    pub fn take_stages(&mut self) -> Stages {
-        std::mem::take(&mut self.stages)
+    pub fn take_times(&mut self) -> PhaseTimes {
+        std::mem::take(&mut self.times)
     }
 
     /// Returns the device.
@@ -263,17 +264,19 @@ impl GpuBackend {
         self.plays += 1;
         let (plays, most) = (self.plays, self.idle_plays);
         self.pipelines.retain(|_, compiled| plays - compiled.played <= most);
-        let batches = plan(groups, trace, self.records, self.room(), &self.specialised(groups, trace))?;
-        self.stages.gather += start.elapsed();
-        for index in 0..=batches.len() {
-            if let Some(work) = batches.get(index) {
-                self.submit(index % 2, groups, work, trace)?;
-            }
-            if let Some(previous) = index.checked_sub(1) {
-                self.collect(previous % 2, &batches[previous], trace, done)?;
+        let batches = plan(groups, trace, self.records, self.capacity(), &self.specialised(groups, trace))?;
+        self.times.gather += start.elapsed();
+        let mut previous = None;
+        for (index, plan) in batches.iter().enumerate() {
+            let submitted = self.submit(index % 2, groups, plan, trace)?;
+            if let Some((plan, submitted)) = previous.replace((plan, submitted)) {
+                self.collect(plan, submitted, done)?;
             }
         }
-        self.stages.traffic += self.gpu.traffic() - before;
+        if let Some((plan, submitted)) = previous {
+            self.collect(plan, submitted, done)?;
+        }
+        self.times.traffic += self.gpu.traffic() - before;
         Ok(())
     }
 
@@ -284,11 +287,11 @@ impl GpuBackend {
         groups: &[Group<'_>],
         visit: &(dyn Fn(usize, usize, &Episode<'_>) + Sync),
     ) -> Result<(), BackendError> {
-        self.play_tasks(groups, false, &|share, readback, _| {
-            let world = groups[share.group].world;
-            let Task { sets, seen, table, owners, .. } = share.task;
-            let stride = share.task.teams as usize;
-            let (group, first) = (share.group, share.first_team);
+        self.play_tasks(groups, false, &|planned, readback, _| {
+            let world = groups[planned.group].world;
+            let Task { sets, seen, table, owners, .. } = planned.task;
+            let stride = planned.task.teams as usize;
+            let (group, first) = (planned.group, planned.first_team);
             match readback {
                 Readback::Whole(record) => {
                     let sets = &record[sets as usize..][..world.set_words() * stride];
@@ -309,7 +312,7 @@ impl GpuBackend {
                     };
                     for (offset, ends) in table.windows(2).enumerate() {
                         let words = &words[ends[0] as usize..ends[1] as usize];
-                        let sets = Strided { words, stride: 1, offset: 0 };
+                        let sets = Strided::contiguous(words);
                         let seen = Seen::Owners(Strided { words: owners, stride, offset });
                         visit(group, first + offset, &Episode { sets, seen, sights: Strided::NONE });
                     }
@@ -334,7 +337,7 @@ impl Backend for GpuBackend {
         let (teams, agents, steps) = (group.team_count(), world.agents(), world.steps());
         let (set_words, seen_words) = (world.set_words(), world.leaders() * world.followers());
         let sight_words = if group.records().sights() { world.sight_words() } else { 0 };
-        let trace = std::sync::Mutex::new(Trace {
+        let trace = Mutex::new(Trace {
             teams,
             agents,
             moments: vec![Moment::zeroed(); (steps + 1) * teams * agents],
@@ -342,49 +345,48 @@ impl Backend for GpuBackend {
             seen: vec![0; teams * seen_words],
             sights: vec![0; teams * sight_words],
         });
-        self.play_tasks(std::slice::from_ref(group), true, &|share, readback, moments| {
+        self.play_tasks(std::slice::from_ref(group), true, &|planned, readback, moments| {
             let Readback::Whole(record) = readback else { unreachable!("no trace is packed") };
-            let mut trace = trace.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-            let task = share.task;
-            let stride = task.teams as usize;
+            let Trace { moments: all_moments, sets, seen, sights, .. } = &mut *lock(&trace);
+            let Task { teams: stride, moments: first_moment, sets: first_set, seen: first_seen, .. } = planned.task;
+            let [stride, first_moment, first_set, first_seen] =
+                [stride, first_moment, first_set, first_seen].map(|number| number as usize);
             for step in 0..=steps {
-                let from = task.moments as usize + step * stride * agents;
-                let to = (step * teams + share.first_team) * agents;
-                trace.moments[to..to + stride * agents].copy_from_slice(&moments[from..from + stride * agents]);
+                let from = first_moment + step * stride * agents;
+                let to = (step * teams + planned.first_team) * agents;
+                all_moments[to..to + stride * agents].copy_from_slice(&moments[from..from + stride * agents]);
             }
-            for offset in 0..stride {
-                let team = share.first_team + offset;
-                for word in 0..set_words {
-                    trace.sets[team * set_words + word] = record[task.sets as usize + word * stride + offset];
+            // Copies words that are interleaved by team.
+            let scatter = |from: usize, words: usize, all: &mut [u32]| {
+                for (word, numbers) in record[from..].chunks_exact(stride).take(words).enumerate() {
+                    let to = all[planned.first_team * words + word..].iter_mut().step_by(words);
+                    to.zip(numbers).for_each(|(to, &number)| *to = number);
                 }
-                for word in 0..seen_words {
-                    trace.seen[team * seen_words + word] = record[task.seen as usize + word * stride + offset];
-                }
-                for word in 0..sight_words {
-                    let at = task.seen as usize + (seen_words + word) * stride + offset;
-                    trace.sights[team * sight_words + word] = record[at];
-                }
-            }
+            };
+            scatter(first_set, set_words, sets);
+            scatter(first_seen, seen_words, seen);
+            scatter(first_seen + seen_words * stride, sight_words, sights);
         })?;
-        Ok(trace.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner))
+        Ok(trace.into_inner().unwrap_or_else(PoisonError::into_inner))
     }
 
     fn hold(&mut self, weights: &[f32], sizes: [usize; 3]) -> Result<Option<Box<dyn DevicePopulation>>, BackendError> {
-        let [leaders, slots, parameters] = sizes;
-        let allowed = self.room().buffer;
+        check_sizes(weights.len(), sizes)?;
+        let [populations, slots, parameters] = sizes;
+        let allowed = self.capacity().buffer;
         let bytes = (slots * parameters * size_of::<f32>()) as u64;
-        let least = match self.holding {
+        let least = match self.residency {
             ResidencyPolicy::Never => return Ok(None),
             ResidencyPolicy::From(least) => least,
             ResidencyPolicy::Always => 0,
         };
-        if leaders as u64 * bytes < least {
+        if populations as u64 * bytes < least {
             return Ok(None);
         }
         if bytes > allowed {
-            return match self.holding {
+            return match self.residency {
                 ResidencyPolicy::Always => Err(BackendError::TooLarge(format!(
-                    "the policies of one leader take {bytes} bytes, this adapter holds {allowed} in one buffer; \
+                    "one population takes {bytes} bytes, this adapter holds {allowed} in one buffer; \
                      breed on the host, or use a smaller population"
                 ))),
                 _ => Ok(None),
@@ -397,7 +399,7 @@ impl Backend for GpuBackend {
         match kernels.hold(weights, sizes) {
             Ok(population) => Ok(Some(Box::new(population))),
             Err(DeviceError::OutOfMemory { .. } | DeviceError::TooLarge { .. })
-                if self.holding != ResidencyPolicy::Always =>
+                if self.residency != ResidencyPolicy::Always =>
             {
                 Ok(None)
             }
@@ -406,7 +408,7 @@ impl Backend for GpuBackend {
     }
 
     fn describe(&self) -> String {
-        let held = match self.holding {
+        let held = match self.residency {
             ResidencyPolicy::Never => String::new(),
             ResidencyPolicy::From(bytes) => format!(", holds populations of {} MiB or more", bytes >> 20),
             ResidencyPolicy::Always => ", holds all populations".into(),

@@ -8,7 +8,7 @@ const TARGET: f64 = 0.1;
 /// Work of the first submission of a kernel, in iterations. It takes milliseconds on the slowest GPUs.
 const FIRST_ITERATIONS: u64 = 1 << 24;
 /// Minimum time of a trial whose duration says something about the device's speed.
-const TELLING: Duration = Duration::from_millis(5);
+const MIN_TRIAL_TIME: Duration = Duration::from_millis(5);
 
 /// The speed at which a device plays a kernel, as far as it is known. Work is counted in loop iterations over all
 /// threads, as the planner estimates them.
@@ -16,14 +16,14 @@ pub(super) struct Pace {
     /// Iterations of the next trial.
     trial: u64,
     /// Iterations per second of the last trial. Some drivers compile in the first dispatch, so two trials are timed.
-    tried: Option<f64>,
+    last_trial_rate: Option<f64>,
     /// Iterations per second.
     rate: Option<f64>,
 }
 
 impl Default for Pace {
     fn default() -> Pace {
-        Pace { trial: FIRST_ITERATIONS, tried: None, rate: None }
+        Pace { trial: FIRST_ITERATIONS, last_trial_rate: None, rate: None }
     }
 }
 
@@ -48,12 +48,12 @@ impl Pace {
     }
 
     /// Notes how long a trial took. The device had nothing else to do.
-    pub(super) fn try_out(&mut self, iterations: u64, elapsed: Duration) {
+    pub(super) fn record_trial(&mut self, iterations: u64, elapsed: Duration) {
         let rate = iterations as f64 / elapsed.as_secs_f64().max(1e-9);
-        if elapsed < TELLING {
+        if elapsed < MIN_TRIAL_TIME {
             // The overhead of a submission hides the speed.
             self.trial = self.trial.saturating_mul(8);
-        } else if let Some(first) = self.tried.replace(rate) {
+        } else if let Some(first) = self.last_trial_rate.replace(rate) {
             self.rate = Some(rate.max(first));
         }
     }
@@ -63,7 +63,7 @@ impl Pace {
     pub(super) fn observe(&mut self, iterations: u64, elapsed: Duration, exact: bool) {
         let Some(known) = &mut self.rate else { return };
         let rate = iterations as f64 / elapsed.as_secs_f64().max(1e-9);
-        if elapsed >= TELLING && (exact || rate > *known) {
+        if elapsed >= MIN_TRIAL_TIME && (exact || rate > *known) {
             *known = rate;
         }
     }
@@ -78,11 +78,11 @@ mod tests {
         let mut pace = Pace::default();
         assert_eq!(pace.tasks(1 << 20, 0.0), 16);
         // Too short to tell: a larger trial. Then two that tell, the first with a compilation.
-        pace.try_out(1 << 24, Duration::from_millis(1));
+        pace.record_trial(1 << 24, Duration::from_millis(1));
         assert_eq!(pace.tasks(1 << 20, 0.0), 128);
-        pace.try_out(1 << 27, Duration::from_secs(1));
+        pace.record_trial(1 << 27, Duration::from_secs(1));
         assert!(!pace.is_known());
-        pace.try_out(1 << 27, Duration::from_millis(50));
+        pace.record_trial(1 << 27, Duration::from_millis(50));
         assert!(pace.is_known());
         assert_eq!(pace.tasks(1 << 20, 0.0), 256);
         assert_eq!(pace.tasks(1 << 20, 0.05), 128);

@@ -28,15 +28,15 @@ pub(super) struct Compiled {
 /// Returns the shapes that get a specialised kernel: those that have one, and of the others those with most
 /// agent-steps, up to [`MAX_SPECIALISED`] in all.
 fn worth_compiling(work: BTreeMap<Shape, u64>, compiled: &HashSet<Shape>) -> HashSet<Shape> {
-    let room = MAX_SPECIALISED.saturating_sub(compiled.iter().filter(|shape| shape.is_specialised()).count());
+    let free = MAX_SPECIALISED.saturating_sub(compiled.iter().filter(|shape| shape.is_specialised()).count());
     let (mut shapes, mut new): (Vec<_>, Vec<_>) = work.into_iter().partition(|(shape, _)| compiled.contains(shape));
     new.sort_by_key(|(_, agent_steps)| Reverse(*agent_steps));
-    shapes.extend(new.into_iter().take(room));
+    shapes.extend(new.into_iter().take(free));
     shapes.into_iter().map(|(shape, _)| shape).collect()
 }
 
 impl GpuBackend {
-    pub(super) fn room(&self) -> Capacity {
+    pub(super) fn capacity(&self) -> Capacity {
         let limits = &self.gpu.limits;
         Capacity {
             batch: self.batch_bytes,
@@ -52,7 +52,7 @@ impl GpuBackend {
     pub(super) fn specialised(&self, groups: &[Group<'_>], trace: bool) -> HashSet<Shape> {
         let mut work: BTreeMap<Shape, u64> = BTreeMap::new();
         for group in groups {
-            if let Some(workgroup) = Workgroup::specialised(group.world, self.room()) {
+            if let Some(workgroup) = Workgroup::specialised(group.world, self.capacity()) {
                 let agent_steps = group.team_count() * group.world.agents() * group.world.steps();
                 let shape = Shape::specialised(group.world, workgroup, Recorded::of(group, trace));
                 *work.entry(shape).or_default() += agent_steps as u64;

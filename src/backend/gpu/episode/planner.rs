@@ -108,6 +108,7 @@ pub(crate) fn state_bytes(world: &World, request: RecordRequest<'_>) -> u64 {
 }
 
 /// A task and where its teams come from.
+#[derive(Clone, Copy)]
 pub(super) struct PlannedTask {
     pub(super) group: usize,
     pub(super) first_team: usize,
@@ -153,19 +154,99 @@ impl PlannedTask {
     }
 }
 
+/// Numbers of elements in the buffers that grow with the teams. Every other such buffer is smaller than one of them.
+#[derive(Clone, Copy, Default)]
+pub(super) struct Elements {
+    /// Words of records.
+    pub(super) record: usize,
+    /// Weights, in fours.
+    pub(super) weights: usize,
+    /// Moments of a trace.
+    pub(super) moments: usize,
+    /// States between two dispatches.
+    pub(super) states: usize,
+}
+
+impl Elements {
+    /// Returns the bytes of each buffer, in the order of the fields.
+    pub(super) fn bytes(self) -> [u64; 4] {
+        let bytes = |count: usize, size: usize| count as u64 * size as u64;
+        [
+            bytes(self.record, size_of::<u32>()),
+            bytes(self.weights, size_of::<[f32; FOUR]>()),
+            bytes(self.moments, size_of::<Moment>()),
+            bytes(self.states, size_of::<State>()),
+        ]
+    }
+}
+
+/// How the teams of one group become tasks.
+struct GroupPlan<'a> {
+    group: &'a Group<'a>,
+    per_team: Elements,
+    /// Maximum bytes per team in one buffer.
+    bytes_per_team: u64,
+    teams_per_task: usize,
+    /// A task without teams.
+    template: PlannedTask,
+}
+
+impl<'a> GroupPlan<'a> {
+    /// Plans group `index`. Its world gets the specialised kernel if its shape is one of `specialised`.
+    fn new(
+        index: usize,
+        group: &'a Group<'a>,
+        trace: bool,
+        capacity: Capacity,
+        specialised: &HashSet<Shape>,
+    ) -> Result<GroupPlan<'a>, BackendError> {
+        let world = group.world;
+        let recorded = Recorded::of(group, trace);
+        let own_kernel = Workgroup::specialised(world, capacity)
+            .map(|workgroup| (workgroup, Shape::specialised(world, workgroup, recorded)));
+        let (workgroup, shape) = own_kernel.filter(|(_, shape)| specialised.contains(shape)).unwrap_or_else(|| {
+            let workgroup = Workgroup::generic(world, capacity.workgroup);
+            (workgroup, Shape::generic(world, workgroup, recorded))
+        });
+        let steps_per_dispatch = steps_per_dispatch(world, workgroup, recorded);
+        let per_team = Elements {
+            record: record_words(world, group.records()),
+            weights: fours(world),
+            moments: if trace { (world.steps() + 1) * world.agents() } else { 0 },
+            states: if world.steps() > steps_per_dispatch { world.agents() } else { 0 },
+        };
+        let with_status = Elements { record: per_team.record + STATUS, ..per_team };
+        let bytes_per_team = with_status.bytes().into_iter().max().unwrap_or(0);
+        if bytes_per_team > capacity.buffer {
+            return Err(BackendError::TooLarge(format!(
+                "one team takes {bytes_per_team} bytes in one buffer, this adapter allows {}; \
+                 use the CPU, fewer steps or fewer POIs",
+                capacity.buffer
+            )));
+        }
+        let teams_per_task = workgroup.teams.min((capacity.target() / bytes_per_team.max(1)).max(1) as usize);
+        let template = PlannedTask {
+            group: index,
+            first_team: 0,
+            shape,
+            task: Task::default(),
+            steps_per_dispatch,
+            iterations_per_step: iterations_per_step(world, workgroup, recorded) * workgroup.threads,
+        };
+        Ok(GroupPlan { group, per_team, bytes_per_team, teams_per_task, template })
+    }
+}
+
 /// Tasks that fit the device's buffers together: one batch.
 #[derive(Default)]
 pub(super) struct BatchPlan {
-    pub(super) shares: Vec<PlannedTask>,
+    pub(super) tasks: Vec<PlannedTask>,
     /// The shapes of its kernels.
     pub(super) shapes: BTreeSet<Shape>,
     pub(super) worlds: Vec<Constants>,
     pub(super) places: Vec<Vec2>,
-    /// Weights, in fours.
-    pub(super) weights: usize,
-    pub(super) record: usize,
-    pub(super) moments: usize,
-    pub(super) states: usize,
+    /// The elements that its tasks use.
+    pub(super) used: Elements,
     /// Words of all sets in the record.
     pub(super) sets: usize,
     /// If the record is packed: the words of tables and owners, and the minimum size of a set, `[pois]` per group.
@@ -174,24 +255,68 @@ pub(super) struct BatchPlan {
 }
 
 impl BatchPlan {
+    /// Reports whether `teams` more teams of a group exceed the capacity.
+    fn is_full(&self, plan: &GroupPlan<'_>, teams: usize, capacity: Capacity) -> bool {
+        let more = teams as u64 * plan.bytes_per_team;
+        self.used.bytes().into_iter().any(|used| used + more > capacity.target())
+            || self.shapes.len() >= capacity.kernels && !self.shapes.contains(&plan.template.shape)
+    }
+
+    /// Stores a group's world, starts and POIs, and returns a task that refers to them.
+    fn store(&mut self, plan: &GroupPlan<'_>) -> Task {
+        let Group { world, starts, .. } = *plan.group;
+        let (index, first) = (self.worlds.len() as u32, self.places.len() as u32);
+        self.places.extend(starts);
+        if plan.group.moved_pois().is_none() {
+            self.places.extend(&world.pois);
+        }
+        // The shader finds headings behind the POIs.
+        self.places.extend(&world.headings);
+        self.worlds.push(world.constants);
+        self.shapes.insert(plan.template.shape);
+        let (pois, end) = (first + world.agents() as u32, world.constants.steps);
+        Task { world: index, starts: first, pois, end, ..Task::default() }
+    }
+
+    /// Adds a task. `stored` refers to its group's world.
+    fn push(&mut self, plan: &GroupPlan<'_>, first_team: usize, teams: usize, stored: Task) {
+        let (used, per_team, sets) = (&mut self.used, plan.per_team, plan.group.world.set_words() * teams);
+        let task = Task {
+            weights: used.weights as u32,
+            sets: used.record as u32,
+            seen: (used.record + sets) as u32,
+            moments: used.moments as u32,
+            states: used.states as u32,
+            teams: teams as u32,
+            status: (used.record + per_team.record * teams) as u32,
+            ..stored
+        };
+        used.record += per_team.record * teams + STATUS;
+        used.weights += per_team.weights * teams;
+        used.moments += per_team.moments * teams;
+        used.states += per_team.states * teams;
+        self.sets += sets;
+        self.tasks.push(PlannedTask { first_team, task, ..plan.template });
+    }
+
     /// Lays out the packed record, unless the whole record is requested, the rule depends on when sets occur, packing
     /// would take too long for one dispatch, or it would save nothing.
     fn pack(&mut self, groups: &[Group<'_>], records: Records) {
-        let packs = |share: &PlannedTask| {
-            let (world, need) = (groups[share.group].world, groups[share.group].records());
-            need.least(1).is_some() && !world.rule.is_timed() && pack_iterations(groups, share) <= MAX_ITERATIONS
+        let packs = |planned: &PlannedTask| {
+            let (world, need) = (groups[planned.group].world, groups[planned.group].records());
+            need.least(1).is_some() && !world.rule.is_timed() && pack_iterations(groups, planned) <= MAX_ITERATIONS
         };
         // The first task of a group is the largest.
-        let all_pack = self.shares.chunk_by(|a, b| a.group == b.group).all(|shares| packs(&shares[0]));
-        if !records.packs((self.record * size_of::<u32>()) as u64) || !all_pack {
+        let all_pack = self.tasks.chunk_by(|a, b| a.group == b.group).all(|tasks| packs(&tasks[0]));
+        if !records.packs(self.used.bytes()[0]) || !all_pack {
             return;
         }
         let mut head = 0;
-        for shares in self.shares.chunk_by_mut(|a, b| a.group == b.group) {
-            let (world, need) = (groups[shares[0].group].world, groups[shares[0].group].records());
+        for tasks in self.tasks.chunk_by_mut(|a, b| a.group == b.group) {
+            let (world, need) = (groups[tasks[0].group].world, groups[tasks[0].group].records());
             let least = self.least.len() as u32;
             self.least.extend(world.coupling.iter().filter_map(|&coupling| need.least(coupling)));
-            for PlannedTask { task, .. } in shares {
+            for PlannedTask { task, .. } in tasks {
                 let teams = task.teams as usize;
                 (task.least, task.table, task.owners) = (least, head as u32, NOWHERE);
                 head += teams + 2;
@@ -201,7 +326,7 @@ impl BatchPlan {
                 }
             }
         }
-        self.head = Some(head).filter(|head| head + PACKED_HEAD < self.record);
+        self.head = Some(head).filter(|head| head + PACKED_HEAD < self.used.record);
     }
 }
 
@@ -211,8 +336,8 @@ pub(super) fn owner_words(world: &World) -> usize {
 }
 
 /// Returns the maximum loop iterations per thread to pack a task.
-fn pack_iterations(groups: &[Group<'_>], share: &PlannedTask) -> usize {
-    let (world, teams) = (groups[share.group].world, share.task.teams as usize);
+fn pack_iterations(groups: &[Group<'_>], planned: &PlannedTask) -> usize {
+    let (world, teams) = (groups[planned.group].world, planned.task.teams as usize);
     let sets = (world.pois.len() * teams).div_ceil(PACK_WORKGROUP);
     let owners = (owner_words(world) * teams).div_ceil(PACK_WORKGROUP) * 4 * (world.leaders() + 2);
     // Each set is read twice, and at most as many are written or skipped.
@@ -228,102 +353,29 @@ pub(super) fn plan(
     groups: &[Group<'_>],
     trace: bool,
     records: Records,
-    room: Capacity,
+    capacity: Capacity,
     specialised: &HashSet<Shape>,
 ) -> Result<Vec<BatchPlan>, BackendError> {
-    let target = room.buffer.min(room.batch);
     let mut batches = vec![BatchPlan::default()];
     for (index, group) in groups.iter().enumerate() {
-        let world = group.world;
-        let recorded = Recorded::of(group, trace);
-        let moments_per_team = if trace { (world.steps() + 1) * world.agents() } else { 0 };
-        let for_it = Workgroup::specialised(world, room)
-            .map(|workgroup| (workgroup, Shape::specialised(world, workgroup, recorded)));
-        let (workgroup, shape) = for_it.filter(|(_, shape)| specialised.contains(shape)).unwrap_or_else(|| {
-            let workgroup = Workgroup::generic(world, room.workgroup);
-            (workgroup, Shape::generic(world, workgroup, recorded))
-        });
-        let (steps_per_dispatch, iterations_per_step) =
-            (steps_per_dispatch(world, workgroup, recorded), iterations_per_step(world, workgroup, recorded));
-        let states_per_team = if world.steps() > steps_per_dispatch { world.agents() } else { 0 };
-        // Every buffer that grows with the teams is one of these, or smaller than one of them.
-        let bytes_per_team = [
-            (record_words(world, group.records()) + STATUS) * size_of::<u32>(),
-            fours(world) * size_of::<[f32; FOUR]>(),
-            moments_per_team * size_of::<Moment>(),
-            states_per_team * size_of::<State>(),
-        ]
-        .into_iter()
-        .max()
-        .unwrap_or(0) as u64;
-        if bytes_per_team > room.buffer {
-            return Err(BackendError::TooLarge(format!(
-                "one team takes {bytes_per_team} bytes in one buffer, this adapter allows {}; \
-                 use the CPU, fewer steps or fewer POIs",
-                room.buffer
-            )));
-        }
-        let teams_per_task = workgroup.teams.min((target / bytes_per_team.max(1)).max(1) as usize);
+        let plan = GroupPlan::new(index, group, trace, capacity, specialised)?;
         // A group's world, starts and POIs are stored once per batch.
-        let mut stored: Option<(usize, Task)> = None;
-        for first_team in (0..group.team_count()).step_by(teams_per_task) {
-            let teams = teams_per_task.min(group.team_count() - first_team);
-            let mut work = batches.last_mut().expect("there is a batch");
-            let full = |used: usize, size: usize| used as u64 * size as u64 + teams as u64 * bytes_per_team > target;
-            if full(work.record, size_of::<u32>())
-                || full(work.weights, size_of::<[f32; FOUR]>())
-                || full(work.moments, size_of::<Moment>())
-                || full(work.states, size_of::<State>())
-                || work.shapes.len() >= room.kernels && !work.shapes.contains(&shape)
-            {
+        let mut stored = None;
+        for first_team in (0..group.team_count()).step_by(plan.teams_per_task) {
+            let teams = plan.teams_per_task.min(group.team_count() - first_team);
+            let mut batch = batches.last_mut().expect("there is a batch");
+            if batch.is_full(&plan, teams, capacity) {
                 batches.push(BatchPlan::default());
-                work = batches.last_mut().expect("just pushed");
+                batch = batches.last_mut().expect("just pushed");
                 stored = None;
             }
-            let (world_index, base) = *stored.get_or_insert_with(|| {
-                let starts = work.places.len() as u32;
-                let pois = starts + world.agents() as u32;
-                work.places.extend(group.starts);
-                if group.moved_pois().is_none() {
-                    work.places.extend(&world.pois);
-                }
-                // The shader finds headings behind the POIs.
-                work.places.extend(&world.headings);
-                work.worlds.push(world.constants);
-                work.shapes.insert(shape);
-                (work.worlds.len() - 1, Task { starts, pois, ..Task::default() })
-            });
-            let task = Task {
-                world: world_index as u32,
-                weights: work.weights as u32,
-                sets: work.record as u32,
-                seen: (work.record + world.set_words() * teams) as u32,
-                moments: work.moments as u32,
-                states: work.states as u32,
-                teams: teams as u32,
-                end: world.constants.steps,
-                status: (work.record + record_words(world, group.records()) * teams) as u32,
-                ..base
-            };
-            work.weights += fours(world) * teams;
-            work.record += record_words(world, group.records()) * teams + STATUS;
-            work.sets += world.set_words() * teams;
-            work.moments += moments_per_team * teams;
-            work.states += states_per_team * teams;
-            let iterations_per_step = iterations_per_step * workgroup.threads;
-            work.shares.push(PlannedTask {
-                group: index,
-                first_team,
-                shape,
-                task,
-                steps_per_dispatch,
-                iterations_per_step,
-            });
+            let stored = *stored.get_or_insert_with(|| batch.store(&plan));
+            batch.push(&plan, first_team, teams, stored);
         }
     }
-    batches.retain(|work| !work.shares.is_empty());
+    batches.retain(|batch| !batch.tasks.is_empty());
     if !trace {
-        batches.iter_mut().for_each(|work| work.pack(groups, records));
+        batches.iter_mut().for_each(|batch| batch.pack(groups, records));
     }
     Ok(batches)
 }
@@ -366,14 +418,14 @@ mod tests {
             fitnesses: &[crate::config::Fitness::Df],
         };
         for buffer in [128 << 20, 1 << 20, 1 << 14] {
-            let room = Capacity { batch: BATCH_BYTES, buffer, ..Capacity::of_workgroups(256) };
-            let batches = plan(&[group], false, Records::Whole, room, &HashSet::new()).unwrap();
-            for work in &batches {
-                let states = (work.states * size_of::<State>()) as u64;
+            let capacity = Capacity { batch: BATCH_BYTES, buffer, ..Capacity::of_workgroups(256) };
+            let batches = plan(&[group], false, Records::Whole, capacity, &HashSet::new()).unwrap();
+            for batch in &batches {
+                let [record, .., states] = batch.used.bytes();
                 assert!(states > 0 && states <= buffer, "{states} bytes of states, {buffer} allowed");
-                assert!((work.record * size_of::<u32>()) as u64 <= buffer);
+                assert!(record <= buffer);
             }
-            let teams: u32 = batches.iter().flat_map(|work| &work.shares).map(|share| share.task.teams).sum();
+            let teams: u32 = batches.iter().flat_map(|batch| &batch.tasks).map(|planned| planned.task.teams).sum();
             assert_eq!(teams as usize, population);
         }
         assert_eq!(state_bytes(&world, group.records()), 256 * 20);

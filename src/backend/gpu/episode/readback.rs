@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use super::GpuBackend;
-use super::flight::{Buffers, PackedReadback};
+use super::flight::{PackedReadback, SubmittedBatch};
 use super::planner::{BatchPlan, PACKED_HEAD, PlannedTask};
 use crate::backend::Moment;
 use crate::backend::gpu::device::DeviceError;
@@ -29,99 +29,125 @@ impl GpuBackend {
     /// Waits for one batch, and passes its record on.
     pub(super) fn collect(
         &mut self,
-        flight: usize,
-        work: &BatchPlan,
-        trace: bool,
+        plan: &BatchPlan,
+        mut batch: SubmittedBatch,
         done: &Done<'_>,
     ) -> Result<(), DeviceError> {
         let start = Instant::now();
-        self.gpu.wait_for(self.flights[flight].submitted.clone())?;
+        self.gpu.wait_for(Some(batch.last.clone()))?;
         let done_waiting = Instant::now();
-        self.note_pace(flight, work, done_waiting, done_waiting - start);
-        let mut score = Duration::ZERO;
-        // Both stay as they are if the device did not do the work that its driver reports as done.
-        let nonce = self.flights[flight].nonce;
-        let mut share_out = |record: Readback<'_>, moments: &[Moment]| {
-            let done_by_device = |share: &PlannedTask| {
-                let status = match record {
-                    Readback::Whole(words) => words[share.task.status as usize],
-                    Readback::Packed(words) => words[share.packed_status()],
-                };
-                status == share.final_status(nonce)
-            };
-            if !work.shares.par_iter().all(done_by_device) {
-                return Err(self.gpu.lose_undone("an episode"));
-            }
-            let start = Instant::now();
-            work.shares.par_iter().for_each(|share| done(share, record, moments));
-            score += start.elapsed();
-            Ok(())
+        self.note_pace(&batch, plan, done_waiting, done_waiting - start);
+        self.check_populations(&batch)?;
+        let score = match self.score_packed(plan, &batch, done)? {
+            Some(score) => score,
+            None => self.score_whole(plan, &mut batch, done)?,
         };
-        let record_bytes = (work.record * size_of::<u32>()) as u64;
-        let moment_bytes = (work.moments * size_of::<Moment>()) as u64;
-        let buffers = &mut self.flights[flight];
-        let mut fits = false;
-        if let Some(back) = buffers.populations_back.as_ref().filter(|_| !buffers.populations.is_empty()) {
-            let expected: &[u8] = bytemuck::cast_slice(&buffers.populations);
-            if !self.gpu.mapped(back, 0..expected.len() as u64, |bytes| bytes == expected)? {
-                return Err(self.gpu.lose_undone("breeding"));
-            }
-        }
-        if let (Some(head), Some(PackedReadback { room, bytes }), Some(back)) =
-            (work.head, buffers.sent, &buffers.packed_back)
-        {
-            let used = self.gpu.mapped(back, 0..bytes, |bytes| {
-                let words: &[u32] = bytemuck::cast_slice(bytes);
-                let used = words[0] as usize;
-                fits = used <= room && words.len() > PACKED_HEAD;
-                match fits {
-                    true => share_out(Readback::Packed(&words[PACKED_HEAD..]), &[]).map(|()| used),
-                    false => Ok(used),
-                }
-            })??;
-            // The next generation may keep more, so there is room for half as much again. The room shrinks slowly.
-            let kept = 1.5 * used.saturating_sub(head) as f64 / work.sets as f64;
-            self.kept_share = kept.max(0.9 * self.kept_share);
-        }
-        if !fits {
-            if !buffers.whole {
-                buffers.bring_record(&self.gpu, record_bytes)?;
-            }
-            match (&buffers.record_back, &buffers.moments_back) {
-                (Some(record), Some(moments)) if trace => self.gpu.mapped(record, 0..record_bytes, |record| {
-                    self.gpu.mapped(moments, 0..moment_bytes, |moments| {
-                        share_out(Readback::Whole(bytemuck::cast_slice(record)), bytemuck::cast_slice(moments))
-                    })
-                })???,
-                (Some(record), _) => self.gpu.mapped(record, 0..record_bytes, |record| {
-                    share_out(Readback::Whole(bytemuck::cast_slice(record)), &[])
-                })??,
-                _ => unreachable!("a batch was submitted"),
-            }
-        }
-        for watch in buffers.watches.iter().take(buffers.submissions) {
+        for watch in self.flights[batch.flight].watches.iter().take(batch.submissions) {
             let time = watch.read(&self.gpu)?;
-            self.stages.gpu += time;
-            self.stages.longest = self.stages.longest.max(time);
+            self.times.gpu += time;
+            self.times.longest = self.times.longest.max(time);
         }
-        self.stages.wait += done_waiting - start;
-        self.stages.score += score;
-        self.stages.read_back += done_waiting.elapsed().saturating_sub(score);
+        self.times.wait += done_waiting - start;
+        self.times.score += score;
+        self.times.read_back += done_waiting.elapsed().saturating_sub(score);
         Ok(())
     }
 
+    /// Checks that the populations of a batch were bred as planned.
+    fn check_populations(&self, batch: &SubmittedBatch) -> Result<(), DeviceError> {
+        let Some((back, expected)) = &batch.readback.populations else { return Ok(()) };
+        let expected: &[u8] = bytemuck::cast_slice(expected);
+        match self.gpu.mapped(back, 0..expected.len() as u64, |bytes| bytes == expected)? {
+            true => Ok(()),
+            false => Err(self.gpu.lose_undone("breeding")),
+        }
+    }
+
+    /// Passes the packed record on, if there is one and everything fitted. Returns how long that took.
+    fn score_packed(
+        &mut self,
+        plan: &BatchPlan,
+        batch: &SubmittedBatch,
+        done: &Done<'_>,
+    ) -> Result<Option<Duration>, DeviceError> {
+        let (Some(head), Some((back, PackedReadback { room, bytes }))) = (plan.head, &batch.readback.packed) else {
+            return Ok(None);
+        };
+        let (used, score) = self.gpu.mapped(back, 0..*bytes, |bytes| {
+            let words: &[u32] = bytemuck::cast_slice(bytes);
+            let used = words[0] as usize;
+            if used > *room || words.len() == PACKED_HEAD {
+                return Ok((used, None));
+            }
+            let record = Readback::Packed(&words[PACKED_HEAD..]);
+            self.score_tasks(plan, batch.nonce, record, &[], done).map(|score| (used, Some(score)))
+        })??;
+        // The next generation may keep more, so there is room for half as much again. The room shrinks slowly.
+        let kept = 1.5 * used.saturating_sub(head) as f64 / plan.sets as f64;
+        self.kept_share = kept.max(0.9 * self.kept_share);
+        Ok(score)
+    }
+
+    /// Passes the whole record on, with the moments of a trace. Returns how long that took.
+    fn score_whole(
+        &mut self,
+        plan: &BatchPlan,
+        batch: &mut SubmittedBatch,
+        done: &Done<'_>,
+    ) -> Result<Duration, DeviceError> {
+        let [record_bytes, _, moment_bytes, _] = plan.used.bytes();
+        let record = match batch.readback.record.take() {
+            Some(record) => record,
+            None => self.bring_record(batch, record_bytes)?,
+        };
+        self.gpu.mapped(&record, 0..record_bytes, |record| {
+            let record = Readback::Whole(bytemuck::cast_slice(record));
+            let score = |moments: &[Moment]| self.score_tasks(plan, batch.nonce, record, moments, done);
+            match &batch.readback.moments {
+                Some(back) => self.gpu.mapped(back, 0..moment_bytes, |bytes| score(bytemuck::cast_slice(bytes)))?,
+                None => score(&[]),
+            }
+        })?
+    }
+
+    /// Calls `done` for each task, and returns how long that took.
+    fn score_tasks(
+        &self,
+        plan: &BatchPlan,
+        nonce: u32,
+        record: Readback<'_>,
+        moments: &[Moment],
+        done: &Done<'_>,
+    ) -> Result<Duration, DeviceError> {
+        // The status stays as it is if the device did not do the work that its driver reports as done.
+        let done_by_device = |planned: &PlannedTask| {
+            let status = match record {
+                Readback::Whole(words) => words[planned.task.status as usize],
+                Readback::Packed(words) => words[planned.packed_status()],
+            };
+            status == planned.final_status(nonce)
+        };
+        if !plan.tasks.par_iter().all(done_by_device) {
+            return Err(self.gpu.lose_undone("an episode"));
+        }
+        let start = Instant::now();
+        plan.tasks.par_iter().for_each(|planned| done(planned, record, moments));
+        Ok(start.elapsed())
+    }
+
     /// Notes how long a batch took that is `done`, after the host has waited for it.
-    fn note_pace(&mut self, flight: usize, work: &BatchPlan, done: Instant, waited: Duration) {
-        let Buffers { started, iterations, submissions, .. } = self.flights[flight];
+    fn note_pace(&mut self, batch: &SubmittedBatch, plan: &BatchPlan, done: Instant, waited: Duration) {
         // The device plays one batch after the other.
         let before = self.done_at.replace(done);
-        let Some(started) = started.map(|started| before.map_or(started, |before| started.max(before))) else { return };
-        let elapsed = self.gpu.taken(iterations, done - started);
+        let Some(started) = batch.started.map(|started| before.map_or(started, |before| started.max(before))) else {
+            return;
+        };
+        let elapsed = self.gpu.taken(batch.iterations, done - started);
         if !self.clock {
-            self.stages.longest = self.stages.longest.max(elapsed / submissions.max(1) as u32);
+            self.times.longest = self.times.longest.max(elapsed / batch.submissions.max(1) as u32);
         }
-        if let (1, Some(pace)) = (work.shapes.len(), work.shapes.first().and_then(|shape| self.paces.get_mut(shape))) {
-            pace.observe(iterations, elapsed, waited > WAITED);
+        if let (1, Some(pace)) = (plan.shapes.len(), plan.shapes.first().and_then(|shape| self.paces.get_mut(shape))) {
+            pace.observe(batch.iterations, elapsed, waited > WAITED);
         }
     }
 }

@@ -97,8 +97,8 @@ impl Shape {
     }
 
     /// Returns the specialised shape, if it is asked for and possible.
-    pub(super) fn asked_for(world: &World, kernel: Kernel, room: Capacity, records: Recorded) -> Option<Shape> {
-        let workgroup = Workgroup::specialised(world, room).filter(|_| kernel != Kernel::Generic);
+    pub(super) fn asked_for(world: &World, kernel: Kernel, capacity: Capacity, records: Recorded) -> Option<Shape> {
+        let workgroup = Workgroup::specialised(world, capacity).filter(|_| kernel != Kernel::Generic);
         workgroup.map(|workgroup| Shape::specialised(world, workgroup, records))
     }
 
@@ -122,20 +122,20 @@ pub(super) struct Workgroup {
 }
 
 /// Returns the threads that `teams` teams need.
-fn seats(world: &World, teams: usize) -> usize {
+fn threads_needed(world: &World, teams: usize) -> usize {
     (teams * world.leaders()).next_multiple_of(ROLE) + teams * world.followers()
 }
 
 impl Workgroup {
     /// Returns the workgroup of a specialised kernel: as many teams as a warp has threads, or as many as fit. `None` if
     /// there are too many agents or the policy is too large.
-    pub(super) fn specialised(world: &World, room: Capacity) -> Option<Workgroup> {
-        let threads = |teams: usize| seats(world, teams).next_multiple_of(ROLE);
+    pub(super) fn specialised(world: &World, capacity: Capacity) -> Option<Workgroup> {
+        let threads = |teams: usize| threads_needed(world, teams).next_multiple_of(ROLE);
         let bytes = |teams: usize| 2 * teams * world.agents() * size_of::<Vec2>();
         let fits = |&teams: &usize| {
-            teams <= room.teams
-                && threads(teams) <= room.workgroup.min(MAX_THREADS)
-                && bytes(teams) <= room.workgroup_bytes
+            teams <= capacity.teams
+                && threads(teams) <= capacity.workgroup.min(MAX_THREADS)
+                && bytes(teams) <= capacity.workgroup_bytes
         };
         let teams = TEAMS.into_iter().find(fits).filter(|_| world.parameters() <= MAX_STRAIGHT_WEIGHTS)?;
         Some(Workgroup { threads: threads(teams), slots: 1, teams })
@@ -145,13 +145,13 @@ impl Workgroup {
     pub(super) fn generic(world: &World, largest: usize) -> Workgroup {
         let sizes = WORKGROUPS.into_iter().filter(|&size| size <= largest);
         let one_each = sizes.clone().filter_map(|threads| {
-            let teams = (1..=threads).take_while(|&teams| seats(world, teams) <= threads).last()?;
+            let teams = (1..=threads).take_while(|&teams| threads_needed(world, teams) <= threads).last()?;
             Some(Workgroup { threads, slots: 1, teams })
         });
         // Compares the shares of busy threads by cross-multiplication. The smaller workgroup wins ties.
         one_each.reduce(|a, b| if b.teams * a.threads > a.teams * b.threads { b } else { a }).unwrap_or_else(|| {
             let threads = sizes.max().unwrap_or(WORKGROUPS[0]);
-            Workgroup { threads, slots: seats(world, 1).div_ceil(threads), teams: 1 }
+            Workgroup { threads, slots: threads_needed(world, 1).div_ceil(threads), teams: 1 }
         })
     }
 }
@@ -173,6 +173,11 @@ pub(super) struct Capacity {
 }
 
 impl Capacity {
+    /// Returns the bytes of one buffer after which a batch is full.
+    pub(super) fn target(&self) -> u64 {
+        self.buffer.min(self.batch)
+    }
+
     /// Returns the limits of a device with this maximum of threads per workgroup, and no limit on batches.
     pub(super) fn of_workgroups(threads: usize) -> Capacity {
         let bytes = MAX_OFFSET;

@@ -143,9 +143,9 @@ pub fn shaders() -> Vec<(&'static str, String)> {
 /// one, else the generic one. `threads` is the maximum per workgroup.
 #[doc(hidden)]
 pub fn shader_of(world: &World, kernel: Kernel, threads: usize) -> String {
-    let room = Capacity::of_workgroups(threads);
+    let capacity = Capacity::of_workgroups(threads);
     let little = Recorded { trace: false, sights: false };
-    let made = Shape::asked_for(world, kernel, room, little);
+    let made = Shape::asked_for(world, kernel, capacity, little);
     source(made.unwrap_or_else(|| Shape::generic(world, Workgroup::generic(world, threads), little)))
 }
 
@@ -170,17 +170,17 @@ pub struct WorkgroupBuffers {
 /// A team exceeds the limits of any device.
 #[doc(hidden)]
 pub fn workgroup_of(group: &Group<'_>, kernel: Kernel, threads: usize) -> Result<WorkgroupBuffers, BackendError> {
-    let room = Capacity::of_workgroups(threads);
-    let made = Shape::asked_for(group.world, kernel, room, Recorded::of(group, false));
-    let batches = plan(&[*group], false, Records::Whole, room, &made.into_iter().collect())?;
-    let work = &batches[0];
-    let PlannedTask { task, first_team, shape, .. } = work.shares[0];
+    let capacity = Capacity::of_workgroups(threads);
+    let made = Shape::asked_for(group.world, kernel, capacity, Recorded::of(group, false));
+    let batches = plan(&[*group], false, Records::Whole, capacity, &made.into_iter().collect())?;
+    let batch = &batches[0];
+    let PlannedTask { task, first_team, shape, .. } = batch.tasks[0];
     let mut weights = vec![[0.0; FOUR]; fours(group.world) * task.teams as usize];
     if let Weights::OnHost(policies) = group.weights {
         gather(group, policies, first_team, task.teams as usize, &mut weights);
     }
     let words = |bytes: &[u8]| bytemuck::pod_collect_to_vec(bytes);
-    let world = Constants { steps: task.end + 1, ..work.worlds[0] };
+    let world = Constants { steps: task.end + 1, ..batch.worlds[0] };
     let agents = group.world.agents() * task.teams as usize;
     Ok(WorkgroupBuffers {
         shader: source(shape),
@@ -190,7 +190,7 @@ pub fn workgroup_of(group: &Group<'_>, kernel: Kernel, threads: usize) -> Result
             vec![0; 4],
             words(bytemuck::bytes_of(&world)),
             words(bytemuck::bytes_of(&task)),
-            words(bytemuck::cast_slice(&work.places)),
+            words(bytemuck::cast_slice(&batch.places)),
             words(bytemuck::cast_slice(&weights)),
             vec![0; task.status as usize + 1],
             Vec::new(),

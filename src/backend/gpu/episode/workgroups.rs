@@ -20,13 +20,13 @@ impl GpuBackend {
     /// large group comes.
     pub(super) fn measure_workgroups(&mut self, groups: &[Group<'_>]) -> Result<(), BackendError> {
         let is_timed = |group: &Group<'_>| {
-            let workgroup = Workgroup::specialised(group.world, self.room());
+            let workgroup = Workgroup::specialised(group.world, self.capacity());
             group.team_count() >= MIN_TEAMS && workgroup.is_some_and(|workgroup| workgroup.teams == CANDIDATES[0])
         };
         if self.teams_per_workgroup.is_some() || self.kernel == Kernel::Generic || !groups.iter().any(is_timed) {
             return Ok(());
         }
-        let stages = self.stages;
+        let times = self.times;
         let measured = fastest(CANDIDATES, |teams| {
             self.teams_per_workgroup = Some(teams);
             let start = Instant::now();
@@ -35,7 +35,7 @@ impl GpuBackend {
         });
         // After an error, the next rollout measures again.
         self.teams_per_workgroup = measured.as_ref().ok().copied();
-        self.stages = stages;
+        self.times = times;
         measured.map(drop)
     }
 }

@@ -172,7 +172,7 @@ fn is_comparison(op: BinaryOperator) -> bool {
 /// The binding of the guard.
 const GUARD: ResourceBinding = ResourceBinding { group: 0, binding: 0 };
 
-/// Returns whether an expression is a sum, difference or product of floats, scalar or vector.
+/// Reports whether an expression is a sum, difference or product of floats, scalar or vector.
 fn is_sum_or_product(expression: &Expression, inner: &TypeInner) -> bool {
     use BinaryOperator::{Add, Multiply, Subtract};
     matches!(expression, Expression::Binary { op: Add | Subtract | Multiply, .. }) && is_float(inner)

@@ -1,0 +1,76 @@
+//! How many bytes episodes and populations take.
+
+use super::BackendError;
+use crate::config::Fitness;
+use crate::credit::RecordRequest;
+use crate::world::World;
+
+/// Default minimum bytes of a trial's populations to be held on a GPU: about what the bus transfers in the time of the
+/// few dispatches that holding costs. An estimate, not a measurement. Software renderers hold none.
+pub const HELD_FROM: u64 = 1 << 20;
+
+/// Default minimum bytes of a batch's records to be packed on a GPU: about what the bus transfers in the time of one
+/// more dispatch. An estimate, not a measurement. Software renderers pack none.
+pub(crate) const PACKED_FROM: u64 = 1 << 20;
+
+/// Target bytes of one buffer of a batch on a GPU: enough to fill the device, small enough to overlap batches.
+pub(crate) const BATCH_BYTES: u64 = 256 << 20;
+/// Weights that a GPU thread loads at once.
+pub(super) const FOUR: usize = 4;
+
+/// Returns the words of a team's record: sets, counts and, if needed, sightings.
+pub(super) fn record_words(world: &World, records: RecordRequest<'_>) -> usize {
+    let sights = if records.sights() { world.sight_words() } else { 0 };
+    world.set_words() + world.leaders() * world.followers() + sights
+}
+
+/// Returns the bytes of the record of a team that is scored by a fitness.
+pub(crate) fn record_bytes(world: &World, fitness: Fitness) -> u64 {
+    (record_words(world, RecordRequest(&[fitness])) * size_of::<u32>()) as u64
+}
+
+/// Returns the weights of a team as an episode on a GPU loads them, in fours.
+pub(super) fn fours(world: &World) -> usize {
+    world.leaders() * world.parameters().div_ceil(FOUR)
+}
+
+/// Returns the bytes of a team's weights as an episode on a GPU loads them.
+pub(crate) fn weight_bytes(world: &World) -> u64 {
+    (fours(world) * size_of::<[f32; FOUR]>()) as u64
+}
+
+/// Returns the bytes of a team's states that a GPU keeps between dispatches, 0 if one dispatch plays the whole episode.
+pub(crate) fn state_bytes(world: &World, fitness: Fitness) -> u64 {
+    #[cfg(feature = "gpu")]
+    let bytes = super::gpu::episode::state_bytes(world, RecordRequest(&[fitness]));
+    #[cfg(not(feature = "gpu"))]
+    let bytes = {
+        let _ = (world, fitness);
+        0
+    };
+    bytes
+}
+
+/// Returns the bytes of a trial's populations, `[populations, slots, parameters]`, on a GPU that holds them: one buffer
+/// per population, one more, and every slot's parent. 0 if they are too small to be held by default.
+pub(crate) fn held_bytes([populations, slots, parameters]: [usize; 3]) -> u64 {
+    let [populations, population, parents] =
+        [populations, 4 * slots * parameters, 4 * populations * slots].map(|count| count as u64);
+    if populations * population < HELD_FROM { 0 } else { (populations + 1) * population + parents }
+}
+
+/// Checks that so many weights fill populations of these sizes, `[populations, slots, parameters]`.
+///
+/// # Errors
+/// There are too few or too many weights, or a size is 0.
+pub(super) fn check_sizes(weights: usize, sizes: [usize; 3]) -> Result<(), BackendError> {
+    let expected = sizes.into_iter().try_fold(1, usize::checked_mul);
+    if weights > 0 && expected == Some(weights) {
+        return Ok(());
+    }
+    let [populations, slots, parameters] = sizes;
+    Err(BackendError::InvalidInput(format!(
+        "the populations cannot be held: {weights} weights for {populations} populations of {slots} slots with \
+         {parameters} parameters; no size may be 0, and their product is the number of weights"
+    )))
+}
