@@ -164,7 +164,7 @@ fn tasks_resume_and_those_that_a_constant_speed_solves_fail() {
     let run = |line: &str| run(folder.path(), &format!("{line} --trials 2"));
     let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("configs");
     let file = |name: &str| configs.join(name).display().to_string();
-    let (task, solved) = (file("tasks/return.toml"), file("strictly_forward.toml"));
+    let (task, solved) = (file("tasks/slalom.toml"), file("strictly_forward.toml"));
     let (code, table, error) = run(&format!("{task} --out a"));
     assert_eq!(code, Some(0), "{error}");
     // Without `--resume`, the same command does not overwrite the runs.
