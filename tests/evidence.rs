@@ -4,7 +4,7 @@
 #![cfg(feature = "cli")]
 
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use assert_cmd::cargo::cargo_bin_cmd;
 use flotilla::backend::cpu::Cpu;
@@ -170,34 +170,4 @@ fn the_page_shows_differences_and_names_invalid_files() {
     fs::write(folder.path().join("four.json"), "{\"schema\": 2}").unwrap();
     let error = evidence::page(folder.path()).unwrap_err();
     assert!(error.contains("four.json"), "{error}");
-}
-
-/// Tests that every test that the page names exists.
-#[test]
-fn tests_that_the_page_names_exist() {
-    let page = fs::read_to_string(root().join("docs/develop/evidence.md")).unwrap();
-    let table = page.split("## What exactness relies on").nth(1).unwrap();
-    let rows = table.lines().filter(|line| line.starts_with("| "));
-    let names = rows.filter_map(|line| line.trim_end_matches(" |").rsplit(" | ").next());
-    let names: Vec<&str> = names.flat_map(|cell| cell.split('`').skip(1).step_by(2)).collect();
-    assert!(names.len() > 10, "{names:?}");
-    let mut code = String::new();
-    let mut folders = vec![root().join("tests"), root().join("src")];
-    while let Some(folder) = folders.pop() {
-        for entry in fs::read_dir(folder).unwrap() {
-            let path = entry.unwrap().path();
-            match path.is_dir() {
-                true => folders.push(path),
-                false if path.extension().is_some_and(|ending| ending == "rs") => code += &read(&path),
-                false => {}
-            }
-        }
-    }
-    for name in names {
-        assert!(code.contains(&format!("fn {name}(")), "there is no test {name}");
-    }
-}
-
-fn read(path: &Path) -> String {
-    fs::read_to_string(path).unwrap()
 }

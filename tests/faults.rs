@@ -14,7 +14,6 @@ mod support;
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::sync::Mutex;
@@ -373,14 +372,12 @@ fn inject(shim: &Shim, case: &Case<'_>, prepared: &Prepared) -> Option<String> {
 
 #[test]
 fn resume_after_any_fault_gives_the_same_results() {
-    let long = std::env::var("FLOTILLA_LONG").is_ok_and(|long| long == "1");
+    let long = support::is_long();
     let only = std::env::var("FLOTILLA_FAULTS").ok();
     let shim = match Shim::compile() {
         Ok(shim) => shim,
         Err(reason) => {
-            // Written to the stream directly, because the output of `eprintln!` in a passing test is hidden.
-            writeln!(std::io::stderr(), "\nresume_after_any_fault_gives_the_same_results: skipped: {reason}").unwrap();
-            return;
+            return support::skip_without("resume_after_any_fault_gives_the_same_results", &reason);
         }
     };
     let chosen: Vec<&Scenario> = SCENARIOS
@@ -432,7 +429,10 @@ fn resume_after_any_fault_gives_the_same_results() {
 /// Without this test, a shim that injects nothing would let the other test pass.
 #[test]
 fn the_shim_fails_only_the_chosen_call() {
-    let Ok(shim) = Shim::compile() else { return };
+    let shim = match Shim::compile() {
+        Ok(shim) => shim,
+        Err(reason) => return support::skip_without("the_shim_fails_only_the_chosen_call", &reason),
+    };
     let place = folder();
     let written = |call: usize, fault: Fault| -> (Option<i32>, bool) {
         let target: PathBuf = place.path().join("x");

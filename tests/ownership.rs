@@ -267,7 +267,6 @@ fn folders_of_other_users_are_entered_only_if_named() {
 
 #[cfg(unix)]
 mod links {
-    use std::io::Write;
     use std::os::unix::fs::{chown, symlink};
 
     use super::*;
@@ -495,8 +494,8 @@ mod links {
     fn a_run_of_another_user_is_changed_only_if_it_is_named() {
         let place = with_run();
         if chown(place.path("run"), Some(12345), None).is_err() {
-            writeln!(io::stderr(), "\nskipped: only root can change the owner of files").unwrap();
-            return;
+            let test = "a_run_of_another_user_is_changed_only_if_it_is_named";
+            return support::skip(test, "only root can change the owner of files");
         }
         let _ = fs::remove_file(place.path("run/curves.svg"));
         for line in ["replay run --quiet", "plot run"] {

@@ -8,7 +8,8 @@
 //! - A `toml` block is written to the file that the paragraph before it names (`` `sweep.toml` ``), if any.
 //! - `<!-- not run: WHY -->` before a block skips it.
 //! - `<!-- short: FLAGS -->` before a block of long studies shortens its commands with these flags, each with a value.
-//!   They replace the same flags of a command, or are added if the command takes them.
+//!   They replace the same flags of a command, or are added if the command takes them. A pair of other words replaces
+//!   the first word with the second.
 //! - `<!-- output -->` before a `text` block compares it with what the last command printed. Its lines have to be
 //!   printed in this order; other lines may be between them. `…` matches any part of a line.
 //!
@@ -175,6 +176,11 @@ fn shortened(command: &str, flags: &str) -> String {
     let words: Vec<&str> = flags.split_whitespace().collect();
     for flag in words.chunks(2) {
         let [name, value] = flag else { panic!("{flags}: not every flag has a value") };
+        if !name.starts_with('-') {
+            command =
+                command.split(' ').map(|word| if word == *name { value } else { word }).collect::<Vec<_>>().join(" ");
+            continue;
+        }
         let before = command.clone();
         let mut parts: Vec<&str> = before.split(' ').collect();
         let place = parts.iter().position(|part| part == name);
@@ -360,6 +366,8 @@ fn short_flags_replace_or_extend_those_of_a_command() {
     assert_eq!(short("flotilla paper --trials 200 --out a # b"), "flotilla paper --trials 2 --out a");
     assert_eq!(short("flotilla train c.toml --population 5000"), "flotilla train c.toml --population 20 --trials 2");
     assert_eq!(short("flotilla compare a --csv"), "flotilla compare a --csv");
+    let words = shortened("flotilla tasks a/*.toml --out b", "a/*.toml a/c.toml d e");
+    assert_eq!(words, "flotilla tasks a/c.toml --out b");
     let page = "<!-- short: --teams 2 -->\n```\nfalse\n```\n";
     assert_eq!(check_page("p.md", page).failed.len(), 1);
 }

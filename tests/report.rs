@@ -1208,7 +1208,7 @@ fn a_paper_stopped_by_a_signal_resumes_to_the_same_files() {
     let folder = TempDir::new().unwrap();
     let out = folder.path().join("a paper");
     let program = assert_cmd::cargo::cargo_bin!("flotilla");
-    let flags = ["--trials", "1", "--generations", "60", "--backend", "cpu", "--quiet"];
+    let flags = ["--trials", "1", "--generations", "25", "--backend", "cpu", "--quiet"];
     // The folder has an older paper, which --force overwrites. Its files must not disturb the resume.
     let older = ["--trials", "1", "--generations", "1", "--seed", "9", "--backend", "cpu", "--quiet"];
     succeed(&[&["paper", "--out", out.to_str().unwrap()], &older[..]].concat());

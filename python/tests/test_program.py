@@ -24,6 +24,17 @@ def test_the_command_comes_with_the_package():
     assert failed.returncode == 1 and failed.stderr.startswith("error: nowhere.toml: cannot be read")
 
 
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no limit of open files for one process")
+def test_the_command_raises_the_limit_of_open_files(config, tmp_path):
+    # Without a larger limit, a sweep of 16 points fails.
+    grid = f'[grid]\n"learning.seed" = {list(range(16))}\n'
+    (tmp_path / "grid.toml").write_text(config.replace(learning={"generations": 1}).to_toml() + grid)
+    command = f"ulimit -S -n 48; exec '{sys.executable}' -m flotilla sweep grid.toml --out points --quiet --backend cpu"
+    finished = subprocess.run(["sh", "-c", command], capture_output=True, text=True)
+    assert finished.returncode == 0, finished.stderr
+    assert len(list((tmp_path / "points/points").iterdir())) == 16
+
+
 def test_run_json_has_the_command_line(config, program, tmp_path):
     (tmp_path / "c.toml").write_text(config.to_toml())
     program("train", "c.toml", "--out", "run", "--quiet")

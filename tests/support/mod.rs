@@ -1,7 +1,6 @@
 //! Helpers for tests: small configs, a temporary directory in which commands run, and GPU adapters.
 #![allow(dead_code, unused_imports, reason = "no test uses all helpers")]
 
-#[cfg(feature = "gpu")]
 use std::io::Write;
 
 #[cfg(feature = "cli")]
@@ -235,6 +234,27 @@ mod commands {
     }
 }
 
+/// Whether tests run in their long forms, as in `.ci/nightly`.
+pub fn is_long() -> bool {
+    std::env::var("FLOTILLA_LONG").is_ok_and(|long| long == "1")
+}
+
+/// Prints that a test was skipped, and why.
+///
+/// Writes to the stream, because the output of `eprintln!` is not shown for a passing test.
+pub fn skip(test: &str, reason: &str) {
+    writeln!(std::io::stderr(), "\n{test}: skipped: {reason}").expect("standard error is writable");
+}
+
+/// Prints that a test was skipped because a program of this machine is missing.
+///
+/// With `FLOTILLA_REQUIRE_TOOLS=1`, as in `.ci/run`, panics instead.
+pub fn skip_without(test: &str, reason: &str) {
+    let required = std::env::var("FLOTILLA_REQUIRE_TOOLS").is_ok_and(|required| required == "1");
+    assert!(!required, "{test}: {reason}, but it is required");
+    skip(test, reason);
+}
+
 /// Returns whether an edit changes at least one shader, so that a renamed variable is noticed without a GPU.
 #[cfg(feature = "gpu")]
 pub fn edits_a_shader(edit: fn(String) -> String) -> bool {
@@ -250,10 +270,9 @@ pub fn adapters(test: &str) -> Vec<(Request, AdapterInfo)> {
     if found.is_empty() {
         let set = |name: &str| std::env::var(name).map_or(format!("{name} not set"), |value| format!("{name}={value}"));
         let reason = ["VK_DRIVER_FILES", "VK_ICD_FILENAMES", "WGPU_BACKEND"].map(set).join(", ");
-        let message = format!("{test}: skipped: no GPU adapter found ({reason})");
-        assert!(std::env::var("FLOTILLA_REQUIRE_GPU").as_deref() != Ok("1"), "{message}, but one is required");
-        // Write to the stream, because the output of `eprintln!` is not shown for a passing test.
-        writeln!(std::io::stderr(), "\n{message}").expect("standard error is writable");
+        let reason = format!("no GPU adapter found ({reason})");
+        assert!(std::env::var("FLOTILLA_REQUIRE_GPU").as_deref() != Ok("1"), "{test}: {reason}, but one is required");
+        skip(test, &reason);
     }
     let request = |index: usize| Request::from(AdapterChoice::Named(index.to_string()));
     found.into_iter().enumerate().map(|(index, info)| (request(index), info)).collect()
