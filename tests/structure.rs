@@ -207,7 +207,7 @@ fn public_items(path: &Path) -> Vec<String> {
 fn the_public_interface_is_as_listed() {
     let paths = ["src/front", "src/ops"].into_iter().flat_map(|module| files(Path::new(module)));
     let public_items = paths.flat_map(|path| public_items(&path)).collect::<Vec<_>>().join("\n") + "\n";
-    let path = "tests/face.txt";
+    let path = "tests/public_api.txt";
     if std::env::var("FLOTILLA_WRITE").as_deref() == Ok("1") {
         fs::write(path, &public_items).unwrap();
     }
