@@ -83,7 +83,7 @@ fn random_action(key: Key, outputs: usize, policy: &mut [f32]) {
 /// Plays the baselines of several configs side by side, generation by generation. Each plays in the world of the
 /// config's own keys, without stages.
 pub struct Baselines {
-    places: Vec<Setting>,
+    settings: Vec<Setting>,
     generation: usize,
 }
 
@@ -121,7 +121,7 @@ struct Trial {
     /// random networks.
     observed: Vec<u32>,
     /// POIs that each constant observed when it last played.
-    of_constants: Vec<u32>,
+    last_constants: Vec<u32>,
     /// POIs that each constant observed in all generations.
     constants: Vec<u64>,
     /// The random actions and networks that observed most, best first.
@@ -135,12 +135,12 @@ impl Baselines {
             let trials = 0..config.learning.trials;
             Setting::new(config, trials)
         };
-        Baselines { places: configs.into_iter().map(all).collect(), generation: 0 }
+        Baselines { settings: configs.into_iter().map(all).collect(), generation: 0 }
     }
 
     /// Prepares the baselines of one trial of a valid config. The trial may be beyond the config's number of trials.
     pub fn of_trial(config: Config, trial: usize) -> Baselines {
-        Baselines { places: vec![Setting::new(config, trial..trial + 1)], generation: 0 }
+        Baselines { settings: vec![Setting::new(config, trial..trial + 1)], generation: 0 }
     }
 
     /// Returns the next generation to play.
@@ -150,7 +150,7 @@ impl Baselines {
 
     /// Returns whether every config's last generation has been played.
     pub fn is_done(&self) -> bool {
-        self.places.iter().all(|place| place.config.learning.generations < self.generation)
+        self.settings.iter().all(|setting| setting.config.learning.generations < self.generation)
     }
 
     /// Plays one generation of every config that has one left.
@@ -160,37 +160,37 @@ impl Baselines {
     pub fn advance(&mut self, backend: &mut dyn Backend) -> Result<(), BackendError> {
         let generation = self.generation;
         let mut playing: Vec<_> =
-            self.places.iter_mut().filter(|place| generation <= place.config.learning.generations).collect();
-        playing.iter_mut().for_each(|place| place.start(generation));
-        let most = playing.iter().map(|place| place.teams(generation)).max().unwrap_or(0);
+            self.settings.iter_mut().filter(|setting| generation <= setting.config.learning.generations).collect();
+        playing.iter_mut().for_each(|setting| setting.start(generation));
+        let most = playing.iter().map(|setting| setting.teams(generation)).max().unwrap_or(0);
         for first in (0..most).step_by(DRAWN_TOGETHER) {
-            playing.iter_mut().for_each(|place| place.draw(generation, first));
+            playing.iter_mut().for_each(|setting| setting.draw(generation, first));
             let mut rounds = Vec::new();
-            for place in &playing {
-                let teams = place.teams(generation).min(first + DRAWN_TOGETHER).saturating_sub(first);
-                rounds.extend(place.trials.iter().filter(|_| teams > 0).map(|trial| place.round(trial, teams)));
+            for setting in &playing {
+                let teams = setting.teams(generation).min(first + DRAWN_TOGETHER).saturating_sub(first);
+                rounds.extend(setting.trials.iter().filter(|_| teams > 0).map(|trial| setting.round(trial, teams)));
             }
             let mut observed = play(backend, &rounds)?.into_iter();
-            for place in &mut playing {
-                let playing = place.teams(generation) > first;
-                place.trials.iter_mut().filter(|_| playing).zip(&mut observed).for_each(|(trial, observed)| {
+            for setting in &mut playing {
+                let playing = setting.teams(generation) > first;
+                setting.trials.iter_mut().filter(|_| playing).zip(&mut observed).for_each(|(trial, observed)| {
                     trial.observed.extend(observed);
                 });
             }
         }
-        playing.iter_mut().for_each(|place| place.collect_results(generation));
+        playing.iter_mut().for_each(|setting| setting.collect_results(generation));
         self.generation += 1;
         Ok(())
     }
 
     /// Returns G of the generations played so far, for each config.
     pub fn so_far(&self) -> impl Iterator<Item = &Baseline> {
-        self.places.iter().map(|place| &place.found)
+        self.settings.iter().map(|setting| &setting.found)
     }
 
     /// Returns G per generation, for each config.
     pub fn found(self) -> Vec<Baseline> {
-        self.places.into_iter().map(|place| place.found).collect()
+        self.settings.into_iter().map(|setting| setting.found).collect()
     }
 
     /// Chooses the team of each baseline after the last generation, `[configs][trials]`.
@@ -203,8 +203,8 @@ impl Baselines {
     /// The backend fails.
     pub fn outcomes(&self, backend: &mut dyn Backend, episodes: u32) -> Result<Vec<Vec<Outcome>>, BackendError> {
         let mut outcomes = Vec::new();
-        for place in &self.places {
-            let trials = place.trials.iter().map(|trial| place.outcome(trial, backend, episodes));
+        for setting in &self.settings {
+            let trials = setting.trials.iter().map(|trial| setting.outcome(trial, backend, episodes));
             outcomes.push(trials.collect::<Result<_, _>>()?);
         }
         Ok(outcomes)
@@ -261,7 +261,7 @@ impl Setting {
             weights: vec![],
             starts: vec![vec![]; episodes_per_team],
             observed: Vec::with_capacity(constants.len() + 2 * config.learning.teams()),
-            of_constants: vec![],
+            last_constants: vec![],
             constants: vec![0; constants.len()],
             finalists: [vec![], vec![]],
         };
@@ -356,9 +356,9 @@ impl Setting {
         for (place, trial) in self.trials.iter_mut().enumerate() {
             let (constants, random) = trial.observed.split_at(played);
             if played > 0 {
-                trial.of_constants = constants.to_vec();
+                trial.last_constants = constants.to_vec();
             }
-            let constants = &trial.of_constants;
+            let constants = &trial.last_constants;
             trial.constants.iter_mut().zip(constants).for_each(|(sum, &observed)| *sum += u64::from(observed));
             let most = constants.iter().copied().max().unwrap_or(0);
             self.found.constant[place].push(f64::from(most) / whole);

@@ -93,8 +93,8 @@ impl WorkTotal {
         WorkTotal { all: NONE, looked: NONE }
     }
 
-    /// Adds some work. Returns the total if [`find`] should choose again: when it is no longer short, and each time it has
-    /// doubled.
+    /// Adds some work. Returns the total if [`find`] should choose again: when it is no longer short, and each time it
+    /// has doubled.
     pub fn add(&mut self, work: Work) -> Option<Work> {
         self.add_for(work, current_num_threads())
     }

@@ -160,8 +160,8 @@ mod threads {
         }
     }
 
-    /// Starts the threads of this process. The default is `RAYON_NUM_THREADS`, or else one per core. Only the first call
-    /// does anything; later calls return what it returned.
+    /// Starts the threads of this process. The default is `RAYON_NUM_THREADS`, or else one per core. Only the first
+    /// call does anything; later calls return what it returned.
     ///
     /// If rayon fails to start a thread, it cannot be set up again. So this starts the threads first, and rayon gets
     /// those that could be started.

@@ -1,7 +1,7 @@
 //! Scripted teams: leaders that drive to given places, whatever they sense. They show that a task can be solved.
 //!
-//! A script is a CSV table with the columns `leader,until,x,y,speed`. Before step `until`, the leader drives to (x, y)
-//! at no more than this speed, and waits there. A leader's rows are in order, and after the last it stops.
+//! A script is a CSV table with the columns `leader,until,x,y,speed`. Until step `until`, the leader drives to (x, y) at
+//! no more than this speed, and waits there. A leader's rows are in ascending order of `until`. After the last it stops.
 
 use std::f32::consts::PI;
 
@@ -15,7 +15,7 @@ use crate::world::World;
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Script(Vec<Leg>);
 
-/// One leader's target before a step.
+/// A target of one leader, until a step.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Leg {
@@ -38,10 +38,36 @@ impl Script {
         Ok(Script(reader.deserialize().collect::<Result<_, _>>()?))
     }
 
-    /// Plays one team from the config's start. Returns the step at which each POI was first observed, `[pois]`.
+    /// Checks that the script is for the leaders of a config.
     ///
     /// # Errors
-    /// There is too little memory.
+    /// There are no rows, a leader does not exist, a number is out of range, or a leader's rows are not in order.
+    pub fn check(&self, config: &Config) -> Result<(), String> {
+        if self.0.is_empty() {
+            return Err("there are no rows".into());
+        }
+        let mut last = vec![0; config.learners()];
+        for (row, leg) in (1..).zip(&self.0) {
+            let leaders = last.len();
+            let Some(last) = last.get_mut(leg.leader) else {
+                return Err(format!("row {row}: leader {} of {leaders}; they count from 0", leg.leader));
+            };
+            if ![leg.x, leg.y, leg.speed].iter().all(|number| number.is_finite()) || leg.speed < 0.0 {
+                return Err(format!("row {row}: x, y and speed have to be finite, and speed at least 0"));
+            }
+            if leg.until <= *last {
+                return Err(format!("row {row}: `until` has to be larger than in this leader's row before"));
+            }
+            *last = leg.until;
+        }
+        Ok(())
+    }
+
+    /// Plays one team from the start in the config's own keys, without stages or jitter. Returns the step at which each
+    /// POI was first observed, `[pois]`.
+    ///
+    /// # Errors
+    /// There is too little memory, or a target is not finite, see [`Script::check`].
     pub fn play(&self, config: &Config) -> Result<Vec<Option<u32>>, StepError> {
         let mut stepper = Stepper::new(World::new(config), 1)?;
         let (leaders, max_speed) = (config.learners(), config.motion.max_speed as f32);

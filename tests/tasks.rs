@@ -56,6 +56,30 @@ fn a_scripted_team_solves_the_relay_with_an_enforced_hand_over() {
     assert!(observed.iter().all(Option::is_some), "{observed:?}");
 }
 
+#[test]
+fn invalid_scripts_are_refused_before_training() {
+    let folder = TempDir::new().unwrap();
+    let config = Path::new(env!("CARGO_MANIFEST_DIR")).join("configs/tasks/slalom.toml");
+    fs::copy(config, folder.path().join("task.toml")).unwrap();
+    let head = "leader,until,x,y,speed\n";
+    for (rows, message) in [
+        ("", "there are no rows"),
+        ("7,5,1,1,1\n", "row 1: leader 7 of 1"),
+        ("0,5,NaN,1,1\n", "row 1: x, y and speed have to be finite"),
+        ("0,5,1,1,-1\n", "speed at least 0"),
+        ("0,5,1,1,1\n0,5,2,2,1\n", "row 2: `until` has to be larger"),
+        ("0,5,1,1,fast\n", "task.csv"),
+    ] {
+        fs::write(folder.path().join("task.csv"), format!("{head}{rows}")).unwrap();
+        let (code, _, error) = run(folder.path(), "task.toml --trials 2");
+        assert!(code == Some(2) && error.contains(message), "{rows}: {error}");
+        assert!(!folder.path().join("tasks").exists());
+    }
+    fs::write(folder.path().join("task.csv"), format!("{head}0,5,1,1,1\n")).unwrap();
+    let (code, _, error) = run(folder.path(), "task.toml --trials 2");
+    assert!(code == Some(1) && error.contains("the scripted team has G 0.00"), "{error}");
+}
+
 /// Between these marks, the page has what the test below prints.
 const MARKS: [&str; 2] = ["<!-- what comes out: cargo test --test tasks -->\n", "<!-- so far -->\n"];
 

@@ -103,7 +103,7 @@ struct Watcher<'a> {
 }
 
 impl Watcher<'_> {
-    /// Reports a generation to the callback. Reports whether to stop.
+    /// Passes a generation to the callback. Returns whether to stop.
     fn tell(&self, rows: &[Row], last: usize, champions: Option<&[f32]>) -> PyResult<bool> {
         let (Some(callback), Some(row)) = (self.callback, rows.first()) else { return Ok(false) };
         Python::attach(|py| {

@@ -68,7 +68,7 @@ impl Ceiling {
         Ok(())
     }
 
-    /// Reiterations lane operations per second.
+    /// Returns lane operations per second.
     ///
     /// # Errors
     /// The device failed.

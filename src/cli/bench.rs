@@ -194,14 +194,14 @@ fn line(measure: &Timing) -> String {
         100.0 * measure.ceiling_share(),
     );
     if let Some(profile) = &measure.profile {
-        let stages = stages(profile);
-        let whole: f64 = stages.iter().filter(|(_, part, _)| !part).map(|(.., ms)| ms).sum();
-        for (name, part, ms) in stages {
+        let phases = phases(profile);
+        let whole: f64 = phases.iter().filter(|(_, part, _)| !part).map(|(.., ms)| ms).sum();
+        for (name, part, ms) in phases {
             let name = format!("{}{}", if part { "  of it, " } else { "" }, name.replace('_', " "));
             let _ = writeln!(line, "{:>8} {name:<24} {ms:>12.4} ms {:>5.1}%", "", 100.0 * ms / whole);
         }
-        if let Some(stages) = &profile.gpu_times {
-            let ms = 1e3 * stages.longest.as_secs_f64();
+        if let Some(times) = &profile.gpu_times {
+            let ms = 1e3 * times.longest.as_secs_f64();
             let _ = writeln!(line, "{:>8} {:<24} {ms:>12.4} ms", "", "longest submission");
         }
         for (name, part, bytes) in traffic(profile) {
@@ -212,20 +212,20 @@ fn line(measure: &Timing) -> String {
     line
 }
 
-/// Returns the stages of a generation in order, each with its time in ms. `true` marks a part of the rollout before it.
-fn stages(profile: &Profile) -> Vec<(&'static str, bool, f64)> {
-    let Profile { generations, times, gpu_times: stages, .. } = profile;
+/// Returns the phases of a generation in order, each with its time in ms. `true` marks a part of the rollout before it.
+fn phases(profile: &Profile) -> Vec<(&'static str, bool, f64)> {
+    let Profile { generations, times, gpu_times, .. } = profile;
     let mut rows = vec![("teams_and_starts", false, times.prepare), ("rollout_and_scores", false, times.play)];
-    if let Some(stages) = stages {
+    if let Some(on_gpu) = gpu_times {
         rows.extend([
-            ("gather", true, stages.gather),
-            ("upload", true, stages.upload),
-            ("wait", true, stages.wait),
-            ("read_back", true, stages.read_back),
-            ("score", true, stages.score),
+            ("gather", true, on_gpu.gather),
+            ("upload", true, on_gpu.upload),
+            ("wait", true, on_gpu.wait),
+            ("read_back", true, on_gpu.read_back),
+            ("score", true, on_gpu.score),
         ]);
-        if !stages.gpu.is_zero() {
-            rows.push(("gpu_by_its_clock", true, stages.gpu));
+        if !on_gpu.gpu.is_zero() {
+            rows.push(("gpu_by_its_clock", true, on_gpu.gpu));
         }
     }
     rows.extend([("fitness_and_champions", false, times.collect), ("selection_and_mutation", false, times.breed)]);
@@ -236,9 +236,9 @@ fn stages(profile: &Profile) -> Vec<(&'static str, bool, f64)> {
 /// Returns the bytes per generation that cross a GPU's bus, in both directions. `true` marks the rollout's part of the
 /// total before it.
 fn traffic(profile: &Profile) -> Vec<(&'static str, bool, f64)> {
-    let Profile { generations, gpu_times: stages, traffic, .. } = profile;
-    let rows = stages.iter().flat_map(|stages| {
-        let rollouts = stages.traffic;
+    let Profile { generations, gpu_times, traffic, .. } = profile;
+    let rows = gpu_times.iter().flat_map(|times| {
+        let rollouts = times.traffic;
         [
             ("up_to_the_device", false, traffic.up),
             ("rollout_up", true, rollouts.up),
@@ -277,11 +277,11 @@ fn json(measure: &Timing) -> serde_json::Value {
         object["generation_share"] = json!(rollout / generation);
     }
     if let Some(profile) = &measure.profile {
-        let stages = stages(profile).into_iter().map(|(name, _, ms)| (format!("{name}_ms"), json!(ms)));
+        let phases = phases(profile).into_iter().map(|(name, _, ms)| (format!("{name}_ms"), json!(ms)));
         let traffic = traffic(profile).into_iter().map(|(name, _, bytes)| (format!("{name}_bytes"), json!(bytes)));
-        let longest = profile.gpu_times.map(|stages| 1e3 * stages.longest.as_secs_f64());
+        let longest = profile.gpu_times.map(|times| 1e3 * times.longest.as_secs_f64());
         let longest = longest.map(|ms| ("longest_submission_ms".to_string(), json!(ms)));
-        object["profile"] = serde_json::Value::Object(stages.chain(longest).chain(traffic).collect());
+        object["profile"] = serde_json::Value::Object(phases.chain(longest).chain(traffic).collect());
     }
     object
 }

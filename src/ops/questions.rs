@@ -183,7 +183,9 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         "Means over {} trials of seed {} with 95 % bootstrap intervals. In parentheses beside a champion's G is that of the\n\
          best of {} teams. p is from Mann and Whitney's test, two-sided, with Holm's correction for all pairs of arms at\n\
          one place.\n",
-        first.trials, first.seed, first.population
+        first.trials,
+        first.seed,
+        first.teams()
     );
     let page = questions::page(&answers, &heading);
     write(&disk, &out.join(PAGE), Ok(page.clone().into_bytes()))?;

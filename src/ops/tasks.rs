@@ -136,10 +136,11 @@ impl Trained {
 /// A config is invalid, the folder cannot be used, or training fails or is stopped. A task that is not admitted is an
 /// outcome.
 pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
-    let mut tasks: Vec<(&Task, [Option<Config>; 2])> = Vec::new();
+    // Each task with G of its scripted team and its configs, that of the small populations first.
+    let mut tasks: Vec<(&Task, Option<f64>, Vec<Config>)> = Vec::new();
     for task in &request.tasks {
         let name = &task.name;
-        if tasks.iter().any(|(other, _)| other.name == *name) {
+        if tasks.iter().any(|(other, ..)| other.name == *name) {
             return Err(Error::Usage(format!("two configs have the name {name}; rename one").into()));
         }
         let set =
@@ -150,32 +151,32 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
             let set = [&task.config.set[..], &common, more].concat();
             ConfigText { set, ..task.config.clone() }.read()
         };
-        let small = read(&[set("population", SMALL.0.into())])?;
-        let large = match i64::from(request.population) {
-            0 => None,
-            policies => Some(read(&[set("population", policies.into()), set("elites", "10%".into())])?),
-        };
-        tasks.push((task, [Some(small), large]));
+        let mut configs = vec![read(&[set("population", SMALL.0.into())])?];
+        if request.population > 0 {
+            configs.push(read(&[set("population", request.population.into()), set("elites", "10%".into())])?);
+        }
+        let scripted_g = task.script.as_ref().map(|script| play_script(script, name, &configs[0])).transpose()?;
+        tasks.push((task, scripted_g, configs));
     }
     let mut work = Work::default();
-    for config in tasks.iter().flat_map(|(_, configs)| configs.iter().flatten()) {
+    for config in tasks.iter().flat_map(|(.., configs)| configs) {
         // One training after the other.
         FITNESSES.iter().for_each(|_| work += Work::of([config]));
     }
     let (backend, on) = backends.open(work)?;
     let disk = ownership::create_output_folder(&Disk::default(), &request.out, request.named)?;
     let mut found = Vec::new();
-    for (task, configs) in &tasks {
+    for (task, scripted_g, configs) in tasks {
         let name = &task.name;
         context.message(format_args!("{name}: playing baselines and training on {on}"));
-        let small = configs[0].as_ref().expect("small populations are always trained");
+        let small = &configs[0];
         let quiet = Context { report: &|_| (), ..context };
         let played = baseline::play(small, SEEDS, EPISODES, &mut *backend.0, quiet)?;
         let g = |of: fn(&Played) -> f64| played.iter().map(of).collect();
         let baselines = [g(|played| played.constants[played.best_constant]), g(|p| p.action), g(|p| p.network)];
         let mut trained = Vec::new();
         // One training at a time, because large populations take much memory.
-        for config in configs.iter().flatten() {
+        for config in &configs {
             for fitness in FITNESSES {
                 let mut config = config.clone();
                 config.learning.fitness = fitness;
@@ -187,18 +188,19 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
             }
         }
         let pois = small.world.pois.len();
-        let scripted_g = match &task.script {
-            Some(script) => {
-                let observed = script.play(small).map_err(|error| Error::Refused(error.to_string().into()))?;
-                Some(observed.iter().flatten().count() as f64 / pois as f64)
-            }
-            None => None,
-        };
         let refused = reason(&baselines, &trained, scripted_g);
         let scripted = scripted_g == Some(1.0);
         found.push(Found { name: name.clone(), pois, baselines, trained, scripted_g, scripted, refused });
     }
     Ok(Outcome { population: request.population, tasks: found })
+}
+
+/// Returns G of a task's scripted team.
+fn play_script(script: &Script, name: &str, config: &Config) -> Result<f64, Error> {
+    let invalid = |error: String| Error::Usage(format!("{name}: scripted team: {error}").into());
+    script.check(config).map_err(invalid)?;
+    let observed = script.play(config).map_err(|error| invalid(error.to_string()))?;
+    Ok(observed.iter().flatten().count() as f64 / config.world.pois.len() as f64)
 }
 
 /// Trains one run of a task, unless it is finished.
@@ -267,12 +269,10 @@ fn reason(baselines: &[Vec<f64>; 3], trained: &[Trained], scripted_g: Option<f64
     if let Some(found) = trained.iter().filter(small).find(|found| 2 * found.solved() > found.champion_g.len()) {
         return Some(format!("{} policies solve it with fitness {}", SMALL.0, found.fitness));
     }
-    if trained.iter().any(|found| found.solved() > 0) {
-        return None;
-    }
     match scripted_g {
         Some(1.0) => None,
-        Some(g) => Some(format!("no champion solves it, and the scripted team has G {g:.2}")),
+        Some(g) => Some(format!("the scripted team has G {g:.2}; it has to observe every POI")),
+        None if trained.iter().any(|found| found.solved() > 0) => None,
         None => Some("no champion solves it, and there is no scripted team beside the config".into()),
     }
 }

@@ -1,12 +1,12 @@
 //! Checkpoints: the state from which a run resumes, in `checkpoints/GENERATION.safetensors`.
 //!
-//! A [`CheckpointWriter`] writes them on a separate thread. It keeps the last two, and also the checkpoint of generation 0 if
-//! there is one. Each checkpoint records the digest of its config and the length of `metrics.csv` at that time. The
+//! A [`CheckpointWriter`] writes them on a separate thread. It keeps the last two, and also the checkpoint of
+//! generation 0 if there is one. Each checkpoint records the digest of its config and the length of `metrics.csv` at that time. The
 //! checksum of [`super::tensors`] protects it.
 //!
 //! A finished run leaves one more checkpoint, so that the run can be extended. Its weights are those of
-//! `policies.safetensors`, put back into the order given by their fitness. With an evolution strategy or a hall of fame it
-//! has weights of its own, because the run continues from more than the policies.
+//! `policies.safetensors`, put back into the order given by their fitness. With an evolution strategy or a hall of
+//! fame it has weights of its own, because the run continues from more than the policies.
 
 use std::collections::BTreeMap;
 use std::fs;

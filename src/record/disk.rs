@@ -32,7 +32,7 @@ pub enum Operation {
 /// Called before each operation. If it returns an error, the operation fails with that error.
 pub(crate) type FaultHook = dyn Fn(Operation, &Path) -> io::Result<()> + Send + Sync;
 
-/// The file system, optionally limited to one folder. Tests can add a fault_hook that makes operations fail.
+/// The file system, optionally limited to one folder. Tests can add a hook that makes operations fail.
 #[derive(Clone, Default)]
 pub struct Disk {
     fault_hook: Option<Arc<FaultHook>>,
@@ -40,8 +40,8 @@ pub struct Disk {
 }
 
 impl Disk {
-    /// Returns a disk whose operations fail if `fault_hook` returns an error. A failed write still writes the first half of
-    /// its bytes.
+    /// Returns a disk whose operations fail if `fault_hook` returns an error. A failed write still writes the first half
+    /// of its bytes.
     pub fn failing(fault_hook: impl Fn(Operation, &Path) -> io::Result<()> + Send + Sync + 'static) -> Disk {
         Disk { fault_hook: Some(Arc::new(fault_hook)), root: None }
     }
@@ -84,7 +84,7 @@ impl Disk {
         }
     }
 
-    /// Returns the type of the entry at a path, or `None` if existing is none. Links are not followed.
+    /// Returns the type of the entry at a path, or `None` if there is none. Links are not followed.
     ///
     /// # Errors
     /// Returns the system's error.
@@ -134,7 +134,7 @@ impl Disk {
         Ok(Output { disk: self.clone(), path: path.into(), file })
     }
 
-    /// Opens an existing file, truncates it to `length` bytes and continues writing from existing. A link is an error.
+    /// Opens an existing file, truncates it to `length` bytes and continues writing from there. A link is an error.
     ///
     /// # Errors
     /// Returns the system's error.

@@ -97,13 +97,13 @@ struct RunMark {
 /// # Errors
 /// The folder has a file that a run would replace but holds no run, or it cannot be read.
 pub(crate) fn holds_run(folder: &Path, config: &Config) -> Result<bool, RecordError> {
-    let existing = |name: &str| {
+    let find = |name: &str| {
         let path = folder.join(name);
         let exists = file::exists(&path).map_err(RecordError::read(&path))?;
         Ok::<_, RecordError>(exists.then_some(path))
     };
     let refuse = |path: PathBuf| Err(RecordError::NotOurs { path });
-    let run = existing(RUN)?;
+    let run = find(RUN)?;
     if let Some(path) = &run {
         match read_text(path, MAX_RUN_BYTES) {
             Ok(text) if serde_json::from_str::<RunMark>(&text).is_ok() => return Ok(true),
@@ -117,11 +117,11 @@ pub(crate) fn holds_run(folder: &Path, config: &Config) -> Result<bool, RecordEr
     if paths().any(|path| tensors::open(&path).is_ok_and(|file| file.kind().is_some())) {
         return Ok(true);
     }
-    let no_folder = existing(CHECKPOINTS)?.filter(|path| !path.is_dir());
+    let no_folder = find(CHECKPOINTS)?.filter(|path| !path.is_dir());
     if let Some(path) = run.or_else(|| paths().next()).or(no_folder) {
         return refuse(path);
     }
-    if let Some(path) = existing(CONFIG)? {
+    if let Some(path) = find(CONFIG)? {
         // A run may start from a config with the same content.
         match Config::load(&path) {
             Ok(existing) if without_checkpoint(&existing) == without_checkpoint(config) => {}
@@ -129,13 +129,13 @@ pub(crate) fn holds_run(folder: &Path, config: &Config) -> Result<bool, RecordEr
         }
     }
     let mut left = false;
-    if let Some(path) = existing(METRICS)? {
+    if let Some(path) = find(METRICS)? {
         if !metrics::begins(&path).map_err(RecordError::read(&path))? {
             return refuse(path);
         }
         left = true;
     }
-    if let Some(path) = existing(POLICIES)? {
+    if let Some(path) = find(POLICIES)? {
         if !policies::belongs_to(&path, config) {
             return refuse(path);
         }

@@ -158,7 +158,7 @@ pub enum Measure {
 }
 
 impl Measure {
-    /// Returns the measured value of a trial, or none if the trial's scores does not determine it.
+    /// Returns the measured value of a trial, or none if the trial's scores do not determine it.
     fn of(self, trial: &Trial) -> Option<f64> {
         match self {
             Measure::BestG { generation } => Some(trial.scores[generation][0]),

@@ -35,7 +35,7 @@ const RECORD_BACK: &str = "record, read back";
 /// group. The slices are adjacent on the device.
 type Gathering<'a> = (Vec<(GatherJob, &'a Population)>, Vec<&'a [u32]>);
 
-/// What is kept from one batch to the next.
+/// Buffers and stopwatches that later batches reuse.
 #[derive(Default)]
 pub(super) struct Flight {
     buffers: Buffers,
@@ -230,7 +230,7 @@ impl GpuBackend {
     ) -> Result<KernelBuffers, DeviceError> {
         let (gpu, buffers) = (&self.gpu, &mut self.flights[flight].buffers);
         let [record, weights, moments, states] = batch.used.bytes();
-        let buffers_of_all = KernelBuffers {
+        let kernel_buffers = KernelBuffers {
             worlds: buffers.upload(gpu, "worlds", &batch.worlds)?,
             tasks: buffers.upload(gpu, "tasks", tasks)?,
             places: buffers.upload(gpu, "places", &batch.places)?,
@@ -255,10 +255,10 @@ impl GpuBackend {
                 let end = last.task.weights as usize + last.fours(groups);
                 let bytes = bytemuck::cast_slice(&self.staging[first..end]);
                 let offset = (first * size_of::<[f32; FOUR]>()) as u64;
-                gpu.scoped("weights", || gpu.write(&buffers_of_all.weights, offset, bytes))?;
+                gpu.scoped("weights", || gpu.write(&kernel_buffers.weights, offset, bytes))?;
             }
         }
-        Ok(buffers_of_all)
+        Ok(kernel_buffers)
     }
 
     /// Returns the dispatches that gather policies from populations on the device.
