@@ -595,6 +595,15 @@ fn a_lost_device_is_an_error() {
     }
 }
 
+/// With NVIDIA's driver, a process crashed when one thread unloaded the driver while another one ended.
+#[test]
+fn threads_that_open_devices_may_end_at_any_time() {
+    for (request, _) in support::adapters("threads_that_open_devices_may_end_at_any_time") {
+        let open = || (0..3).for_each(|_| drop(gpu::open(request.clone()).unwrap_or_else(|error| panic!("{error}"))));
+        std::thread::scope(|scope| (0..4).for_each(|_| drop(scope.spawn(open))));
+    }
+}
+
 #[test]
 fn running_out_of_memory_is_an_error() {
     for (request, info) in support::adapters("running_out_of_memory_is_an_error") {

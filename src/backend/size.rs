@@ -5,9 +5,9 @@ use crate::config::Fitness;
 use crate::credit::RecordRequest;
 use crate::world::World;
 
-/// Default minimum bytes of a trial's populations to be held on a GPU: about what the bus transfers in the time of the
-/// few dispatches that holding costs. An estimate, not a measurement. Software renderers hold none.
-pub const HELD_FROM: u64 = 1 << 20;
+/// Default minimum bytes of a trial's populations to be held on a GPU. Measured on an NVIDIA H100: generations are faster
+/// from 230 KB on, and about the same at 90 KB (`benches/README.md`). Software renderers hold none.
+pub const HELD_FROM: u64 = 1 << 17;
 
 /// Default minimum bytes of a batch's records to be packed on a GPU: about what the bus transfers in the time of one
 /// more dispatch. An estimate, not a measurement. Software renderers pack none.

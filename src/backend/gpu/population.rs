@@ -12,6 +12,7 @@ use crate::backend::{BackendError, DevicePopulation};
 use crate::config::Mutation;
 use crate::evolve::{self, Breeding};
 use crate::gpu_struct::{GpuStruct, gpu_struct};
+use crate::parallel::*;
 
 /// Threads per workgroup.
 const WORKGROUP: usize = 256;
@@ -19,6 +20,8 @@ const WORKGROUP: usize = 256;
 const TILE: usize = 32;
 /// Leaders per gather dispatch. With three other storage buffers they stay below the 8 that every WebGPU device allows.
 pub(super) const LEADERS_PER_GATHER: usize = 4;
+/// Bytes that one thread copies at a time.
+const COPIED_TOGETHER: usize = 1 << 20;
 /// Bytes per transfer, so that little memory is needed besides the populations.
 const MAX_TRANSFER: usize = 64 << 20;
 
@@ -126,7 +129,7 @@ impl Kernels {
             pieces.map(move |(index, piece)| (buffer, index, piece))
         });
         let mut done = vec![0; populations];
-        let words = populations + populations * size.div_ceil(MAX_TRANSFER / size_of::<f32>());
+        let words = populations + populations * size.div_ceil(MAX_TRANSFER / size_of::<f32>()) + 1;
         let status = gpu.buffer("the status of a population", (words * size_of::<u32>()) as u64, usage)?;
         for (buffer, index, piece) in pieces {
             let nonce = gpu.nonces(1);
@@ -192,9 +195,9 @@ pub(super) struct Population {
     breed_jobs: wgpu::Buffer,
     plan: wgpu::Buffer,
     /// Per population the number of workgroups that have bred, then the nonces of the pieces that were copied to the
-    /// device.
+    /// device, then the nonce of the last copy to the host.
     status: wgpu::Buffer,
-    /// The content of `status` if everything was done that was submitted.
+    /// The content of `status` before its last word, if everything was done that was submitted.
     done: Vec<u32>,
     /// `[populations, slots, parameters]`.
     sizes: [usize; 3],
@@ -288,18 +291,29 @@ impl DevicePopulation for Population {
     }
 
     fn fetch(&self, weights: &mut [f32]) -> Result<(), BackendError> {
+        let gpu = &self.kernels.gpu;
+        let largest = self.pieces().next().map_or(0, |bytes| bytes.len() as u64);
+        let landing = gpu.landing(largest + self.status.size())?;
         let policies = weights.chunks_exact_mut(self.population_len());
         for (buffer, policies) in self.buffers.iter().zip(policies) {
             for bytes in self.pieces() {
-                let gpu = &self.kernels.gpu;
-                let ranges = [(buffer, bytes.start as u64..bytes.end as u64), (&self.status, 0..self.status.size())];
                 // The status comes with each piece, so that neither the breeding nor the copy can be missing.
-                let words = gpu.read::<u32>(&ranges)?;
-                let (piece, status) = words.split_at(bytes.len() / size_of::<f32>());
-                if status != self.done {
+                let expected = [&self.done[..], &[gpu.nonces(1)]].concat();
+                let [nonce_at, end] = [self.done.len(), expected.len()].map(|words| (words * size_of::<u32>()) as u64);
+                let nonce = bytemuck::bytes_of(&expected[self.done.len()]);
+                gpu.scoped("reading back", || gpu.write(&self.status, nonce_at, nonce))?;
+                let ranges = [(buffer, bytes.start as u64..bytes.end as u64), (&self.status, 0..end)];
+                let is_done = gpu.read_by(&landing, &ranges, |read| {
+                    let (piece, status) = read.split_at(bytes.len());
+                    // All threads copy, because the host's memory may be new, and the system then clears it page by page.
+                    let target = &mut bytemuck::cast_slice_mut::<f32, u8>(policies)[bytes.clone()];
+                    let parts = target.par_chunks_mut(COPIED_TOGETHER).zip(piece.par_chunks(COPIED_TOGETHER));
+                    parts.for_each(|(to, from)| to.copy_from_slice(from));
+                    status == bytemuck::cast_slice::<u32, u8>(&expected)
+                })?;
+                if !is_done {
                     return Err(gpu.lose_undone("breeding").into());
                 }
-                policies[bytes.start / size_of::<f32>()..][..piece.len()].copy_from_slice(bytemuck::cast_slice(piece));
             }
         }
         Ok(())

@@ -1,6 +1,7 @@
 //! Adapters: finding them, describing them, choosing one.
 
 use std::fmt;
+use std::sync::OnceLock;
 
 use super::DeviceError;
 use crate::backend::gpu::exact::Pass;
@@ -92,21 +93,30 @@ impl From<&wgpu::AdapterInfo> for AdapterInfo {
 /// Returns all adapters that can compute, the preferred ones first.
 ///
 /// `WGPU_BACKEND` limits the backends (`vulkan`, `metal`, `dx12`). wgpu's other variables have their effect, too, such as
-/// `WGPU_DX12_COMPILER`. The Vulkan loader has its own `VK_DRIVER_FILES`.
+/// `WGPU_DX12_COMPILER`. The Vulkan loader has its own `VK_DRIVER_FILES`. The first call of a process reads them.
 pub fn adapters() -> Vec<AdapterInfo> {
     found().into_iter().map(|(_, info)| info).collect()
 }
 
+/// Returns the drivers of the system, loaded once per process.
+///
+/// They are never unloaded. A library that NVIDIA's Vulkan driver for Linux loads registers a function for the end of
+/// each thread. If another thread unloads the driver in that moment, the process crashes.
+fn instance() -> &'static wgpu::Instance {
+    static INSTANCE: OnceLock<wgpu::Instance> = OnceLock::new();
+    INSTANCE.get_or_init(|| {
+        // The default instance ignores the environment, and enables validation layers in debug builds.
+        wgpu::Instance::new(wgpu::InstanceDescriptor {
+            backends: wgpu::Backends::all().with_env(),
+            flags: wgpu::InstanceFlags::empty().with_env(),
+            backend_options: wgpu::BackendOptions::from_env_or_default(),
+            ..wgpu::InstanceDescriptor::new_without_display_handle()
+        })
+    })
+}
+
 fn found() -> Vec<(wgpu::Adapter, AdapterInfo)> {
-    // The default instance ignores the environment, and enables validation layers in debug builds.
-    let backends = wgpu::Backends::all().with_env();
-    let instance = wgpu::Instance::new(wgpu::InstanceDescriptor {
-        backends,
-        flags: wgpu::InstanceFlags::empty().with_env(),
-        backend_options: wgpu::BackendOptions::from_env_or_default(),
-        ..wgpu::InstanceDescriptor::new_without_display_handle()
-    });
-    let mut adapters: Vec<_> = host::wait(instance.enumerate_adapters(backends))
+    let mut adapters: Vec<_> = host::wait(instance().enumerate_adapters(wgpu::Backends::all()))
         .into_iter()
         .filter(|a| a.get_downlevel_capabilities().flags.contains(wgpu::DownlevelFlags::COMPUTE_SHADERS))
         .map(|adapter| (adapter.get_info(), adapter))

@@ -89,20 +89,40 @@ impl Gpu {
     /// # Errors
     /// The device was lost, or has too little memory for the copy.
     pub fn read<T: Pod>(&self, ranges: &[(&wgpu::Buffer, Range<u64>)]) -> Result<Vec<T>, DeviceError> {
-        let size = ranges.iter().map(|(_, bytes)| bytes.end - bytes.start).sum();
-        let usage = wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::MAP_READ;
-        let landing = self.buffer("reading back", size, usage)?;
+        let landing = self.landing(ranges.iter().map(|(_, bytes)| bytes.end - bytes.start).sum())?;
+        self.read_by(&landing, ranges, bytemuck::pod_collect_to_vec)
+    }
+
+    /// Creates a buffer of `bytes` bytes for [`Gpu::read_by`].
+    ///
+    /// # Errors
+    /// It exceeds the device's limits, or there is too little memory.
+    pub(in crate::backend::gpu) fn landing(&self, bytes: u64) -> Result<wgpu::Buffer, DeviceError> {
+        self.buffer("reading back", bytes, wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::MAP_READ)
+    }
+
+    /// [`Gpu::read`] with a buffer that several reads share, because drivers take long to create one. Calls `show` with
+    /// the bytes of all ranges.
+    ///
+    /// # Errors
+    /// The device was lost, or the buffer cannot be read.
+    pub(in crate::backend::gpu) fn read_by<T>(
+        &self,
+        landing: &wgpu::Buffer,
+        ranges: &[(&wgpu::Buffer, Range<u64>)],
+        show: impl FnOnce(&[u8]) -> T,
+    ) -> Result<T, DeviceError> {
+        let mut size = 0;
         self.scoped("reading back", || {
             let mut encoder = self.device.create_command_encoder(&Default::default());
-            let mut to = 0;
             for (buffer, bytes) in ranges {
-                encoder.copy_buffer_to_buffer(buffer, bytes.start, &landing, to, bytes.end - bytes.start);
-                to += bytes.end - bytes.start;
+                encoder.copy_buffer_to_buffer(buffer, bytes.start, landing, size, bytes.end - bytes.start);
+                size += bytes.end - bytes.start;
             }
             self.submit_commands("reading back", 0, encoder);
         })?;
         self.wait()?;
-        self.mapped(&landing, 0..size, bytemuck::pod_collect_to_vec)
+        self.mapped(landing, 0..size, show)
     }
 
     /// Calls `show` with a range of a buffer (in bytes, multiples of 4; usage `MAP_READ`). All work that writes it must

@@ -410,7 +410,7 @@ impl Backend for GpuBackend {
     fn describe(&self) -> String {
         let held = match self.residency {
             ResidencyPolicy::Never => String::new(),
-            ResidencyPolicy::From(bytes) => format!(", holds populations of {} MiB or more", bytes >> 20),
+            ResidencyPolicy::From(bytes) => format!(", holds populations of {} KiB or more", bytes >> 10),
             ResidencyPolicy::Always => ", holds all populations".into(),
         };
         format!("gpu ({}, {} pass{held})", self.gpu.adapter, self.gpu.pass)
