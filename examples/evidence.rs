@@ -81,8 +81,7 @@ Two things are not promised: times, and processes that change the rounding mode 
 with `libm`, too.
 
 On Metal only the guarded pass is used. It does not depend on compiler options. Between a product and the sum after it stands an integer
-operation with a word read from a buffer, whose value no compiler can know. Nobody has run flotilla on a hardware GPU, on Metal or on DirectX
-yet.
+operation with a word read from a buffer, whose value no compiler can know. Nobody has run flotilla on Metal or on DirectX yet.
 ";
 
 /// Returns the page for the files of a directory.
