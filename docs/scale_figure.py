@@ -2,7 +2,7 @@
 
     pip install matplotlib
     python3 docs/scale_figure.py                 # from docs/results/scale/coupling6-curves.csv
-    python3 docs/scale_figure.py SWEEP...        # writes that file first, from the sweeps of about 5 000 000 teams
+    python3 docs/scale_figure.py SWEEP...        # writes that file first, from equal-* of docs/results/scale.md
 """
 
 import csv
@@ -17,7 +17,7 @@ FITNESS = "Df"
 TITLE = "G of the champion at coupling 6, by the number of teams played"
 DESCRIPTION = (
     "On a logarithmic axis, for 50, 500, 5000 and 50 000 policies that play equally many teams: leader-follower "
-    "champions rise to between 0.7 and 1, the higher the larger the population; all-leaders champions rise late, to "
+    "champions end between 0.7 and 1, the higher the larger the population; all-leaders champions rise late, to "
     "0.45 with 500 policies and to between 0.1 and 0.28 with the others."
 )
 
@@ -64,7 +64,7 @@ def draw():
     for (paradigm, population), curve in sorted(curves.items(), key=lambda item: (item[0][0], item[0][1])):
         colour = "#0072b2" if paradigm == "leader-follower" else "#d55e00"
         teams, mean, error = zip(*curve)
-        axes.plot(teams, mean, styles[population], color=colour, label=f"{paradigm}, {population:_} policies".replace("_", " "))
+        axes.plot(teams, mean, styles[population], color=colour, label=f"{paradigm}, {population} policies".replace("50000", "50 000"))
         low = [m - e for m, e in zip(mean, error)]
         high = [m + e for m, e in zip(mean, error)]
         axes.fill_between(teams, low, high, color=colour, alpha=0.12, linewidth=0)

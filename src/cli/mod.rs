@@ -569,7 +569,7 @@ pub enum BackendChoice {
 /// Where populations are kept between generations.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Breed {
-    /// GPU memory if populations have at least 1 MiB per trial and fit, otherwise main memory
+    /// GPU memory if populations have at least 128 KiB per trial and fit, otherwise main memory
     Auto,
     /// Main memory
     Host,
