@@ -55,7 +55,7 @@ fn only_a_numbered_name_makes_a_film() {
         ("%d.png", "0.png", "1.png"),
         ("9%-%02d.png", "9%-00.png", "9%-01.png"),
     ] {
-        place.good(&["replay", "run", "--out", pattern]);
+        place.good(&["replay", "run", "--width", "100", "--fps", "2", "--out", pattern]);
         assert!(place.path(first).exists() && place.path(second).exists(), "{pattern}: {:?}", place.names());
     }
 }

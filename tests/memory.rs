@@ -158,7 +158,7 @@ fn packed_records_and_populations_are_counted() {
     };
     // Per team, weights and record: 4 leaders of 112 weights; 25 steps of 4 POIs, and 8 followers with 4 leaders each.
     let (weights, record) = (4 * 112 * 4, (25 * 4 + 8 * 4) * 4);
-    assert_eq!(adapter(100), 2 * 101 * (weights + record));
+    assert_eq!(adapter(50), 2 * 51 * (weights + record));
     // Populations of this size stay on the device, which takes five more sets of weights per team, and the parents.
     let population = 5 * 112 * 4 + 4 * 4;
     assert_eq!(adapter(2000), 2 * 2001 * (weights + 2 * record + population));

@@ -29,6 +29,7 @@ use std::process::Stdio;
 use std::time::{Duration, Instant};
 
 use clap::error::{ContextKind, ContextValue, ErrorKind};
+use rayon::prelude::*;
 use tempfile::TempDir;
 
 /// The time limit of one command.
@@ -322,15 +323,16 @@ fn every_command_on_the_pages_works() {
     let (mut failed, mut summary) = (Vec::new(), String::new());
     let mut ran = 0;
     let only = std::env::var("FLOTILLA_PAGE").unwrap_or_default();
-    for page in pages() {
-        let name = page.strip_prefix(env!("CARGO_MANIFEST_DIR")).unwrap().display().to_string();
-        if !name.contains(&only) {
-            continue;
-        }
-        let mut result = check_page(&name, &fs::read_to_string(&page).unwrap());
+    let name = |page: &PathBuf| page.strip_prefix(env!("CARGO_MANIFEST_DIR")).unwrap().display().to_string();
+    let chosen: Vec<PathBuf> = pages().into_iter().filter(|page| name(page).contains(&only)).collect();
+    // Each page has a directory of its own.
+    let results: Vec<PageResult> =
+        chosen.par_iter().map(|page| check_page(&name(page), &fs::read_to_string(page).unwrap())).collect();
+    for (page, mut result) in chosen.iter().zip(results) {
         ran += result.ran;
         summary += &format!(
-            "{name}: {} commands run, {} only parsed, {} left out\n",
+            "{}: {} commands run, {} only parsed, {} left out\n",
+            name(page),
             result.ran,
             result.parsed,
             result.left_out.len()
