@@ -235,6 +235,10 @@ fn files_of_a_newer_version_are_not_changed() {
     let stderr = place.refused(1, "train small.toml --out run --resume");
     assert!(stderr.contains("run.json: it was written by flotilla 8.1.0"), "{stderr}");
     assert_eq!(files(&place.path("run")), before);
+    // The same text of this version is damaged.
+    place.write("run/run.json", text.replace("\"done\"", "\"paused\""));
+    let stderr = place.refused(1, "plot run");
+    assert!(stderr.contains("run.json: not the record of a run"), "{stderr}");
 }
 
 #[test]

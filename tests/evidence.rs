@@ -42,6 +42,10 @@ fn a_report_needs_no_gpu() {
     assert_eq!(report.date.len(), "2026-01-31".len());
     assert!(report.target.starts_with(std::env::consts::ARCH), "{}", report.target);
     assert!(report.toolchain.starts_with("rustc 1."), "{}", report.toolchain);
+    if let Ok(text) = fs::read_to_string("/proc/cpuinfo") {
+        let name = |line: &str| Some(line.strip_prefix("model name")?.split_once(':')?.1.trim().to_string());
+        assert_eq!(report.processor, text.lines().find_map(name));
+    }
     assert_eq!(report.comparisons.len(), Cpu::levels().len() - 1, "expected every instruction set but the narrowest");
     for comparison in &report.comparisons {
         let Compared { adapter, worlds, agent_steps, equal, .. } = comparison;

@@ -79,7 +79,11 @@ fn outputs_do_not_replace_inputs_or_files_of_a_run() {
     // Other file names in a run's folder are allowed, and so are devices.
     place.good(&[&rollout[..], &["--scores", "run/scores.csv", "--trace", "/dev/null"]].concat());
     assert!(place.read("run/scores.csv").starts_with("team,leader,g"));
+    place.good(&[&rollout[..], &["--scores", "/dev/null", "--trace", "/dev/null"]].concat());
     assert!(!fs::metadata("/dev/null").unwrap().is_file());
+    // A folder is refused before anything is played and written.
+    let stderr = place.refused(1, &[&rollout[..], &["--scores", "x.csv", "--trace", "run"]].concat());
+    assert!(stderr.contains("run: cannot be written") && !place.path("x.csv").exists(), "{stderr}");
 }
 
 #[test]

@@ -4,6 +4,8 @@
 
 mod support;
 
+use std::fs;
+
 use serde_json::Value;
 use support::{Place, SMALL};
 
@@ -86,6 +88,14 @@ fn other_commands_print_json() {
     let baseline = result(&place, &[&baseline[..], &cpu].concat());
     // Two generations of 8 random teams: generation 0, and generation 1 as in training.
     assert_eq!((&baseline["backend"], &baseline["teams"]), (&"cpu".into(), &16.into()));
+    // Random episodes are played only if starts or POIs move. Then constant actions have an interval, too.
+    assert!(baseline["episodes"] == 1 && baseline["constant"]["interval_95"].is_null(), "{baseline}");
+    for key in ["start_jitter", "poi_jitter"] {
+        let set = format!("learning.{key}=2");
+        let moved = ["baseline", "x.toml", "--seeds", "2", "--episodes", "5", "--generations", "1", "--set", &set];
+        let moved = result(&place, &[&moved[..], &cpu].concat());
+        assert!(moved["episodes"] == 5 && moved["constant"]["interval_95"].is_array(), "{moved}");
+    }
     let swept = result(&place, &[&["sweep", "s.toml", "--out", ODD_NAMES[0]][..], &cpu].concat());
     assert_eq!(swept["points"].as_array().unwrap().len(), 2);
     let (code, lines) = run_json(
@@ -135,6 +145,15 @@ fn failures_print_one_object() {
     assert_eq!(failure(&place, &["check", "none.toml"]).0, "config_unreadable");
     assert_eq!(failure(&place, &["verify", "--set", "world.steps=3"]).0, "usage");
     assert_eq!(failure(&place, &["no-such-command"]).0, "usage");
+    for name in ["theirs", "locked"] {
+        fs::create_dir(place.path(name)).unwrap();
+    }
+    place.write("theirs/metrics.csv", "of another program");
+    assert_eq!(on_cpu(&["train", "x.toml", "--out", "theirs"]), "not_ours");
+    let lock = fs::File::create(place.path("locked/.lock")).unwrap();
+    lock.lock().unwrap();
+    assert_eq!(on_cpu(&["train", "x.toml", "--out", "locked", "--resume"]), "locked");
+    assert_eq!(on_cpu(&["rollout", "x.toml", "--policies", "none.safetensors"]), "not_read");
     place.write("run/config.toml", SMALL.replace("steps = 9", "steps = 8"));
     assert_eq!(failure(&place, &["plot", "run", "--out", "a.svg"]).0, "damaged");
     for name in INVALID_NAMES {

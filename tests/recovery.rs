@@ -8,7 +8,7 @@
 mod support;
 
 use std::fs;
-use std::io::{self, Cursor, Read};
+use std::io::{self, Cursor, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Output, Stdio};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering::SeqCst};
@@ -22,7 +22,7 @@ use flotilla::backend::gpu::episode::GpuBackend;
 use flotilla::backend::{Backend, BackendError, Group, GroupScores, Trace};
 use flotilla::backend::{Machine, OpenBackend};
 use flotilla::config::Config;
-use flotilla::record::checkpoint::{self, Checkpoint};
+use flotilla::record::checkpoint::{self, Checkpoint, CheckpointWriter, Schedule};
 use flotilla::record::disk::{Disk, Operation};
 use flotilla::record::folder::{CONFIG, Folder, METRICS, Note, POLICIES, RUN, Run, Start, StartFrom, Status};
 use flotilla::record::{RecordError, metrics, policies};
@@ -127,6 +127,50 @@ fn checkpoints_do_not_change_results() {
     let mut never = config.clone();
     never.checkpoint.generations = 0;
     assert_eq!(reference(&config), reference(&never));
+}
+
+#[test]
+fn checkpoints_are_due_by_generations_or_by_time() {
+    let writer = CheckpointWriter::new(Disk::default(), "checkpoints".into(), small(), vec![], 4);
+    let due = |generations, seconds| {
+        let schedule = Schedule { generations, seconds };
+        [4, 5, 6, 7].map(|next| writer.is_due(&schedule, next))
+    };
+    assert_eq!(due(0, 0.0), [false; 4]);
+    assert_eq!(due(2, 0.0), [false, false, true, true]);
+    // No checkpoint was written yet, so its cost is 0.
+    assert_eq!(due(0, f64::MIN_POSITIVE), [false, true, true, true]);
+    assert_eq!(due(0, 1e9), [false; 4]);
+    assert_eq!(due(2, 1e9), [false, false, true, true]);
+}
+
+#[test]
+fn no_checkpoint_is_due_by_time_while_the_previous_one_is_written() {
+    let (folder, _, paths) = stopped_run(&small());
+    let checkpoint = Checkpoint::read(fs::File::open(&paths[1]).unwrap(), &small()).unwrap();
+    let gate = Arc::new(Mutex::new(()));
+    let disk = Disk::failing({
+        let gate = gate.clone();
+        move |_, _| {
+            drop(gate.lock());
+            Ok(())
+        }
+    });
+    let metrics = Disk::default().create(&folder.path().join("metrics")).unwrap();
+    let mut writer = CheckpointWriter::new(disk, folder.path().into(), small(), vec![], 4);
+    let schedule = Schedule { generations: 0, seconds: f64::MIN_POSITIVE };
+    // While this is locked, the writer waits.
+    let closed = gate.lock().unwrap();
+    let since = Instant::now();
+    writer.save(checkpoint, metrics, since).unwrap();
+    // The known part of the checkpoint's cost is at most this long.
+    let cost = since.elapsed();
+    while since.elapsed() < cost * 50 {
+        assert!(!writer.is_due(&schedule, 10));
+    }
+    drop(closed);
+    writer.wait().unwrap();
+    assert_eq!(writer.newest(), Some(9));
 }
 
 #[test]
@@ -255,6 +299,13 @@ fn a_run_with_missing_or_damaged_files_is_extended() {
     let stopped = tempfile::tempdir().unwrap();
     session(&short, stopped.path(), Start::Fresh, Disk::default(), cpu(), Some(8)).end.unwrap();
     resumes(stopped.path(), 8);
+    // While an extension is stopped, the digests of the shorter run are not recorded.
+    let (_folder, path, _) = run();
+    let recorded = || Run::read(&path.join(RUN)).unwrap();
+    assert!(recorded().state == Status::Done && recorded().digest.is_some() && recorded().files.is_some());
+    session(&config, &path, Start::Resume, Disk::default(), cpu(), Some(10)).end.unwrap();
+    assert_eq!((recorded().state, recorded().digest, recorded().files), (Status::Stopped, None, None));
+    resumes(&path, 10);
 
     // A run cannot become shorter. The refusal changes no file.
     let (_folder, path, _) = run();
@@ -509,6 +560,65 @@ fn a_damaged_checkpoint_is_reported_and_the_previous_one_is_used() {
     let (results, outcome) = resume(&config, &path);
     assert_eq!((outcome.start, outcome.notes.len()), (0, 3), "{:?}", outcome.notes);
     assert_eq!((results, result_files(&path)), expected);
+}
+
+#[test]
+fn a_checkpoint_of_another_run_is_set_aside_and_the_previous_one_is_used() {
+    let config = small();
+    let expected = reference(&config);
+    let (_folder, path, paths) = stopped_run(&config);
+    let mut other = config.clone();
+    other.learning.seed = 3;
+    let (_other_folder, _, others) = stopped_run(&other);
+    fs::copy(&others[1], &paths[1]).unwrap();
+    let (results, outcome) = resume(&config, &path);
+    let note = outcome.notes[0].to_string();
+    assert!(note.contains("000000009.safetensors: it is of another run"), "{note}");
+    assert_eq!(outcome.start, 8, "{:?}", outcome.notes);
+    assert_eq!((results, result_files(&path)), expected);
+}
+
+/// A file of which one read fails, after `left` others.
+struct FailingRead<R> {
+    source: R,
+    left: Option<usize>,
+    kind: io::ErrorKind,
+}
+
+impl<R: Read> Read for FailingRead<R> {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        let fails = self.left == Some(0);
+        self.left = self.left.and_then(|left| left.checked_sub(1));
+        if fails { Err(self.kind.into()) } else { self.source.read(buffer) }
+    }
+}
+
+impl<R: Seek> Seek for FailingRead<R> {
+    fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
+        self.source.seek(to)
+    }
+}
+
+#[test]
+fn an_interrupted_read_is_repeated_and_a_failed_one_is_reported() {
+    let config = small();
+    let (_folder, _, paths) = stopped_run(&config);
+    let whole = fs::read(&paths[1]).unwrap();
+    let expected = Checkpoint::read(Cursor::new(&whole), &config).unwrap();
+    for reads in 0.. {
+        let read = |kind| {
+            let mut file = FailingRead { source: Cursor::new(&whole), left: Some(reads), kind };
+            (Checkpoint::read(&mut file, &config), file.left.is_none())
+        };
+        assert_eq!(read(io::ErrorKind::Interrupted).0.unwrap(), expected, "after {reads} reads");
+        let (found, failed) = read(io::ErrorKind::TimedOut);
+        if !failed {
+            assert!(reads >= 5, "a checkpoint took only {reads} reads");
+            return;
+        }
+        let error = found.expect_err("a read failed");
+        assert!(error.contains("cannot be read"), "after {reads} reads: {error}");
+    }
 }
 
 #[test]

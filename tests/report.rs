@@ -570,6 +570,16 @@ fn gifs_and_frames_have_the_requested_size_and_rate() {
         assert_eq!(fs::read(name).unwrap()[16..20], 400_u32.to_be_bytes());
     }
 
+    // A still picture of any step of the episode, with the requested width.
+    let (_, output) = render("still.svg", &["--step", "5"]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let (path, output) = render("late.svg", &["--step", "6"]);
+    let message = String::from_utf8(output.stderr).unwrap();
+    assert!(output.status.code() == Some(2) && message.contains("the episode has steps 0 to 5"), "{message}");
+    assert!(!path.exists());
+    let (still, _) = render("still.png", &["--width", "300"]);
+    assert_eq!(fs::read(still).unwrap()[16..20], 300_u32.to_be_bytes());
+
     // Flags that do nothing for a format are refused.
     for (name, flags, flag) in [
         ("a.svg", ["--width", "400"], "--width"),

@@ -438,6 +438,11 @@ fn a_warm_started_run_resumes_to_the_same_results() {
         let before = [&whole, &first].map(|path| read_files(path));
         let error = train(config, &whole, Some(other.clone()), Start::Resume, 99).unwrap_err().to_string();
         assert!(error.contains("started from a file of policies with SHA-256") && !error.contains('\n'), "{error}");
+        // The message has the start of both digests.
+        assert!(
+            [&digest, &other.digest].iter().all(|digest| error.contains(&format!(" {}…", &digest[..16]))),
+            "{error}"
+        );
         let error = train(config, &first, init(), Start::Resume, 99).unwrap_err().to_string();
         assert!(error.contains("did not start from a file"), "{error}");
         assert!(before == [&whole, &first].map(|path| read_files(path)), "a refused command changed files");

@@ -594,6 +594,30 @@ fn results_have_every_fifth_generation_and_the_last() {
     }
     let error = fail(flotilla(&sweep, &out, &["--collect", "--axes", "radius"]), 2);
     assert!(error.contains("it has world.coupling, world.steps, learning.generations"), "{error}");
+    let error = fail(flotilla(&sweep, &out, &["--collect", "--axes", "steps,world.steps"]), 2);
+    assert!(error.contains("--axes: world.steps twice"), "{error}");
+    succeed(flotilla(&sweep, &out, &["--collect", "--axes", "steps,world.coupling"]));
+}
+
+#[test]
+fn a_large_sweep_prints_its_best_and_its_worst_points() {
+    for points in [12, 15] {
+        let seeds: Vec<usize> = (0..points).collect();
+        let (folder, sweep) = write_sweep(&format!("{}[grid]\n\"learning.seed\" = {seeds:?}\n", support::TINY));
+        let out = folder.path().join("out");
+        let text = succeed(flotilla(&sweep, &out, &["--quiet"]));
+        let mut table = csv::Reader::from_path(out.join("points.csv")).unwrap();
+        let column = table.headers().unwrap().iter().position(|name| name == "best_g").unwrap();
+        let mut means: Vec<f64> = table.records().map(|row| row.unwrap()[column].parse().unwrap()).collect();
+        means.sort_by(|a, b| b.total_cmp(a));
+        let mut expected: Vec<String> = means.iter().map(|mean| format!("  {mean:.3} ±")).collect();
+        if points == 15 {
+            expected.splice(6..9, ["  … (3 more)".to_string()]);
+        }
+        let listed: Vec<&str> = text.lines().filter(|line| line.contains('±') || line.contains('…')).skip(1).collect();
+        assert_eq!(listed.len(), expected.len(), "{text}");
+        assert!(listed.iter().zip(&expected).all(|(line, start)| line.starts_with(start)), "{expected:?}: {text}");
+    }
 }
 
 /// Returns a sweep that takes long enough to be killed halfway.

@@ -15,6 +15,8 @@ use assert_cmd::cargo::cargo_bin_cmd;
 use flotilla::Config;
 use flotilla::script::Script;
 use flotilla::sweep::questions::parts;
+use serde_json::Value;
+use support::{Place, TINY};
 use tempfile::TempDir;
 
 fn task_files(ending: &str) -> Vec<PathBuf> {
@@ -78,6 +80,10 @@ fn invalid_scripts_are_refused_before_training() {
     fs::write(folder.path().join("task.csv"), format!("{head}0,5,1,1,1\n")).unwrap();
     let (code, _, error) = run(folder.path(), "task.toml --trials 2");
     assert!(code == Some(1) && error.contains("the scripted team has G 0.00"), "{error}");
+    // Without a scripted team, a champion has to solve the task.
+    fs::remove_file(folder.path().join("task.csv")).unwrap();
+    let (code, _, error) = run(folder.path(), "task.toml --trials 2 --resume");
+    assert!(code == Some(1) && error.contains("no champion solves it, and there is no scripted team"), "{error}");
 }
 
 /// Between these marks, the page has what the test below prints.
@@ -150,4 +156,24 @@ fn tasks_resume_and_those_that_a_constant_speed_solves_fail() {
     assert!(code == Some(1) && error.contains("G of the best constant speed is 1.00"), "{error}");
     let (code, _, error) = run(&format!("{task} {task} --out c"));
     assert!(code == Some(2) && error.contains("two configs"), "{error}");
+}
+
+#[test]
+fn champions_play_held_out_episodes_if_starts_or_pois_move() {
+    let place = Place::new(&[]).on_cpu();
+    for key in ["start_jitter", "poi_jitter"] {
+        place.write(format!("{key}.toml"), format!("{TINY}{key} = 2.0\n"));
+        let output = place.run(&format!("tasks {key}.toml --trials 2 --population 0 --quiet --json"));
+        let found: Value = serde_json::Deserializer::from_slice(&output.stdout).into_iter().next().unwrap().unwrap();
+        for trained in found["tasks"][0]["trained"].as_array().unwrap() {
+            let run = format!("tasks/{key}/50-{}", trained["fitness"].as_str().unwrap());
+            for trial in 0..2 {
+                let line = format!("rollout {run} --trial {trial} --episodes 200 --seed 0 --json");
+                let played: Value = serde_json::from_str(&place.good(&line).0).unwrap();
+                // The champions are policy 0 of every leader.
+                let expected = played["team_0"]["mean"].as_f64().unwrap() / played["pois"].as_f64().unwrap();
+                assert_eq!(trained["champion_g"][trial].as_f64(), Some(expected), "{run}, trial {trial}");
+            }
+        }
+    }
 }

@@ -386,10 +386,13 @@ fn trained() -> Place {
 /// Returns the numbers of a trace by episode, team, step and agent: the state, then the policy's inputs and outputs.
 fn traced(text: &str, episodes: usize) -> Vec<Vec<Vec<Vec<Vec<f64>>>>> {
     let (teams, steps, agents) = (8, 10, 5);
+    let columns = text.lines().next().unwrap().split(',').count();
+    assert_eq!(columns, if episodes == 1 { 19 } else { 20 });
     let mut rows = text.lines().skip(1);
     let mut row = |episode: usize, team: usize, step: usize, agent: usize| {
         let row: Vec<&str> = rows.next().unwrap().split(',').collect();
         assert_eq!(row[..3], [team, step, agent].map(|number| number.to_string()));
+        assert_eq!(row.len(), columns);
         assert!(episodes == 1 || row[19] == episode.to_string(), "{row:?}");
         row[4..19].iter().filter(|text| !text.is_empty()).map(|text| text.parse().unwrap()).collect()
     };
