@@ -325,6 +325,8 @@ fn a_sweep_is_compared_along_an_axis_and_seeds_add_trials() {
     let report = json(&place, "compare s --by fitness");
     assert_eq!(report["comparisons"].as_array().unwrap().len(), 1);
     assert_eq!(report["comparisons"][0]["arms"][1]["trials"], 3);
+    fs::rename(place.path("s/points/0007"), place.path("s/points/0006")).unwrap();
+    assert_fails(&place, "compare s --by fitness", 1, &["s/points/0006 is a run of another config"]);
     fs::remove_dir_all(place.path("s/points")).unwrap();
     assert_fails(
         &place,

@@ -46,6 +46,9 @@ fn a_report_needs_no_gpu() {
         let name = |line: &str| Some(line.strip_prefix("model name")?.split_once(':')?.1.trim().to_string());
         assert_eq!(report.processor, text.lines().find_map(name));
     }
+    let widest = report.instructions.expect("the widest instruction set");
+    let widest = format!("cpu ({widest}");
+    assert!(report.comparisons.last().is_none_or(|last| last.adapter.starts_with(&widest)), "{widest}");
     assert_eq!(report.comparisons.len(), Cpu::levels().len() - 1, "expected every instruction set but the narrowest");
     for comparison in &report.comparisons {
         let Compared { adapter, worlds, agent_steps, equal, .. } = comparison;

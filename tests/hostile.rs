@@ -364,3 +364,18 @@ fn endless_lines_fail() {
     let long = format!("{}\n{endless}", flotilla::record::metrics::HEADER);
     assert!(Rows::new(long.as_bytes()).unwrap().next().unwrap().unwrap_err().to_string().contains("longer than"));
 }
+
+#[test]
+fn invalid_rows_of_metrics_fail() {
+    use flotilla::record::metrics::HEADER;
+    let staged = &format!("{HEADER},stage");
+    let row = |header: &str, line: &str| Rows::new(format!("{header}\n{line}\n").as_bytes()).unwrap().next().unwrap();
+    assert_eq!(row(HEADER, "0,0,1,0.5,0,2.5").unwrap().1, 2.5);
+    assert_eq!(row(staged, "0,0,1,0.5,0,2.5,1").unwrap().1, 2.5);
+    for line in ["0,0,1,0.5,0,-1", "0,0,1,0.5,0,NaN", "0,0,1,0.5,0,inf", "0,0,1,0.5,0", "0,0,1,0.5,0,2.5,1"] {
+        assert!(row(HEADER, line).is_err(), "{line}");
+    }
+    for line in ["0,0,1,0.5,0,2.5", "0,0,1,0.5,0,2.5,x", "0,0,1,0.5,0,2.5,1,1"] {
+        assert!(row(staged, line).is_err(), "{line}");
+    }
+}

@@ -80,7 +80,14 @@ fn outputs_do_not_replace_inputs_or_files_of_a_run() {
     place.good(&[&rollout[..], &["--scores", "run/scores.csv", "--trace", "/dev/null"]].concat());
     assert!(place.read("run/scores.csv").starts_with("team,leader,g"));
     place.good(&[&rollout[..], &["--scores", "/dev/null", "--trace", "/dev/null"]].concat());
+    // Only the file paper.toml of a paper's folder belongs to the paper.
+    fs::create_dir_all(place.path("paper/arms")).unwrap();
+    place.good(&[&rollout[..], &["--scores", "paper/scores.csv", "--trace", "paper.toml"]].concat());
+    let stderr = place.refused(2, &[&rollout[..], &["--scores", "paper/paper.toml"]].concat());
+    assert!(stderr.contains("belongs to what is in"), "{stderr}");
     assert!(!fs::metadata("/dev/null").unwrap().is_file());
+    let stderr = place.refused(1, &[&rollout[..], &["--scores", "none/x.csv"]].concat());
+    assert!(stderr.contains("the folder none does not exist; make it first"), "{stderr}");
     // A folder is refused before anything is played and written.
     let stderr = place.refused(1, &[&rollout[..], &["--scores", "x.csv", "--trace", "run"]].concat());
     assert!(stderr.contains("run: cannot be written") && !place.path("x.csv").exists(), "{stderr}");

@@ -88,6 +88,10 @@ fn other_commands_print_json() {
     let baseline = result(&place, &[&baseline[..], &cpu].concat());
     // Two generations of 8 random teams: generation 0, and generation 1 as in training.
     assert_eq!((&baseline["backend"], &baseline["teams"]), (&"cpu".into(), &16.into()));
+    for name in ["constant", "action", "network"] {
+        let seeds = baseline[name]["seeds"].as_array().unwrap().iter().map(|pois| pois.as_f64().unwrap());
+        assert_eq!(baseline[name]["mean"].as_f64(), Some(seeds.sum::<f64>() / 2.0), "{name}");
+    }
     // Random episodes are played only if starts or POIs move. Then constant actions have an interval, too.
     assert!(baseline["episodes"] == 1 && baseline["constant"]["interval_95"].is_null(), "{baseline}");
     for key in ["start_jitter", "poi_jitter"] {

@@ -24,7 +24,7 @@ use flotilla::backend::{Machine, OpenBackend};
 use flotilla::config::Config;
 use flotilla::record::checkpoint::{self, Checkpoint, CheckpointWriter, Schedule};
 use flotilla::record::disk::{Disk, Operation};
-use flotilla::record::folder::{CONFIG, Folder, METRICS, Note, POLICIES, RUN, Run, Start, StartFrom, Status};
+use flotilla::record::folder::{self, CONFIG, Folder, METRICS, Note, POLICIES, RUN, Run, Start, StartFrom, Status};
 use flotilla::record::{RecordError, metrics, policies};
 use flotilla::run::{Options, Results, RunError, Session, SessionEnd};
 use rand::{RngExt, SeedableRng, rngs::ChaCha8Rng};
@@ -299,13 +299,14 @@ fn a_run_with_missing_or_damaged_files_is_extended() {
     let stopped = tempfile::tempdir().unwrap();
     session(&short, stopped.path(), Start::Fresh, Disk::default(), cpu(), Some(8)).end.unwrap();
     resumes(stopped.path(), 8);
-    // While an extension is stopped, the digests of the shorter run are not recorded.
+    // While a run is extended, the digests of the shorter run are not recorded.
     let (_folder, path, _) = run();
     let recorded = || Run::read(&path.join(RUN)).unwrap();
     assert!(recorded().state == Status::Done && recorded().digest.is_some() && recorded().files.is_some());
-    session(&config, &path, Start::Resume, Disk::default(), cpu(), Some(10)).end.unwrap();
-    assert_eq!((recorded().state, recorded().digest, recorded().files), (Status::Stopped, None, None));
-    resumes(&path, 10);
+    let opened = Folder::open(&path, Start::Resume, &config, StartFrom::Unspecified, Disk::default()).unwrap();
+    assert_eq!((recorded().state, recorded().digest, recorded().files), (Status::Running, None, None));
+    drop(opened);
+    resumes(&path, 8);
 
     // A run cannot become shorter. The refusal changes no file.
     let (_folder, path, _) = run();
@@ -507,6 +508,18 @@ fn damaged(whole: &[u8]) -> impl Iterator<Item = (String, Vec<u8>)> {
 }
 
 #[test]
+fn a_folder_that_cannot_be_read_is_not_a_folder_without_checkpoints() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("file");
+    fs::write(&file, "").unwrap();
+    assert_eq!(checkpoint::list(&file).unwrap(), [0; 0]);
+    assert_eq!(checkpoint::list(&folder.path().join("missing")).unwrap(), [0; 0]);
+    // No file system allows a name of this length.
+    let error = checkpoint::list(&folder.path().join("x".repeat(10_000))).unwrap_err();
+    assert!(matches!(error, RecordError::Read { .. }), "{error}");
+}
+
+#[test]
 fn every_damaged_byte_of_a_checkpoint_is_detected() {
     let config = small();
     let (_folder, _, paths) = stopped_run(&config);
@@ -648,7 +661,12 @@ fn a_changed_config_is_refused_with_the_names_of_its_keys() {
         error.contains("learning.seed: 0 there, 5 here") && error.contains("world.steps: 8 there, 9 here"),
         "{error}"
     );
-    assert!(!error.contains("checkpoint."), "{error}");
+    assert!(!error.contains("checkpoint.") && !error.contains('…'), "{error}");
+    // The values of a key with a long text are cut.
+    let mut long = config.clone();
+    long.world.pois = vec![[10.0, 10.0]; 20];
+    let differences = folder::differences(&config, &long);
+    assert!(differences.len() == 1 && differences[0].ends_with("… here"), "{differences:?}");
     // Without the config file, the checkpoint still identifies its config.
     fs::remove_file(path.join("config.toml")).unwrap();
     let error = session(&changed, &path, Start::Resume, Disk::default(), cpu(), None).end.unwrap_err();
@@ -717,6 +735,13 @@ fn a_lost_device_does_not_change_results() {
         let outcome = session(&config, &path, Start::Fresh, Disk::default(), failing(), None);
         let error = flotilla::cli::Error::from(outcome.end.unwrap_err()).to_string();
         assert!(error.contains("the device was lost") && error.contains("--resume"), "{error}");
+        // A command that trains no run suggests to run it again.
+        let error = BackendError::from(DeviceError::Lost { adapter: "test".into(), reason: "pulled out".into() });
+        let error = flotilla::cli::Error::from(error).to_string();
+        assert!(error.ends_with("; run again, or use --backend cpu"), "{error}");
+        let error = BackendError::from(DeviceError::UnknownAdapter { name: "test".into(), found: vec![] });
+        let error = flotilla::cli::Error::from(error).to_string();
+        assert!(error.ends_with("; use --backend cpu"), "{error}");
         assert_eq!(Run::read(&path.join("run.json")).unwrap().state, Status::Stopped);
         let (results, outcome) = resume(&config, &path);
         assert_eq!((outcome.start, results), (left, expected.0.clone()));

@@ -1164,6 +1164,10 @@ fn a_paper_is_overwritten_only_with_force() {
         let folder = Path::new(arm["folder"].as_str().unwrap());
         let run: Value = serde_json::from_str(&fs::read_to_string(folder.join("run.json")).unwrap()).unwrap();
         assert_eq!(run["digest"], arm["digest"]);
+        let metrics = fs::read_to_string(folder.join("metrics.csv")).unwrap();
+        let rows = metrics.lines().map(|line| line.split(',').collect::<Vec<_>>()).filter(|row| row[1] == "4");
+        let best: Vec<f64> = rows.map(|row| row[2].parse().unwrap()).collect();
+        assert_eq!(arm["best_g"].as_f64(), Some((best[0] + best[1]) / 2.0), "{arm}");
     }
     let original = outcome(&out);
     refused(&out, &["--generations", "4"], &["holds a paper already", "--resume", "--force"]);

@@ -17,10 +17,11 @@ use flotilla::config::{Config, Sharing};
 use flotilla::record::digests::Verification;
 use flotilla::record::disk::Disk;
 use flotilla::record::folder::{Folder, METRICS, POLICIES, RUN, Run, Start, StartFrom};
+use flotilla::record::metrics::Lines;
 use flotilla::record::policies::{self, Init, read_init};
 use flotilla::report::replay::{Which, replay};
 use flotilla::run::{Options, Results, RunError, Session, SessionEnd};
-use flotilla::trainer::Trainer;
+use flotilla::trainer::{Row, Trainer};
 use flotilla::verify;
 use support::SMALL;
 use tempfile::TempDir;
@@ -67,6 +68,13 @@ fn each_stage_changes_the_config_of_the_file() {
     let immediate = immediate.validate().unwrap();
     assert_eq!((immediate.stages().len(), immediate.stage_of(6)), (1, 0));
     assert_eq!(immediate.at(0).world.coupling, flotilla::config::Coupling::Same(1));
+    // `metrics.csv` numbers the stages in the same way.
+    let column = |config: &Config, generation: usize| {
+        let row = Row { experiment: 0, trial: 0, generation, best_g: 0.0, mean_g: 0.0, champion_g: 0.0 };
+        Lines::of(config).line(&row, 0.0).trim_end().rsplit(',').next().unwrap().parse().unwrap()
+    };
+    assert_eq!((0..7).map(|generation| column(&config, generation)).collect::<Vec<usize>>(), [0, 0, 1, 1, 2, 2, 2]);
+    assert_eq!([0, 6].map(|generation| column(&immediate, generation)), [0, 0]);
 }
 
 #[test]
@@ -573,6 +581,9 @@ fn a_shared_policy_fits_any_number_of_leaders() {
     let (code, _, stderr) = run(&folder, "train small.toml --out cold --init run/policies.safetensors");
     let reason = "weights.0 is F32 [1, 8, 57], but the config needs F32 [2, 1 to 1048576, 57]";
     assert!(code == Some(1) && stderr.contains(reason) && stderr.lines().count() == 1, "{stderr}");
+    // Every trial needs policies of its own.
+    let (code, _, stderr) = run(&folder, "train shared.toml --trials 4 --out cold --init run/policies.safetensors");
+    assert!(code == Some(1) && stderr.contains("it has no tensor weights.3; it has weights.0"), "{stderr}");
     let (code, _, stderr) = run(&folder, "train small.toml --out cold --init small.toml");
     assert!(code == Some(1) && stderr.starts_with("error: small.toml: ") && stderr.lines().count() == 1, "{stderr}");
     let (code, _, stderr) = run(&folder, "train small.toml --out cold --init missing.safetensors");

@@ -752,7 +752,15 @@ fn a_folder_with_another_sweep_or_a_run_is_refused() {
         assert!(error.contains("holds another sweep"), "{error}");
         assert!(error.contains("there: \"world.coupling\" = [1, 3]"), "{error}");
         assert!(error.contains("here: \"world.coupling\" = [1, 2, 3]"), "{error}");
+        assert!(!error.contains('…'), "{error}");
     }
+    // At most eight lines are shown of each.
+    let keys = ["seed=6", "population=12", "trials=3", "fitness='G'", "episodes_per_team=2"];
+    let keys = keys.into_iter().chain(["start_jitter=1.0", "poi_jitter=1.0", "hall_of_fame=1", "elites=3"]);
+    let set: Vec<String> = keys.flat_map(|key| ["--set".to_string(), format!("learning.{key}")]).collect();
+    let flags: Vec<&str> = ["--resume"].into_iter().chain(set.iter().map(|flag| &**flag)).collect();
+    let error = fail(flotilla(&sweep, &out, &flags), 1);
+    assert!(error.matches("\n  here: ").count() == 8 && error.matches('…').count() == 1, "{error}");
     // Another seed makes another sweep. Another comment does not.
     assert!(fail(flotilla(&sweep, &out, &["--seed", "6", "--resume"]), 1).contains("there: seed = 5"));
     let (_other, same) = write_sweep(&format!("# The same.\n{SMALL}"));
@@ -866,6 +874,19 @@ fn damaged_points_are_reported_as_missing() {
     fs::remove_dir_all(out.join("points/0004")).unwrap();
     succeed(flotilla(&sweep, &out, &["--quiet", "--resume"]));
     assert!(results(&out) == before);
+}
+
+#[test]
+fn at_most_twenty_missing_points_are_listed() {
+    for points in [21, 22] {
+        let seeds: Vec<usize> = (0..points).collect();
+        let (folder, sweep) = write_sweep(&format!("{}[grid]\n\"learning.seed\" = {seeds:?}\n", support::TINY));
+        let out = folder.path().join("out");
+        succeed(flotilla(&sweep, &out, &["--quiet", "--shard", &format!("1/{points}")]));
+        let error = fail(flotilla(&sweep, &out, &["--collect"]), 1);
+        assert!(error.contains(&format!("{} of {points} points are missing", points - 1)), "{error}");
+        assert_eq!((error.matches("it was not run").count(), error.contains('…')), (20, points == 22), "{error}");
+    }
 }
 
 #[test]

@@ -165,7 +165,9 @@ fn champions_play_held_out_episodes_if_starts_or_pois_move() {
         place.write(format!("{key}.toml"), format!("{TINY}{key} = 2.0\n"));
         let output = place.run(&format!("tasks {key}.toml --trials 2 --population 0 --quiet --json"));
         let found: Value = serde_json::Deserializer::from_slice(&output.stdout).into_iter().next().unwrap().unwrap();
-        for trained in found["tasks"][0]["trained"].as_array().unwrap() {
+        let task = &found["tasks"][0];
+        assert!(task["scripted_g"].is_null() && task["scripted"] == false, "{task}");
+        for trained in task["trained"].as_array().unwrap() {
             let run = format!("tasks/{key}/50-{}", trained["fitness"].as_str().unwrap());
             for trial in 0..2 {
                 let line = format!("rollout {run} --trial {trial} --episodes 200 --seed 0 --json");

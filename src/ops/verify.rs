@@ -371,4 +371,28 @@ mod tests {
         assert!(expected(&plan, Some(BUDGET), 4).contains("about 60 s"));
         assert!(expected(&plan, None, 1).contains("35 worlds by each of 1 combination "));
     }
+
+    #[test]
+    fn only_a_bare_request_has_a_budget() {
+        let config = ("small".to_string(), include_str!("../../configs/generally_forward.toml").to_string());
+        let budget = |request: Request| plan(&request).unwrap().1;
+        assert_eq!(budget(Request::default()), Some(BUDGET));
+        assert_eq!(budget(Request { worlds: Some(3), ..Request::default() }), None);
+        assert_eq!(budget(Request { evidence: true, ..Request::default() }), None);
+        assert_eq!(budget(Request { config: Some(config), ..Request::default() }), None);
+    }
+
+    #[test]
+    fn a_different_comparison_is_an_error_with_its_own_exit_code() {
+        let compared = |failures: &[Option<&str>]| {
+            let agreement =
+                |failure: &Option<&str>| Agreement { mismatch: failure.map(String::from), ..Agreement::default() };
+            let lines = failures.iter().map(|failure| line("a GPU".into(), &Cpu::default(), Ok(agreement(failure))));
+            Outcome { equal: false, comparisons: lines.collect(), evidence: None }
+        };
+        assert!(compared(&[None, None]).difference().is_none());
+        let error = compared(&[Some("stage credit"), None, None]).difference().unwrap();
+        assert_eq!((error.exit_code(), error.code()), (3, "different"));
+        assert!(error.to_string().starts_with("1 of 3 comparisons found other bits than the CPU's"), "{error}");
+    }
 }
