@@ -352,6 +352,29 @@ fn zip(folder: &Path, top: &str, to: &Path) {
     zip.finish().unwrap();
 }
 
+/// Names in an archive cannot lead out of the folder into which it is unpacked.
+#[test]
+fn only_the_files_of_a_run_are_unpacked() {
+    let run = Run::new(CONFIG, &[]);
+    let names = ["checkpoints/../../../evil.safetensors", "../../evil.safetensors", "evil.safetensors"];
+    let [archive, temporary] = ["run.zip", "temporary"].map(|name| run.folder.path().join(name));
+    zip(&run.path(), "", &archive);
+    let file = fs::File::options().read(true).write(true).open(&archive).unwrap();
+    let mut zip = zip::ZipWriter::new_append(file).unwrap();
+    for name in names {
+        zip.start_file(name, zip::write::SimpleFileOptions::default()).unwrap();
+        zip.write_all(b"evil").unwrap();
+    }
+    zip.finish().unwrap();
+    fs::create_dir(&temporary).unwrap();
+    let mut plot = support::flotilla();
+    plot.env("TMPDIR", &temporary).current_dir(run.folder.path()).arg("plot").arg(&archive);
+    let output = plot.output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    assert!(!run.folder.path().join("evil.safetensors").exists());
+    assert_eq!(fs::read_dir(&temporary).unwrap().count(), 0);
+}
+
 #[test]
 fn a_zipped_run_is_read_like_its_folder() {
     let run = Run::new(CONFIG, &["--checkpoint-generations", "2"]);
