@@ -10,7 +10,7 @@ mod support;
 use std::ffi::OsStr;
 use std::fs;
 use std::os::unix::ffi::OsStrExt;
-use std::process::Command;
+use std::process::{Command, Stdio};
 
 use support::{Place, TINY};
 
@@ -26,6 +26,15 @@ fn with_run() -> Place {
     let place = place();
     place.good("train small.toml --out run --quiet");
     place
+}
+
+/// Returns the path of a device like `/dev/null` (minor number 3) or `/dev/full` (7). Root gets one in the test's folder
+/// where that is possible: a program that replaced outputs would replace the system's own.
+fn device(place: &Place, name: &str, minor: &str) -> String {
+    let own = place.path(name);
+    let made = Command::new("mknod").arg(&own).args(["c", "1", minor]).stderr(Stdio::null()).status();
+    let works = made.is_ok_and(|status| status.success()) && fs::File::options().write(true).open(&own).is_ok();
+    if works { own.display().to_string() } else { format!("/dev/{name}") }
 }
 
 #[test]
@@ -77,15 +86,16 @@ fn outputs_do_not_replace_inputs_or_files_of_a_run() {
         assert_eq!(fs::read(place.path(name)).unwrap(), content, "{name}");
     }
     // Other file names in a run's folder are allowed, and so are devices.
-    place.good(&[&rollout[..], &["--scores", "run/scores.csv", "--trace", "/dev/null"]].concat());
+    let null = &device(&place, "null", "3")[..];
+    place.good(&[&rollout[..], &["--scores", "run/scores.csv", "--trace", null]].concat());
     assert!(place.read("run/scores.csv").starts_with("team,leader,g"));
-    place.good(&[&rollout[..], &["--scores", "/dev/null", "--trace", "/dev/null"]].concat());
+    place.good(&[&rollout[..], &["--scores", null, "--trace", null]].concat());
     // Only the file paper.toml of a paper's folder belongs to the paper.
     fs::create_dir_all(place.path("paper/arms")).unwrap();
     place.good(&[&rollout[..], &["--scores", "paper/scores.csv", "--trace", "paper.toml"]].concat());
     let stderr = place.refused(2, &[&rollout[..], &["--scores", "paper/paper.toml"]].concat());
     assert!(stderr.contains("belongs to what is in"), "{stderr}");
-    assert!(!fs::metadata("/dev/null").unwrap().is_file());
+    assert!(!fs::metadata(null).unwrap().is_file());
     let stderr = place.refused(1, &[&rollout[..], &["--scores", "none/x.csv"]].concat());
     assert!(stderr.contains("the folder none does not exist; make it first"), "{stderr}");
     // A folder is refused before anything is played and written.
@@ -97,14 +107,15 @@ fn outputs_do_not_replace_inputs_or_files_of_a_run() {
 fn outputs_are_complete_or_absent_and_devices_are_not_replaced() {
     let place = with_run();
     let rollout = ["rollout", "small.toml", "--policies", "run/policies.safetensors"];
-    if fs::metadata("/dev/full").is_ok() {
-        let stderr = place.refused(1, &[&rollout[..], &["--scores", "/dev/full"]].concat());
+    let full = &device(&place, "full", "7")[..];
+    if fs::metadata(full).is_ok() {
+        let stderr = place.refused(1, &[&rollout[..], &["--scores", full]].concat());
         assert!(
-            stderr.contains("/dev/full: cannot be written") && stderr.contains("free some space, then run it again"),
+            stderr.contains("full: cannot be written") && stderr.contains("free some space, then run it again"),
             "{stderr}"
         );
         assert!(!stderr.contains("--resume"), "rollout has no --resume: {stderr}");
-        assert!(!fs::metadata("/dev/full").unwrap().is_file());
+        assert!(!fs::metadata(full).unwrap().is_file());
     }
     let (scores, _) = place.good(&[&rollout[..], &["--scores", "/dev/stdout"]].concat());
     assert!(scores.starts_with("team,leader,g,d,df,dpp,dt\n0,0,"), "{scores}");
