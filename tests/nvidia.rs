@@ -66,7 +66,7 @@ template <class T> INLINE T max(T a, T b) { return a < b ? b : a; }
 __device__ inline float abs(float x) { return fabsf(x); }
 __device__ inline float floor(float x) { return floorf(x); }
 __device__ inline uint ctz(uint x) { return __clz(__brev(x)); }
-enum class mem_flags { mem_threadgroup };
+enum class mem_flags { mem_device, mem_threadgroup };
 __device__ inline void threadgroup_barrier(mem_flags) { __syncthreads(); }
 }
 template <class T, class U> __device__ inline T as_type(U from) {
@@ -228,16 +228,11 @@ struct Compiled {
     assembly: String,
 }
 
-/// Compiles a shader for a chip. `fuse` lets the compiler fuse products into sums. `single_workgroup` tells it that one
-/// workgroup at a time is enough.
-fn compile(wgsl: &str, pass: Pass, chip: &str, fuse: bool, single_workgroup: bool) -> Compiled {
+/// Compiles a shader for a chip. `fuse` lets the compiler fuse products into sums.
+fn compile(wgsl: &str, pass: Pass, chip: &str, fuse: bool) -> Compiled {
     let folder = tempfile::tempdir().expect("a folder for the kernel");
     let (source, binary) = (folder.path().join("kernel.cu"), folder.path().join("kernel.cubin"));
-    let text = cuda(&metal(wgsl, pass));
-    let (before, bounds) = text.split_once("__launch_bounds__(").expect("a kernel has bounds");
-    let text =
-        if single_workgroup { format!("{before}__launch_bounds__({}", bounds.replacen(')', ", 1)", 1)) } else { text };
-    std::fs::write(&source, text).expect("the directory is writable");
+    std::fs::write(&source, cuda(&metal(wgsl, pass))).expect("the directory is writable");
     let mut nvcc = Command::new("nvcc");
     nvcc.args(["-cubin", "-std=c++17", "-ftz=true", "--expt-relaxed-constexpr", "-w", "-Xptxas", "-v", "-arch", chip])
         .arg(format!("-fmad={fuse}"))
@@ -286,13 +281,11 @@ fn guards_prevent_fusing_and_registers_rarely_spill() {
             let (mut max_registers, mut shaders) = (0, 0);
             for (name, text) in episodes() {
                 // Vulkan's no-contraction decoration is a flag of nvcc, so only the guarded pass is tested with fusing.
-                let kernel = compile(&text, pass, chip, pass == Pass::Guarded, false);
+                let kernel = compile(&text, pass, chip, pass == Pass::Guarded);
                 let case = format!("{chip} under the {pass} pass, {name}");
                 assert!(count(&kernel.assembly, "FMUL") > 50, "{case}: this is not assembly: {}", kernel.assembly);
                 assert!(pass != Pass::Guarded || count(&kernel.assembly, "FFMA") == 0, "{case}: fused");
                 assert!(kernel.stack <= STACK, "{case}: {} bytes of local memory", kernel.stack);
-                let single_workgroup = compile(&text, pass, chip, pass == Pass::Guarded, true);
-                assert_eq!(single_workgroup.stack, 0, "{case}: local memory, although one workgroup has all registers");
                 (max_registers, shaders) = (max_registers.max(kernel.registers), shaders + 1);
             }
             println!("{chip}: {shaders} shaders, {pass} pass, at most {max_registers} registers");
@@ -312,7 +305,7 @@ fn without_a_pass_the_compiler_fuses() {
         return;
     }
     let (name, text) = episodes().swap_remove(0);
-    let fused = count(&compile(&text, Pass::Plain, CHIPS[2], true, false).assembly, "FFMA");
+    let fused = count(&compile(&text, Pass::Plain, CHIPS[2], true).assembly, "FFMA");
     assert!(fused > 50, "{name}: only {fused} fused instructions");
 }
 
@@ -330,7 +323,7 @@ fn table() {
     println!("|---|{}", "---|".repeat(passes.len() * CHIPS.len()));
     for (name, text) in episodes() {
         let cells = passes.iter().flat_map(|&pass| CHIPS.iter().map(move |chip| (pass, *chip))).map(|(pass, chip)| {
-            let Compiled { registers, stack, spilled, .. } = compile(&text, pass, chip, pass == Pass::Guarded, false);
+            let Compiled { registers, stack, spilled, .. } = compile(&text, pass, chip, pass == Pass::Guarded);
             format!("{registers}, {stack}, {spilled}")
         });
         println!("| {name} | {} |", cells.collect::<Vec<_>>().join(" | "));
