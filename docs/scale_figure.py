@@ -64,7 +64,8 @@ def draw():
     for (paradigm, population), curve in sorted(curves.items(), key=lambda item: (item[0][0], item[0][1])):
         colour = "#0072b2" if paradigm == "leader-follower" else "#d55e00"
         teams, mean, error = zip(*curve)
-        axes.plot(teams, mean, styles[population], color=colour, label=f"{paradigm}, {population} policies".replace("50000", "50 000"))
+        label = f"{paradigm}, {population} policies".replace("50000", "50 000")
+        axes.plot(teams, mean, styles[population], color=colour, label=label)
         low = [m - e for m, e in zip(mean, error)]
         high = [m + e for m, e in zip(mean, error)]
         axes.fill_between(teams, low, high, color=colour, alpha=0.12, linewidth=0)

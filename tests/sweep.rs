@@ -58,6 +58,12 @@ fn write_sweep(text: &str) -> (TempDir, PathBuf) {
     (folder, path)
 }
 
+/// Writes a sweep over so many seeds, as [`write_sweep`] does.
+fn sweep_of_seeds(points: usize) -> (TempDir, PathBuf) {
+    let seeds: Vec<usize> = (0..points).collect();
+    write_sweep(&format!("{}[grid]\n\"learning.seed\" = {seeds:?}\n", support::TINY))
+}
+
 fn command(sweep: &Path, out: &Path, flags: &[&str]) -> Command {
     let mut command = support::flotilla();
     command.arg("sweep").arg(sweep).arg("--out").arg(out).args(["--backend", "cpu"]).args(flags);
@@ -602,8 +608,7 @@ fn results_have_every_fifth_generation_and_the_last() {
 #[test]
 fn a_large_sweep_prints_its_best_and_its_worst_points() {
     for points in [12, 15] {
-        let seeds: Vec<usize> = (0..points).collect();
-        let (folder, sweep) = write_sweep(&format!("{}[grid]\n\"learning.seed\" = {seeds:?}\n", support::TINY));
+        let (folder, sweep) = sweep_of_seeds(points);
         let out = folder.path().join("out");
         let text = succeed(flotilla(&sweep, &out, &["--quiet"]));
         let mut table = csv::Reader::from_path(out.join("points.csv")).unwrap();
@@ -879,8 +884,7 @@ fn damaged_points_are_reported_as_missing() {
 #[test]
 fn at_most_twenty_missing_points_are_listed() {
     for points in [21, 22] {
-        let seeds: Vec<usize> = (0..points).collect();
-        let (folder, sweep) = write_sweep(&format!("{}[grid]\n\"learning.seed\" = {seeds:?}\n", support::TINY));
+        let (folder, sweep) = sweep_of_seeds(points);
         let out = folder.path().join("out");
         succeed(flotilla(&sweep, &out, &["--quiet", "--shard", &format!("1/{points}")]));
         let error = fail(flotilla(&sweep, &out, &["--collect"]), 1);

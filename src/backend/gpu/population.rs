@@ -303,7 +303,7 @@ impl DevicePopulation for Population {
                 let nonce = bytemuck::bytes_of(&expected[self.done.len()]);
                 gpu.scoped("reading back", || gpu.write(&self.status, nonce_at, nonce))?;
                 let ranges = [(buffer, bytes.start as u64..bytes.end as u64), (&self.status, 0..end)];
-                let is_done = gpu.read_by(&landing, &ranges, |read| {
+                let is_done = gpu.read_through(&landing, &ranges, |read| {
                     let (piece, status) = read.split_at(bytes.len());
                     // All threads copy, because the host's memory may be new, and the system then clears it page by page.
                     let target = &mut bytemuck::cast_slice_mut::<f32, u8>(policies)[bytes.clone()];

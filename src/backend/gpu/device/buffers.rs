@@ -90,10 +90,10 @@ impl Gpu {
     /// The device was lost, or has too little memory for the copy.
     pub fn read<T: Pod>(&self, ranges: &[(&wgpu::Buffer, Range<u64>)]) -> Result<Vec<T>, DeviceError> {
         let landing = self.landing(ranges.iter().map(|(_, bytes)| bytes.end - bytes.start).sum())?;
-        self.read_by(&landing, ranges, bytemuck::pod_collect_to_vec)
+        self.read_through(&landing, ranges, bytemuck::pod_collect_to_vec)
     }
 
-    /// Creates a buffer of `bytes` bytes for [`Gpu::read_by`].
+    /// Creates a buffer of `bytes` bytes for [`Gpu::read_through`].
     ///
     /// # Errors
     /// It exceeds the device's limits, or there is too little memory.
@@ -101,12 +101,12 @@ impl Gpu {
         self.buffer("reading back", bytes, wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::MAP_READ)
     }
 
-    /// [`Gpu::read`] with a buffer that several reads share, because drivers take long to create one. Calls `show` with
-    /// the bytes of all ranges.
+    /// Reads like [`Gpu::read`], through a buffer of [`Gpu::landing`] that several reads share, because drivers take long
+    /// to create one. Calls `show` with the bytes of all ranges.
     ///
     /// # Errors
     /// The device was lost, or the buffer cannot be read.
-    pub(in crate::backend::gpu) fn read_by<T>(
+    pub(in crate::backend::gpu) fn read_through<T>(
         &self,
         landing: &wgpu::Buffer,
         ranges: &[(&wgpu::Buffer, Range<u64>)],
