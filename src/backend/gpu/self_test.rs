@@ -16,8 +16,10 @@ use crate::backend::compare::first_mismatch;
 use crate::backend::cpu::Cpu;
 use crate::backend::{Backend, BackendError, DevicePopulation, Group, Weights};
 use crate::config::{Config, Fitness, Learning, Sharing};
+use crate::config_enum::Choice;
 use crate::credit::{Episode, Seen};
 use crate::evolve::{Breeding, Key, Purpose};
+use crate::model::sense::Density;
 use crate::parallel::lock;
 use crate::sample;
 use crate::world::World;
@@ -181,10 +183,16 @@ fn arithmetic(gpu: &Gpu) -> Result<Option<Deviation>, DeviceError> {
     }))
 }
 
-/// Tests an episode of the paper's first layout, stage by stage.
+/// Tests an episode of the paper's first layout with each density, stage by stage.
 fn episode(gpu: &Gpu) -> Result<Option<Deviation>, DeviceError> {
+    let by_density = |(_, density): &_| episode_with(gpu, *density).transpose();
+    Density::ALL.iter().find_map(by_density).transpose()
+}
+
+fn episode_with(gpu: &Gpu, density: Density) -> Result<Option<Deviation>, DeviceError> {
     const TEAMS: usize = 8;
-    let config = Config::parse(CONFIG, "generally_forward.toml").expect("the project's own config");
+    let mut config = Config::parse(CONFIG, "generally_forward.toml").expect("the project's own config");
+    config.sense.density = density;
     let world = World::new(&config);
     let weights = sample::weights(&world, TEAMS, 0);
     let teams: Vec<u32> = (0..TEAMS as u32).flat_map(|team| vec![team; world.leaders()]).collect();
@@ -205,7 +213,7 @@ fn episode(gpu: &Gpu) -> Result<Option<Deviation>, DeviceError> {
     }
     let found = episodes.trace(&group).map_err(traced)?;
     Ok(first_mismatch(&world, &expected, &found).map(|mismatch| Deviation {
-        probe: format!("an episode, {mismatch}").into(),
+        probe: format!("an episode with {density} density, {mismatch}").into(),
         values: Vec::new(),
         cpu: mismatch.expected,
         gpu: mismatch.found,
