@@ -2,7 +2,7 @@
 //!
 //! Random records cover every rule, fitness and memory layout. Small records made by hand test one property each.
 
-use flotilla::config::{Fitness, LedBy, Observers};
+use flotilla::config::{Choice, Fitness, LedBy, Observers};
 use flotilla::credit::{Credit, Episode, RecordRequest, Scores, Seen, Strided, owner_bits};
 use flotilla::model::rule;
 use flotilla::world::{Constants, Led, World};
@@ -322,14 +322,13 @@ fn compare(record: &Record, credit: &mut Credit, rng: &mut ChaCha8Rng, stride: u
     if world.rule.is_timed() {
         return expected;
     }
-    let requests: [&[Fitness]; 5] =
-        [&[Fitness::D, Fitness::Df, Fitness::Dpp], &[Fitness::G], &[Fitness::D], &[Fitness::Df], &[Fitness::Dpp]];
-    for request in requests {
-        let (sets, owners) = record.packed(RecordRequest(request));
+    let single = Fitness::ALL.iter().map(|&(_, fitness)| vec![fitness]).filter(|request| request != &[Fitness::Dt]);
+    for request in [vec![Fitness::D, Fitness::Df, Fitness::Dpp]].into_iter().chain(single) {
+        let (sets, owners) = record.packed(RecordRequest(&request));
         let contiguous = |words| Strided { words, stride: 1, offset: 0 };
         let seen = Seen::Owners(contiguous(&owners));
         let episode = Episode { sets: contiguous(&sets), seen, sights: Strided::NONE };
-        let &[fitness] = request else {
+        let [fitness] = request[..] else {
             let found = Scores { dt: expected.dt.clone(), ..credit.all(&episode, &world) };
             assert_eq!(found, expected, "packed record");
             continue;

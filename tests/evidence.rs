@@ -9,7 +9,7 @@ use std::path::PathBuf;
 use assert_cmd::cargo::cargo_bin_cmd;
 use flotilla::backend::cpu::Cpu;
 use flotilla::backend::{Backend, BackendError, Group, GroupScores, Trace};
-use flotilla::config::Fitness;
+use flotilla::config::{Choice, Fitness};
 use flotilla::record::evidence::{Compared, MachineReport, SCHEMA, Tier};
 use flotilla::verify::{self, Plan};
 
@@ -98,6 +98,9 @@ impl Backend for FaultyBackend {
 fn a_single_world_is_compared_with_every_kind_of_scores() {
     let worlds = verify::short_trainings().into_iter().take(1).collect();
     let plan = Plan { worlds, teams: 64, seed: 0, generations: 0 };
+    for (word, fitness) in Fitness::ALL {
+        assert!(verify::KINDS.contains(&&[*fitness][..]), "no kind of scores is {word} alone");
+    }
     for fitnesses in verify::KINDS {
         let mut faulty = FaultyBackend { cpu: Cpu::default(), fitnesses };
         let outcome = verify::compare(&plan, &mut Cpu::default(), &mut faulty, |_| {}).unwrap();

@@ -13,7 +13,7 @@ use flotilla::backend::cpu::{Cpu, level_name};
 #[cfg(feature = "gpu")]
 use flotilla::backend::gpu::{self, episode::GpuBackend};
 use flotilla::backend::{Backend, BackendError, Group, GroupScores, Trace};
-use flotilla::config::{Config, Override, ValidConfig};
+use flotilla::config::{self, Config, Override, ValidConfig};
 use flotilla::trainer::{Row, Trainer};
 use flotilla::world::World;
 use sha2::{Digest, Sha256};
@@ -376,6 +376,22 @@ const HEADER: &str = "\
 # Users with runs of earlier versions rely on these digests. If results have to change, give the reason in the changelog
 # and record the digests again: FLOTILLA_MINT=1 cargo test --test golden
 ";
+
+#[test]
+fn the_cases_have_every_word_of_every_key() {
+    let tables: Vec<toml::Table> = CONFIGS.iter().map(|config| config.to_toml().parse().unwrap()).collect();
+    let keys = config::keys().into_iter().filter(|key| key.kind == "word");
+    let mut words = 0;
+    for key in keys {
+        let (section, name) = key.name.split_once('.').unwrap();
+        for word in key.range.split(" or ").map(|word| word.trim_matches('"')) {
+            let has_word = |table: &toml::Table| table[section][name].as_str() == Some(word);
+            assert!(tables.iter().any(has_word), "no case has {} = '{word}'", key.name);
+            words += 1;
+        }
+    }
+    assert!(words > 20, "only {words} words were found in the table of keys");
+}
 
 /// Trains all cases and compares them with the recorded digests.
 pub fn check(machine: &str, backend: &mut dyn Backend) {

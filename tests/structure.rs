@@ -1,8 +1,11 @@
-//! Tests the structure of the crate: modules import downwards, and only one module reads the clock.
+//! Tests the structure of the crate: modules import downwards, only one module reads the clock, and the browser page
+//! offers every fitness.
 
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
+
+use flotilla::config::{Choice, Fitness};
 
 /// Returns the Rust files of a module, given its path without an extension.
 fn files(module: &Path) -> Vec<PathBuf> {
@@ -220,4 +223,15 @@ fn the_public_interface_is_as_listed() {
          If programs that use it still build, or this is a new minor version: \
          FLOTILLA_WRITE=1 cargo test --test structure"
     );
+}
+
+#[test]
+fn the_browser_page_has_every_fitness() {
+    let page = fs::read_to_string("web/page/index.html").unwrap();
+    let select = page.split("<select id=\"fitness\">").nth(1).and_then(|rest| rest.split("</select>").next()).unwrap();
+    let compare = fs::read_to_string("web/page/compare.js").unwrap();
+    for word in Fitness::names() {
+        assert!(select.contains(&format!("<option>{word}</option>")), "index.html does not offer {word}");
+        assert!(compare.contains(&format!("\"{word}\"")), "compare.js does not compare {word}");
+    }
 }

@@ -800,7 +800,7 @@ def check_first_visit(tab, page, call, downloads):
     tab.click("#undo")
     assert tab.evaluate("page.state.compared") is None
     tab.assert_no_errors()
-    print("five fitnesses are compared, and each arm's command gives its digest")
+    print("all fitnesses are compared, and each arm's command gives its digest")
 
     # The controls can edit any valid TOML, and keep its comments.
     for text in TOML_STYLES:

@@ -24,7 +24,7 @@ def actions_of(trace, step):
 
 
 @pytest.mark.parametrize("seed", range(10))
-@pytest.mark.parametrize("reward", ["G", "D", "Df", "D++", "Dt"])
+@pytest.mark.parametrize("reward", flotilla._native.FITNESSES)
 def test_steps_with_the_actions_of_policies_give_the_bits_of_a_rollout(seed, reward):
     config = random_config(seed).replace(learning={"start_jitter": 0.0, "poi_jitter": 0.0, "fitness": reward})
     policies = random_policies(config, 11, seed)
@@ -48,7 +48,7 @@ def test_steps_with_the_actions_of_policies_give_the_bits_of_a_rollout(seed, rew
     if reward == "G":
         assert np.allclose(total, scores.g[:, None], atol=1e-6)
     else:
-        expected = {"D": scores.d, "Df": scores.df, "D++": scores.dpp, "Dt": scores.dt}[reward]
+        expected = scores[reward]
         assert np.array_equal(rewards.view(np.uint32), expected.view(np.uint32))
     assert np.array_equal(env.observed.sum(1), scores.observed)
 

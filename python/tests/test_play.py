@@ -231,7 +231,7 @@ except KeyboardInterrupt:
     assert 0 <= seconds < 5, finished
 
 
-@pytest.mark.parametrize("reward", ["G", "D", "Df", "D++", "Dt"])
+@pytest.mark.parametrize("reward", flotilla._native.FITNESSES)
 @pytest.mark.parametrize("seed", range(4))
 def test_collect_equals_the_steps_of_an_environment(reward, seed):
     config = random_config(seed)

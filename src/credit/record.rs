@@ -31,23 +31,30 @@ impl RecordRequest<'_> {
     /// Returns the minimum number of agents in a set that can affect a score, at a POI of this coupling. `None` if the
     /// sets of all steps are needed.
     pub fn least(self, coupling: u32) -> Option<u32> {
-        match self {
+        let least = |fitness: &Fitness| match fitness {
             // Dt depends on when sets occur.
-            _ if self.sights() => None,
+            Fitness::Dt => None,
             // D++ depends on how many agents are missing.
-            RecordRequest(fitnesses) if fitnesses.contains(&Fitness::Dpp) => Some(1),
-            _ => Some(coupling),
-        }
+            Fitness::Dpp => Some(1),
+            Fitness::G | Fitness::D | Fitness::Df => Some(coupling),
+        };
+        self.0.iter().map(least).fold(Some(coupling), |least, needed| Some(least?.min(needed?)))
     }
 
     /// Reports whether the leader that each follower saw most is needed.
     pub fn owners(self) -> bool {
-        self.0.contains(&Fitness::Df)
+        self.0.iter().any(|fitness| match fitness {
+            Fitness::Df => true,
+            Fitness::G | Fitness::D | Fitness::Dpp | Fitness::Dt => false,
+        })
     }
 
     /// Reports whether the leaders that each follower saw at each step are needed.
     pub(crate) fn sights(self) -> bool {
-        self.0.contains(&Fitness::Dt)
+        self.0.iter().any(|fitness| match fitness {
+            Fitness::Dt => true,
+            Fitness::G | Fitness::D | Fitness::Df | Fitness::Dpp => false,
+        })
     }
 }
 

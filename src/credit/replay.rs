@@ -26,7 +26,7 @@ impl Credit {
                 gather(owner, world, groups);
             }
             Fitness::Dt => lead(&episode.sights, world, led),
-            _ => {}
+            Fitness::G | Fitness::D | Fitness::Dpp => {}
         }
         for (leader, score) in scores.iter_mut().enumerate().take(leaders) {
             let mut lost = || {
@@ -46,7 +46,9 @@ impl Credit {
                         };
                         replay.observe_without(observed_at, stay, counterfactual);
                     }
-                    _ => replay.observe_without(observed_at, alone, counterfactual),
+                    Fitness::G | Fitness::D | Fitness::Dpp => {
+                        replay.observe_without(observed_at, alone, counterfactual);
+                    }
                 }
                 observed - count(counterfactual)
             };
