@@ -61,8 +61,9 @@
 //! |---|---|
 //! | add a density | `model/sense.rs` and its shader `shaders/sense.wgsl`, `bench/operations.rs` |
 //! | add a fitness | `config/learning.rs`, `credit/` (`mod.rs`, `replay.rs`; `record.rs` for what it needs, `fast.rs` for speed) |
-//! | show a fitness beside the others | `evaluate.rs`, `cli/rollout.rs`, `report/replay/page.rs` |
-//! | add a place that holds populations | a backend with `Backend::hold` and a `DevicePopulation`, see `backend/gpu/population.rs` |
+//! | test a new word of a key | `tests/model.rs` or `tests/credit.rs`, a case in `tests/golden.rs`; for a fitness `KINDS` in `verify.rs` |
+//! | show a fitness beside the others | `evaluate.rs`, `ops/rollout.rs`, `report/replay/page.rs`, `python/flotilla/_play.py`, `web/page/` |
+//! | add a place that holds populations | a backend with `Backend::hold` and a `DevicePopulation`, such as `FakeDevice` in `tests/population.rs` |
 //! | add a claim of the paper | `report/paper/claims/list.rs` |
 //! | add an open question | `sweep/questions/list.rs`, `configs/questions/` |
 //! | add a kind of value in configs | `reader/request.rs`, `reader/allowed.rs` |

@@ -21,7 +21,7 @@ pub struct Group<'a> {
     pub starts: &'a [Vec2],
     /// The policies.
     pub weights: Weights<'a>,
-    /// Policies per population.
+    /// Policies per population. In training these are its [slots](crate::config::Learning::slots).
     pub policies: usize,
     /// Whether each leader chooses from a population of its own.
     pub sharing: Sharing,
@@ -62,7 +62,8 @@ impl<'a> Group<'a> {
         (population * self.policies + policy) * self.world.parameters()
     }
 
-    /// Checks the group. Every backend calls this before it plays.
+    /// Checks the group. Every backend calls this before it plays. A backend that holds the policies also checks their
+    /// number.
     ///
     /// # Errors
     /// An array has the wrong length, the world is inconsistent, or a team plays a policy that does not exist.

@@ -69,7 +69,9 @@ pub trait Backend: Send {
 
 /// The populations of one trial in a device's memory, which dropping them frees.
 ///
-/// After an error their generation is undefined.
+/// After an error their generation is undefined. A backend recognises its own populations in [`Weights::OnDevice`] by a
+/// cast to [`Any`]. If they are in the host's memory in another form, [`Breeding::on_host`] computes the next
+/// generation; `FakeDevice` in `tests/population.rs` is such a backend.
 pub trait DevicePopulation: Any + Debug + Send + Sync {
     /// Replaces the populations by the next generation, with the bits of [`crate::evolve::mutate`].
     ///
