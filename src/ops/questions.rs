@@ -7,6 +7,7 @@ use serde::Serialize;
 use super::paper::Request;
 use super::sweep::{claim, free_memory, same_sweep};
 use super::{BackendSource, Context, Error, Event, check_memory, with_remedy};
+use crate::backend::OpenBackend;
 use crate::choice::Work;
 use crate::config::Config;
 use crate::escape::PathExt;
@@ -17,7 +18,7 @@ use crate::report::comparison::{self, Comparison};
 use crate::report::curves::PRINT;
 use crate::report::scene::Format;
 use crate::run::{Session, SessionEnd};
-use crate::sweep::questions::{self, Answer, OpenQuestion, QUESTIONS, Study};
+use crate::sweep::questions::{self, Answer, OpenQuestion, QUESTIONS, Study, Warm};
 use crate::sweep::results::point_folder;
 use crate::sweep::run::SweepProgress;
 use crate::sweep::{Sweep, shard};
@@ -81,21 +82,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         let trials = sweep.points[0].config.learning.trials;
         return Err(Error::Usage(format!("--trials {trials}: intervals and tests take two trials or more").into()));
     }
-    if let Some(what) = folder::collection(out) {
-        return Err(Error::Refused(with_remedy(format!("{} holds {what}", out.escaped()), "choose another --out")));
-    }
-    if folder::holds_run(out)? {
-        return Err(Error::Refused(with_remedy(format!("{} holds a run", out.escaped()), "choose another --out")));
-    }
-    parts.iter().try_for_each(|(part, sweep)| same_sweep(sweep, &out.join(part.name)))?;
-    if !all_parts().any(|part| out.join(part.name).join(SWEEP).exists())
-        && let Some(theirs) = files().chain([PAGE.into()]).find(|name| out.join(name).exists())
-    {
-        return Err(Error::Refused(with_remedy(
-            format!("{} holds {theirs}, but none of the questions' sweeps", out.escaped()),
-            "choose another --out",
-        )));
-    }
+    check_folder(&parts, out)?;
     let configs = || parts.iter().flat_map(|(_, sweep)| &sweep.points).map(|point| &point.config);
     let (backend, on) = backends.open(Work::of(configs().map(|config| &**config)))?;
     check_memory(configs(), backend)?;
@@ -114,70 +101,8 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let folders: Vec<(PathBuf, &Config)> = points.chain(warm_runs).collect();
     folder::check(&disk, folders.iter().map(|(path, config)| (&**path, *config)), start)?;
 
-    let stopped = || Error::Stopped("with everything saved".into());
-    let cost = |sweep: &Sweep| sweep.points.iter().map(shard::cost).sum::<u128>() as f64;
-    // Each warm start costs as much as an average point of its sweep.
-    let times = |at: usize| 1.0 + warm[at].len() as f64 / parts[at].1.points.len() as f64;
-    let whole: f64 = parts.iter().enumerate().map(|(at, (_, sweep))| cost(sweep) * times(at)).sum();
-    let mut before = 0.0;
-    for (at, (part, sweep)) in parts.iter().enumerate() {
-        let folder = out.join(part.name);
-        claim(&disk, sweep, &folder)?;
-        let points: Vec<_> = sweep.points.iter().collect();
-        let share = |now: &SweepProgress| {
-            let share = now.played as f64 / now.total.max(1) as f64;
-            let text = format!("{}: {}/{} experiments done", part.name, now.done, now.points);
-            (context.report)(Event::Fraction((before + share * cost(sweep)) / whole, text));
-        };
-        let ended =
-            super::sweep::train_points(context, sweep, &points, &folder, start, &disk, free_memory(), backend, &share)?;
-        if ended == SessionEnd::Stopped {
-            return Err(stopped());
-        }
-        before += cost(sweep);
-        if warm[at].is_empty() {
-            continue;
-        }
-        let runs = warm[at].iter().map(|run| {
-            Ok((run.config.clone(), run.folder.clone(), Some(policies::read_init(&run.policies, &run.config)?)))
-        });
-        let (mut session, _) = Session::open_from(runs.collect::<Result<_, RecordError>>()?, start, &disk)?;
-        let mut watch = |_: &crate::run::Progress<'_>| {
-            (context.report)(Event::Fraction(before / whole, format!("{}: warm starts", part.name)));
-        };
-        if !session.is_done()
-            && context.train(&mut watch, |options| session.train(backend, options))? == SessionEnd::Stopped
-        {
-            return Err(stopped());
-        }
-        before += cost(sweep) * (times(at) - 1.0);
-    }
-
-    let mut answers: Vec<(OpenQuestion, Vec<Answer>)> = Vec::new();
-    for question in QUESTIONS.iter().filter(|question| request.questions.contains(&question.letter)) {
-        let mut of_parts = Vec::new();
-        for part in question.parts {
-            if context.is_stopped() {
-                return Err(stopped());
-            }
-            let sweep = parts.iter().find(|(other, _)| other.name == part.name).map(|(_, sweep)| sweep);
-            let Some(sweep) = sweep else { continue };
-            (context.report)(Event::Fraction(1.0, format!("comparing {}", part.name)));
-            let answer = part.answer(sweep, out, &mut *backend.0)?;
-            for kind in Format::ALL {
-                let path = out.join(format!("{}.{}", part.name, kind.extension()));
-                let bytes = answer.scene().file(kind, PRINT);
-                write(&disk, &path, bytes)?;
-            }
-            let mut csv = Vec::new();
-            let all: Vec<_> = answer.comparisons().cloned().collect();
-            let path = out.join(format!("{}.csv", part.name));
-            write(&disk, &path, comparison::csv(&all, &mut csv).map(|()| csv))?;
-            of_parts.push(answer);
-        }
-        answers.push((*question, of_parts));
-    }
-    (context.report)(Event::Pause);
+    train(&parts, &warm, request, &disk, backend, context)?;
+    let answers = compare(&parts, request, &disk, backend, context)?;
     let first = &parts[0].1.points[0].config.learning;
     let heading = format!(
         "Means over {} trials of seed {} with 95 % bootstrap intervals. In parentheses beside a champion's G is that of the\n\
@@ -202,6 +127,118 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         page: out.join(PAGE).escaped().to_string(),
         text: page,
     })
+}
+
+/// Refuses a folder with other content, or with other sweeps.
+fn check_folder(parts: &[(&Study, Sweep)], out: &Path) -> Result<(), Error> {
+    let refused = |what: &str| {
+        let reason = format!("{} holds {what}", out.escaped());
+        Err(Error::Refused(with_remedy(reason, "choose another --out")))
+    };
+    if let Some(what) = folder::collection(out) {
+        return refused(what);
+    }
+    if folder::holds_run(out)? {
+        return refused("a run");
+    }
+    parts.iter().try_for_each(|(part, sweep)| same_sweep(sweep, &out.join(part.name)))?;
+    let has_sweeps = all_parts().any(|part| out.join(part.name).join(SWEEP).exists());
+    match files().chain([PAGE.into()]).find(|name| out.join(name).exists()) {
+        Some(theirs) if !has_sweeps => refused(&format!("{theirs}, but none of the questions' sweeps")),
+        _ => Ok(()),
+    }
+}
+
+/// Returns the error of a command that the user stops.
+fn stopped() -> Error {
+    Error::Stopped("with everything saved".into())
+}
+
+/// Trains the sweep of each part, and then its runs from policies of that sweep.
+fn train(
+    parts: &[(&Study, Sweep)],
+    warm: &[Vec<Warm>],
+    request: &Request,
+    disk: &Disk,
+    backend: &mut OpenBackend,
+    context: Context<'_>,
+) -> Result<(), Error> {
+    let (out, start) = (&request.out, request.start);
+    let cost = |sweep: &Sweep| sweep.points.iter().map(shard::cost).sum::<u128>() as f64;
+    // Each warm start costs as much as an average point of its sweep.
+    let times = |at: usize| 1.0 + warm[at].len() as f64 / parts[at].1.points.len() as f64;
+    let whole: f64 = parts.iter().enumerate().map(|(at, (_, sweep))| cost(sweep) * times(at)).sum();
+    let mut before = 0.0;
+    for (at, (part, sweep)) in parts.iter().enumerate() {
+        let folder = out.join(part.name);
+        claim(disk, sweep, &folder)?;
+        let points: Vec<_> = sweep.points.iter().collect();
+        let share = |now: &SweepProgress| {
+            let share = now.played as f64 / now.total.max(1) as f64;
+            let text = format!("{}: {}/{} experiments done", part.name, now.done, now.points);
+            (context.report)(Event::Fraction((before + share * cost(sweep)) / whole, text));
+        };
+        let ended =
+            super::sweep::train_points(context, sweep, &points, &folder, start, disk, free_memory(), backend, &share)?;
+        if ended == SessionEnd::Stopped {
+            return Err(stopped());
+        }
+        before += cost(sweep);
+        if warm[at].is_empty() {
+            continue;
+        }
+        let runs = warm[at].iter().map(|run| {
+            Ok((run.config.clone(), run.folder.clone(), Some(policies::read_init(&run.policies, &run.config)?)))
+        });
+        let (mut session, _) = Session::open_from(runs.collect::<Result<_, RecordError>>()?, start, disk)?;
+        let mut watch = |_: &crate::run::Progress<'_>| {
+            (context.report)(Event::Fraction(before / whole, format!("{}: warm starts", part.name)));
+        };
+        if !session.is_done()
+            && context.train(&mut watch, |options| session.train(backend, options))? == SessionEnd::Stopped
+        {
+            return Err(stopped());
+        }
+        before += cost(sweep) * (times(at) - 1.0);
+    }
+    Ok(())
+}
+
+/// Compares the results of each question's parts, and writes their pictures and tables.
+fn compare(
+    parts: &[(&Study, Sweep)],
+    request: &Request,
+    disk: &Disk,
+    backend: &mut OpenBackend,
+    context: Context<'_>,
+) -> Result<Vec<(OpenQuestion, Vec<Answer>)>, Error> {
+    let out = &request.out;
+    let mut answers: Vec<(OpenQuestion, Vec<Answer>)> = Vec::new();
+    for question in QUESTIONS.iter().filter(|question| request.questions.contains(&question.letter)) {
+        let mut of_parts = Vec::new();
+        for part in question.parts {
+            if context.is_stopped() {
+                return Err(stopped());
+            }
+            let sweep = parts.iter().find(|(other, _)| other.name == part.name).map(|(_, sweep)| sweep);
+            let Some(sweep) = sweep else { continue };
+            (context.report)(Event::Fraction(1.0, format!("comparing {}", part.name)));
+            let answer = part.answer(sweep, out, &mut *backend.0)?;
+            for kind in Format::ALL {
+                let path = out.join(format!("{}.{}", part.name, kind.extension()));
+                let bytes = answer.scene().file(kind, PRINT);
+                write(disk, &path, bytes)?;
+            }
+            let mut csv = Vec::new();
+            let all: Vec<_> = answer.comparisons().cloned().collect();
+            let path = out.join(format!("{}.csv", part.name));
+            write(disk, &path, comparison::csv(&all, &mut csv).map(|()| csv))?;
+            of_parts.push(answer);
+        }
+        answers.push((*question, of_parts));
+    }
+    (context.report)(Event::Pause);
+    Ok(answers)
 }
 
 fn write(disk: &Disk, path: &Path, bytes: std::io::Result<Vec<u8>>) -> Result<(), Error> {

@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 
 use super::remedy::RUNS;
 use super::{BackendSource, ConfigText, Context, Error, Event, Processor, check_memory, escaped, with_remedy};
+use crate::backend::OpenBackend;
 use crate::choice::Work;
 use crate::config::Config;
 use crate::escape::PathExt;
@@ -205,83 +206,22 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let (backend, on) = backends.open(Work::of([&*config]))?;
     check_memory([&config], backend)?;
     context.warn_of_unreachable(&config);
-    let (init, start) = (request.init.as_deref(), request.start);
-    let first = init.map(|path| policies::read_init(path, &config)).transpose()?;
     let folder = request.folder()?;
-    if let Some(what) = folder::collection(&folder) {
-        let text = format!("{} holds {what}, not a run", folder.escaped());
-        return Err(Error::Refused(with_remedy(text, "choose another --out")));
-    }
-    if let Some(path) = init.filter(|path| file::resolved(path) == file::resolved(&folder.join(POLICIES))) {
-        let text = format!("--init {}: this run would be written over it", path.escaped());
-        return Err(Error::Usage(with_remedy(text, "choose another --out")));
-    }
-    let disk = Disk::default();
-    if folder.is_dir() {
-        let disk = ownership::open_output_folder(&disk, &folder, request.out.is_some())?;
-        // A foreign picture must not prevent a run from being resumed.
-        if start != Start::Resume {
-            ownership::check(&disk, [folder.join(CURVES)])?;
-        }
-    }
-    let opened = Session::open_from(vec![(Config::clone(&config), folder.clone(), first)], start, &disk);
-    let (mut session, found) = opened.map_err(|error| match error {
-        RunError::Record(RecordError::Exists { .. }) if request.tensorboard => Error::Refused(with_remedy(
-            format!("{error}\nfor event files of the run that is there:"),
-            format!("  {}", request.command_to_resume(&folder, context)),
-        )),
-        // This avoids the advice to use `--resume`. Until the run's origin is recorded, a resumed run would start from
-        // random policies.
-        RunError::Record(error) if init.is_some() => error.into(),
-        error => error.into(),
-    })?;
-    for (_, note) in found {
-        if note.is_damage() { context.warn(note) } else { context.note(note) }
-    }
-    let disk = session.disk(0).clone();
-    let mut events = EventFiles::open(request, &folder, config.learning.trials, &disk, context);
-    let (since, from) = (Instant::now(), session.generations()[0]);
-    let (was_done, mut last) = (session.is_done(), config.learning.generations);
+    let mut session = open_session(request, &config, &folder, context)?;
+    let (since, from, was_done) = (Instant::now(), session.generations()[0], session.is_done());
     if !was_done {
         context.message(format_args!("training on {on}, into {}", folder.escaped()));
-        (context.report)(Event::Begin(vec![(String::new(), config.pois())], from, last));
+        (context.report)(Event::Begin(vec![(String::new(), config.pois())], from, config.learning.generations));
     }
-    while !session.is_done() {
-        let mut watch = |progress: &Progress<'_>| {
-            context.rows(progress.generations[0], progress.rows);
-            events.add(progress.rows);
-        };
-        let ended = context.train(&mut watch, |options| session.train(backend, options));
-        context.pause();
-        events.flush();
-        if ended? == SessionEnd::Finished {
-            break;
-        }
-        if !context.ends() {
-            let next = session.generations()[0];
-            return Err(Error::Stopped(with_remedy(
-                format!("before generation {next} of {last}, with everything saved"),
-                format!("continue with\n  {}", request.command_to_resume(&folder, context)),
-            )));
-        }
-        last = session.end()?;
-    }
+    let last = train(&mut session, request, &folder, backend, context)?;
     let (config, results) = (session.config(0), session.results(0).expect("the run is done"));
     // A session that ended after the run but before its picture left an older picture, or none.
     let is_drawn = || fs::read_to_string(folder.join(CURVES)).is_ok_and(|svg| Scene::shows(&svg, &results.digest));
-    if let Some(error) = (!was_done || !is_drawn()).then(|| draw(&disk, &folder).err()).flatten() {
+    if let Some(error) = (!was_done || !is_drawn()).then(|| draw(session.disk(0), &folder).err()).flatten() {
         // Everything that was learned is already saved.
         context.warn(format_args!("{}: not drawn: {}", folder.join(CURVES).escaped(), error.message()));
     }
-    let ever = |all: Vec<History>| all.iter().any(|history| history.most() > 0.0);
-    if !History::all(&folder, config, Verification::Required).is_ok_and(ever) {
-        context.warn(format_args!(
-            "warning: no team observed any POI in any generation, so there was nothing to learn from; try more \
-             world.steps, a smaller world.coupling, POIs nearer to the starts, or a larger learning.population; \
-             `flotilla replay {}` shows what teams do",
-            shell::quoted(shell::argument(&folder))
-        ));
-    }
+    warn_if_nothing_was_observed(&folder, config, context);
     let learning = &config.learning;
     Ok(Outcome {
         config: request.name.clone(),
@@ -303,6 +243,92 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         trained_on: (!was_done).then_some(on),
         folder,
     })
+}
+
+/// Opens the run's folder, and tells the user what was found there.
+fn open_session(request: &Request, config: &Config, folder: &Path, context: Context<'_>) -> Result<Session, Error> {
+    let (init, start) = (request.init.as_deref(), request.start);
+    let first = init.map(|path| policies::read_init(path, config)).transpose()?;
+    if let Some(what) = folder::collection(folder) {
+        let text = format!("{} holds {what}, not a run", folder.escaped());
+        return Err(Error::Refused(with_remedy(text, "choose another --out")));
+    }
+    if let Some(path) = init.filter(|path| file::resolved(path) == file::resolved(&folder.join(POLICIES))) {
+        let text = format!("--init {}: this run would be written over it", path.escaped());
+        return Err(Error::Usage(with_remedy(text, "choose another --out")));
+    }
+    let disk = Disk::default();
+    if folder.is_dir() {
+        let disk = ownership::open_output_folder(&disk, folder, request.out.is_some())?;
+        // A foreign picture must not prevent a run from being resumed.
+        if start != Start::Resume {
+            ownership::check(&disk, [folder.join(CURVES)])?;
+        }
+    }
+    let opened = Session::open_from(vec![(config.clone(), folder.to_path_buf(), first)], start, &disk);
+    let (session, found) = opened.map_err(|error| match error {
+        RunError::Record(RecordError::Exists { .. }) if request.tensorboard => Error::Refused(with_remedy(
+            format!("{error}\nfor event files of the run that is there:"),
+            format!("  {}", request.command_to_resume(folder, context)),
+        )),
+        // This avoids the advice to use `--resume`. Until the run's origin is recorded, a resumed run would start from
+        // random policies.
+        RunError::Record(error) if init.is_some() => error.into(),
+        error => error.into(),
+    })?;
+    for (_, note) in found {
+        if note.is_damage() { context.warn(note) } else { context.note(note) }
+    }
+    Ok(session)
+}
+
+/// Trains a run to its end, or until the user ends it. Returns the last generation, which is earlier in that case.
+fn train(
+    session: &mut Session,
+    request: &Request,
+    folder: &Path,
+    backend: &mut OpenBackend,
+    context: Context<'_>,
+) -> Result<usize, Error> {
+    let learning = &session.config(0).learning;
+    let (trials, mut last) = (learning.trials, learning.generations);
+    let disk = session.disk(0).clone();
+    let mut events = EventFiles::open(request, folder, trials, &disk, context);
+    while !session.is_done() {
+        let mut watch = |progress: &Progress<'_>| {
+            context.rows(progress.generations[0], progress.rows);
+            events.add(progress.rows);
+        };
+        let ended = context.train(&mut watch, |options| session.train(backend, options));
+        context.pause();
+        events.flush();
+        if ended? == SessionEnd::Finished {
+            break;
+        }
+        if !context.ends() {
+            let next = session.generations()[0];
+            return Err(Error::Stopped(with_remedy(
+                format!("before generation {next} of {last}, with everything saved"),
+                format!("continue with\n  {}", request.command_to_resume(folder, context)),
+            )));
+        }
+        // The generation that is played next becomes the last.
+        last = session.end()?;
+    }
+    Ok(last)
+}
+
+/// Warns if no team observed a POI in any generation.
+fn warn_if_nothing_was_observed(folder: &Path, config: &Config, context: Context<'_>) {
+    let ever = |all: Vec<History>| all.iter().any(|history| history.most() > 0.0);
+    if !History::all(folder, config, Verification::Required).is_ok_and(ever) {
+        context.warn(format_args!(
+            "warning: no team observed any POI in any generation, so there was nothing to learn from; try more \
+             world.steps, a smaller world.coupling, POIs nearer to the starts, or a larger learning.population; \
+             `flotilla replay {}` shows what teams do",
+            shell::quoted(shell::argument(folder))
+        ));
+    }
 }
 
 /// The results of a training in memory.
