@@ -42,25 +42,56 @@ impl Folder {
         if found.finished.is_some() {
             return began.map_or(Ok(()), |existing| self.check_init(existing, init));
         }
-        // If the config file agrees with the given config but the origin does not, then the file was edited.
-        let edited = || {
-            let origin = found.run.as_ref()?.origin.as_ref().filter(|origin| !origin.allows(config))?;
-            let (path, existing, requested) = (self.path.clone(), origin.generations, config.learning.generations);
-            Some(match existing > requested {
-                true => RecordError::Shorter { path, existing, requested },
-                false if before.is_some() => RecordError::Edited { path: self.file(CONFIG) },
-                false => {
-                    let differences = vec![format!("  {} has another digest", self.file(RUN).display())];
-                    RecordError::ConfigDiffers { path, differences }
-                }
-            })
-        };
-        let edited = edited();
-        let any = !kept.is_empty();
+        let edited = self.edited(config, found.run.as_ref(), before.is_some());
+        let had_checkpoints = !kept.is_empty();
+        self.find_checkpoint(config, before.as_ref(), edited.is_some(), init, &mut kept, found)?;
+        if found.checkpoint.is_none() {
+            edited.map_or(Ok(()), Err)?;
+            self.check_start(began, from, had_checkpoints)?;
+        }
+        found.notes.push(match &found.checkpoint {
+            Some((checkpoint, _)) => Note::Resuming { generation: checkpoint.snapshot.generation },
+            None if had_checkpoints => Note::StartingOver,
+            None => Note::Starting,
+        });
+        found.kept = kept;
+        Ok(())
+    }
+
+    /// Returns an error if the run's origin does not allow the given config. `has_config` says that the config file
+    /// agrees with the given config, so that it was edited.
+    fn edited(&self, config: &Config, run: Option<&Run>, has_config: bool) -> Option<RecordError> {
+        let origin = run?.origin.as_ref().filter(|origin| !origin.allows(config))?;
+        let (path, existing, requested) = (self.path.clone(), origin.generations, config.learning.generations);
+        Some(match existing > requested {
+            true => RecordError::Shorter { path, existing, requested },
+            false if has_config => RecordError::Edited { path: self.file(CONFIG) },
+            false => {
+                let differences = vec![format!("  {} has another digest", self.file(RUN).display())];
+                RecordError::ConfigDiffers { path, differences }
+            }
+        })
+    }
+
+    /// Finds the newest usable checkpoint among the generations in `kept`. Unusable ones are renamed or removed, and
+    /// leave `kept`.
+    ///
+    /// `before` is the config in the folder, if it can be read. `edited` says that the run's origin does not allow the
+    /// given config, so that checkpoints of another config are no damage.
+    fn find_checkpoint(
+        &self,
+        config: &Config,
+        before: Option<&Config>,
+        edited: bool,
+        init: Option<&str>,
+        kept: &mut Vec<usize>,
+        found: &mut Resumed,
+    ) -> Result<(), RecordError> {
+        let checkpoints = self.file(CHECKPOINTS);
         while let Some(&generation) = kept.last() {
             let path = checkpoint::path(&checkpoints, generation);
             // Checkpoints of earlier versions lack the number of generations. The config in the folder has it.
-            let reason = match checkpoint::read(&path, &self.file(POLICIES), before.as_ref().unwrap_or(config)) {
+            let reason = match checkpoint::read(&path, &self.file(POLICIES), before.unwrap_or(config)) {
                 Ok(Some(checkpoint)) if checkpoint.is_of(config) => {
                     self.check_init(checkpoint.init.clone(), init)?;
                     let metrics = self.file(METRICS);
@@ -73,7 +104,7 @@ impl Folder {
                         None => format!("{}: {} has changed since this was written", path.escaped(), metrics.escaped()),
                     }
                 }
-                Ok(Some(_)) if edited.is_some() => break,
+                Ok(Some(_)) if edited => break,
                 Ok(Some(_)) if before.is_some() => format!("{}: it is of another run", path.escaped()),
                 Ok(Some(_)) => {
                     let differences = vec![format!("  {} has another digest", path.escaped())];
@@ -94,27 +125,30 @@ impl Folder {
             self.disk.rename(&path, &damaged).map_err(RecordError::write(&damaged))?;
             kept.pop();
         }
-        if let Some(edited) = edited.filter(|_| found.checkpoint.is_none()) {
-            return Err(edited);
-        }
-        if began.is_none() && found.checkpoint.is_none() && from == StartFrom::Unspecified {
+        Ok(())
+    }
+
+    /// Fails if a run without usable checkpoints cannot start over as it began. `began` is the digest of the policies
+    /// that it began with, if `run.json` can be read.
+    fn check_start(
+        &self,
+        began: Option<Option<String>>,
+        from: StartFrom<'_>,
+        had_checkpoints: bool,
+    ) -> Result<(), RecordError> {
+        let init = from.digest();
+        if began.is_none() && from == StartFrom::Unspecified {
             let is_there = |name: &str| file::exists(&self.file(name)).map_err(RecordError::read(&self.file(name)));
-            if any || is_there(INIT_MARK)? || is_there(RUN)? || is_there(METRICS)? || is_there(POLICIES)? {
+            if had_checkpoints || is_there(INIT_MARK)? || is_there(RUN)? || is_there(METRICS)? || is_there(POLICIES)? {
                 return Err(RecordError::OriginUnknown { path: self.path.clone() });
             }
         }
-        if let Some(existing) = began.filter(|_| found.checkpoint.is_none()) {
-            self.check_init(existing.clone(), init)?;
+        if let Some(existing) = began {
+            self.check_init(existing.clone(), init.as_deref())?;
             if let Some(existing) = existing.filter(|_| init.is_none()) {
                 return Err(RecordError::InitNeeded { path: self.path.clone(), existing });
             }
         }
-        found.notes.push(match &found.checkpoint {
-            Some((checkpoint, _)) => Note::Resuming { generation: checkpoint.snapshot.generation },
-            None if any => Note::StartingOver,
-            None => Note::Starting,
-        });
-        found.kept = kept;
         Ok(())
     }
 
