@@ -15,6 +15,7 @@ use flotilla::config::Sharing;
 use flotilla::config::{Fitness, MAX_AGENTS, MAX_POPULATION, MAX_STEPS, Stage};
 use flotilla::evaluate::Starts;
 use flotilla::front::{self, Failure, Processor, Trained};
+use flotilla::record::checkpoint;
 use flotilla::record::digests::Verification;
 use flotilla::record::disk::Disk;
 use flotilla::record::folder::Start;
@@ -87,6 +88,25 @@ fn requesting_champions_does_not_change_training() {
     assert_eq!(champions[6], best);
     // Without this, champions of the previous generation would pass, too.
     assert_ne!(champions[5], best);
+}
+
+#[test]
+fn a_finished_run_has_no_ending_without_its_own_last_checkpoint() {
+    let folder = tempfile::tempdir().expect("a folder for runs");
+    let [own, other] = ["own", "other"].map(|name| folder.path().join(name));
+    let config = config(0);
+    let mut other_config = config.clone();
+    other_config.learning.seed += 1;
+    run_digest(&config, &own);
+    run_digest(&other_config, &other);
+    let last = |run: &Path| checkpoint::path(&run.join("checkpoints"), 7);
+    let read = || Trained::read(&own, Verification::Required).expect("the run is complete");
+    let mut expected = read();
+    assert!(expected.ending.take().is_some());
+    fs::copy(last(&other), last(&own)).expect("both runs have a last checkpoint");
+    assert_eq!(read(), expected);
+    fs::remove_file(last(&own)).expect("the file was just written");
+    assert_eq!(read(), expected);
 }
 
 #[test]

@@ -487,6 +487,15 @@ fn a_wrong_value_of_a_flag_exits_with_code_2() {
 }
 
 #[test]
+fn generations_with_pois_in_different_places_are_not_compared() {
+    let place = place();
+    place.good("train small.toml --set learning.poi_jitter=0.5 --generations 2 --out moved --quiet");
+    let stderr = place.refused(2, "replay moved --compare 0");
+    assert!(stderr.contains("POIs are elsewhere in every generation (learning.poi_jitter)"), "{stderr}");
+    place.good("replay moved");
+}
+
+#[test]
 fn messages_of_drivers_are_not_printed() {
     let place = place();
     for folder in [None, Some(""), Some("relative"), Some("/no/such/folder")] {

@@ -216,6 +216,41 @@ fn a_finished_run_is_not_trained_again() {
     }
 }
 
+#[test]
+fn a_finished_run_whose_metrics_cannot_be_read_is_not_changed() {
+    let config = small();
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("run");
+    session(&config, &path, Start::Fresh, Disk::default(), cpu(), None).end.unwrap();
+    let files = || [RUN, POLICIES].map(|name| fs::read(path.join(name)).unwrap());
+    let (metrics, before) = (fs::read(path.join(METRICS)).unwrap(), files());
+    // A directory can be read by nobody, not even by root.
+    fs::remove_file(path.join(METRICS)).unwrap();
+    fs::create_dir(path.join(METRICS)).unwrap();
+    let error = session(&config, &path, Start::Resume, Disk::default(), cpu(), None).end.unwrap_err();
+    assert!(error.to_string().contains(METRICS), "{error}");
+    assert_eq!(files(), before);
+    // If the file can be read again, the run is finished.
+    fs::remove_dir(path.join(METRICS)).unwrap();
+    fs::write(path.join(METRICS), metrics).unwrap();
+    let outcome = session(&config, &path, Start::Resume, Disk::default(), cpu(), None);
+    assert_eq!((outcome.end.unwrap(), outcome.results), (SessionEnd::Finished, Some(reference(&config).0)));
+}
+
+#[test]
+fn only_a_missing_entry_has_no_kind() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("file");
+    fs::write(&file, "").unwrap();
+    for disk in [Disk::default(), Disk::default().within(folder.path()).unwrap()] {
+        assert!(disk.kind(&file).unwrap().is_some());
+        assert!(disk.kind(&folder.path().join("missing")).unwrap().is_none());
+        assert!(disk.kind(&folder.path().join("missing/file")).unwrap().is_none());
+        // No file system allows a name of this length.
+        assert!(disk.kind(&folder.path().join("x".repeat(10_000))).is_err());
+    }
+}
+
 /// Returns the config with another number of generations.
 fn with_generations(config: &Config, generations: usize) -> Config {
     let mut config = config.clone();
