@@ -487,6 +487,13 @@ fn a_wrong_value_of_a_flag_exits_with_code_2() {
 }
 
 #[test]
+fn a_wrong_start_leaves_no_folder() {
+    let place = place();
+    place.refused(1, "train small.toml --init missing.safetensors");
+    assert_eq!(place.names(), ["grid.toml", "small.toml"]);
+}
+
+#[test]
 fn generations_with_pois_in_different_places_are_not_compared() {
     let place = place();
     place.good("train small.toml --set learning.poi_jitter=0.5 --generations 2 --out moved --quiet");

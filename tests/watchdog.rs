@@ -327,7 +327,7 @@ impl Faults for Edited {
     }
 }
 
-/// The self-test at opening also covers the kernels that only training uses.
+/// The self-test at opening also covers every density, and the kernels that only training uses.
 #[test]
 fn opening_detects_an_edit_of_any_kernel() {
     type Edit = fn(String) -> String;

@@ -69,9 +69,9 @@ pub trait Backend: Send {
 
 /// The populations of one trial in a device's memory, which dropping them frees.
 ///
-/// After an error their generation is undefined. A backend recognises its own populations in [`Weights::OnDevice`] by a
-/// cast to [`Any`]. If they are in the host's memory in another form, [`Breeding::on_host`] computes the next
-/// generation; `FakeDevice` in `tests/population.rs` is such a backend.
+/// After an error their generation is undefined. A backend recognises its own populations in [`Weights::OnDevice`] by
+/// downcasting through [`Any`]. A backend that keeps them in the host's memory can breed with [`Breeding::on_host`], as
+/// `FakeDevice` in `tests/population.rs` does.
 pub trait DevicePopulation: Any + Debug + Send + Sync {
     /// Replaces the populations by the next generation, with the bits of [`crate::evolve::mutate`].
     ///

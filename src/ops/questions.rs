@@ -149,7 +149,7 @@ fn check_folder(parts: &[(&Study, Sweep)], out: &Path) -> Result<(), Error> {
     }
 }
 
-/// Returns the error of a command that the user stops.
+/// Returns the error for a command that the user stopped.
 fn stopped() -> Error {
     Error::Stopped("with everything saved".into())
 }

@@ -24,7 +24,7 @@ use crate::record::disk::Disk;
 use crate::record::finished::{Finished, Storage};
 use crate::record::folder::{self, CONFIG, FirstAndLastRows, METRICS, POLICIES, RUN, Start};
 use crate::record::ownership::{self, CURVES};
-use crate::record::policies;
+use crate::record::policies::{self, Init};
 use crate::report::curves::Band;
 use crate::report::replay::History;
 use crate::report::runs;
@@ -206,14 +206,17 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let (backend, on) = backends.open(Work::of([&*config]))?;
     check_memory([&config], backend)?;
     context.warn_of_unreachable(&config);
+    // Read before a folder is chosen, which is created.
+    let init = request.init.as_deref().map(|path| policies::read_init(path, &config)).transpose()?;
     let folder = request.folder()?;
-    let mut session = open_session(request, &config, &folder, context)?;
+    let mut session = open_session(request, &config, init, &folder, context)?;
+    let mut events = EventFiles::open(request, &folder, config.learning.trials, session.disk(0), context);
     let (since, from, was_done) = (Instant::now(), session.generations()[0], session.is_done());
     if !was_done {
         context.message(format_args!("training on {on}, into {}", folder.escaped()));
         (context.report)(Event::Begin(vec![(String::new(), config.pois())], from, config.learning.generations));
     }
-    let last = train(&mut session, request, &folder, backend, context)?;
+    let last = train(&mut session, &mut events, request, &folder, backend, context)?;
     let (config, results) = (session.config(0), session.results(0).expect("the run is done"));
     // A session that ended after the run but before its picture left an older picture, or none.
     let is_drawn = || fs::read_to_string(folder.join(CURVES)).is_ok_and(|svg| Scene::shows(&svg, &results.digest));
@@ -245,10 +248,15 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     })
 }
 
-/// Opens the run's folder, and tells the user what was found there.
-fn open_session(request: &Request, config: &Config, folder: &Path, context: Context<'_>) -> Result<Session, Error> {
+/// Opens the run's folder, and reports what it found. `policies` are those of [`Request::init`].
+fn open_session(
+    request: &Request,
+    config: &Config,
+    policies: Option<Init>,
+    folder: &Path,
+    context: Context<'_>,
+) -> Result<Session, Error> {
     let (init, start) = (request.init.as_deref(), request.start);
-    let first = init.map(|path| policies::read_init(path, config)).transpose()?;
     if let Some(what) = folder::collection(folder) {
         let text = format!("{} holds {what}, not a run", folder.escaped());
         return Err(Error::Refused(with_remedy(text, "choose another --out")));
@@ -265,7 +273,7 @@ fn open_session(request: &Request, config: &Config, folder: &Path, context: Cont
             ownership::check(&disk, [folder.join(CURVES)])?;
         }
     }
-    let opened = Session::open_from(vec![(config.clone(), folder.to_path_buf(), first)], start, &disk);
+    let opened = Session::open_from(vec![(config.clone(), folder.to_path_buf(), policies)], start, &disk);
     let (session, found) = opened.map_err(|error| match error {
         RunError::Record(RecordError::Exists { .. }) if request.tensorboard => Error::Refused(with_remedy(
             format!("{error}\nfor event files of the run that is there:"),
@@ -285,15 +293,13 @@ fn open_session(request: &Request, config: &Config, folder: &Path, context: Cont
 /// Trains a run to its end, or until the user ends it. Returns the last generation, which is earlier in that case.
 fn train(
     session: &mut Session,
+    events: &mut EventFiles<'_>,
     request: &Request,
     folder: &Path,
     backend: &mut OpenBackend,
     context: Context<'_>,
 ) -> Result<usize, Error> {
-    let learning = &session.config(0).learning;
-    let (trials, mut last) = (learning.trials, learning.generations);
-    let disk = session.disk(0).clone();
-    let mut events = EventFiles::open(request, folder, trials, &disk, context);
+    let mut last = session.config(0).learning.generations;
     while !session.is_done() {
         let mut watch = |progress: &Progress<'_>| {
             context.rows(progress.generations[0], progress.rows);
@@ -312,13 +318,12 @@ fn train(
                 format!("continue with\n  {}", request.command_to_resume(folder, context)),
             )));
         }
-        // The generation that is played next becomes the last.
         last = session.end()?;
     }
     Ok(last)
 }
 
-/// Warns if no team observed a POI in any generation.
+/// Warns if no team observed a POI in any generation, or if the metrics cannot be read.
 fn warn_if_nothing_was_observed(folder: &Path, config: &Config, context: Context<'_>) {
     let ever = |all: Vec<History>| all.iter().any(|history| history.most() > 0.0);
     if !History::all(folder, config, Verification::Required).is_ok_and(ever) {

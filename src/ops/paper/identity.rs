@@ -1,4 +1,4 @@
-//! `paper.toml`, which says what a paper's folder holds.
+//! `paper.toml`, which identifies the paper in a folder.
 
 use std::path::Path;
 
@@ -27,7 +27,7 @@ impl Identity {
     /// Checks that a paper may be written into a folder.
     ///
     /// # Errors
-    /// The folder holds something else, or a paper that `start` does not allow to continue or replace.
+    /// The folder holds something else, or a paper that `start` does not allow to be resumed or replaced.
     pub(super) fn check(&self, out: &Path, start: Start) -> Result<(), Error> {
         if out.is_file() {
             return Err(RecordError::NoFolder { path: out.into() }.into());

@@ -21,10 +21,10 @@ use crate::report::paper::{self, Evidence, Experiment, Summary, Trajectory, clai
 use crate::report::scene::Format;
 use crate::run::RunError;
 
-mod arms;
+mod experiments;
 mod identity;
 
-use arms::Arms;
+use experiments::Experiments;
 use identity::Identity;
 
 /// The results in a paper's folder, for people and for programs.
@@ -82,17 +82,17 @@ pub struct ExperimentOutcome {
 }
 
 impl ExperimentOutcome {
-    fn of(arm: &Experiment, folder: &Path, digest: Option<String>) -> ExperimentOutcome {
+    fn of(experiment: &Experiment, folder: &Path, digest: Option<String>) -> ExperimentOutcome {
         ExperimentOutcome {
-            name: arm_name(arm),
+            name: folder_name(experiment),
             folder: folder.escaped().to_string(),
-            layout: arm.layout.name,
-            paradigm: arm.paradigm,
-            actions: arm.config.policy.actions,
-            fitness: arm.fitness,
-            pois: arm.pois(),
+            layout: experiment.layout.name,
+            paradigm: experiment.paradigm,
+            actions: experiment.config.policy.actions,
+            fitness: experiment.fitness,
+            pois: experiment.pois(),
             digest,
-            best_g: arm.best.iter().filter_map(|trial| trial.last()).sum::<f64>() / arm.best.len() as f64,
+            best_g: experiment.best.iter().filter_map(|trial| trial.last()).sum::<f64>() / experiment.best.len() as f64,
         }
     }
 }
@@ -143,29 +143,29 @@ pub struct Outcome {
 /// The folder or a config cannot be used, training fails or is stopped, or files cannot be written.
 pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
     let Request { ref out, start, .. } = *request;
-    let mut arms = Arms::new(paper::arms(&request.set)?, out);
-    let learning = arms.experiments[0].config.learning.clone();
+    let mut experiments = Experiments::new(paper::arms(&request.set)?, out);
+    let learning = experiments.all[0].config.learning.clone();
     let identity = Identity::of(&learning);
     identity.check(out, start)?;
-    let (backend, on) = backends.open(Work::of(&arms.configs))?;
-    let plan = memory::Peaks::of(&ValidConfig::all(&arms.configs)?, current_num_threads());
+    let (backend, on) = backends.open(Work::of(&experiments.configs))?;
+    let plan = memory::Peaks::of(&ValidConfig::all(&experiments.configs)?, current_num_threads());
     plan.check(backend.1.backend == "gpu").map_err(RunError::from)?;
     let disk = ownership::create_output_folder(&Disk::default(), out, request.is_out_named())?;
     let _lock = folder::lock(&disk, out)?;
     // Checked again, because another process could write here until the folder was locked.
     identity.check(out, start)?;
-    arms.check_folders(&disk, start)?;
+    experiments.check_folders(&disk, start)?;
     ownership::check(&disk, products().map(|name| out.join(name)))?;
     identity.write(out, start, &disk)?;
-    let mut session = arms.open(start, &disk, context)?;
+    let mut session = experiments.open(start, &disk, context)?;
     if !session.is_done() {
-        arms.train(&mut session, backend, &on, out, context)?;
+        experiments.train(&mut session, backend, &on, out, context)?;
     }
-    arms.record_copies(&disk)?;
-    arms.read_metrics()?;
-    let baselines = play_baselines(paper::baseline_configs(&arms.experiments), learning.generations, backend, context)?;
+    experiments.record_copies(&disk)?;
+    experiments.read_metrics()?;
+    let baselines = play_baselines(paper::baseline_configs(&experiments.all), learning.generations, backend, context)?;
 
-    let found = Evidence { arms: &arms.experiments, baselines: &baselines };
+    let found = Evidence { arms: &experiments.all, baselines: &baselines };
     let publish =
         |name: &str, content: &[u8]| ownership::publish(&disk, &out.join(name), |file| file.write_all(content));
     for (index, layout) in paper::LAYOUTS.iter().enumerate() {
@@ -182,7 +182,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let heading = tables::heading(&learning, &claims);
     let full = tables::full(&claims);
     publish(CLAIMS, tables::page(&baseline, &heading, &full).as_bytes())?;
-    let seconds = (0..arms.configs.len()).map(|run| session.run(run).seconds).fold(0.0, f64::max);
+    let seconds = (0..experiments.configs.len()).map(|run| session.run(run).seconds).fold(0.0, f64::max);
     let summary = Summary {
         version: crate::version::VERSION,
         backend: session.run(0).backend.clone(),
@@ -196,8 +196,9 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     };
     let summary = serde_json::to_string(&summary).expect("plain fields are JSON") + "\n";
     publish(SUMMARY, summary.as_bytes())?;
-    let digest = |arm: usize| session.results(arms.config_of[arm]).map(|results| results.digest.clone());
-    let outcome = |arm: usize| ExperimentOutcome::of(&arms.experiments[arm], &arms.folders[arm], digest(arm));
+    let digest = |index: usize| session.results(experiments.config_of[index]).map(|results| results.digest.clone());
+    let outcome =
+        |index: usize| ExperimentOutcome::of(&experiments.all[index], &experiments.folders[index], digest(index));
     let path = |name: &str| out.join(name).escaped().to_string();
     Ok(Outcome {
         folder: out.escaped().to_string(),
@@ -206,7 +207,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         generations: learning.generations,
         processor: Processor::of_run(session.run(0)),
         seconds,
-        arms: (0..arms.experiments.len()).map(outcome).collect(),
+        arms: (0..experiments.all.len()).map(outcome).collect(),
         files: Files { claims: path(CLAIMS), summary: path(SUMMARY), figures: FIGURES.map(path).to_vec() },
         text: format!("{baseline}\n{}\n{heading}\n\n", tables::verdicts(&claims)),
         claims,
@@ -258,7 +259,7 @@ fn products() -> impl Iterator<Item = &'static str> {
     [CLAIMS, SUMMARY].into_iter().chain(FIGURES)
 }
 
-/// Returns the name of an arm's folder, such as `chaotic-all-leaders-Df`.
-fn arm_name(arm: &Experiment) -> String {
-    arm.name().replace(", ", "-").replace(' ', "-")
+/// Returns the name of an experiment's folder, such as `chaotic-all-leaders-Df`.
+fn folder_name(experiment: &Experiment) -> String {
+    experiment.name().replace(", ", "-").replace(' ', "-")
 }

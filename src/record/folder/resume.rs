@@ -5,7 +5,9 @@ use std::path::Path;
 
 use sha2::{Digest, Sha256};
 
-use super::{CHECKPOINTS, CONFIG, Folder, INIT_MARK, METRICS, Note, Origin, POLICIES, RUN, Resumed, Run, RunSums};
+use super::{
+    CHECKPOINTS, CONFIG, Checkpoint, Folder, INIT_MARK, METRICS, Note, Origin, POLICIES, RUN, Resumed, Run, RunSums,
+};
 use super::{StartFrom, Status};
 use crate::config::{Config, MAX_STAGES};
 use crate::escape::PathExt;
@@ -38,16 +40,18 @@ impl Folder {
             Err(error) => return Err(error),
         }
         found.finished = found.run.as_ref().map_or(Ok(None), |run| self.finished(run, config))?;
-        let began = found.run.as_ref().map(|run| run.init.clone());
-        if found.finished.is_some() {
-            return began.map_or(Ok(()), |existing| self.check_init(existing, init));
+        if let Some(run) = found.run.as_ref().filter(|_| found.finished.is_some()) {
+            return self.check_init(run.init.clone(), init);
         }
-        let edited = self.edited(config, found.run.as_ref(), before.is_some());
-        let had_checkpoints = !kept.is_empty();
-        self.find_checkpoint(config, before.as_ref(), edited.is_some(), init, &mut kept, found)?;
+        let origin_error = self.origin_error(config, found.run.as_ref(), before.is_some());
+        let (is_other, had_checkpoints) = (origin_error.is_some(), !kept.is_empty());
+        found.checkpoint =
+            self.find_checkpoint(config, before.as_ref(), is_other, init, &mut kept, &mut found.notes)?;
         if found.checkpoint.is_none() {
-            edited.map_or(Ok(()), Err)?;
-            self.check_start(began, from, had_checkpoints)?;
+            if let Some(error) = origin_error {
+                return Err(error);
+            }
+            self.check_start(found.run.as_ref(), from, had_checkpoints)?;
         }
         found.notes.push(match &found.checkpoint {
             Some((checkpoint, _)) => Note::Resuming { generation: checkpoint.snapshot.generation },
@@ -58,9 +62,9 @@ impl Folder {
         Ok(())
     }
 
-    /// Returns an error if the run's origin does not allow the given config. `has_config` says that the config file
-    /// agrees with the given config, so that it was edited.
-    fn edited(&self, config: &Config, run: Option<&Run>, has_config: bool) -> Option<RecordError> {
+    /// Returns an error if the run's origin does not allow the given config. `has_config` says that `config.toml` could
+    /// be read. It then agrees with the given config, so that a mismatch means that it was edited.
+    fn origin_error(&self, config: &Config, run: Option<&Run>, has_config: bool) -> Option<RecordError> {
         let origin = run?.origin.as_ref().filter(|origin| !origin.allows(config))?;
         let (path, existing, requested) = (self.path.clone(), origin.generations, config.learning.generations);
         Some(match existing > requested {
@@ -73,20 +77,20 @@ impl Folder {
         })
     }
 
-    /// Finds the newest usable checkpoint among the generations in `kept`. Unusable ones are renamed or removed, and
+    /// Returns the newest usable checkpoint among the generations in `kept`. Unusable ones are renamed or removed, and
     /// leave `kept`.
     ///
-    /// `before` is the config in the folder, if it can be read. `edited` says that the run's origin does not allow the
-    /// given config, so that checkpoints of another config are no damage.
+    /// `before` is the config in the folder, if it can be read. `is_other` says that the run's origin does not allow
+    /// the given config. A checkpoint of another config is no damage then: it is kept, and the search ends there.
     fn find_checkpoint(
         &self,
         config: &Config,
         before: Option<&Config>,
-        edited: bool,
+        is_other: bool,
         init: Option<&str>,
         kept: &mut Vec<usize>,
-        found: &mut Resumed,
-    ) -> Result<(), RecordError> {
+        notes: &mut Vec<Note>,
+    ) -> Result<Option<(Checkpoint, metrics::Writer)>, RecordError> {
         let checkpoints = self.file(CHECKPOINTS);
         while let Some(&generation) = kept.last() {
             let path = checkpoint::path(&checkpoints, generation);
@@ -97,14 +101,11 @@ impl Folder {
                     let metrics = self.file(METRICS);
                     let resumed = metrics::Writer::resume(&self.disk, &metrics, &checkpoint.metrics, config);
                     match resumed.map_err(RecordError::write(&metrics))? {
-                        Some(metrics) => {
-                            found.checkpoint = Some((checkpoint, metrics));
-                            break;
-                        }
+                        Some(metrics) => return Ok(Some((checkpoint, metrics))),
                         None => format!("{}: {} has changed since this was written", path.escaped(), metrics.escaped()),
                     }
                 }
-                Ok(Some(_)) if edited => break,
+                Ok(Some(_)) if is_other => break,
                 Ok(Some(_)) if before.is_some() => format!("{}: it is of another run", path.escaped()),
                 Ok(Some(_)) => {
                     let differences = vec![format!("  {} has another digest", path.escaped())];
@@ -120,36 +121,33 @@ impl Folder {
                 Err(error @ RecordError::Damaged { .. }) => error.to_string(),
                 Err(error) => return Err(error),
             };
-            found.notes.push(Note::SetAside(reason));
+            notes.push(Note::SetAside(reason));
             let damaged = checkpoint::quarantine_path(&path);
             self.disk.rename(&path, &damaged).map_err(RecordError::write(&damaged))?;
             kept.pop();
         }
-        Ok(())
+        Ok(None)
     }
 
-    /// Fails if a run without usable checkpoints cannot start over as it began. `began` is the digest of the policies
-    /// that it began with, if `run.json` can be read.
-    fn check_start(
-        &self,
-        began: Option<Option<String>>,
-        from: StartFrom<'_>,
-        had_checkpoints: bool,
-    ) -> Result<(), RecordError> {
+    /// Fails if a run without usable checkpoints cannot start over as it began. `run` is the content of `run.json`, if
+    /// it can be read.
+    fn check_start(&self, run: Option<&Run>, from: StartFrom<'_>, had_checkpoints: bool) -> Result<(), RecordError> {
+        let path = self.path.clone();
+        let Some(run) = run else {
+            let exists = |name: &str| file::exists(&self.file(name)).map_err(RecordError::read(&self.file(name)));
+            if from == StartFrom::Unspecified
+                && (had_checkpoints || exists(INIT_MARK)? || exists(RUN)? || exists(METRICS)? || exists(POLICIES)?)
+            {
+                return Err(RecordError::OriginUnknown { path });
+            }
+            return Ok(());
+        };
         let init = from.digest();
-        if began.is_none() && from == StartFrom::Unspecified {
-            let is_there = |name: &str| file::exists(&self.file(name)).map_err(RecordError::read(&self.file(name)));
-            if had_checkpoints || is_there(INIT_MARK)? || is_there(RUN)? || is_there(METRICS)? || is_there(POLICIES)? {
-                return Err(RecordError::OriginUnknown { path: self.path.clone() });
-            }
+        self.check_init(run.init.clone(), init.as_deref())?;
+        match run.init.clone().filter(|_| init.is_none()) {
+            Some(existing) => Err(RecordError::InitNeeded { path, existing }),
+            None => Ok(()),
         }
-        if let Some(existing) = began {
-            self.check_init(existing.clone(), init.as_deref())?;
-            if let Some(existing) = existing.filter(|_| init.is_none()) {
-                return Err(RecordError::InitNeeded { path: self.path.clone(), existing });
-            }
-        }
-        Ok(())
     }
 
     /// Fails if a newer version of the program wrote any of the files. Callers check this before they change a file.

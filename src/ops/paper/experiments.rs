@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use super::arm_name;
+use super::folder_name;
 use crate::backend::OpenBackend;
 use crate::config::Config;
 use crate::escape::PathExt;
@@ -16,24 +16,24 @@ use crate::report::runs;
 use crate::run::{self, Session, SessionEnd, Twin};
 use crate::trainer::Row;
 
-/// The experiments of a paper and their folders. Experiments with the same config are trained once. The first of them
+/// The experiments of a paper and their folders. Experiments with the same training are trained once. The first of them
 /// is trained, and the others are copies.
-pub(super) struct Arms {
+pub(super) struct Experiments {
     /// All experiments.
-    pub(super) experiments: Vec<Experiment>,
+    pub(super) all: Vec<Experiment>,
     /// The folder of each experiment.
     pub(super) folders: Vec<PathBuf>,
-    /// The different configs.
+    /// The configs that are trained.
     pub(super) configs: Vec<Config>,
-    /// The index of each experiment's config.
+    /// The index of the config that each experiment is trained with.
     pub(super) config_of: Vec<usize>,
 }
 
-impl Arms {
-    pub(super) fn new(experiments: Vec<Experiment>, out: &Path) -> Arms {
-        let (configs, config_of) = paper::trained(&experiments);
-        let folders = experiments.iter().map(|experiment| out.join(ARMS).join(arm_name(experiment))).collect();
-        Arms { experiments, folders, configs, config_of }
+impl Experiments {
+    pub(super) fn new(all: Vec<Experiment>, out: &Path) -> Experiments {
+        let (configs, config_of) = paper::trained(&all);
+        let folders = all.iter().map(|experiment| out.join(ARMS).join(folder_name(experiment))).collect();
+        Experiments { all, folders, configs, config_of }
     }
 
     /// Returns the experiment that is trained with a config.
@@ -43,7 +43,7 @@ impl Arms {
 
     /// Returns the experiments that are copies.
     fn copies(&self) -> impl Iterator<Item = usize> {
-        (0..self.experiments.len()).filter(|&arm| self.trained(self.config_of[arm]) != arm)
+        (0..self.all.len()).filter(|&experiment| self.trained(self.config_of[experiment]) != experiment)
     }
 
     /// Checks whether runs may be started in all folders, without changing them.
@@ -51,11 +51,11 @@ impl Arms {
     /// # Errors
     /// See [`folder::check`].
     pub(super) fn check_folders(&self, disk: &Disk, start: Start) -> Result<(), RecordError> {
-        let configs = self.experiments.iter().map(|experiment| &experiment.config);
+        let configs = self.all.iter().map(|experiment| &experiment.config);
         folder::check(disk, self.folders.iter().map(|path| &**path).zip(configs), start)
     }
 
-    /// Opens the runs of all configs, and warns of damaged files.
+    /// Opens the runs of all configs, and warns of damaged files. `Start::Force` also clears the folders of copies.
     ///
     /// # Errors
     /// A folder cannot be used.
@@ -63,13 +63,13 @@ impl Arms {
         let folders = (0..self.configs.len()).map(|config| self.folders[self.trained(config)].clone());
         let (session, notes) = Session::open(self.configs.iter().cloned().zip(folders).collect(), start, disk)?;
         for (config, note) in notes.iter().filter(|(_, note)| note.is_damage()) {
-            context.warn(format_args!("{}: {note}", self.experiments[self.trained(*config)].name()));
+            context.warn(format_args!("{}: {note}", self.all[self.trained(*config)].name()));
         }
         if start == Start::Force {
             // Old results are removed now, so that none are left if this run is stopped.
-            for arm in self.copies() {
-                let config = &self.experiments[arm].config;
-                Folder::open(&self.folders[arm], start, config, StartFrom::Random, disk.clone())?;
+            for experiment in self.copies() {
+                let (folder, config) = (&self.folders[experiment], &self.all[experiment].config);
+                Folder::open(folder, start, config, StartFrom::Random, disk.clone())?;
             }
         }
         Ok(session)
@@ -87,23 +87,23 @@ impl Arms {
         out: &Path,
         context: Context<'_>,
     ) -> Result<(), Error> {
-        let learning = &self.experiments[0].config.learning;
-        let (count, different, trials) = (self.experiments.len(), self.configs.len(), learning.trials);
+        let learning = &self.all[0].config.learning;
+        let (count, different, trials) = (self.all.len(), self.configs.len(), learning.trials);
         context.message(format_args!(
             "training {count} experiments, {different} of them different, of {trials} trials each on {on}, into {}",
             out.escaped()
         ));
-        let names = self.experiments.iter().map(|arm| (arm.name(), Some(arm.pois()))).collect();
+        let names = self.all.iter().map(|experiment| (experiment.name(), Some(experiment.pois()))).collect();
         let next = |generations: &[usize]| generations.iter().min().copied().unwrap_or(0);
         (context.report)(Event::Begin(names, next(session.generations()), learning.generations));
-        // A row of a config counts for each of its experiments.
-        let of_arms = |row: &Row| {
+        // The trainer's experiments are the configs. A row counts for each experiment with that config.
+        let of_all = |row: &Row| {
             let row = *row;
-            let arms = self.config_of.iter().enumerate().filter(move |&(_, &config)| config == row.experiment);
-            arms.map(move |(arm, _)| Row { experiment: arm, ..row })
+            let same = self.config_of.iter().enumerate().filter(move |&(_, &config)| config == row.experiment);
+            same.map(move |(experiment, _)| Row { experiment, ..row })
         };
         let mut watch = |now: &run::Progress<'_>| {
-            let rows: Vec<Row> = now.rows.iter().flat_map(of_arms).collect();
+            let rows: Vec<Row> = now.rows.iter().flat_map(of_all).collect();
             context.rows(next(now.generations), &rows);
         };
         let ended = context.train(&mut watch, |options| session.train(backend, options));
@@ -115,16 +115,16 @@ impl Arms {
         Ok(())
     }
 
-    /// Records the copies, whose configs must have been trained.
+    /// Records the copies. The runs that they copy must be finished.
     ///
     /// # Errors
     /// A folder cannot be used, read or written.
     pub(super) fn record_copies(&self, disk: &Disk) -> Result<(), Error> {
-        let twin = |arm: usize| Twin {
-            of: self.folders[self.trained(self.config_of[arm])].clone(),
-            of_config: self.configs[self.config_of[arm]].clone(),
-            folder: self.folders[arm].clone(),
-            config: self.experiments[arm].config.clone(),
+        let twin = |experiment: usize| Twin {
+            of: self.folders[self.trained(self.config_of[experiment])].clone(),
+            of_config: self.configs[self.config_of[experiment]].clone(),
+            folder: self.folders[experiment].clone(),
+            config: self.all[experiment].config.clone(),
         };
         Ok(run::record_twins(self.copies().map(twin).collect(), Start::Resume, disk)?)
     }
@@ -134,9 +134,9 @@ impl Arms {
     /// # Errors
     /// Metrics are missing or were changed after the run.
     pub(super) fn read_metrics(&mut self) -> Result<(), Error> {
-        for (arm, folder) in self.experiments.iter_mut().zip(&self.folders) {
-            let config = arm.config.clone();
-            runs::metrics(folder, &config, Verification::Required, |row| arm.add(row))?;
+        for (experiment, folder) in self.all.iter_mut().zip(&self.folders) {
+            let config = experiment.config.clone();
+            runs::metrics(folder, &config, Verification::Required, |row| experiment.add(row))?;
         }
         Ok(())
     }
