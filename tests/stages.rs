@@ -118,6 +118,8 @@ fn errors_in_stages_name_their_line() {
         (stage("7", ""), 2, "stages[0].from: found 7, allowed a whole number, 0 to 6 (learning.generations)"),
         (stage("-1", ""), 2, "stages[0].from: found something else"),
         (stage("3", "") + &stage("3", ""), 5, "stages[1].from: found 3, allowed a whole number, 4 to 6"),
+        // No generation is left for the second stage.
+        (stage("6", "") + &stage("7", ""), 5, "stages[1].from: the stage before begins in the last generation, 6"),
         ("[[stages]]\nset = {}\n".into(), 1, "stages[0]: missing `from`"),
         (stage("1", "").replace("set", "sett"), 3, "stages[0].sett: unknown key; a stage has from, set"),
         ("[[stages]]\nfrom = 1\nset = 3\n".into(), 3, "stages[0].set: allowed a table"),
