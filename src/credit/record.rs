@@ -38,7 +38,7 @@ impl RecordRequest<'_> {
             Fitness::Dpp => Some(1),
             Fitness::G | Fitness::D | Fitness::Df => Some(coupling),
         };
-        self.0.iter().map(least).fold(Some(coupling), |least, needed| Some(least?.min(needed?)))
+        self.0.iter().map(least).try_fold(coupling, |least, needed| Some(least.min(needed?)))
     }
 
     /// Reports whether the leader that each follower saw most is needed.
