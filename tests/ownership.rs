@@ -530,8 +530,8 @@ fn train(config: &Config, path: &Path, start: Start, disk: Disk) -> Result<(), S
         on_recovery: &mut |_| {},
         watch: &mut |_| {},
     };
-    let mut player: OpenBackend = (Box::new(Cpu::default()), Machine::default());
-    let ended = session.train(&mut player, &mut options).map_err(|error| error.to_string())?;
+    let mut backend: OpenBackend = (Box::new(Cpu::default()), Machine::default());
+    let ended = session.train(&mut backend, &mut options).map_err(|error| error.to_string())?;
     assert_eq!(ended, SessionEnd::Finished);
     Ok(())
 }

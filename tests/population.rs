@@ -538,8 +538,8 @@ fn a_run_survives_the_loss_of_its_device() {
             on_recovery: &mut |_| {},
             watch: &mut |_| {},
         };
-        let mut player = device.map_or_else(cpu, |device| (Box::new(device), Machine::default()));
-        let ended = session.train(&mut player, &mut options).map(|outcome| {
+        let mut backend = device.map_or_else(cpu, |device| (Box::new(device), Machine::default()));
+        let ended = session.train(&mut backend, &mut options).map(|outcome| {
             assert_eq!(outcome, SessionEnd::Finished);
             session.results(0).cloned().unwrap()
         });

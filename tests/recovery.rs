@@ -59,7 +59,7 @@ fn session(
     path: &Path,
     start: Start,
     disk: Disk,
-    player: OpenBackend,
+    backend: OpenBackend,
     stop_at: Option<usize>,
 ) -> Outcome {
     let (mut session, notes) = match Session::open(vec![(config.clone(), path.into())], start, &disk) {
@@ -72,14 +72,14 @@ fn session(
         return Outcome { end: Ok(SessionEnd::Finished), results, notes, start: 0, reached: 0 };
     }
     let start = session.generations()[0];
-    let end = train(&mut session, player, &mut |_| None, &mut |next| stop_at.is_some_and(|at| next[0] >= at));
+    let end = train(&mut session, backend, &mut |_| None, &mut |next| stop_at.is_some_and(|at| next[0] >= at));
     Outcome { end, results: session.results(0).cloned(), notes, start, reached: session.generations()[0] }
 }
 
 /// Trains until `stops` returns true or the runs are finished.
 fn train(
     session: &mut Session,
-    mut player: OpenBackend,
+    mut backend: OpenBackend,
     fallback: &mut dyn FnMut(&BackendError) -> Option<OpenBackend>,
     stops: &mut dyn FnMut(&[usize]) -> bool,
 ) -> Result<SessionEnd, RunError> {
@@ -92,7 +92,7 @@ fn train(
         on_recovery: &mut |_| {},
         watch: &mut |now| stop.store(stops(now.generations), SeqCst),
     };
-    session.train(&mut player, &mut options)
+    session.train(&mut backend, &mut options)
 }
 
 /// Resumes a run to its end, on a disk without failures.
@@ -810,8 +810,8 @@ fn a_run_can_alternate_between_cpu_and_gpu() {
         };
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("run");
-        for (stop_at, player) in [(4, cpu()), (9, gpu()), (12, cpu())] {
-            let outcome = session(&config, &path, Start::Resume, Disk::default(), player, Some(stop_at));
+        for (stop_at, backend) in [(4, cpu()), (9, gpu()), (12, cpu())] {
+            let outcome = session(&config, &path, Start::Resume, Disk::default(), backend, Some(stop_at));
             assert_eq!((outcome.end.unwrap(), outcome.reached), (SessionEnd::Stopped, stop_at));
         }
         let outcome = session(&config, &path, Start::Resume, Disk::default(), gpu(), None);

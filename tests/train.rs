@@ -806,8 +806,8 @@ fn compare_files(method: &str) {
     let text = SMALL.replacen("[learning]", &format!("[learning]\nmethod = \"{method}\""), 1);
     let config = Config::parse(&text, "small.toml").unwrap();
     assert!(config.to_toml().contains(&format!("method = \"{method}\"")));
-    let mut player = front::cpu();
-    let trained = front::train(&config, &mut *player.0, |_| Continue(())).unwrap();
+    let mut backend = front::cpu();
+    let trained = front::train(&config, &mut *backend.0, |_| Continue(())).unwrap();
     let columns = config.learning.generations + 1;
     let row = |(generation, trial): (usize, usize)| {
         let at = trial * columns + generation;
@@ -825,9 +825,9 @@ fn compare_files(method: &str) {
         run: Run {
             version: flotilla::VERSION.into(),
             commit: flotilla::COMMIT.map(String::from),
-            backend: player.1.backend.clone(),
-            description: player.0.describe(),
-            threads: player.1.threads,
+            backend: backend.1.backend.clone(),
+            description: backend.0.describe(),
+            threads: backend.1.threads,
             sessions: 1,
             ..Run::new(&config)
         },

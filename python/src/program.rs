@@ -137,7 +137,7 @@ impl BackendSource for Lazy<'_> {
                 }
             }
         }
-        let Lent { player, description, .. } = self.open.as_mut().expect("it was opened above");
-        Ok((player, description.clone()))
+        let Lent { backend, description, .. } = self.open.as_mut().expect("it was opened above");
+        Ok((backend, description.clone()))
     }
 }

@@ -91,7 +91,7 @@ pub fn play<R: Send>(
 ) -> PyResult<R> {
     aside(py, || {
         let mut lent = Lent::open(backend, work)?;
-        let done = play(&mut lent.player)?;
+        let done = play(&mut lent.backend)?;
         lent.give_back();
         Ok(done)
     })
@@ -101,7 +101,7 @@ pub fn play<R: Send>(
 pub struct Lent {
     name: String,
     /// The open backend.
-    pub player: OpenBackend,
+    pub backend: OpenBackend,
     /// The backend for people, with the reason if nobody asked for it.
     pub description: String,
 }
@@ -112,29 +112,29 @@ impl Lent {
         if name == "auto" {
             return Lent::choose(work);
         }
-        let player = match take(name) {
-            Some(player) => player,
+        let backend = match take(name) {
+            Some(backend) => backend,
             None => find(name, None)?.0.unwrap_or_else(front::cpu),
         };
-        Ok(Lent::of(name, player, None))
+        Ok(Lent::of(name, backend, None))
     }
 
-    fn of(name: &str, player: OpenBackend, reason: Option<String>) -> Lent {
+    fn of(name: &str, backend: OpenBackend, reason: Option<String>) -> Lent {
         let reason = reason.map_or(String::new(), |reason| format!(" [auto: {reason}]"));
-        let description = format!("{}{reason}", player.0.describe());
-        Lent { name: name.into(), player, description }
+        let description = format!("{}{reason}", backend.0.describe());
+        Lent { name: name.into(), backend, description }
     }
 
     /// Takes or opens the backend that is expected to finish first. An idle backend "auto" is a GPU.
     fn choose(work: Work) -> PyResult<Lent> {
         let work = WORK.lock().unwrap_or_else(PoisonError::into_inner).add(work);
-        if let Some(player) = take("auto") {
-            return Ok(Lent::of("auto", player, None));
+        if let Some(backend) = take("auto") {
+            return Ok(Lent::of("auto", backend, None));
         }
         let cpu = || take("cpu").unwrap_or_else(front::cpu);
         let Some(work) = work else { return Ok(Lent::of("cpu", cpu(), None)) };
         Ok(match find("auto", Some(work))? {
-            (Some(player), reason) => Lent::of("auto", player, reason),
+            (Some(backend), reason) => Lent::of("auto", backend, reason),
             (None, reason) => Lent::of("cpu", cpu(), reason),
         })
     }
@@ -144,7 +144,7 @@ impl Lent {
         if let Ok(mut idle) = IDLE.try_lock()
             && idle.len() < MAX_IDLE_BACKENDS
         {
-            idle.push((self.name, self.player));
+            idle.push((self.name, self.backend));
         }
     }
 }

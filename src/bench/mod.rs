@@ -171,18 +171,22 @@ pub fn with_agents(config: &Config, agents: usize) -> Result<Config, String> {
 ///
 /// # Errors
 /// The backend failed.
-pub(crate) fn measure(config: &Config, player: &mut Subject, generations: Generations) -> Result<Timing, BackendError> {
+pub(crate) fn measure(
+    config: &Config,
+    subject: &mut Subject,
+    generations: Generations,
+) -> Result<Timing, BackendError> {
     let world = World::new(config);
-    let ceiling = &mut player.ceiling()?;
-    let ([rollout, ceiling], mean_g, reach) = rollout(config, &world, player.backend(), ceiling)?;
+    let ceiling = &mut subject.ceiling()?;
+    let ([rollout, ceiling], mean_g, reach) = rollout(config, &world, subject.backend(), ceiling)?;
     let (generation, profile) = match generations {
         Generations::LeftOut => (None, None),
-        Generations::Timed => (Some(self::generations(config, player)?.0), None),
+        Generations::Timed => (Some(self::generations(config, subject)?.0), None),
         Generations::Profiled => {
-            if let Subject::Gpu(gpu) = player {
+            if let Subject::Gpu(gpu) = subject {
                 gpu.use_clock();
             }
-            let (generation, profile) = self::generations(config, player)?;
+            let (generation, profile) = self::generations(config, subject)?;
             (Some(generation), Some(profile))
         }
     };
@@ -204,19 +208,19 @@ pub(crate) fn measure(config: &Config, player: &mut Subject, generations: Genera
 
 /// Returns seconds per generation, and its phases. The first generation is not counted, because it compiles and
 /// allocates.
-fn generations(config: &Config, player: &mut Subject) -> Result<(f64, Profile), BackendError> {
+fn generations(config: &Config, subject: &mut Subject) -> Result<(f64, Profile), BackendError> {
     let mut trainer = Trainer::new([config.validate()?]);
-    trainer.advance(player.backend())?;
-    let take = |trainer: &mut Trainer, player: &mut Subject| {
-        let (gpu_times, traffic) = match player {
+    trainer.advance(subject.backend())?;
+    let take = |trainer: &mut Trainer, subject: &mut Subject| {
+        let (gpu_times, traffic) = match subject {
             Subject::Cpu(..) => (None, Traffic::default()),
             Subject::Gpu(gpu) => (Some(gpu.take_times()), gpu.gpu().traffic()),
         };
         Profile { generations: trainer.generation(0), times: trainer.take_times(), gpu_times, traffic }
     };
-    let before = take(&mut trainer, player);
-    let [seconds, _] = time(|| trainer.advance(player.backend()).map(drop), || Ok(0.0))?;
-    let profile = take(&mut trainer, player);
+    let before = take(&mut trainer, subject);
+    let [seconds, _] = time(|| trainer.advance(subject.backend()).map(drop), || Ok(0.0))?;
+    let profile = take(&mut trainer, subject);
     let generations = profile.generations - before.generations;
     Ok((seconds, Profile { generations, traffic: profile.traffic - before.traffic, ..profile }))
 }

@@ -47,7 +47,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     let config = config.text(keys.into_iter().flatten().chain(set.set).collect())?;
     let request = Request { config, seeds, episodes };
     let mut console = Console::new(&run, Loss::default(), printed.quiet);
-    let found = console.play(|player, context| baseline::run(&request, player, context))?;
+    let found = console.play(|backends, context| baseline::run(&request, backends, context))?;
     printed.outcome(&found, in_words)
 }
 

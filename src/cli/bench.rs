@@ -76,13 +76,13 @@ pub fn run(args: Args) -> Result<(), Error> {
     // Only the first stage is measured.
     let config = Config::read(&text, &name, &[], &args.overrides.list())?.validate()?;
     let configs = combinations(config.at(0), &args)?;
-    let (mut player, machine) = open(&args)?;
+    let (mut subject, machine) = open(&args)?;
     for config in &configs {
         let plan = Peaks::of([&config.validate()?], rayon::current_num_threads());
         plan.check(machine.backend == "gpu").map_err(RunError::from)?;
     }
     if !args.json {
-        print(&format!("{name} on {}\n{HEADER}\n", player.backend().describe()))?;
+        print(&format!("{name} on {}\n{HEADER}\n", subject.backend().describe()))?;
     }
     let generations = match (args.rollout_only, args.profile) {
         (true, _) => Generations::LeftOut,
@@ -90,11 +90,11 @@ pub fn run(args: Args) -> Result<(), Error> {
         (false, true) => Generations::Profiled,
     };
     for config in configs {
-        let measure = bench::measure(&config, &mut player, generations)?;
+        let measure = bench::measure(&config, &mut subject, generations)?;
         match args.json {
             true => {
                 let mut object = json(&measure);
-                Processor::of(&machine, &player.backend().describe()).add_to(&mut object);
+                Processor::of(&machine, &subject.backend().describe()).add_to(&mut object);
                 print_json(&object)?;
             }
             false => print(&line(&measure))?,

@@ -73,7 +73,8 @@ pub fn run(args: Args) -> Result<(), Error> {
     let resume = |error: Error| error.or_advise(|| format!("continue with\n  {}", args.command_to_resume()));
     let out = args.out.escaped();
     if !args.questions.is_empty() {
-        let found = console.run(|player, context| ops::questions::run(&request, player, context)).map_err(resume)?;
+        let found =
+            console.run(|backends, context| ops::questions::run(&request, backends, context)).map_err(resume)?;
         return args.printed.outcome(&found, |found| {
             format!(
                 "{}\nFiles in {out}: questions.md, for each table its figure (.svg, .png, .pdf) and every comparison (.csv), and \
@@ -82,7 +83,7 @@ pub fn run(args: Args) -> Result<(), Error> {
             )
         });
     }
-    let found = console.run(|player, context| ops::paper::run(&request, player, context)).map_err(resume)?;
+    let found = console.run(|backends, context| ops::paper::run(&request, backends, context)).map_err(resume)?;
     args.printed.outcome(&found, |found| {
         format!(
             "{}Trained in {:.1} s. Files in {out}: figure4, figure5, figure6 (.svg, .png, .pdf), claims.md (with every \

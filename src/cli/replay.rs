@@ -58,7 +58,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     }
     let request = Request { folder, trial, generation, team, compare, step, out, width, fps, unverified };
     let mut console = Console::new(&run, Loss::default(), printed.quiet);
-    let found = console.run(|player, context| replay::run(&request, player, context))?;
+    let found = console.run(|backends, context| replay::run(&request, backends, context))?;
     printed.summary(&found, in_words)
 }
 

@@ -78,7 +78,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     let set = keys.into_iter().flatten().chain(set.set).collect();
     let request = Request { path, set, policies, trial, stage, trace, scores, unverified, episodes, seed };
     let mut console = Console::new(&args.run, Loss::default(), args.printed.quiet);
-    let found = console.play(|player, context| rollout::run(&request, player, context))?;
+    let found = console.play(|backends, context| rollout::run(&request, backends, context))?;
     args.printed.outcome(&found, in_words)
 }
 

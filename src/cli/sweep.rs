@@ -220,7 +220,7 @@ pub fn run(mut args: Args) -> Result<(), Error> {
     let request = args.request(&sweep, &out, shard);
     let mut console = Console::new(&args.run, args.loss, args.quiet);
     if !args.collect {
-        let trained = console.run(|player, context| ops::sweep::train(&request, &sweep, player, context));
+        let trained = console.run(|backends, context| ops::sweep::train(&request, &sweep, backends, context));
         trained
             .map_err(|error| error.or_advise(|| format!("continue with\n  {}", args.command_to_resume(&out, shard))))?;
     }

@@ -54,7 +54,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     let request = Request { tasks, out, named, start, trials, population, seed };
     let mut console = Console::new(&run, loss, printed.quiet);
     let found = console
-        .run(|player, context| tasks::run(&request, player, context))
+        .run(|backends, context| tasks::run(&request, backends, context))
         .map_err(|error| error.or_advise(|| "run the same command with --resume to continue".into()))?;
     printed.outcome(&found, in_words)?;
     found.refused().map_or(Ok(()), Err)

@@ -47,7 +47,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     let (name, start) = (config.name(), existing.start());
     let request = Request { config: config.text(checkpoints.list())?, name, out, start, init, tensorboard };
     let mut console = Console::new(&run, loss, printed.quiet);
-    let found = console.run(|player, context| train::run(&request, player, context))?;
+    let found = console.run(|backends, context| train::run(&request, backends, context))?;
     printed.summary(&found, report)
 }
 

@@ -46,7 +46,7 @@ seconds = 0
 fn train(folder: &Path) {
     let (mut session, notes) = Session::open(vec![(config(), folder.into())], Start::Resume, &Disk::default()).unwrap();
     assert!(!notes.iter().any(|(_, note)| note.is_damage()), "{notes:?}");
-    let mut player: OpenBackend = (Box::new(Cpu::default()), Machine::default());
+    let mut backend: OpenBackend = (Box::new(Cpu::default()), Machine::default());
     let (stop, save) = (AtomicBool::new(false), AtomicBool::new(false));
     let mut options = Options {
         command: "",
@@ -57,7 +57,7 @@ fn train(folder: &Path) {
         // Slow down, so that there is time for a kill.
         watch: &mut |_| std::thread::sleep(Duration::from_millis(10)),
     };
-    assert_eq!(session.train(&mut player, &mut options).unwrap(), SessionEnd::Finished);
+    assert_eq!(session.train(&mut backend, &mut options).unwrap(), SessionEnd::Finished);
 }
 
 /// Returns the bytes of the policies, and the metrics without the seconds.

@@ -83,7 +83,7 @@ const BATCH_BYTES: u64 = 16 << 20;
 
 /// State that a worker keeps between requests.
 pub struct Session {
-    player: OpenBackend,
+    backend: OpenBackend,
     training: Training,
     drive: Option<Drive>,
     random: Option<Random>,
@@ -91,7 +91,7 @@ pub struct Session {
 
 impl Default for Session {
     fn default() -> Session {
-        Session { player: front::cpu(), training: Training::default(), drive: None, random: None }
+        Session { backend: front::cpu(), training: Training::default(), drive: None, random: None }
     }
 }
 
@@ -130,15 +130,15 @@ pub fn answer(session: &mut Session, text: &str, bytes: &[u8]) -> Result<Answer,
         }
         Ask::About => words(json!({ "version": flotilla::VERSION })),
         Ask::Open { gpu, pass } => {
-            session.player = if gpu { front::on_gpu(episodes(open_gpu(pass.as_deref())?)?) } else { front::cpu() };
-            words(machine(&session.player))
+            session.backend = if gpu { front::on_gpu(episodes(open_gpu(pass.as_deref())?)?) } else { front::cpu() };
+            words(machine(&session.backend))
         }
         Ask::Train { runs } => {
             session.training = Training::new(runs)?;
             words(json!({}))
         }
         Ask::Advance { generations, milliseconds } => {
-            session.training.advance(&mut *session.player.0, generations, milliseconds)
+            session.training.advance(&mut *session.backend.0, generations, milliseconds)
         }
         Ask::Best { run, trial, generation } => words(session.training.best(run, trial, generation)?),
         Ask::Ends { run } => session.training.ends(run),
