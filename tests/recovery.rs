@@ -553,9 +553,11 @@ fn a_folder_that_cannot_be_read_is_not_a_folder_without_checkpoints() {
     fs::write(&file, "").unwrap();
     assert_eq!(checkpoint::list(&file).unwrap(), [0; 0]);
     assert_eq!(checkpoint::list(&folder.path().join("missing")).unwrap(), [0; 0]);
-    // No file system allows a name of this length.
-    let error = checkpoint::list(&folder.path().join("x".repeat(10_000))).unwrap_err();
-    assert!(matches!(error, RecordError::Read { .. }), "{error}");
+    // No file system of Unix allows a name of this length. Windows says that the file is missing.
+    if cfg!(unix) {
+        let error = checkpoint::list(&folder.path().join("x".repeat(10_000))).unwrap_err();
+        assert!(matches!(error, RecordError::Read { .. }), "{error}");
+    }
 }
 
 #[test]
