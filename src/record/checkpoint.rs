@@ -238,8 +238,9 @@ impl Shapes {
 /// The folder cannot be read.
 pub fn list(folder: &Path) -> Result<Vec<usize>, RecordError> {
     let entries = match fs::read_dir(folder) {
-        // Systems disagree on the error for a file where a folder is expected.
-        Err(error) if error.kind() == ErrorKind::NotFound || folder.is_file() => return Ok(vec![]),
+        Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => return Ok(vec![]),
+        // Wine has another error for a file in the folder's place.
+        Err(_) if folder.is_file() => return Ok(vec![]),
         entries => entries.map_err(RecordError::read(folder))?,
     };
     let mut generations = Vec::new();
