@@ -422,10 +422,13 @@ fn the_message_about_resuming_a_zipped_run_has_working_commands() {
             let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
             assert_eq!(output.status.code(), Some(2), "{stderr}");
             let target = if top.is_empty() { format!(" -d {unpacked}") } else { String::new() };
+            // Windows separates names by a backslash, which shells need in quotes.
+            let path = Path::new(&unpacked).join("config.toml").display().to_string();
+            let path = if cfg!(windows) { format!("'{path}'") } else { path };
             for expected in [
                 format!("{name} is a run in a zip file"),
                 format!("unzip {name}{target}\n"),
-                format!("flotilla train {config} --out {unpacked} --resume"),
+                format!("flotilla train {path} --out {unpacked} --resume"),
             ] {
                 assert!(stderr.contains(&expected), "{expected}: {stderr}");
             }
