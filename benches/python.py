@@ -42,10 +42,12 @@ def case(name: str):
                 env.step(actions)
 
         return episode, 25
-    if kind in ("train", "own", "asked"):
+    if kind in ("train", "callback", "own", "asked"):
         config = config.replace(learning={"generations": 50})
         if kind == "train":
             return lambda: flotilla.train(config, backend="cpu"), 51
+        if kind == "callback":
+            return lambda: flotilla.train(config, backend="cpu", callback=lambda generation: None), 51
         if not hasattr(flotilla, "Coevolution"):
             return None
 
@@ -128,7 +130,7 @@ def main(old: str, new: str, rounds: int = 7) -> None:
     print("\n| | before | now |\n|---|---|---|")
     kinds = ("trace", "positions", "written", "collect")
     pairs = [(f"{kind} {teams}", f"rollout {teams}") for teams in (64, 4096) for kind in kinds]
-    for kind, base in [*pairs, ("own 50", "train 50"), ("asked 50", "train 50")]:
+    for kind, base in [*pairs, *((f"{kind} 50", "train 50") for kind in ("callback", "own", "asked"))]:
         cells = []
         for worker in workers:
             turns = [[ask(worker, name) for name in (kind, base)] for _ in range(rounds)]

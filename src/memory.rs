@@ -164,6 +164,7 @@ fn free_of_system() -> Option<u64> {
 }
 
 /// Implementation of [`available`] on Linux, with the system's files below `root`.
+#[cfg(any(test, not(all(feature = "cli", any(target_os = "macos", windows)))))]
 fn available_under(root: &Path) -> Option<u64> {
     let read = |path: &str| fs::read_to_string(root.join(path)).ok();
     let kib = |text: String, name: &str| field(&text, name).map(|kib| kib.saturating_mul(1024));
@@ -179,6 +180,7 @@ fn available_under(root: &Path) -> Option<u64> {
 
 /// Returns what the memory limits of a control group and of its parent groups leave. `line` is the line of the group in
 /// `/proc/self/cgroup`. Its format is `0::/path` in version 2 and `number:controllers:/path` in version 1.
+#[cfg(any(test, not(all(feature = "cli", any(target_os = "macos", windows)))))]
 fn limits_of_group(root: &Path, line: &str) -> Vec<u64> {
     let mut parts = line.splitn(3, ':').skip(1);
     let (Some(controllers), Some(path)) = (parts.next(), parts.next()) else { return vec![] };
@@ -201,6 +203,7 @@ fn limits_of_group(root: &Path, line: &str) -> Vec<u64> {
 }
 
 /// Returns the number after a name at the start of a line.
+#[cfg(any(test, not(all(feature = "cli", any(target_os = "macos", windows)))))]
 fn field(text: &str, name: &str) -> Option<u64> {
     text.lines().find_map(|line| line.strip_prefix(name)?.split_whitespace().next()?.parse().ok())
 }

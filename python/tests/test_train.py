@@ -238,24 +238,6 @@ def test_errors_of_callbacks_are_raised(config, out):
         assert train(config, out=out, resume=True).digest == train(config).digest
 
 
-def test_a_callback_costs_less_than_two_percent_of_the_paper_s_generations():
-    # The cost of a call is measured with 3001 generations of a tiny world. In a large world, it would be lost in noise.
-
-    def fastest(config, callback=None):
-        seconds = []
-        for _ in range(5):
-            start = time.process_time()
-            train(config, backend="cpu", callback=callback, progress=False)
-            seconds.append(time.process_time() - start)
-        return min(seconds)
-
-    paper = Config.paper()
-    world = {"leaders": [[5, 5]], "followers": [], "pois": [[9, 9]], "coupling": 1, "steps": 1}
-    tiny = paper.replace(world=world, learning={"population": 2, "generations": 3000})
-    per_call = (fastest(tiny, lambda generation: None) - fastest(tiny)) / 3001
-    assert per_call < 0.02 * fastest(paper) / 101
-
-
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for one process")
 def test_ctrl_c_saves_a_run_that_can_resume(config, tmp_path):
     long = config.replace(learning={"generations": 100_000, "population": 50})

@@ -285,3 +285,23 @@ fn json(measure: &Timing) -> serde_json::Value {
     }
     object
 }
+
+#[cfg(test)]
+mod tests {
+    use clap::{Args as _, FromArgMatches};
+
+    use super::*;
+
+    /// The time of a generation is compared with that of a rollout, which plays one episode per team.
+    #[test]
+    fn generations_play_one_episode_per_team() {
+        let text = include_str!("../../configs/strictly_forward.toml");
+        let text = text.replace("[learning]", "[learning]\nepisodes_per_team = 8\nstart_jitter = 1.0");
+        let config = Config::parse(&text, "config.toml").unwrap();
+        let words = ["bench", "--teams", "2,3", "--steps", "1,2"];
+        let matches = Args::augment_args(clap::Command::new("bench")).get_matches_from(words);
+        let configs = combinations(&config, &Args::from_arg_matches(&matches).unwrap()).unwrap();
+        assert_eq!(configs.len(), 4);
+        assert!(configs.iter().all(|config| config.learning.episodes_per_team == 1));
+    }
+}
