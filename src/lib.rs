@@ -102,7 +102,7 @@
 //! | [`report`] | `report` | pictures, films, pages; the paper's claims |
 //! | [`sweep`] | `report` | many runs of a parameter grid |
 //! | [`front`] | | the functions that most programs need |
-//! | [`choice`] | `gpu` and `record` | the processor that is expected to be done first |
+//! | [`choice`] | `gpu` and `record` | the processor that is expected to finish first |
 //! | [`ops`] | `gpu` and `report` | the use cases of the program, and their errors |
 //! | [`mod@bench`] | `cli` | a backend's speed, and the machine's arithmetic ceiling |
 //! | [`cli`] | `cli` | the command line |

@@ -245,7 +245,7 @@ fn unfinished_runs_are_compared_up_to_the_last_common_generation() {
     );
 
     fs::write(&metrics, fs::read_to_string(&metrics).unwrap().replace("\n1,1,", "\n1,2,")).unwrap();
-    assert_fails(&place, "compare whole part", 1, &["metrics.csv: trial 1 of generation 2 is out of turn"]);
+    assert_fails(&place, "compare whole part", 1, &["metrics.csv: trial 1 of generation 2 is out of order"]);
 }
 
 #[test]

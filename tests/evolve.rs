@@ -726,6 +726,24 @@ fn experiments_trained_together_equal_experiments_trained_alone() {
     }
 }
 
+/// A snapshot that was taken after the last champions played continues with more generations, too.
+#[test]
+fn a_snapshot_of_a_finished_experiment_extends_it() {
+    for (experiment, config) in experiments().into_iter().enumerate() {
+        let trials = config.learning.trials;
+        let mut longer = config.clone();
+        longer.learning.generations += 2;
+        let new = |config: &Config| Trainer::new([config.validate().unwrap()]);
+        let (mut trainer, mut extended, mut whole) = (new(&config), new(&longer), new(&longer));
+        trainer.finish(&mut Cpu::default()).unwrap();
+        assert!(extended.restore(0, trainer.snapshot(0).unwrap()));
+        let rows = extended.finish(&mut Cpu::default()).unwrap();
+        let expected = whole.finish(&mut Cpu::default()).unwrap();
+        assert_eq!(rows, expected[trials * config.learning.generations..], "experiment {experiment}");
+        assert_eq!(extended.policies(0), whole.policies(0), "experiment {experiment}");
+    }
+}
+
 /// A plain implementation of Algorithm 1 for one trial. It plays every team separately, with its own copy of the
 /// weights.
 struct PlainTrial<'a> {

@@ -14,7 +14,7 @@ use flotilla::backend::{Backend, Group};
 use flotilla::config::Sharing;
 use flotilla::config::{Fitness, MAX_AGENTS, MAX_POPULATION, MAX_STEPS, Stage};
 use flotilla::evaluate::Starts;
-use flotilla::front::{self, Failure, Processor, Trained};
+use flotilla::front::{self, Coevolution, Failure, Processor, Trained};
 use flotilla::record::checkpoint;
 use flotilla::record::digests::Verification;
 use flotilla::record::disk::Disk;
@@ -88,6 +88,37 @@ fn requesting_champions_does_not_change_training() {
     assert_eq!(champions[6], best);
     // Without this, champions of the previous generation would pass, too.
     assert_ne!(champions[5], best);
+}
+
+/// If the last champions could not be played, only they are left, and no team has to be scored.
+#[test]
+fn coevolution_continues_with_the_last_champions_alone() {
+    let (config, mut backend) = (config(0), Cpu::default());
+    let new = || Coevolution::new(&config).expect("a valid config");
+    let mut coevolution = new();
+    while !coevolution.is_done() {
+        coevolution.tell(&mut backend, None).expect("training succeeds");
+    }
+    let expected = coevolution.finish().expect("all generations were played");
+    let mut state = coevolution.state().expect("there is enough memory");
+    state.snapshot.generation -= 1;
+    state.rows.truncate(config.learning.generations * config.learning.trials);
+    let mut restored = new();
+    restored.restore(state).expect("the state is of this config");
+    assert_eq!(restored.play(&mut backend).expect("the champions play"), (vec![], vec![]));
+    restored.tell(&mut backend, None).expect("training succeeds");
+    assert_eq!(restored.finish().expect("all generations were played"), expected);
+}
+
+#[test]
+fn policies_cannot_be_replaced_once_they_were_played() {
+    let (config, mut backend) = (config(1), Cpu::default());
+    let first = flotilla::train(&config, &mut backend, |_| Continue(())).expect("training succeeds").policies;
+    let mut coevolution = Coevolution::new(&config).expect("a valid config");
+    coevolution.start_from(config.learning.population, &first).expect("the policies fit");
+    coevolution.play(&mut backend).expect("the policies play");
+    let refused = coevolution.start_from(config.learning.population, &first);
+    assert!(matches!(refused, Err(Failure::State)), "{refused:?}");
 }
 
 #[test]
@@ -287,7 +318,7 @@ fn play_and_trace_treat_each_team_separately() {
                 assert_eq!(traced.outputs[at * 2..][..2], moment.outputs, "seed {seed}");
             }
         }
-        assert_eq!(traced.near, trace.sets, "seed {seed}");
+        assert_eq!(traced.agents_at_poi, trace.sets, "seed {seed}");
         let lengths = [traced.positions.len(), traced.headings.len(), traced.speeds.len() * 2];
         assert_eq!(lengths, [teams * (steps + 1) * agents * 2; 3]);
         assert_eq!([traced.inputs.len() / 8, traced.outputs.len() / 2], [teams * steps * leaders; 2]);

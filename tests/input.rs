@@ -68,11 +68,11 @@ fn outputs_do_not_replace_inputs_or_files_of_a_run() {
         (&["--scores", "run/policies.safetensors"][..], "is read from"),
         (&["--trace", "run/../run/policies.safetensors"], "is read from"),
         (&["--scores", "./small.toml"], "is read from"),
-        (&["--scores", "run/metrics.csv"], "belongs to what is in"),
-        (&["--trace", "link.csv"], "belongs to what is in"),
-        (&["--trace", "run/run.json"], "belongs to what is in"),
-        (&["--trace", "run/.lock"], "belongs to what is in"),
-        (&["--trace", "run/checkpoints/x"], "belongs to what is in"),
+        (&["--scores", "run/metrics.csv"], "is part of the run, sweep or paper in"),
+        (&["--trace", "link.csv"], "is part of the run, sweep or paper in"),
+        (&["--trace", "run/run.json"], "is part of the run, sweep or paper in"),
+        (&["--trace", "run/.lock"], "is part of the run, sweep or paper in"),
+        (&["--trace", "run/checkpoints/x"], "is part of the run, sweep or paper in"),
         (&["--scores", "x.csv", "--trace", "./x.csv"], "is written by --scores"),
     ] {
         let stderr = place.refused(2, &[&rollout[..], flags].concat());
@@ -94,9 +94,12 @@ fn outputs_do_not_replace_inputs_or_files_of_a_run() {
     fs::create_dir_all(place.path("paper/arms")).unwrap();
     place.good(&[&rollout[..], &["--scores", "paper/scores.csv", "--trace", "paper.toml"]].concat());
     let stderr = place.refused(2, &[&rollout[..], &["--scores", "paper/paper.toml"]].concat());
-    assert!(stderr.contains("belongs to what is in"), "{stderr}");
+    assert!(stderr.contains("is part of the run, sweep or paper in"), "{stderr}");
     assert!(!fs::metadata(null).unwrap().is_file());
     let stderr = place.refused(1, &[&rollout[..], &["--scores", "none/x.csv"]].concat());
+    assert!(stderr.contains("the folder none does not exist; make it first"), "{stderr}");
+    // The folder is checked before a backend is opened.
+    let stderr = place.refused(1, &["replay", "run", "--out", "none/r.html", "--adapter", "no such adapter"]);
     assert!(stderr.contains("the folder none does not exist; make it first"), "{stderr}");
     // A folder is refused before anything is played and written.
     let stderr = place.refused(1, &[&rollout[..], &["--scores", "x.csv", "--trace", "run"]].concat());
@@ -174,7 +177,7 @@ fn commands_do_not_wait_for_input_from_pipes_and_devices() {
     }
     for command in ["train small.toml", "sweep grid.toml", "paper --trials 1 --generations 1"] {
         let stderr = place.refused(1, &format!("{command} --backend cpu --out pipe"));
-        assert!(stderr.ends_with("a file is where a folder is needed; choose another name\n"), "{stderr}");
+        assert!(stderr.ends_with("a part of this path is a file, not a folder; choose another path\n"), "{stderr}");
     }
     for name in ["config.toml", "metrics.csv", ".lock"] {
         let place = with_run();
@@ -201,7 +204,7 @@ fn an_output_pipe_without_a_reader_is_waited_for_with_a_message() {
     assert!(Command::new("mkfifo").arg(place.path("pipe")).status().unwrap().success());
     let rollout = "flotilla rollout small.toml --policies run/policies.safetensors --quiet --scores";
     let patient = "for _ in $(seq 600); do grep -q waiting stderr && break; sleep 0.1; done; cat pipe";
-    for (reader, stderr) in [("cat pipe", ""), (patient, "waiting for somebody to read from pipe\n")] {
+    for (reader, stderr) in [("cat pipe", ""), (patient, "waiting for a reader of pipe\n")] {
         place.write("stderr", "");
         let output =
             place.shell(&format!("({reader}) > read.csv & {rollout} pipe 2> stderr && wait && {rollout} scores.csv"));
@@ -601,7 +604,8 @@ fn too_little_address_space_is_reported() {
             }
             // The system could not even load the program.
             Some(127) if stderr.contains("shared libraries") => {}
-            // The program was loaded, but what is left does not even hold its command line.
+            // The program was loaded, but what is left does not even hold the stack for signals or its command line.
+            None if refused == 0 && stderr.contains("failed to allocate an alternative stack") => {}
             None if refused == 0 && stderr.starts_with("memory allocation of") => {}
             other => panic!("{mib} MiB: {other:?}: {stderr}"),
         }

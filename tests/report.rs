@@ -537,7 +537,7 @@ fn a_replay_that_contradicts_the_metrics_is_refused() {
         })
         .collect();
     fs::write(run.file("metrics.csv"), forged).unwrap();
-    fail(&["replay", &run.text(), "--backend", "cpu"], &["generation 6", "metrics.csv says"]);
+    fail(&["replay", &run.text(), "--backend", "cpu"], &["generation 6", "metrics.csv has"]);
     fail_with(2, &["replay", &run.text(), "--trial", "3", "--backend", "cpu"], &["no trial 3", "0 to 2"]);
 }
 
@@ -1234,7 +1234,7 @@ fn a_paper_is_overwritten_only_with_force() {
     fs::create_dir(&old).unwrap();
     fs::write(old.join("figure4.svg"), "").unwrap();
     for flags in [&[][..], &["--resume"], &["--force"]] {
-        refused(&old, flags, &["holds figure4.svg, but no paper.toml"]);
+        refused(&old, flags, &["holds figure4.svg but no paper.toml"]);
     }
     assert!(old.join("figure4.svg").exists());
     refused(&sweep, &["--force"], &["holds a sweep, no paper"]);

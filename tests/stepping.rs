@@ -79,7 +79,7 @@ impl Played {
         let sets = self.trace.sets[team * self.world.set_words()..][..self.world.set_words()].chunks(pois * words);
         let sets: Vec<&[u32]> = sets.collect();
         let now = step.checked_sub(1).map_or(vec![0; pois * words], |step| sets[step].to_vec());
-        assert_eq!(stepper.near()[team * now.len()..][..now.len()], now, "near, {case}");
+        assert_eq!(stepper.agents_at_poi()[team * now.len()..][..now.len()], now, "near, {case}");
         let words = &self.trace.sets[team * self.world.set_words()..][..self.world.set_words()];
         let at = credit::observed_at(credit::Strided { words, stride: 1, offset: 0 }, &self.world);
         let by = |step: usize| at.iter().map(move |at| at.is_some_and(|at| at <= step)).collect::<Vec<bool>>();
@@ -283,9 +283,9 @@ fn invalid_input_is_refused_and_changes_nothing() {
         "2 choices, but [teams] are 3",
         "agent 0 of team 0 would start at (NaN, NaN), which is not on the map",
         "11 scores, but [teams][leaders] are 12",
-        "no record was kept to score teams by",
-        "no record was kept to score teams by",
-        "team 3 of 3 (they count from 0)",
+        "no record to score; create the stepper with `Stepper::recording`",
+        "no record to score; create the stepper with `Stepper::recording`",
+        "team 3 does not exist: there are 3, counted from 0",
         "the speed of leader 2 in team 1 is NaN, which is no finite number",
         "the speed of leader 2 in team 1 is inf, which is no finite number",
         "the speed of leader 2 in team 1 is -inf, which is no finite number",
@@ -372,7 +372,8 @@ fn a_restored_stepper_continues_with_the_same_bits() {
                     let states = stepper.states();
                     let bits = [states.positions, states.headings, states.speeds].concat();
                     let bits: Vec<u32> = bits.iter().chain(stepper.inputs()).map(|number| number.to_bits()).collect();
-                    let counts = (stepper.near().to_vec(), stepper.observed().to_vec(), stepper.steps().to_vec());
+                    let counts =
+                        (stepper.agents_at_poi().to_vec(), stepper.observed().to_vec(), stepper.steps().to_vec());
                     (
                         bits,
                         counts,
@@ -400,7 +401,8 @@ fn a_restored_stepper_continues_with_the_same_bits() {
 #[test]
 fn an_invalid_saved_state_is_refused_and_changes_nothing() {
     let world = World::new(&sample::world(1));
-    let mut stepper = Stepper::recording(world.clone(), 3).unwrap();
+    let make = |teams| Stepper::recording(world.clone(), teams).and_then(Stepper::with_sights).unwrap();
+    let mut stepper = make(3);
     stepper.step(&vec![0.5; 3 * world.leaders() * 2]).unwrap();
     let state = stepper.save();
     let refused = |stepper: &mut Stepper, state: &[u8]| {
@@ -413,14 +415,20 @@ fn an_invalid_saved_state_is_refused_and_changes_nothing() {
     }
     refused(&mut stepper, &[&state[..], &[0; 4]].concat());
     refused(&mut Stepper::new(world.clone(), 3).unwrap(), &state);
-    refused(&mut Stepper::recording(world, 4).unwrap(), &state);
-    for word in 0..state.len() / 4 {
+    refused(&mut Stepper::recording(world.clone(), 3).unwrap(), &state);
+    refused(&mut make(4), &state);
+    let mut scores = vec![0.0; 3 * world.leaders()];
+    for (word, bits) in (0..state.len() / 4).flat_map(|word| [f32::NAN.to_bits(), u32::MAX].map(|bits| (word, bits))) {
         let mut damaged = state.clone();
-        damaged[word * 4..word * 4 + 4].copy_from_slice(&f32::NAN.to_le_bytes());
-        // Counts and sets can have any bits, so some damage is accepted.
+        damaged[word * 4..word * 4 + 4].copy_from_slice(&bits.to_le_bytes());
         let before = stepper.save();
-        if stepper.restore(&damaged).is_err() {
-            assert_eq!(stepper.save(), before, "word {word}");
+        match stepper.restore(&damaged) {
+            Err(_) => assert_eq!(stepper.save(), before, "word {word}"),
+            // Counts can have any bits, and sets any members, so some damage is accepted. Scores have to exist.
+            Ok(()) => {
+                (0..3).for_each(|team| drop(stepper.scores(team).unwrap()));
+                stepper.fitness(Fitness::Dt, &mut scores).unwrap();
+            }
         }
     }
     stepper.restore(&state).unwrap();
@@ -453,10 +461,11 @@ fn each_team_can_have_its_own_pois() {
             assert_eq!(&together.observed()[team * pois..][..pois], alone.observed());
         }
     }
-    // A reset to the world's starts restores the world's POIs, for the chosen team only.
-    let chosen: Vec<bool> = (0..teams).map(|team| team == 2).collect();
+    // A reset to the world's starts restores the world's POIs, for the chosen teams only.
+    let chosen: Vec<bool> = (0..teams).map(|team| [0, 2].contains(&team)).collect();
     together.reset_some(&chosen, None).unwrap();
-    assert_eq!((together.pois(2), together.pois(3)), (&world.pois[..], &drawn[3][agents..]));
+    assert_eq!((together.pois(0), together.pois(2)), (&world.pois[..], &world.pois[..]));
+    assert_eq!((together.pois(1), together.pois(3)), (&drawn[1][agents..], &drawn[3][agents..]));
     together.reset();
     assert_eq!(together.pois(3), &world.pois[..]);
 }

@@ -320,7 +320,7 @@ fn errors_in_varied_keys_name_the_line() {
             "\"world.coupling\" = [1, 7]",
             "vary.\"world.coupling\"[1]: found 7, allowed 1 to 6 (the number of agents); at 2",
         ),
-        ("followers_per_leader = [3]", "x.toml:17: vary.followers_per_leader: it lays out whole teams"),
+        ("followers_per_leader = [3]", "x.toml:17: vary.followers_per_leader: not allowed in [vary]"),
         ("skip_impossible = true", "x.toml:17: vary.skip_impossible: found true, allowed a list of values"),
     ] {
         let error = error_of(keys);
@@ -444,7 +444,9 @@ fn the_shard_is_read_from_the_variables_of_job_arrays() {
     let kubernetes = [("JOB_COMPLETION_INDEX", "2"), ("FLOTILLA_SHARDS", "3")];
     assert_eq!(shard(&kubernetes), Ok(Some(Shard { index: 3, count: 3 })));
     assert!(shard(&kubernetes[..1]).unwrap_err().contains("FLOTILLA_SHARDS"));
-    assert!(shard(&[("JOB_COMPLETION_INDEX", "x"), ("FLOTILLA_SHARDS", "3")]).unwrap_err().contains("no whole number"));
+    assert!(
+        shard(&[("JOB_COMPLETION_INDEX", "x"), ("FLOTILLA_SHARDS", "3")]).unwrap_err().contains("not a whole number")
+    );
 }
 
 #[test]
@@ -791,7 +793,7 @@ fn files_of_others_in_a_sweeps_folder_are_not_overwritten() {
         fs::create_dir(&out).unwrap();
         fs::write(out.join(name), "mine").unwrap();
         let error = fail(flotilla(&sweep, &out, &["--quiet", "--force"]), 1);
-        assert!(error.contains(&format!("holds {name}, but no sweep.toml")), "{error}");
+        assert!(error.contains(&format!("holds {name} but no sweep.toml")), "{error}");
         assert_eq!(fs::read_to_string(out.join(name)).unwrap(), "mine");
     }
     let started_by_hand = folder.path().join("own");

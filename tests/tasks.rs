@@ -153,9 +153,18 @@ fn tasks_resume_and_those_that_a_constant_speed_solves_fail() {
     assert_eq!(run(&format!("{task} --out a --resume")).1, table);
     assert_eq!(run(&format!("{task} --out a")).0, Some(1));
     let (code, _, error) = run(&format!("{solved} --out b"));
-    assert!(code == Some(1) && error.contains("G of the best constant speed is 1.00"), "{error}");
+    assert!(code == Some(1) && error.contains("G of the best constant action is 1.00"), "{error}");
     let (code, _, error) = run(&format!("{task} {task} --out c"));
     assert!(code == Some(2) && error.contains("two configs"), "{error}");
+}
+
+/// Both would train in the same directories.
+#[test]
+fn the_large_population_differs_from_the_small_ones() {
+    let place = Place::new(&[]).on_cpu();
+    place.write("tiny.toml", TINY);
+    let error = place.refused(2, "tasks tiny.toml --trials 2 --population 50 --out refused");
+    assert!(error.contains("--population 50") && !place.path("refused").exists(), "{error}");
 }
 
 #[test]

@@ -278,11 +278,17 @@ def check_several_runs(tab, page, flotilla, folder):
     def run(name, layout, *flags):
         command = [flotilla, "train", CONFIGS / f"{layout}.toml", "--seed", "7", "--population", "20", *flags]
         subprocess.run([*map(str, command), "--out", str(folder / name), "--quiet", "--backend", "cpu"], check=True)
-        archive = folder / f"{name}.zip"
-        with zipfile.ZipFile(archive, "w") as to:
-            for file in ["config.toml", "metrics.csv", "policies.safetensors", "run.json"]:
-                to.write(folder / name / file, f"{name}/{file}")
-        return base64(archive.read_bytes())
+        return pack(f"{name}.zip", files_of(name))
+
+    def files_of(name):
+        return [f"{name}/{file}" for file in ["config.toml", "metrics.csv", "policies.safetensors", "run.json"]]
+
+    def pack(archive, paths):
+        """Packs files of runs, and returns the archive in base64."""
+        with zipfile.ZipFile(folder / archive, "w") as to:
+            for path in paths:
+                to.write(folder / path, path)
+        return base64((folder / archive).read_bytes())
 
     def cells(selector):
         rows = "tr => [...tr.cells].map(cell => cell.textContent)"
@@ -344,15 +350,21 @@ def check_several_runs(tab, page, flotilla, folder):
     tab.assert_no_errors()
     # Files that cannot be opened together give an error, and change nothing.
     broken = base64(b"PK\x03\x04" + bytes(40))
+    both = pack("both.zip", [*files_of("of-g"), *files_of("of-df")])
     for group, message in [
         ({"of-g.zip": files["of-g"], "mine.toml": base64(b"")}, "mine.toml: not a run"),
-        ({"of-g.zip": files["of-g"], "broken.zip": broken}, "broken.zip: no archive"),
+        ({"of-g.zip": files["of-g"], "broken.zip": broken}, "broken.zip: not an archive of a run"),
+        ({"both.zip": both}, "both.zip: it has 2 runs"),
         ({f"{index}.zip": files["of-g"] for index in range(7)}, "open 6 runs at most"),
     ]:
         tab.drop_all(group)
         tab.wait(f"document.querySelector('#trouble').textContent.includes({json.dumps(message)})")
         tab.evaluate("document.querySelector('#trouble').textContent = ''")
         assert tab.evaluate("page.state.training.arms.length") == 3
+    # All files of a run are read from one folder, even if a file of another run comes first.
+    tab.drop("stray.zip", pack("stray.zip", ["of-df/metrics.csv", *files_of("of-g")]))
+    tab.wait("document.querySelector('#message').textContent.startsWith('stray.zip: the run is complete')")
+    assert tab.text(".sha") == json.loads((folder / "of-g" / "run.json").read_text())["digest"]
     assert not list(tab.complaints())
     print("several runs are arms of one chart, with the intervals and tests of the program")
 
@@ -1015,7 +1027,7 @@ def main():
         assert json.loads((run / "run.json").read_text())["digest"] == longer, "the resumed run has another digest"
         tab.load(page)
         tab.drop("run.zip", base64(archive.read_bytes()))
-        tab.wait("document.querySelector('#message').textContent.includes('its digest is right')")
+        tab.wait("document.querySelector('#message').textContent.includes('its digest matches')")
         assert tab.text(".sha") == digests["leader-follower"]
         tab.wait("page.state.views[0].data.episodes[0].generation === 6")
         tab.set("#scrub", 2)

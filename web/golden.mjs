@@ -51,8 +51,8 @@ assert.ok(
 );
 console.log("web/page/opening.json is current");
 
-// If the user drives one leader, the other leaders follow their trained policies. Compare their headings after one
-// step.
+// If the user drives one leader, the other leaders follow their trained policies. If the driven leader acts like its
+// policy, too, the episode has the same bits as that of the trained team.
 const { words: resolved } = await player.ask({ ask: "resolve", text: text("layout-generally_forward"), name: "", changes: SMALL });
 const trained = new Training([{ ...resolved, label: "", command: "" }], machine);
 await trained.start([player]);
@@ -60,14 +60,20 @@ await trained.play(() => Infinity, () => {});
 const weights = trained.arms[0].ended[0];
 const numbers = text => new Float32Array(Uint8Array.from(atob(text), c => c.charCodeAt(0)).buffer);
 const { words: whole } = await player.ask({ ask: "play", text: resolved.toml, policies: 1 }, weights);
-const { agents, headings } = whole.episodes[0], after = numbers(headings).slice(2 * agents, 4 * agents);
+const [episode] = whole.episodes, { agents, leaders } = episode;
+const [positions, headings, senses] = [episode.positions, episode.headings, episode.senses].map(numbers);
 await player.ask({ ask: "drive", text: resolved.toml, leader: 0, policies: 1 }, weights);
-const { words: driven } = await player.ask({ ask: "step", turn: 0, speed: 0 });
-for (const leader of [1, 2, 3])
-  for (const axis of [0, 1]) {
-    const difference = driven.headings[2 * leader + axis] - after[2 * leader + axis];
-    assert.ok(Math.abs(difference) < 1e-3, `leader ${leader} does not follow its policy`);
+let driven = null;
+for (let step = 1; step <= whole.steps; step++) {
+  // Per step and leader, there are 8 inputs and 2 outputs.
+  const [turn, speed] = senses.slice(step * leaders * 10 + 8, step * leaders * 10 + 10);
+  driven = (await player.ask({ ask: "step", turn, speed })).words;
+  for (const [found, expected] of [[driven.positions, positions], [driven.headings, headings]]) {
+    const frame = expected.slice(step * agents * 2, (step + 1) * agents * 2);
+    assert.deepEqual(Float32Array.from(found), frame, `step ${step} of the driven episode differs`);
   }
+}
+assert.equal(driven.scores.g, episode.g);
 console.log("teammates follow their policies");
 
 const folder = mkdtempSync(join(tmpdir(), "flotilla-web-"));

@@ -1,8 +1,9 @@
-// Tests the modules of the page that need no browser: node --test web/units.mjs
+// Tests the modules of the page that need no browser, or only a small imitation of one: node --test web/units.mjs
 
 import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
 import { test } from "node:test";
+import { deflateSync } from "node:zlib";
 import { choice_of, comparison, label, read, slug, toml, write } from "./page/compare.js";
 import { angles, moment, words } from "./page/senses.js";
 import { csv } from "./page/table.js";
@@ -48,6 +49,54 @@ test("the inputs shown are those of the chosen leader and frame, and quadrants a
   assert.deepEqual(angles(2), [0, Math.PI / 2]);
   const inputs = { pois: [0, 0, 1, 0], agents: [0, 0, 0, 0], turn: 0.5, speed: 1 };
   assert.match(words(inputs), /front left 1\.00.* 90° to the left, at 100 %/);
+});
+
+test("requests open another worker after one has failed or could not be opened", async () => {
+  const packed = content => deflateSync(content).toString("base64");
+  const texts = { wasm: packed("no module"), worker: "" }, workers = [];
+  const started = { words: { suspends: false } }, about = { words: { version: "1" } };
+  // What workers post in response to `start` and to other requests.
+  let on_start = started, on_request = about;
+  globalThis.matchMedia = () => ({ matches: false });
+  globalThis.document = { getElementById: id => ({ textContent: texts[id] }) };
+  globalThis.Worker = class {
+    constructor() { workers.push(this); }
+    postMessage({ id, words }) {
+      const posted = words.ask === "start" ? on_start : on_request;
+      queueMicrotask(() => this.onmessage({ data: { id, ...posted } }));
+    }
+    terminate() { this.terminated = true; }
+  };
+  const { clerk } = await import("./page/pool.js");
+  const ask = () => clerk.ask({ ask: "about" });
+  const works_with = async number => {
+    on_request = about;
+    assert.equal((await ask()).words.version, "1");
+    assert.equal(workers.length, number);
+  };
+
+  await assert.rejects(ask(), WebAssembly.CompileError);
+  // The smallest module.
+  texts.wasm = packed(Uint8Array.of(0, 0x61, 0x73, 0x6d, 1, 0, 0, 0));
+  on_start = { words: { error: "no memory", fatal: true } };
+  await assert.rejects(ask(), /no memory/);
+  on_start = started;
+  await Promise.all([works_with(3), works_with(3)]);
+  // An error of a request does not end the worker.
+  on_request = { words: { error: "not a config" } };
+  await assert.rejects(ask(), /not a config/);
+  await works_with(3);
+  // A trap and a panic do.
+  on_request = { words: { error: "unreachable", fatal: true } };
+  await assert.rejects(ask(), /unreachable/);
+  await works_with(4);
+  on_request = { told: { panic: "out of bounds" } };
+  await assert.rejects(ask(), /out of bounds/);
+  await works_with(5);
+  // So does a failure between requests.
+  workers[4].onerror({ message: "killed" });
+  await works_with(6);
+  assert.deepEqual(workers.map(({ terminated = false }) => terminated), [true, true, true, true, true, false]);
 });
 
 test("elements have the types that globals.d.ts declares", () => {

@@ -58,7 +58,7 @@ def floats(what: str, values: ArrayLike, axes: int) -> Floats:
     try:
         array = np.asarray(values)
     except ValueError as error:
-        raise ValueError(f"{what} are no array: {error}") from None
+        raise ValueError(f"{what} are not an array: {error}") from None
     if array.dtype.kind not in "fiu":
         raise TypeError(f"{what} are {array.dtype}, allowed are float32 (other numbers are converted to it)")
     if array.ndim != axes:

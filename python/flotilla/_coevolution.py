@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -10,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from flotilla import _native
 from flotilla._arrays import Floats, backend_name, floats
-from flotilla._config import Config
+from flotilla._config import Config, check_config
 from flotilla._run import Generation, Run, first_policies
 
 
@@ -78,12 +79,13 @@ class Coevolution:
         init: ArrayLike | Sequence[ArrayLike] | None = None,
         backend: str | int = "auto",
     ) -> None:
-        if not isinstance(config, Config):
-            raise TypeError(f"config is {type(config).__name__}, allowed is flotilla.Config, see Config.load and Config.paper")
+        check_config(config)
         self.config = config if seed is None else config.replace(learning={"seed": seed})
         self._backend = backend_name(backend)
         self._native = _native.Coevolution(self.config._native)
         self._trials = int(self.config["learning.trials"])
+        # In the format of `run.json`.
+        self._started = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
         if init is not None:
             self._native.start_from(first_policies(init))
 
@@ -167,14 +169,15 @@ class Coevolution:
         """
         if not self.done:
             raise ValueError(f"generation {self.generation} has no fitness yet; a run has results once all generations have one")
-        return Run(self._native.finish(), ("cpu", "ask and tell", None, None, _native.threads(), None), None, None)
+        played = ("cpu", "ask and tell", None, None, _native.threads(), self._started, None)
+        return Run(self._native.finish(), played, None, None)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"config": self.config, "backend": self._backend, "state": self.state}
+        return {"config": self.config, "backend": self._backend, "state": self.state, "started": self._started}
 
     def __setstate__(self, saved: dict[str, Any]) -> None:
         Coevolution.__init__(self, saved["config"], backend=saved["backend"])
-        self.state = saved["state"]
+        self.state, self._started = saved["state"], saved["started"]
 
     def __repr__(self) -> str:
         last = self.config["learning.generations"]

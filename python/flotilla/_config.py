@@ -26,10 +26,10 @@ class Key(NamedTuple):
     range: str
     """What is allowed."""
     default: str | None
-    """As a config file has it; None where it has to be given."""
+    """The default as TOML, or None if the key is required."""
     meaning: str
     paper: str
-    """Section and equation of the paper; empty where it says nothing of the key."""
+    """Section and equation of the paper, or "" if there is none."""
 
 
 def _flat(sections: Mapping[str, Any]) -> list[tuple[str, Any]]:
@@ -228,6 +228,13 @@ class Config(Mapping[str, Any]):
             f"{count(learning['population'], 'team')}, {count(learning['generations'], 'generation')}, "
             f"{count(learning['trials'], 'trial')}, seed {learning['seed']}>"
         )
+
+
+def check_config(config: Any) -> None:
+    """Raises an error if an argument is not a config. A path or a text is a common mistake."""
+    if not isinstance(config, Config):
+        kind = type(config).__name__
+        raise TypeError(f"config is {kind}, but must be a flotilla.Config; see Config.load and Config.paper")
 
 
 def jitters(config: Config, jitter: float | None, poi_jitter: float | None) -> tuple[float, float]:

@@ -14,9 +14,9 @@ class Problem(NamedTuple):
     """
 
     line: int | None
-    """Line of the text, from 1; None of what came from outside of it."""
+    """Line of the text, from 1. None for a problem outside the text."""
     key: str
-    """Dotted key; empty where none is meant."""
+    """Dotted key, or "" if the problem has none."""
     message: str
     """What was found, and what is allowed."""
 

@@ -13,7 +13,7 @@ _F32 = NDArray[np.float32]
 _F64 = NDArray[np.float64]
 _Starts = tuple[int, int, float, float] | None
 
-Played = tuple[str, str, str | None, str | None, int, str | None]
+Played = tuple[str, str, str | None, str | None, int, str, str | None]
 End = tuple[list[_F32], list[_F32]] | None
 Outcome = tuple[Config, list[_F64], list[_F32], str, End]
 

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from flotilla import _native
 from flotilla._arrays import Floats, backend_name, floats, renamed, whole
-from flotilla._config import Config, jitters
+from flotilla._config import Config, check_config, jitters
 
 MAX_EPISODES = 1_000_000
 
@@ -65,7 +65,7 @@ class Rollout:
         g: the share of POIs observed, float64 `[teams]`, as in a run's metrics.
         d: what the team would have lost without each leader, `[teams, leaders]`, as the next three.
         df: without the leader and the followers that it led.
-        dpp: what copies of the leader would have gained, if that is more.
+        dpp: D, or the gain per added copy of the leader if that is larger.
         dt: without the leader and, at each step, the followers that it led then; None unless the config's fitness is Dt.
         trace: what the teams did, if that was asked for.
         deviation: the standard deviation of G over episodes, `[teams]`, if `spread` was asked for, as the next two.
@@ -111,10 +111,12 @@ FIRST_BLOCK = 4_000_000
 
 
 def _checked(config: Any, policies: ArrayLike) -> Floats:
-    """Returns policies as an array `[leaders, teams, parameters]`."""
-    if not isinstance(config, Config):
-        raise TypeError(f"config is {type(config).__name__}, allowed is flotilla.Config, see Config.load and Config.paper")
-    return floats("policies", policies, 3)
+    """Returns policies as an array `[leaders, teams, parameters]` with at least one team."""
+    check_config(config)
+    array = floats("policies", policies, 3)
+    if array.shape[1] == 0:
+        raise ValueError(f"policies are {list(array.shape)}: no teams; pass [leaders, teams, parameters] with 1 team or more")
+    return array
 
 
 def _shapes(config: Config, teams: int) -> dict[str, tuple[int, ...]]:
@@ -363,18 +365,17 @@ def _layers(config: Config | None, parameters: int) -> list[int]:
 
     Without a config, the policy has at most one hidden layer, whose width follows from the number of parameters.
     """
-    if config is not None and not isinstance(config, Config):
-        raise TypeError(f"config is {type(config).__name__}, allowed is flotilla.Config, see Config.load and Config.paper")
     if config is None:
         ins, outs = _native.INPUTS, _native.OUTPUTS
         units = (parameters - outs) // (ins + 1 + outs)
         found = [ins, outs] if parameters == (ins + 1) * outs else [ins, max(units, 1), outs]
     else:
+        check_config(config)
         found = config._native.widths
     expected = sum((before + 1) * after for before, after in zip(found, found[1:]))
     if expected != parameters:
         named = ", ".join(map(str, found))
-        hint = "" if config is not None else "; say by config which layers it has"
+        hint = "" if config is not None else "; pass config= to give its layers"
         raise ValueError(f"a policy has {parameters} parameters, but layers of {named} units take {expected}{hint}")
     return found
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from flotilla import _native
 from flotilla._arrays import Floats, backend_name, floats, whole
-from flotilla._config import Config
+from flotilla._config import Config, check_config
 from flotilla._show import Figure, Replay
 
 if TYPE_CHECKING:
@@ -169,7 +169,8 @@ class Run:
             backend: as of `train`.
 
         Raises:
-            ValueError: there is no such trial or generation.
+            ValueError: there is no such trial or generation, or the worlds of the two generations differ: they are of
+                different stages, or POIs move (`learning.poi_jitter`).
             Error: the run was made with another version of the program, or the backend fails.
 
         Example:
@@ -325,11 +326,10 @@ def train(
         >>> bool(run.metrics["champion_g"].shape[1] <= 51)
         True
     """
-    if not isinstance(config, Config):
-        raise TypeError(f"config is {type(config).__name__}, allowed is flotilla.Config, see Config.load and Config.paper")
+    check_config(config)
     called = _together(callback)
     if out is None and (resume or force):
-        raise ValueError("resume and force are of a run in a folder, say which by out")
+        raise ValueError("resume and force apply to a run directory; pass out=")
     if champions and (out is not None or init is not None):
         raise ValueError("champions are given for training in memory from random policies; leave out out= and init=")
     if resume and force:

@@ -105,7 +105,8 @@ def sweep(
         out: a directory that keeps the sweep, as `flotilla sweep SWEEP --out DIR` does. Not with `executor`.
         skip_impossible: leave out points that cannot run.
         backend: as of `train`.
-        progress: called with the number of finished points and of all points.
+        progress: called with the number of finished points and of all points. Without `executor` it is called once, at the
+            end.
 
     Raises:
         ConfigError: everything that is wrong with the sweep and any of its points.

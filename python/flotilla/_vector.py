@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from flotilla import _native
 from flotilla._arrays import ArraySupply, Floats, aligned, floats, renamed, whole
-from flotilla._config import Config, jitters
+from flotilla._config import Config, check_config, jitters
 
 if TYPE_CHECKING:
     from gymnasium import spaces
@@ -48,8 +48,7 @@ class TeamBatch:
         jitter: float | None = None,
         poi_jitter: float | None = None,
     ) -> None:
-        if not isinstance(config, Config):
-            raise TypeError(f"config is {type(config).__name__}, allowed is flotilla.Config")
+        check_config(config)
         if reward not in _native.FITNESSES:
             raise ValueError(f"reward {reward!r}, allowed are {', '.join(_native.FITNESSES)}")
         if render_mode is not None and render_mode not in RENDER_MODES:

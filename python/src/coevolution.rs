@@ -1,6 +1,6 @@
 //! Training by ask and tell.
 
-use std::sync::Mutex;
+use std::sync::{Mutex, MutexGuard, TryLockError};
 
 use flotilla::choice::Work;
 use flotilla::front;
@@ -40,8 +40,16 @@ pub struct Coevolution {
 }
 
 impl Coevolution {
-    fn lock(&self) -> PyResult<std::sync::MutexGuard<'_, front::Coevolution>> {
-        self.inner.try_lock().map_err(|_| PyValueError::new_err("another thread uses this Coevolution"))
+    /// Returns the training, or an error if another thread uses it. Waiting would hide that two threads share one
+    /// training.
+    fn lock(&self) -> PyResult<MutexGuard<'_, front::Coevolution>> {
+        match self.inner.try_lock() {
+            Ok(inner) => Ok(inner),
+            Err(TryLockError::Poisoned(poisoned)) => Ok(poisoned.into_inner()),
+            Err(TryLockError::WouldBlock) => {
+                Err(PyValueError::new_err("another thread uses this Coevolution: make one Coevolution per thread"))
+            }
+        }
     }
 }
 

@@ -6,7 +6,6 @@ use flotilla::config::{ConfigError, Problem};
 use flotilla::front::Failure;
 use flotilla::ops;
 use flotilla::record::RecordError;
-use flotilla::report::replay::ReplayError;
 use flotilla::report::runs;
 use flotilla::run::RunError;
 use flotilla::stepping::StepError;
@@ -95,16 +94,6 @@ impl Raised for RecordError {
             RecordError::Exists { .. } => {
                 PyFileExistsError::new_err(format!("{self}; choose another folder, or pass force=True"))
             }
-            _ => failed(self),
-        }
-    }
-}
-
-impl Raised for ReplayError {
-    fn raised(self) -> PyErr {
-        match self {
-            ReplayError::Run(error) => error.raised(),
-            ReplayError::NoTrial { .. } | ReplayError::NoGeneration { .. } => PyValueError::new_err(self.to_string()),
             _ => failed(self),
         }
     }

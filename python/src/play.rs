@@ -158,7 +158,8 @@ pub fn record<'py>(
     let scores = workers::aside(py, || {
         let mut sets = vec![0; sets];
         let near_sets = &mut sets[..];
-        let arrays = StepArrays { positions, headings, speeds, inputs, outputs, actions, near: near_sets, observed_at };
+        let arrays =
+            StepArrays { positions, headings, speeds, inputs, outputs, actions, agents_at_poi: near_sets, observed_at };
         let scores = front::record(&config.0, teams, weights, &starts, episodes.0..episodes.1, noise, arrays);
         write_members(&sets, world.agents(), near);
         scores.raise()

@@ -1,14 +1,13 @@
 //! Replays and learning curves.
 
 use std::path::PathBuf;
-use std::time::{Duration, Instant};
 
-use flotilla::choice::Work;
+use flotilla::ops::replay::{Played, play};
 use flotilla::ops::{self, output};
 use flotilla::record::RecordError;
 use flotilla::record::digests::Verification;
 use flotilla::report::curves::{Band, PRINT};
-use flotilla::report::replay::{self as again, Film, ReplayError, Replayed, Which};
+use flotilla::report::replay::{self as again, Film, Replayed, Which};
 use flotilla::report::runs;
 use flotilla::report::scene::{Format, Scene};
 use pyo3::exceptions::PyValueError;
@@ -16,12 +15,14 @@ use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 
 use crate::errors::{Raise, Raised};
+use crate::program::perform;
 use crate::workers;
 
 /// Replayed episodes.
 #[pyclass(frozen)]
 pub struct Replay {
     name: String,
+    /// The config of the stage that the episodes belong to.
     config: flotilla::Config,
     played: Vec<Replayed>,
 }
@@ -37,27 +38,11 @@ pub fn replay(
     backend: &str,
 ) -> PyResult<Replay> {
     let verification = Verification::unless(unverified);
-    let (mut interrupted, mut asked) = (None, Instant::now());
-    let config = runs::config(&folder, verification).raise()?;
-    let work = Work::of_teams(&config, generations.len());
-    let played = workers::play(py, backend, work, |(backend, _)| {
-        let mut watch = |_| {
-            if asked.elapsed() > Duration::from_millis(50) {
-                interrupted = Python::attach(|py| py.check_signals()).err();
-                asked = Instant::now();
-            }
-            interrupted.is_none()
-        };
-        match again::replay(&folder, trial, &generations, Which::Best, verification, &mut **backend, &mut watch) {
-            Err(ReplayError::Stopped) if interrupted.is_some() => Ok(vec![]),
-            played => played.raise(),
-        }
+    let Played { config, episodes, .. } = perform(py, backend, "", &|_, _, _| Ok(false), |backends, context| {
+        play(&folder, trial, &generations, Which::Best, verification, backends, context)
     })?;
-    if let Some(error) = interrupted {
-        return Err(error);
-    }
     let name = folder.file_name().map_or("run".into(), |name| name.to_string_lossy().into_owned());
-    Ok(Replay { name, config, played })
+    Ok(Replay { name, config, played: episodes })
 }
 
 #[pymethods]

@@ -164,7 +164,7 @@ impl Stepper {
             let stepper = self.stepper()?;
             let shape = [stepper.teams(), stepper.world().pois.len(), stepper.world().agents()];
             let mut members = vec![false; shape.iter().product()];
-            write_members(stepper.near(), shape[2], &mut members);
+            write_members(stepper.agents_at_poi(), shape[2], &mut members);
             PyResult::Ok((shape, members))
         })?;
         PyArray1::from_vec(py, members).reshape(&shape[..])
@@ -234,7 +234,8 @@ fn team_of(stepper: &mut stepping::Stepper, team: usize) -> Team {
     let places: Vec<_> = (0..agents).map(|agent| (at(states.positions, agent), at(states.headings, agent))).collect();
     let world = stepper.world();
     let (pois, words) = (world.pois.len(), world.constants.words as usize);
-    let near = |poi: usize| world.rule.count(stepper.near()[(team * pois + poi) * words..][..words].iter().copied());
+    let near =
+        |poi: usize| world.rule.count(stepper.agents_at_poi()[(team * pois + poi) * words..][..words].iter().copied());
     let (step, observed) = (stepper.steps()[team].max(1), &stepper.observed()[team * pois..][..pois]);
     let agent = |(agent, (place, heading))| {
         let group = (agent < leaders).then_some(agent);

@@ -146,12 +146,13 @@ pub fn outcomes(py: Python<'_>, trained: Trained, digest: String) -> PyResult<Ou
 /// State that a longer run continues from: of each trial the weights, if they are needed, and the scores.
 type End<T> = Option<(Vec<T>, Vec<T>)>;
 
-/// The processor: the fields of [`Processor`]. The last is the digest of the initial policies if they were given.
-type Played = (String, String, Option<String>, Option<String>, usize, Option<String>);
+/// The fields of [`Processor`], the time when the training started, and the digest of the initial policies if they were
+/// given.
+type Played = (String, String, Option<String>, Option<String>, usize, String, Option<String>);
 
-fn played(processor: Processor, init: Option<String>) -> Played {
+fn played(processor: Processor, started: String, init: Option<String>) -> Played {
     let Processor { backend, description, adapter, driver, threads, .. } = processor;
-    (backend, description, adapter, driver, threads, init)
+    (backend, description, adapter, driver, threads, started, init)
 }
 
 /// Trains in memory. Also returns the backend, and the seconds at which each generation was complete.
@@ -163,6 +164,7 @@ pub fn train<'py>(
     callback: Option<Py<PyAny>>,
     champions: bool,
 ) -> PyResult<(Outcomes<'py>, Played, Vec<f64>)> {
+    let started = folder::now();
     let watcher = Watcher { callback: callback.as_ref(), populations: config.0.populations() };
     let (InMemory { trained, seconds, processor, .. }, digest) =
         perform(py, backend, "", &|rows, last, champions| watcher.tell(rows, last, champions), |backends, context| {
@@ -170,7 +172,7 @@ pub fn train<'py>(
             let digest = done.trained.digest();
             Ok((done, digest))
         })?;
-    Ok((outcomes(py, trained, digest)?, played(processor, None), seconds))
+    Ok((outcomes(py, trained, digest)?, played(processor, started, None), seconds))
 }
 
 /// Returns the number of policies, and the given policies, `[populations][policies][parameters]`, of each trial.
@@ -238,7 +240,7 @@ pub fn open(py: Python<'_>, folder: PathBuf, unverified: bool) -> PyResult<(Outc
         });
         Ok::<_, PyErr>((trained, digest, run, times.collect::<Result<_, _>>().raise()?))
     })?;
-    Ok((outcomes(py, trained, digest)?, played(Processor::of_run(&run), run.init), times))
+    Ok((outcomes(py, trained, digest)?, played(Processor::of_run(&run), run.started, run.init), times))
 }
 
 /// Writes the results of a training in memory as a run directory, and returns the digest.
@@ -290,7 +292,7 @@ pub fn save(
     };
     let rows: Vec<(Row, f64)> = rows.map(row).collect();
     workers::aside(py, || {
-        let (backend, description, adapter, driver, threads, init) = played;
+        let (backend, description, adapter, driver, threads, started, init) = played;
         let run = folder::Run {
             version: env!("CARGO_PKG_VERSION").into(),
             backend,
@@ -298,6 +300,7 @@ pub fn save(
             adapter,
             driver,
             threads,
+            started,
             updated: folder::now(),
             sessions: 1,
             command: command.into(),

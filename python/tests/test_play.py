@@ -114,7 +114,7 @@ def test_arrays_of_other_types_and_orders_are_converted(config):
         (lambda p: p > 0, TypeError, "policies are bool"),
         (lambda p: p.astype(object), TypeError, "policies are object"),
         (lambda p: "policies", TypeError, "policies are <U8"),
-        (lambda p: [[1], [1, 2]], ValueError, "policies are no array"),
+        (lambda p: [[1], [1, 2]], ValueError, "policies are not an array"),
         (lambda p: None, TypeError, "policies are object"),
     ],
 )
@@ -122,6 +122,13 @@ def test_invalid_policies_raise_a_one_line_error(config, change, error, message)
     with pytest.raises(error, match=message) as raised:
         rollout(config, change(random_policies(config, 5)))
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("call", ["rollout(c, p)", "rollout(c, p, trace=True)", "flotilla.collect(c, p)"])
+def test_policies_of_no_teams_raise(config, call):
+    none = random_policies(config, 0)
+    with pytest.raises(ValueError, match=r"policies are \[4, 0, 112\]: no teams; pass"):
+        eval(call, {"rollout": rollout, "flotilla": flotilla, "c": config, "p": none})
 
 
 @pytest.mark.parametrize("hidden", [[64, 64, 64], [64], [3, 1], []])
@@ -279,7 +286,7 @@ def test_forward_agrees_with_numpy():
     hidden = np.tanh([*inputs, 1] @ policy[:90].reshape(9, 10))
     assert np.allclose(forward(policy, inputs), np.tanh([*hidden, 1] @ policy[90:].reshape(11, 2)), atol=1e-7)
     assert forward(np.zeros((3, 1, 18)), np.zeros((5, 8))).shape == (3, 5, 2)
-    with pytest.raises(ValueError, match="say by config"):
+    with pytest.raises(ValueError, match="pass config="):
         forward(np.zeros(113), inputs)
     with pytest.raises(ValueError, match=r"inputs have the shape \(7,\)"):
         forward(policy, inputs[:7])

@@ -29,6 +29,31 @@ def test_replays_are_shown_and_saved_in_each_format(config):
             run.replay(**wrong)
 
 
+def test_replays_have_the_world_of_their_stage(config):
+    pois = [[15.0, 14.0], [35.0, 14.0]]
+    stages = [{"from": 3, "set": {"world.steps": 25, "world.pois": pois}}]
+    run = train(config.replace(world={"steps": 40}, stages=stages))
+    for generation, steps in ((2, 40), (3, 25)):
+        replay = run.replay(generation=generation)
+        assert f"step {steps} of {steps}: " in replay.still().svg()
+        with pytest.raises(ValueError, match=f"the episode has steps 0 to {steps}"):
+            replay.still(steps + 1)
+        page = replay.page()
+        assert f'"steps":{steps}' in page and ('"pois":[[15.0,14.0],[35.0,14.0]]' in page) == (generation == 3)
+        replay.save("team.gif", width=100, fps=2)
+    assert len(run.replay(generation=6, compare=3).episodes) == 2
+
+
+def test_generations_with_different_worlds_are_not_shown_side_by_side(config):
+    run = train(config.replace(stages=[{"from": 3, "set": {"world.coupling": 2}}]))
+    with pytest.raises(ValueError, match="generations 2 and 3 are of different stages"):
+        run.replay(generation=3, compare=2)
+    moved = train(config.replace(learning={"poi_jitter": 0.5}))
+    with pytest.raises(ValueError, match="POIs are elsewhere in every generation"):
+        moved.replay(compare=0)
+    assert len(moved.replay().episodes) == 1
+
+
 def test_curves_are_drawn(config):
     runs = [train(config), train(config.replace(learning={"fitness": "G"}))]
     assert runs[0].plot()._repr_svg_() != flotilla.plot(runs).svg()

@@ -124,6 +124,27 @@ def test_all_ways_to_train_write_the_same_files(config, program, tmp_path, metho
         assert (extended["digest"], extended["trained_generations"]) == (longer, 10), folder
 
 
+def test_saved_runs_have_the_time_when_training_started(config):
+    run, told = train(config), flotilla.Coevolution(config)
+    told.tell(told.play().fitness)
+    # Times are in whole seconds.
+    time.sleep(1.1)
+    told_later = pickle.loads(pickle.dumps(told))
+    for coevolution in (told, told_later):
+        while not coevolution.done:
+            coevolution.tell(coevolution.play().fitness)
+    unpickled = pickle.loads(pickle.dumps(run))
+    runs = {"saved": run, "pickled": unpickled, "told": told.run, "told later": told_later.run}
+    for folder, each in runs.items():
+        each.save(folder)
+    Run.open("saved").save("copy")
+    records = {name: json.loads(pathlib.Path(name, "run.json").read_text()) for name in (*runs, "copy")}
+    for name, record in records.items():
+        assert record["started"] < record["updated"], name
+    for name, copy in (("saved", "pickled"), ("saved", "copy"), ("told", "told later")):
+        assert records[name]["started"] == records[copy]["started"], copy
+
+
 @pytest.mark.parametrize("out", [None, "run"])
 def test_implausible_configs_warn(config, out):
     with pytest.warns(RuntimeWarning, match="degrees"):

@@ -88,7 +88,7 @@ impl<'a> Group<'a> {
             let found = weights.len();
             return invalid(format!("{found} weights, but {populations} populations of {policies} have {numbers}"));
         }
-        // The largest number of a chunk is found by vectors.
+        // Finding the maximum is vectorised. The position is searched only after a failure.
         let exist = |teams: &[u32]| teams.iter().copied().max().is_none_or(|policy| (policy as usize) < policies);
         if teams.par_chunks(CHECKED_TOGETHER).all(exist) {
             return Ok(());

@@ -42,7 +42,7 @@ impl fmt::Display for Quantity {
 /// The first difference of a trace from the reference.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Mismatch {
-    /// The step, from 1. For counts over an episode, the last step.
+    /// The step, from 1; 0 is the start. For counts over an episode, the last step.
     pub step: usize,
     /// The index of the team in its group.
     pub team: usize,
@@ -60,7 +60,7 @@ impl fmt::Display for Mismatch {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Mismatch { step, team, stage, place, expected, found } = self;
         write!(f, "stage {stage}, team {team}, {place}, step {step}: expected {expected:#010x}")?;
-        if matches!(stage, Quantity::Couple | Quantity::Influence) {
+        if matches!(stage, Quantity::Sight | Quantity::Couple | Quantity::Influence) {
             return write!(f, ", found {found:#010x}");
         }
         let (expected, value) = (f32::from_bits(*expected), f32::from_bits(*found));

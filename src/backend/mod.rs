@@ -5,7 +5,9 @@
 //! | `batch` | the input: groups of teams, where their policies are, and the fitnesses |
 //! | `scores` | the output: the scores of each group, computed while others play |
 //! | `size` | how many bytes episodes and populations take |
-//! | `trace` | every stage of every step, for comparison and replays |
+//! | `trace` | all quantities of every step, for comparison and replays |
+//! | `compare` | the first difference of two traces |
+//! | `cpu`, `gpu` | the two backends |
 //! | `error` | why episodes could not be played |
 
 use std::any::Any;

@@ -1,4 +1,4 @@
-//! The trace of a group: every stage of every step.
+//! The trace of a group: all quantities of every step.
 
 use crate::credit::Episode;
 use crate::gpu_struct::gpu_struct;
@@ -24,7 +24,7 @@ gpu_struct! {
     }
 }
 
-/// Every stage of every step: `moments[(step * teams + team) * agents + agent]`, steps `0..=steps`.
+/// All quantities of every step: `moments[(step * teams + team) * agents + agent]`, steps `0..=steps`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Trace {
     /// Teams of the group.

@@ -2,9 +2,9 @@
 
 use super::console::Console;
 use super::recovery::Loss;
-use super::{ConfigFile, Error, Printed, RunOptions, SetKeys, between, number};
+use super::{ConfigFile, Error, Overrides, Printed, RunOptions, SetKeys, between, number};
 use crate::baseline::SPEEDS;
-use crate::config::{Actions, Choice, Override, Paradigm};
+use crate::config::{Actions, Choice, Paradigm};
 use crate::evaluate::MAX_EPISODES;
 use crate::ops::baseline::{self, Outcome, Request};
 use crate::report::table::markdown;
@@ -27,7 +27,7 @@ pub struct Args {
     #[arg(long, value_name = "N", value_parser = number)]
     population: Option<String>,
     /// Who learns [default: the config's]
-    #[arg(long, value_name = "NAME", value_parser = Words::new(Paradigm::names()))]
+    #[arg(long, value_name = "NAME", value_parser = Words::new(Paradigm::names()), ignore_case = true)]
     paradigm: Option<String>,
     #[command(flatten)]
     set: SetKeys,
@@ -39,12 +39,8 @@ pub struct Args {
 
 pub fn run(args: Args) -> Result<(), Error> {
     let Args { config, seeds, episodes, generations, population, paradigm, set, printed, run } = args;
-    let key = |key: &str, value: Option<String>| {
-        Some(Override::of_text(format!("learning.{key}"), value?, format!("--{key}")))
-    };
-    let paradigm = paradigm.map(|name| toml::Value::from(name).to_string());
-    let keys = [key("generations", generations), key("population", population), key("paradigm", paradigm)];
-    let config = config.text(keys.into_iter().flatten().chain(set.set).collect())?;
+    let overrides = Overrides { generations, population, paradigm, set, ..Overrides::default() };
+    let config = config.text(overrides.list())?;
     let request = Request { config, seeds, episodes };
     let mut console = Console::new(&run, Loss::default(), printed.quiet);
     let found = console.play(|backends, context| baseline::run(&request, backends, context))?;

@@ -6,7 +6,6 @@ use super::sweep::share;
 use super::{Error, console, print, print_json};
 use crate::ops;
 use crate::ops::compare::{Request, at};
-use crate::record::archive::RunFolder;
 use crate::record::digests::UNVERIFIED;
 use crate::report::comparison;
 
@@ -48,8 +47,6 @@ fn generation(text: &str) -> Result<String, String> {
 
 pub fn run(args: Args) -> Result<(), Error> {
     let Args { folders, by, at, reach, paired, unverified, json, csv, latex } = args;
-    let opened = folders.iter().map(|folder| RunFolder::open(folder)).collect::<Result<Vec<_>, _>>()?;
-    let folders = opened.iter().map(|folder| folder.path().into()).collect();
     let request = Request { folders, by, at, reach, paired, unverified };
     let found = console::run_without_backend(false, |context| ops::compare::run(&request, context))?;
     if csv {

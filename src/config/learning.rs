@@ -31,7 +31,7 @@ section! {
         /// followers, D++ with copies of a leader, or Dt without a leader and, at each step, the followers that it
         /// leads then
         fitness: Fitness = "", "3.2, Eq. 1; 4.2, Eq. 5; 2.2",
-        /// k: policies of each learner; a generation has k·m teams
+        /// k: policies per population; a generation has k·m teams, or k·(m + L) with a hall of fame
         population: usize = "policies", "4.3",
         /// m: teams that each policy plays in per generation, each with other random partners; 1 if leaders share a
         /// policy

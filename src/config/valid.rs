@@ -1,5 +1,6 @@
 //! Configs that are validated as a whole.
 
+use std::collections::HashSet;
 use std::ops::Deref;
 
 use super::{Config, ConfigError};
@@ -70,10 +71,9 @@ impl ValidConfig {
     pub fn notes(&self) -> Vec<String> {
         let too_short = |config: &Config| config.motion.too_short(config.world.dt, config.world.map);
         let degrees = |config: &Config| config.world.heading.likely_degrees();
-        let mut notes: Vec<String> =
-            self.stages.iter().flat_map(|(_, config)| [too_short(config), degrees(config)]).flatten().collect();
-        notes.dedup();
-        notes
+        let notes = self.stages.iter().flat_map(|(_, config)| [too_short(config), degrees(config)]).flatten();
+        let mut shown = HashSet::new();
+        notes.filter(|note| shown.insert(note.clone())).collect()
     }
 
     /// Returns the config as it was read, without its resolved stages.

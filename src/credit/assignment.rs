@@ -42,6 +42,7 @@ pub(crate) fn assign(seen: &Seen<'_>, world: &World, owner: &mut Vec<u32>) {
 /// Writes the agents that belong to each leader, one bit per agent, `[leaders][words]`.
 pub(super) fn gather(owner: &[u32], world: &World, groups: &mut Vec<u32>) {
     let words = world.constants.words as usize;
+    groups.clear();
     groups.resize(world.leaders() * words, 0);
     for (agent, &leader) in owner.iter().enumerate().filter(|&(_, &leader)| leader != UNASSIGNED) {
         groups[leader as usize * words + agent / 32] |= 1 << (agent % 32);
@@ -53,7 +54,7 @@ pub(super) fn gather(owner: &[u32], world: &World, groups: &mut Vec<u32>) {
 ///
 /// Only the steps that [count](crate::world::Led) matter. The leader that the follower saw at most of them leads it,
 /// ties to the lower index; or with [`LedBy::AnySeen`] every leader that it saw.
-pub fn lead(sights: &Strided<'_>, world: &World, led: &mut Vec<u32>) {
+pub fn find_leading(sights: &Strided<'_>, world: &World, led: &mut Vec<u32>) {
     let (followers, words) = (world.followers(), world.leader_words());
     let (steps, Led { within, by }) = (sights.len() / (followers * words).max(1), world.led);
     led.clear();
@@ -87,8 +88,8 @@ pub fn lead(sights: &Strided<'_>, world: &World, led: &mut Vec<u32>) {
     }
 }
 
-/// Reports whether a leader leads a follower at a step, from 0, according to the output of [`lead`].
-pub fn leads(led: &[u32], world: &World, step: usize, follower: usize, leader: usize) -> bool {
+/// Reports whether a leader leads a follower at a step, from 0, according to the output of [`find_leading`].
+pub fn is_led_by(led: &[u32], world: &World, step: usize, follower: usize, leader: usize) -> bool {
     let place = (step * world.followers() + follower) * world.leader_words() + leader / 32;
     led[place] >> (leader % 32) & 1 != 0
 }

@@ -13,8 +13,8 @@ impl Credit {
 
     /// Finds the leaders without whom a POI is lost. Such a leader is in every set with enough agents, and no such set
     /// has an agent to spare.
-    pub(super) fn lose_leaders(&mut self, episode: &Episode<'_>, world: &World) {
-        self.all_critical(world);
+    pub(super) fn find_critical_leaders(&mut self, episode: &Episode<'_>, world: &World) {
+        self.mark_all_critical(world);
         let Credit { observed, critical, sets, .. } = self;
         let least = |poi: usize| world.coupling[poi];
         each_set(&episode.sets, world, sets, least, |poi, size, set| {
@@ -25,8 +25,8 @@ impl Credit {
 
     /// Finds the leaders without whose group a POI is lost. Every set with enough agents has more members of the group
     /// than agents to spare.
-    pub(super) fn lose_groups(&mut self, episode: &Episode<'_>, world: &World) {
-        self.all_critical(world);
+    pub(super) fn find_critical_groups(&mut self, episode: &Episode<'_>, world: &World) {
+        self.mark_all_critical(world);
         let Credit { observed, critical, owner, groups, sets, .. } = self;
         let words = world.constants.words as usize;
         groups.clear();
@@ -53,10 +53,10 @@ impl Credit {
         });
     }
 
-    /// Finds what [`Credit::lose_leaders`] finds, and the size of the largest set with each leader at every POI that
+    /// Finds what [`Credit::find_critical_leaders`] finds, and the size of the largest set with each leader at every POI that
     /// was not observed.
-    pub(super) fn add_copies(&mut self, episode: &Episode<'_>, world: &World) {
-        self.all_critical(world);
+    pub(super) fn find_critical_leaders_and_largest_sets(&mut self, episode: &Episode<'_>, world: &World) {
+        self.mark_all_critical(world);
         let leaders = world.leaders();
         self.largest_set_with.clear();
         self.largest_set_with.resize(world.pois.len() * leaders, 0);
@@ -81,7 +81,7 @@ impl Credit {
     }
 
     /// Returns D++ of one leader.
-    pub(super) fn stepping_stone(&mut self, world: &World, leader: usize) -> f32 {
+    pub(super) fn dpp(&mut self, world: &World, leader: usize) -> f32 {
         let most = world.coupling.iter().copied().max().unwrap_or(0);
         self.completed.clear();
         self.completed.resize(most as usize + 1, 0);
@@ -102,7 +102,7 @@ impl Credit {
     }
 
     /// Marks every leader as critical, as before the first large enough set.
-    fn all_critical(&mut self, world: &World) {
+    fn mark_all_critical(&mut self, world: &World) {
         let (leaders, words) = (world.leaders(), world.constants.words as usize);
         // Bits past the last leader stay 0.
         let of_word =

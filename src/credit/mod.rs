@@ -16,7 +16,7 @@ mod record;
 mod replay;
 
 pub(crate) use assignment::{UNASSIGNED, assign};
-pub use assignment::{lead, leads};
+pub use assignment::{find_leading, is_led_by};
 pub use record::{Episode, RecordRequest, Seen, Strided, owner_bits};
 pub use replay::observed_at;
 
@@ -66,7 +66,7 @@ pub struct Credit {
     /// [`Credit::replay`].
     observed_at: Vec<u32>,
     counterfactual: Vec<u32>,
-    /// The output of [`lead`].
+    /// The output of [`find_leading`].
     led: Vec<u32>,
 }
 
@@ -87,18 +87,18 @@ impl Credit {
             }
             Fitness::D | Fitness::Df => {
                 match fitness == Fitness::Df && world.followers() > 0 {
-                    true => self.lose_groups(episode, world),
-                    false => self.lose_leaders(episode, world),
+                    true => self.find_critical_groups(episode, world),
+                    false => self.find_critical_leaders(episode, world),
                 }
                 self.count_lost(world);
                 scores.iter_mut().zip(&self.lost).for_each(|(score, &lost)| *score = share(lost, pois));
             }
             Fitness::Dt => unreachable!("it was replayed"),
             Fitness::Dpp => {
-                self.add_copies(episode, world);
+                self.find_critical_leaders_and_largest_sets(episode, world);
                 self.count_lost(world);
                 for (leader, score) in scores.iter_mut().enumerate().take(world.leaders()) {
-                    *score = self.stepping_stone(world, leader);
+                    *score = self.dpp(world, leader);
                 }
             }
         }

@@ -2,7 +2,7 @@
 
 use std::ops::RangeInclusive;
 
-use super::assignment::{assign, gather, lead, leads};
+use super::assignment::{assign, find_leading, gather, is_led_by};
 use super::{Credit, Episode, Strided, each_bit, share, stepping_stone};
 use crate::config::Fitness;
 use crate::model::rule::NEVER;
@@ -22,10 +22,9 @@ impl Credit {
         match taken {
             Fitness::Df => {
                 assign(&episode.seen, world, owner);
-                groups.clear();
                 gather(owner, world, groups);
             }
-            Fitness::Dt => lead(&episode.sights, world, led),
+            Fitness::Dt => find_leading(&episode.sights, world, led),
             Fitness::G | Fitness::D | Fitness::Dpp => {}
         }
         for (leader, score) in scores.iter_mut().enumerate().take(leaders) {
@@ -40,7 +39,7 @@ impl Credit {
                         let stay = |step, word, agents| {
                             let follow = each_bit(alone(step, word, agents)).filter(|bit| {
                                 let agent = word * 32 + bit;
-                                agent < leaders || !leads(led, world, step as usize - 1, agent - leaders, leader)
+                                agent < leaders || !is_led_by(led, world, step as usize - 1, agent - leaders, leader)
                             });
                             follow.map(|bit| 1 << bit).sum()
                         };

@@ -57,7 +57,7 @@ impl Breeding<'_> {
         if self.parents.len() != populations * slots {
             return invalid(format!("{} parents for {populations} populations of {slots}", self.parents.len()));
         }
-        // The largest number is found by vectors.
+        // Finding the maximum is vectorised. The position is searched only after a failure.
         if self.parents.iter().map(|planned| planned & !UNCHANGED).max().is_none_or(|parent| (parent as usize) < slots)
         {
             return Ok(());

@@ -58,7 +58,7 @@ impl Coevolution {
     /// # Errors
     /// The policies do not fit the config, or a generation was played.
     pub fn start_from(&mut self, policies: usize, first: &[Vec<f32>]) -> Result<(), Failure> {
-        if self.generation() > 0 {
+        if self.generation() > 0 || self.played {
             return Err(Failure::State);
         }
         start_from(&mut self.trainer, &self.config, policies, first)
@@ -121,7 +121,8 @@ impl Coevolution {
     ///
     /// # Errors
     /// The fitness has the wrong length or is not finite, the backend failed, or all generations were played. Nothing
-    /// has changed then.
+    /// has changed then, with one exception: if the last champions cannot be played, their generation was told. Repeat
+    /// the call with `None` to play them.
     pub fn tell(&mut self, backend: &mut dyn Backend, fitness: Option<&[f32]>) -> Result<Generation<'_>, Failure> {
         if self.is_done() {
             return Err(Failure::Done);

@@ -147,7 +147,7 @@ pub struct Traced {
     pub outputs: Vec<f32>,
     /// The agents within the observation radius of each POI after each step, `[teams][steps][pois][words]`. Each agent
     /// is one bit.
-    pub near: Vec<u32>,
+    pub agents_at_poi: Vec<u32>,
 }
 
 /// Plays one episode of given policies and records every step. See [`play`] for the arguments.
@@ -181,7 +181,7 @@ pub fn trace(
         speeds: Vec::with_capacity(states),
         inputs: Vec::with_capacity(teams * steps * leaders * INPUTS),
         outputs: Vec::with_capacity(teams * steps * leaders * OUTPUTS),
-        near: Vec::with_capacity(teams * world.set_words()),
+        agents_at_poi: Vec::with_capacity(teams * world.set_words()),
     };
     let starts = starts.of(episode, world);
     for (_, part) in evaluate::parts(&checked.group(&starts)) {
@@ -198,7 +198,7 @@ pub fn trace(
                 traced.outputs.extend(moment.outputs);
             }
         }
-        traced.near.extend(trace.sets);
+        traced.agents_at_poi.extend(trace.sets);
     }
     Ok(traced)
 }

@@ -67,7 +67,7 @@ impl Peaks {
             let (trials, policies) = (config.learning.trials as u64, config.learning.population);
             let teams = |config: &Config| trials * config.learning.episodes_per_team as u64 * config.max_teams() as u64;
             training += trainer::bytes(config);
-            next += trainer::next_bytes(config);
+            next += trainer::next_schedule_bytes(config);
             checkpoint += checkpoint_bytes(config);
             queue += most(&|config, _| teams(config).div_ceil(lanes) * 16);
             block = block.max(most(&|config, world| cpu::block_bytes(world, config.learning.fitness)));

@@ -88,6 +88,9 @@ pub struct Found {
 /// # Errors
 /// The config is invalid, or the backend fails.
 pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
+    if request.seeds == 0 {
+        return Err(Error::Usage("--seeds 0: allowed 1 or more".into()));
+    }
     let config = request.config.read()?;
     let ((backend, machine), on) = backends.open(Work::of([&config]))?;
     context.message(format_args!("playing on {on}"));

@@ -10,6 +10,7 @@ use crate::config::{Config, WorldConfig};
 use crate::escape::PathExt;
 use crate::file;
 use crate::record;
+use crate::record::archive::RunFolder;
 use crate::record::digests::{self, Verification};
 use crate::record::folder::{self, RUN, Run, SWEEP};
 use crate::report::comparison::{self, At, Cohort, Comparison, ComparisonError, Question};
@@ -21,7 +22,7 @@ use crate::{shell, statistics};
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Request {
-    /// Folders of runs, two at least, or the folder of one sweep.
+    /// Folders or zip files of runs, two at least, or the folder of one sweep.
     pub folders: Vec<PathBuf>,
     /// The axis of a sweep whose values are compared. The default is the only axis.
     #[serde(default)]
@@ -87,7 +88,11 @@ type Contest = (String, Vec<Cohort>);
 ///
 /// # Errors
 /// A run cannot be read, or there is nothing to compare.
-pub fn run(args: &Request, context: Context<'_>) -> Result<Outcome, Error> {
+pub fn run(request: &Request, context: Context<'_>) -> Result<Outcome, Error> {
+    // Runs in zip files stay unpacked until the comparison is done.
+    let opened = request.folders.iter().map(|folder| RunFolder::open(folder)).collect::<Result<Vec<_>, _>>()?;
+    let folders = opened.iter().map(|run| run.path().into()).collect();
+    let args = &Request { folders, ..request.clone() };
     let at = args.at.iter().map(|text| at(text).map_err(|error| Error::Usage(format!("--at {text}: {error}").into())));
     let question = Question { at: at.collect::<Result<_, _>>()?, reach: args.reach, paired: args.paired };
     if args.folders.is_empty() {
@@ -149,7 +154,7 @@ fn of_runs(folders: &[PathBuf], args: &Request, notes: &mut Vec<String>) -> Resu
     let verification = Verification::unless(args.unverified);
     if let Some(by) = &args.by {
         return Err(Error::Usage(
-            format!("--by {by}: that takes the folder of one sweep, which {} is not", folders[0].escaped()).into(),
+            format!("--by {by}: needs the folder of one sweep, and {} is not one", folders[0].escaped()).into(),
         ));
     }
     if folders.len() < 2 {
@@ -201,9 +206,9 @@ fn of_sweep(out: &Path, args: &Request, notes: &mut Vec<String>) -> Result<Vec<C
     let sweep = Sweep::load(&out.join(SWEEP), &[], false)?;
     let keys = || sweep.axes.iter().map(|axis| &*axis.key).collect::<Vec<_>>().join(", ");
     let by = match (&args.by, sweep.axes.len()) {
-        (Some(name), _) => sweep.axis(name).ok_or_else(|| {
-            Error::Usage(format!("--by {name}: that is no axis of the sweep; it has {}", keys()).into())
-        })?,
+        (Some(name), _) => sweep
+            .axis(name)
+            .ok_or_else(|| Error::Usage(format!("--by {name}: not an axis of the sweep; it has {}", keys()).into()))?,
         (None, 1) => 0,
         (None, _) => {
             return Err(Error::Usage(format!("the sweep has several axes; name one by --by: {}", keys()).into()));

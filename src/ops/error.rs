@@ -88,7 +88,7 @@ pub enum Error {
     #[error("standard output cannot be written: {0}")]
     Output(io::Error),
     /// Signal handlers that could not be installed.
-    #[error("signals cannot be listened for: {0}")]
+    #[error("signal handlers cannot be installed: {0}")]
     Signals(io::Error),
     /// Wrong usage that is only found when flags are read together.
     #[error("{0}")]

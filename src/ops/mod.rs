@@ -184,7 +184,7 @@ impl Context<'_> {
 
     /// Fails if the caller asked to stop work that leaves nothing to resume.
     fn check_not_stopped(&self) -> Result<(), Error> {
-        let stopped = || Error::Stopped(with_remedy("before everything was played", "nothing was written"));
+        let stopped = || Error::Stopped("before everything was played; nothing was written".into());
         if self.is_stopped() { Err(stopped()) } else { Ok(()) }
     }
 
@@ -302,7 +302,7 @@ pub struct Processor {
 }
 
 impl Processor {
-    /// Returns an open backend.
+    /// Describes the processor of an open backend.
     pub fn of(machine: &Machine, description: &str) -> Processor {
         let Machine { backend, adapter, driver, threads } = machine.clone();
         Processor { backend, description: description.into(), adapter, driver, threads }

@@ -11,7 +11,7 @@ use std::time::Duration;
 use super::{Error, with_remedy};
 use crate::escape::PathExt;
 use crate::file;
-use crate::record::disk::Disk;
+use crate::record::disk::{Disk, without_path};
 use crate::record::{RecordError, folder, ownership};
 
 /// The file that a picture or a page is written to.
@@ -32,17 +32,20 @@ impl Destination {
         }
     }
 
-    /// Refuses a file that flotilla did not make, unless the user named it.
+    /// Refuses a file that flotilla did not make, and a folder without write permission. A file that the user named is
+    /// not checked; [`check`] does that.
     ///
     /// # Errors
-    /// Fails if it is such a file, or if the folder belongs to another user.
+    /// Fails for such a file or folder, and if the folder belongs to another user.
     pub fn check(&self) -> Result<(), RecordError> {
+        let path = self.path();
         match self {
-            Destination::Named(_) => Ok(()),
-            Destination::OfRun(path) => ownership::check(&self.disk()?, [path]),
-            Destination::Here(path) if path.symlink_metadata().is_err() || ownership::is_drawing(path) => Ok(()),
-            Destination::Here(path) => Err(RecordError::NotOurs { path: path.clone() }),
+            Destination::Named(_) => return Ok(()),
+            Destination::OfRun(_) => ownership::check(&self.disk()?, [path])?,
+            Destination::Here(_) if path.symlink_metadata().is_err() || ownership::is_drawing(path) => {}
+            Destination::Here(_) => return Err(RecordError::NotOurs { path: path.into() }),
         }
+        check_folder(file::folder(path)).map_err(RecordError::write(path))
     }
 
     /// Writes the file completely or not at all.
@@ -75,7 +78,8 @@ impl Destination {
 /// its flag.
 ///
 /// # Errors
-/// Fails for such an output, for a folder, and for a file whose folder does not exist.
+/// Fails for such an output, for a folder, and for a file that cannot be written, because of its permissions or because
+/// its folder does not exist.
 pub fn check(outputs: &[(&str, Option<&Path>)], inputs: &[&Path]) -> Result<(), Error> {
     let mut taken: Vec<_> = inputs.iter().map(|path| (file::resolved(path), "is read from".to_string())).collect();
     for &(flag, path) in outputs {
@@ -107,11 +111,25 @@ pub fn check(outputs: &[(&str, Option<&Path>)], inputs: &[&Path]) -> Result<(), 
             return refused(why);
         }
         if let Some(owner) = folder::owner(path) {
-            return refused(&format!("belongs to what is in {}", owner.escaped()));
+            return refused(&format!("is part of the run, sweep or paper in {}", owner.escaped()));
         }
+        check_permission(&resolved).map_err(RecordError::write(path))?;
         taken.push((resolved, format!("is written by {flag}")));
     }
     Ok(())
+}
+
+/// Fails if a file may not be written or replaced. Links in `path` are already resolved.
+fn check_permission(path: &Path) -> io::Result<()> {
+    if path.is_file() {
+        OpenOptions::new().write(true).open(path)?;
+    }
+    check_folder(file::folder(path))
+}
+
+/// Fails if no file can be created in a folder. Every file is written to a temporary file next to it first.
+fn check_folder(folder: &Path) -> io::Result<()> {
+    tempfile::tempfile_in(folder).map(drop).map_err(without_path)
 }
 
 /// Writes a file as [`write_with`] does.
@@ -174,7 +192,7 @@ fn report_waiting_later(path: &Path) -> mpsc::Sender<()> {
         let _ = thread::Builder::new().spawn(move || {
             let silent = waiting.recv_timeout(REPORT_AFTER) == Err(mpsc::RecvTimeoutError::Timeout);
             if silent && let Some(report) = REPORT.get() {
-                report(&format!("waiting for somebody to read from {}", path.escaped()));
+                report(&format!("waiting for a reader of {}", path.escaped()));
             }
         });
     }

@@ -50,7 +50,7 @@ pub fn device(error: &DeviceError) -> &'static str {
 pub fn backend(error: &BackendError) -> &'static str {
     match error {
         BackendError::Gpu(error) => device(error),
-        BackendError::TooLarge(_) => " (by --backend cpu and --breed host)",
+        BackendError::TooLarge(_) => "; pass --backend cpu, or --breed host",
         BackendError::Gone => "; run it again",
         BackendError::InvalidInput(_) | BackendError::HeldElsewhere => "",
     }
@@ -95,7 +95,7 @@ pub fn record(error: &RecordError, again: &str) -> String {
         }
         RecordError::NotOurs { .. } => "; move it away, or choose another --out".into(),
         RecordError::OfAnotherUser { .. } => "; to write there all the same, name it with --out".into(),
-        RecordError::NoFolder { .. } => "; choose a folder by --out".into(),
+        RecordError::NoFolder { .. } => "; choose a folder with --out".into(),
         RecordError::Shorter { existing, .. } => {
             format!("; resume with --generations {existing} or more, or choose another --out")
         }
@@ -109,7 +109,7 @@ pub fn record(error: &RecordError, again: &str) -> String {
         }
         RecordError::InitDiffers { existing: None, .. } => "; resume without --init, or choose another --out".into(),
         RecordError::OriginUnknown { .. } => {
-            "; give the policies that it started from by --init, or start it over by --force".into()
+            "; pass the policies that it started from with --init, or start over with --force".into()
         }
         RecordError::Edited { path } => format!(
             "; restore what it was, or move {} away and name the run's own config, or choose another --out",
@@ -128,7 +128,7 @@ pub fn record(error: &RecordError, again: &str) -> String {
             format!("; restore it{again}, or read it all the same with --unverified")
         }
         RecordError::Newer { .. } => "; use that version, or choose another --out".into(),
-        RecordError::InitNeeded { .. } => "; give that file by --init".into(),
+        RecordError::InitNeeded { .. } => "; pass that file with --init".into(),
         RecordError::Read { error, .. } => unread(error).into(),
         RecordError::Damaged { .. } | RecordError::NoTrial { .. } => String::new(),
     }

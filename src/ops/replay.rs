@@ -5,10 +5,10 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::output::Destination;
+use super::output::{self, Destination};
 use super::{BackendSource, Context, Error, escaped, points, with_remedy};
 use crate::choice::Work;
-use crate::config::{Config, Learning};
+use crate::config::{Config, Learning, ValidConfig};
 use crate::escape::PathExt;
 use crate::file;
 use crate::record::RecordError;
@@ -185,7 +185,7 @@ impl WhichTrial {
 pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
     let Request { generation, team, compare, step, width, fps, unverified, .. } = *request;
     let verification = Verification::unless(unverified);
-    let opened = RunFolder::open(&request.folder)?;
+    let opened = RunFolder::open_with_checkpoints(&request.folder)?;
     let folder = opened.path();
     let place = match &request.out {
         Some(out) => Destination::Named(out.clone()),
@@ -206,46 +206,25 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         None => 0,
     };
     let generations: Vec<usize> = compare.into_iter().chain([generation]).collect();
-    let refused = |text: String| Err(Error::Usage(text.into()));
-    if let Some(other) = generations.iter().find(|&&other| config.stage_of(other) != config.stage_of(generation)) {
-        return refused(format!("generations {other} and {generation} are of different stages: show one alone"));
-    }
-    let config = config.at(generation);
-    if generations.len() > 1 && config.learning.poi_jitter > 0.0 {
-        return refused("POIs are elsewhere in every generation (learning.poi_jitter): show one alone".into());
-    }
-    place.check()?;
-    let steps = config.world.steps;
+    let steps = stage(&config, &generations)?.world.steps;
     if let Some(step) = step.filter(|&step| step > steps) {
-        return refused(format!("--step {step}: the episode has steps 0 to {steps}"));
+        return Err(Error::Usage(format!("--step {step}: the episode has steps 0 to {steps}").into()));
     }
-    let learning = Learning { trials: 1, ..config.learning.clone() };
-    let ((backend, _), _) = backends.open(Work::of([&Config { learning, ..config.clone() }]))?;
-    let last = generations.iter().max().copied().unwrap_or(0);
-    let mut watch = |generation: usize| {
-        let text = format!("training trial {trial} again: generation {generation} of {last}");
-        context.fraction(generation as f64 / (last + 1) as f64, text);
-        !context.is_stopped()
-    };
-    let played = replay::replay(folder, trial, &generations, team, verification, &mut **backend, &mut watch);
-    context.pause();
-    let played = played.map_err(|error| match error {
-        ReplayError::Stopped => Error::Stopped(with_remedy("before the episode was played", "nothing was written")),
-        error => error.into(),
-    })?;
+    prepare_output(&place, &kind, &request.folder)?;
+    let Played { config, episodes: played } = play(folder, trial, &generations, team, verification, backends, context)?;
 
     let name = folder.canonicalize().ok().and_then(|path| Some(path.file_name()?.to_string_lossy().into_owned()));
     let name = name.unwrap_or_else(|| folder.escaped().to_string());
     let motion = Film { width, fps: fps.unwrap_or(FPS) };
     let content = match kind {
-        Form::Page => Ok(replay::page(&name, config, &played).into_bytes()),
-        Form::Gif => replay::gif(config, &played, motion),
+        Form::Page => Ok(replay::page(&name, &config, &played).into_bytes()),
+        Form::Gif => replay::gif(&config, &played, motion),
         Form::Still(kind) => {
-            let scene = replay::still(config, &played, step.unwrap_or(steps));
+            let scene = replay::still(&config, &played, step.unwrap_or(steps));
             scene.file(kind, width.map_or(PRINT, |width| f64::from(width) / scene.width))
         }
         Form::Film(numbered) => {
-            let written = write_film(&numbered, out, &replay::Frames::new(config, &played, motion))?;
+            let written = write_film(&numbered, out, &replay::Frames::new(&config, &played, motion))?;
             return Ok(outcome(written, &played));
         }
     };
@@ -254,14 +233,84 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     Ok(outcome(Written::File { out: out.into(), bytes: content.len() }, &played))
 }
 
+/// Replayed episodes, and the config of their stage.
+#[non_exhaustive]
+pub struct Played {
+    /// The config of the stage that all the generations belong to.
+    pub config: Config,
+    /// The episodes, in the order of the requested generations.
+    pub episodes: Vec<Replayed>,
+}
+
+/// Replays the episode of one team in each given generation of a trial.
+///
+/// # Errors
+/// The run cannot be read, the request does not fit it, the generations cannot be shown side by side, the backend
+/// fails, or the caller stops the replay.
+pub fn play(
+    folder: &Path,
+    trial: usize,
+    generations: &[usize],
+    team: Which,
+    verification: Verification,
+    backends: &mut dyn BackendSource,
+    context: Context<'_>,
+) -> Result<Played, Error> {
+    let config = stage(&points::config(folder, verification)?.validate()?, generations)?.clone();
+    let learning = Learning { trials: 1, ..config.learning.clone() };
+    let ((backend, _), _) = backends.open(Work::of([&Config { learning, ..config.clone() }]))?;
+    let last = generations.iter().max().copied().unwrap_or(0);
+    let mut watch = |generation: usize| {
+        let text = format!("training trial {trial} again: generation {generation} of {last}");
+        context.fraction(generation as f64 / (last + 1) as f64, text);
+        !context.is_stopped()
+    };
+    let played = replay::replay(folder, trial, generations, team, verification, &mut **backend, &mut watch);
+    context.pause();
+    let episodes = played.map_err(|error| match error {
+        ReplayError::Stopped => Error::Stopped("before the episode was played; nothing was written".into()),
+        error => error.into(),
+    })?;
+    Ok(Played { config, episodes })
+}
+
+/// Returns the config that all the generations play with.
+///
+/// # Errors
+/// The generations cannot be shown side by side, because their worlds differ.
+fn stage<'a>(config: &'a ValidConfig, generations: &[usize]) -> Result<&'a Config, Error> {
+    let refused = |text: String| Err(Error::Usage(text.into()));
+    let first = generations.first().copied().unwrap_or(0);
+    if let Some(other) = generations.iter().find(|&&other| config.stage_of(other) != config.stage_of(first)) {
+        return refused(format!("generations {first} and {other} are of different stages: show one alone"));
+    }
+    let stage = config.at(first);
+    if generations.len() > 1 && stage.learning.poi_jitter > 0.0 {
+        return refused("POIs are elsewhere in every generation (learning.poi_jitter): show one alone".into());
+    }
+    Ok(stage)
+}
+
+/// Checks the output, and creates the folder of a film. Called before the trial is trained again, which may take hours.
+/// `run` is the run's folder or zip file.
+///
+/// # Errors
+/// The file cannot be written, or would overwrite a file of the run.
+fn prepare_output(place: &Destination, kind: &Form, run: &Path) -> Result<(), Error> {
+    let Destination::Named(out) = place else { return Ok(place.check()?) };
+    if matches!(kind, Form::Film(_)) {
+        Disk::default().create_folder(file::folder(out)).map_err(RecordError::write(out))?;
+    }
+    output::check(&[("--out", Some(out.as_path()))], &[run])
+}
+
 fn outcome(written: Written, played: &[Replayed]) -> Outcome {
     let unverified = played.iter().any(|played| played.unverified);
     Outcome { written, episodes: played.iter().map(Episode::of).collect(), unverified }
 }
 
-/// Writes one numbered picture per moment.
+/// Writes one numbered picture per moment. The folder must exist.
 fn write_film(numbered: &Numbered, out: &Path, frames: &replay::Frames<'_>) -> Result<Written, Error> {
-    Disk::default().create_folder(file::folder(out)).map_err(RecordError::write(out))?;
     let place = |number: usize| out.with_file_name(numbered.name(number));
     let count = frames.places.len();
     if let Some(path) =
@@ -289,7 +338,7 @@ fn described(played: &Replayed) -> String {
         played.place(),
         team_g * pois as f64,
         if *episodes > 1 { format!(" (mean of {episodes} episodes)") } else { String::new() },
-        if matches!(which, Which::Number(_)) { "" } else { ", as metrics.csv says" },
+        if matches!(which, Which::Number(_)) { "" } else { ", as in metrics.csv" },
     )
 }
 
@@ -330,7 +379,8 @@ impl Form {
         ];
         match unused.into_iter().find(|(_, unused, _)| *unused) {
             Some((flag, _, of)) => {
-                Err(Error::Usage(format!("{flag} has no meaning for --out {}: it is of {of}", out.escaped()).into()))
+                let text = format!("{flag} does not apply to --out {}", out.escaped());
+                Err(Error::Usage(with_remedy(text, format!("use it with {of}"))))
             }
             None => Ok(()),
         }

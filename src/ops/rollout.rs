@@ -16,6 +16,7 @@ use crate::file;
 use crate::record::archive::RunFolder;
 use crate::record::digests::{self, Digests, Verification};
 use crate::record::{folder, policies, tensors};
+use crate::report::map;
 use crate::report::replay::numbered;
 use crate::world::World;
 
@@ -222,8 +223,8 @@ fn verify(config: &Path, policies: &Path, unverified: bool, context: Context<'_>
 /// Returns the number of teams and of episodes, for people.
 pub(crate) fn counted(teams: usize, episodes: usize) -> String {
     match episodes {
-        1 => format!("{teams} teams"),
-        _ => format!("{teams} teams, {episodes} episodes each"),
+        1 => map::counted(teams, "team"),
+        _ => format!("{}, {episodes} episodes each", map::counted(teams, "team")),
     }
 }
 

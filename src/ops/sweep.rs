@@ -211,7 +211,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
 pub fn picture_axes(sweep: &Sweep, names: &[String]) -> Result<Vec<usize>, Error> {
     let find = |name: &String| {
         let keys = || sweep.axes.iter().map(|axis| &*axis.key).collect::<Vec<_>>().join(", ");
-        let unknown = || Error::Usage(format!("--axes: {name} is no axis of the grid; it has {}", keys()).into());
+        let unknown = || Error::Usage(format!("--axes: {name} is not an axis of the grid; it has {}", keys()).into());
         sweep.axis(name).ok_or_else(unknown)
     };
     if !names.is_empty() && sweep.axes.iter().any(|axis| axis.varied) {
@@ -247,7 +247,7 @@ pub(crate) fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
             .find(|name| out.join(name).exists())
         {
             Some(theirs) => refuse(format!(
-                "{} holds {theirs}, but no {SWEEP}, which would say that it is a sweep's; choose another --out",
+                "{} holds {theirs} but no {SWEEP}, so it is not the folder of a sweep; choose another --out",
                 out.escaped()
             )),
             None => Ok(()),
@@ -286,6 +286,14 @@ pub(crate) fn claim(disk: &Disk, sweep: &Sweep, out: &Path) -> Result<(), Error>
     same_sweep(sweep, out)
 }
 
+/// Checks the numbers of a request. The command line checks its own flags, other callers may not.
+fn check(results: &Results) -> Result<(), Error> {
+    match results.every {
+        0 => Err(Error::Usage("--every 0: allowed 1 or more".into())),
+        _ => Ok(()),
+    }
+}
+
 /// Opens a sweep's folder for writing. Refuses it if a file to be written there was not made by flotilla.
 fn open_folder(out: &Path, named: bool) -> Result<Disk, Error> {
     let disk = ownership::open_output_folder(&Disk::default(), out, named)?;
@@ -305,6 +313,7 @@ pub fn train(
     context: Context<'_>,
 ) -> Result<(), Error> {
     let out = &*request.out;
+    check(&request.results)?;
     let shard = request.shard.map_or(Ok(Shard::WHOLE), |(index, count)| Shard::new(index, count));
     let shard = shard.map_err(|error| Error::Usage(error.into()))?;
     same_sweep(sweep, out)?;
@@ -312,6 +321,8 @@ pub fn train(
     let (backend, on) = backends.open(Work::of(points.iter().map(|point| &*point.config)))?;
     check_memory(points.iter().map(|point| &point.config), backend)?;
     warn_of_unreachable(sweep, &points, context);
+    // Before anything is written: the folder may be of another user.
+    ownership::create_output_folder(&Disk::default(), out, request.named)?;
     claim(&Disk::default(), sweep, out)?;
     let disk = open_folder(out, request.named)?;
     let memory = request.memory.unwrap_or_else(free_memory);
@@ -452,6 +463,7 @@ pub fn collect(request: &Request, sweep: &Sweep, axes: &[usize], context: Contex
         return Err(Error::Usage(format!("{} holds no sweep", out.escaped()).into()));
     }
     same_sweep(sweep, out)?;
+    check(&request.results)?;
     open_folder(out, request.named)?;
     let Results { every, reach, unverified, measure, band, .. } = request.results;
     let options = results::Detail { every, reach, verification: Verification::unless(unverified), measure, band };

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::{BackendSource, ConfigText, Context, Error, Event, baseline, check_memory};
+use super::{BackendSource, ConfigText, Context, Error, Event, baseline, check_memory, with_remedy};
 use crate::backend::{Backend, OpenBackend};
 use crate::baseline::Outcome as Played;
 use crate::choice::Work;
@@ -136,6 +136,10 @@ impl Trained {
 /// A config is invalid, the folder cannot be used, or training fails or is stopped. A task that is not admitted is an
 /// outcome.
 pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
+    if i64::from(request.population) == SMALL.0 {
+        let message = format!("--population {}: the small populations have this size", SMALL.0);
+        return Err(Error::Usage(with_remedy(message, "choose another, or 0 for none")));
+    }
     // Each task with G of its scripted team and its configs, that of the small populations first.
     let mut tasks: Vec<(&Task, Option<f64>, Vec<Config>)> = Vec::new();
     for task in &request.tasks {
@@ -258,7 +262,7 @@ fn measure(config: &Config, folder: &Path, backend: &mut dyn Backend) -> Result<
 
 /// Returns why a task is not admitted.
 fn reason(baselines: &[Vec<f64>; 3], trained: &[Trained], scripted_g: Option<f64>) -> Option<String> {
-    let names = ["the best constant speed", "random constant actions", "random networks"];
+    let names = ["the best constant action", "random constant actions", "random networks"];
     for (name, g) in names.iter().zip(baselines) {
         let g = mean(g);
         if g >= EASY {

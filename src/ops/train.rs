@@ -323,10 +323,10 @@ fn train(
     Ok(last)
 }
 
-/// Warns if no team observed a POI in any generation, or if the metrics cannot be read.
+/// Warns if no team observed a POI in any generation.
 fn warn_if_nothing_was_observed(folder: &Path, config: &Config, context: Context<'_>) {
     let ever = |all: Vec<History>| all.iter().any(|history| history.most() > 0.0);
-    if !History::all(folder, config, Verification::Required).is_ok_and(ever) {
+    if History::all(folder, config, Verification::Required).is_ok_and(|all| !ever(all)) {
         context.warn(format_args!(
             "warning: no team observed any POI in any generation, so there was nothing to learn from; try more \
              world.steps, a smaller world.coupling, POIs nearer to the starts, or a larger learning.population; \
@@ -379,7 +379,7 @@ pub fn in_memory(
     };
     let trained = trained.map_err(Error::of_training)?;
     if stopped {
-        return Err(Error::Stopped(with_remedy("before the last generation", "nothing was saved")));
+        return Err(Error::Stopped("before the last generation; nothing was saved".into()));
     }
     // After an early end, one more generation is played and not reported.
     seconds.resize(trained.config.learning.generations + 1, since.elapsed().as_secs_f64());

@@ -25,16 +25,28 @@ pub(crate) struct RunFolder {
 }
 
 impl RunFolder {
-    /// Opens a run. A zip file is unpacked; any other path is taken as it is.
+    /// Opens a run. A zip file is unpacked, without its checkpoints; any other path is taken as it is.
     ///
     /// # Errors
     /// The zip file cannot be read or unpacked, or does not hold exactly one run.
     pub fn open(path: &Path) -> Result<RunFolder, RecordError> {
+        RunFolder::open_and_unpack(path, false)
+    }
+
+    /// Opens a run as [`RunFolder::open`] does, with its checkpoints, which may take gigabytes.
+    ///
+    /// # Errors
+    /// As for [`RunFolder::open`].
+    pub fn open_with_checkpoints(path: &Path) -> Result<RunFolder, RecordError> {
+        RunFolder::open_and_unpack(path, true)
+    }
+
+    fn open_and_unpack(path: &Path, checkpoints: bool) -> Result<RunFolder, RecordError> {
         let Some(file) = zip_file(path)? else { return Ok(RunFolder { path: path.into(), unpacked: None }) };
         let temporary = TempDir::new().map_err(RecordError::write(&std::env::temp_dir()))?;
         // Pictures and messages show the folder's name.
         let folder = temporary.path().join(file::stem(path, "run"));
-        unpack(path, file, &folder)?;
+        unpack(path, file, &folder, checkpoints)?;
         Ok(RunFolder { path: folder, unpacked: Some(temporary) })
     }
 
@@ -72,8 +84,9 @@ pub(crate) fn run_prefix(path: &Path) -> Option<String> {
     Some(names.iter().find_map(|name| inside(name, CONFIG))?.trim_end_matches('/').into())
 }
 
-/// Unpacks the files of a run. Other files of the archive are ignored, so no name in it leads out of the folder.
-fn unpack(path: &Path, file: File, folder: &Path) -> Result<(), RecordError> {
+/// Unpacks the files of a run, with or without its checkpoints. Other files of the archive are ignored, so no name in it
+/// leads out of the folder.
+fn unpack(path: &Path, file: File, folder: &Path, checkpoints: bool) -> Result<(), RecordError> {
     let damaged = |error: zip::result::ZipError| RecordError::damaged(path, error);
     let mut archive = ZipArchive::new(file).map_err(damaged)?;
     let names: Vec<String> = archive.file_names().flatten().map(Into::into).collect();
@@ -91,7 +104,7 @@ fn unpack(path: &Path, file: File, folder: &Path) -> Result<(), RecordError> {
     for name in &names {
         let Some(own) = name.strip_prefix(top) else { continue };
         let checkpoint = own.strip_prefix(CHECKPOINTS).and_then(|rest| rest.strip_prefix('/'));
-        let is_checkpoint = checkpoint.is_some_and(|rest| {
+        let is_checkpoint = checkpoint.filter(|_| checkpoints).is_some_and(|rest| {
             rest.ends_with(".safetensors")
                 && rest.bytes().all(|byte| byte.is_ascii_alphanumeric() || b".-_".contains(&byte))
         });

@@ -112,7 +112,7 @@ impl Disk {
         }
         fs::create_dir_all(path).map_err(|error| match error.kind() {
             kind @ (io::ErrorKind::AlreadyExists | io::ErrorKind::NotADirectory) => {
-                io::Error::new(kind, "a file is where a folder is needed; choose another name")
+                io::Error::new(kind, "a part of this path is a file, not a folder; choose another path")
             }
             _ => error,
         })

@@ -195,7 +195,7 @@ fn not_a_folder(kind: Option<FileKind>, path: &Path, error: io::Error) -> io::Er
     match kind {
         Some(FileKind::Link) => is_link(path),
         Some(FileKind::File | FileKind::Other) => {
-            io::Error::new(ErrorKind::NotADirectory, "a file is where a folder is needed; choose another name")
+            io::Error::new(ErrorKind::NotADirectory, "a part of this path is a file, not a folder; choose another path")
         }
         Some(FileKind::Folder) | None => error,
     }

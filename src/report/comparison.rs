@@ -111,7 +111,7 @@ pub enum ComparisonError {
     #[error("{0} has no generation that every trial has reached")]
     TooShort(String),
     /// Some arms have not reached a requested generation.
-    #[error("the arms have reached generation {last}")]
+    #[error("the arms have only reached generation {last}; choose one up to that")]
     Beyond {
         /// The requested generation.
         at: usize,

@@ -131,7 +131,7 @@ pub fn trials(folder: &Path, config: &Config, verification: Verification) -> Res
         None => Ok(trials),
         Some((trial, generation)) => Err(ReadError::Record(RecordError::Damaged {
             path: folder.join(METRICS),
-            reason: format!("trial {trial} of generation {generation} is out of turn"),
+            reason: format!("trial {trial} of generation {generation} is out of order"),
         })),
     }
 }

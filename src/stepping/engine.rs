@@ -15,18 +15,28 @@ use super::state::Saved;
 
 /// The arrays that a stepper shows, of all teams.
 pub(super) struct Observations {
+    /// What leaders sense, `[teams][leaders][8]`.
     pub(super) inputs: Vec<f32>,
-    pub(super) near: Vec<u32>,
+    /// The agents at each POI, one bit per agent, `[teams][pois][words]`.
+    pub(super) agents_at_poi: Vec<u32>,
+    /// Whether the last step observed a POI first, `[teams][pois]`.
     pub(super) newly: Vec<bool>,
+    /// Whether a POI was observed, `[teams][pois]`.
     pub(super) observed: Vec<bool>,
+    /// The steps that each team has played, `[teams]`.
     pub(super) steps: Vec<u32>,
+    /// In units, `[teams][agents][2]`.
     pub(super) positions: Vec<f32>,
+    /// Unit vectors, `[teams][agents][2]`.
     pub(super) headings: Vec<f32>,
+    /// In units per second, `[teams][agents]`.
     pub(super) speeds: Vec<f32>,
 }
 
 /// Vectors of teams of any instruction set.
 pub(super) trait Vectors: Send + Sync {
+    /// Resets the `chosen` teams, `[teams]`, or all, to `starts`, `[teams][agents]`, or to the world's. `moved` as for
+    /// [`Vectors::step`].
     fn reset(
         &mut self,
         world: &World,
@@ -39,6 +49,7 @@ pub(super) trait Vectors: Send + Sync {
     fn step(&mut self, world: &World, moved: &[Vec2], actions: &[f32], observations: &mut Observations);
     /// Puts all teams into a saved state, except what is shown of them; of that it sets the inputs.
     fn restore(&mut self, world: &World, saved: &Saved<'_>, moved: &[Vec2], observations: &mut Observations);
+    /// Writes the positions, headings and speeds of all teams.
     fn states(&mut self, world: &World, observations: &mut Observations);
     /// Allocates a record of sightings for all steps.
     fn keep_sights(&mut self, world: &World);
@@ -197,7 +208,7 @@ struct View<'a, S: Simd> {
 /// The [`Observations`] of some teams.
 struct Slices<'a> {
     inputs: &'a mut [f32],
-    near: &'a mut [u32],
+    agents_at_poi: &'a mut [u32],
     newly: &'a mut [bool],
     observed: &'a mut [bool],
     steps: &'a mut [u32],
@@ -208,8 +219,11 @@ struct Slices<'a> {
 
 impl<'a, S: Simd> View<'a, S> {
     fn new(blocks: &'a mut [TeamBlock<S>], observations: &'a mut Observations) -> View<'a, S> {
-        let Observations { inputs, near, newly, observed, steps, positions, headings, speeds } = observations;
-        View { blocks, observations: Slices { inputs, near, newly, observed, steps, positions, headings, speeds } }
+        let Observations { inputs, agents_at_poi, newly, observed, steps, positions, headings, speeds } = observations;
+        View {
+            blocks,
+            observations: Slices { inputs, agents_at_poi, newly, observed, steps, positions, headings, speeds },
+        }
     }
 
     /// Calls `act` with a few vectors at a time, on all threads.
@@ -232,7 +246,10 @@ impl<'a> Slices<'a> {
         let (agents, pois) = (world.agents(), world.pois.len());
         Slices {
             inputs: self.inputs.split_off_mut(..teams * world.leaders() * INPUTS).unwrap_or_default(),
-            near: self.near.split_off_mut(..teams * pois * world.constants.words as usize).unwrap_or_default(),
+            agents_at_poi: self
+                .agents_at_poi
+                .split_off_mut(..teams * pois * world.constants.words as usize)
+                .unwrap_or_default(),
             newly: self.newly.split_off_mut(..teams * pois).unwrap_or_default(),
             observed: self.observed.split_off_mut(..teams * pois).unwrap_or_default(),
             steps: self.steps.split_off_mut(..teams).unwrap_or_default(),
@@ -309,7 +326,7 @@ impl<S: Simd> Workspace<S> {
         starts: Option<&[Vec2]>,
         observations: Slices<'_>,
     ) {
-        let Slices { inputs, near, newly, observed, steps, .. } = observations;
+        let Slices { inputs, agents_at_poi, newly, observed, steps, .. } = observations;
         let (agents, pois, words) = (world.agents(), world.pois.len(), world.constants.words as usize);
         let TeamBlock { first, teams, ref mut state, ref mut record, ref mut sights } = *block;
         let is_chosen = |team: usize| chosen.is_none_or(|chosen| chosen[team]);
@@ -331,7 +348,7 @@ impl<S: Simd> Workspace<S> {
         }
         let (size, seen) = (record.len() / teams, sights.len() / teams);
         for team in (0..teams).filter(|team| is_chosen(first + team)) {
-            near[team * pois * words..][..pois * words].fill(0);
+            agents_at_poi[team * pois * words..][..pois * words].fill(0);
             newly[team * pois..][..pois].fill(false);
             observed[team * pois..][..pois].fill(false);
             steps[team] = 0;
@@ -344,7 +361,7 @@ impl<S: Simd> Workspace<S> {
 
     #[inline(always)]
     fn step(&mut self, simd: S, world: &World, block: &mut TeamBlock<S>, actions: &[f32], observations: Slices<'_>) {
-        let Slices { inputs, near, newly, observed, steps, .. } = observations;
+        let Slices { inputs, agents_at_poi, newly, observed, steps, .. } = observations;
         let last = world.constants.steps;
         let playing = (0..).zip(&*steps).map(|(team, &step)| u64::from(step < last) << team).sum::<u64>();
         newly.fill(false);
@@ -374,7 +391,7 @@ impl<S: Simd> Workspace<S> {
             simd,
             pois * words,
             (0, 1),
-            bytemuck::cast_slice_mut(near),
+            bytemuck::cast_slice_mut(agents_at_poi),
             #[inline(always)]
             |column| &sets[column * width..][..width],
         );
@@ -397,7 +414,7 @@ impl<S: Simd> Workspace<S> {
             let size = pois * words;
             for (team, &step) in steps.iter().enumerate().filter(|(_, step)| **step < last) {
                 let at = team * world.set_words() + step as usize * size;
-                record[at..at + size].copy_from_slice(&near[team * size..][..size]);
+                record[at..at + size].copy_from_slice(&agents_at_poi[team * size..][..size]);
             }
         }
         steps.iter_mut().for_each(|step| *step = last.min(*step + 1));

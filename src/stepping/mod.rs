@@ -121,7 +121,7 @@ pub enum StepError {
     #[error("the saved state does not fit: {0}")]
     State(&'static str),
     /// The team does not exist.
-    #[error("team {team} of {teams} (they count from 0)")]
+    #[error("team {team} does not exist: there are {teams}, counted from 0")]
     NoTeam {
         /// The team, from 0.
         team: usize,
@@ -129,10 +129,10 @@ pub enum StepError {
         teams: usize,
     },
     /// Scores need a record, see [`Stepper::recording`].
-    #[error("no record was kept to score teams by")]
+    #[error("no record to score; create the stepper with `Stepper::recording`")]
     NotRecorded,
     /// Dt needs a record of sightings, see [`Stepper::with_sights`].
-    #[error("no record was kept of who saw whom at which step, which Dt asks; make the stepper `with_sights`")]
+    #[error("no record of who saw whom at which step, which Dt needs; create the stepper with `with_sights`")]
     NotSeen,
 }
 
@@ -167,8 +167,8 @@ impl Stepper {
         }
         let (agents, leaders, pois) = (world.agents(), world.leaders(), world.pois.len());
         let words = world.constants.words as usize;
-        // Reserved first, because a failing allocation below would abort. Counts a team's numbers, both in the vectors
-        // and as shown.
+        // Probed first, because a failing allocation below would abort. Counts a team's numbers, both in the vectors and
+        // as shown.
         let record = if recording { world.set_words() } else { 0 };
         let in_vectors = agents * 6 + leaders * (INPUTS + OUTPUTS) + world.followers() * (11 + leaders) + pois * words;
         let numbers = in_vectors + record + leaders * INPUTS + agents * 5 + pois * (words + 1) + 1;
@@ -180,7 +180,7 @@ impl Stepper {
         let vectors = dispatch!(level, simd => vectors(simd, &world, teams, record));
         let observations = Observations {
             inputs: vec![0.0; teams * leaders * INPUTS],
-            near: vec![0; teams * pois * words],
+            agents_at_poi: vec![0; teams * pois * words],
             newly: vec![false; teams * pois],
             observed: vec![false; teams * pois],
             steps: vec![0; teams],
@@ -252,7 +252,7 @@ impl Stepper {
         }
         let pois = self.world.pois.len();
         for (team, moved) in self.moved.chunks_exact_mut(pois).enumerate().filter(|&(team, _)| chosen[team]) {
-            moved.copy_from_slice(given.get(team * pois..).map_or(&self.world.pois, |given| &given[..pois]));
+            moved.copy_from_slice(given.get(team * pois..(team + 1) * pois).unwrap_or(&self.world.pois));
         }
         let starts = starts.as_ref().map(|(starts, _)| &starts[..]);
         self.vectors.reset(&self.world, Some(chosen), starts, &self.moved, &mut self.observations);
@@ -302,8 +302,8 @@ impl Stepper {
 
     /// Returns the agents at each POI after the last step, `[teams][pois][words]`, one bit per agent. Before the first
     /// step there are none.
-    pub fn near(&self) -> &[u32] {
-        &self.observations.near
+    pub fn agents_at_poi(&self) -> &[u32] {
+        &self.observations.agents_at_poi
     }
 
     /// Returns which POIs the last step observed first, `[teams][pois]`.

@@ -50,7 +50,7 @@ impl Stepper {
         for numbers in [&observations.positions, &observations.headings, &observations.speeds] {
             words.extend_from_slice(bytemuck::cast_slice(numbers));
         }
-        words.extend_from_slice(&observations.near);
+        words.extend_from_slice(&observations.agents_at_poi);
         for flags in [&observations.newly, &observations.observed] {
             words.extend(flags.iter().map(|&flag| u32::from(flag)));
         }
@@ -91,7 +91,7 @@ impl Stepper {
         let mut words = Words(&words[HEADER..]);
         let [positions, headings] = [(); 2].map(|()| words.numbers(teams * agents * 2));
         let speeds = words.numbers(teams * agents);
-        let near = words.take(teams * sets);
+        let agents_at_poi = words.take(teams * sets);
         let [newly, observed] = [(); 2].map(|()| words.take(teams * pois));
         let steps = words.take(teams);
         let moved: &[Vec2] = bytemuck::cast_slice(words.numbers(teams * moved * 2));
@@ -103,13 +103,13 @@ impl Stepper {
             record: words.take(teams * record),
             sights: words.take(teams * sights),
         };
-        check(world, &saved, moved)?;
+        check(world, agents_at_poi, &saved, moved)?;
         if newly.iter().chain(observed).any(|&flag| flag > 1) || steps.iter().any(|&step| step > world.constants.steps)
         {
             return Err(StepError::State("a step or flag is out of range"));
         }
         self.moved = moved.to_vec();
-        self.observations.near.copy_from_slice(near);
+        self.observations.agents_at_poi.copy_from_slice(agents_at_poi);
         self.observations.newly.iter_mut().zip(newly).for_each(|(to, &flag)| *to = flag == 1);
         self.observations.observed.iter_mut().zip(observed).for_each(|(to, &flag)| *to = flag == 1);
         self.observations.steps.copy_from_slice(steps);
@@ -127,8 +127,8 @@ impl Stepper {
     }
 }
 
-/// Checks that all numbers are in the range of a state that was played.
-fn check(world: &World, saved: &Saved<'_>, moved: &[Vec2]) -> Result<(), StepError> {
+/// Checks that all numbers and sets are in the range of a state that was played. `agents_at_poi` has the agents at each POI.
+fn check(world: &World, agents_at_poi: &[u32], saved: &Saved<'_>, moved: &[Vec2]) -> Result<(), StepError> {
     let map = world.map();
     let on_map = |place: &[f32]| (0.0..=map.x).contains(&place[0]) && (0.0..=map.y).contains(&place[1]);
     let unit = |heading: &[f32]| (libm::hypotf(heading[0], heading[1]) - 1.0).abs() < 0.01;
@@ -138,5 +138,16 @@ fn check(world: &World, saved: &Saved<'_>, moved: &[Vec2]) -> Result<(), StepErr
     if !saved.headings.chunks_exact(2).all(unit) || !saved.speeds.iter().all(|speed| speed.is_finite()) {
         return Err(StepError::State("a heading or speed is out of range"));
     }
+    // Scores use the members of sets as indices.
+    let agents = |sets: &[u32]| has_only(world.agents(), sets);
+    if !agents(agents_at_poi) || !agents(saved.record) || !has_only(world.leaders(), saved.sights) {
+        return Err(StepError::State("a set has an agent that does not exist"));
+    }
     Ok(())
+}
+
+/// Reports whether sets of bits, each of as many words as `members` need, have no bit beyond the last member.
+fn has_only(members: usize, sets: &[u32]) -> bool {
+    let (words, used) = (members.div_ceil(32), members % 32);
+    used == 0 || sets.chunks_exact(words).all(|set| set[words - 1] >> used == 0)
 }

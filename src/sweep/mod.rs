@@ -19,7 +19,7 @@
 //! | [`questions`] | the open questions of the paper, as sweeps |
 
 use std::collections::hash_map::Entry;
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, HashMap, HashSet};
 use std::path::Path;
 
 use toml::de::{DeTable, DeValue};
@@ -283,7 +283,7 @@ impl Grid {
             Value::Boolean(skip) if key == SKIP && !varied => self.skip = skip,
             other if key == SKIP && !varied => report(format!("found {other}, allowed true or false")),
             _ if varied && layout::AXES.contains(&key) => {
-                report("it lays out whole teams, of which the file has none of its own; allowed in [grid]".into());
+                report("not allowed in [vary], because it replaces the whole layout; move it to [grid]".into());
             }
             _ if varied && self.axes.iter().any(|(other, _)| other.key == key) => {
                 report("it is also in [grid]; leave one of them out".into());
@@ -337,7 +337,8 @@ impl Grid {
                 problems.push(problem(Some(*line), &axis.name_of(value), message));
             }
         }
-        problems.dedup();
+        let mut reported = HashSet::new();
+        problems.retain(|Problem { line, key, message }| reported.insert((*line, key.clone(), message.clone())));
         let variations = self.variations();
         let own = |key: &str| {
             let configs = tried.chunks(variations).filter_map(|of| of[0].config.as_ref().ok());

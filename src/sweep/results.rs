@@ -187,7 +187,7 @@ fn read(point: &Point, out: &Path, options: &Detail) -> Result<(Vec<Row>, Outcom
         let Row { trial, generation, best_g, .. } = row;
         if (generation, trial) != (next / trials, next % trials) || generation > last {
             return Err(Missing::Damaged(format!(
-                "{}: trial {trial} of generation {generation} is out of turn",
+                "{}: trial {trial} of generation {generation} is out of order",
                 path.escaped()
             )));
         }

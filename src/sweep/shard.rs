@@ -51,7 +51,7 @@ impl Shard {
         let number = |name: &str| match get(name) {
             None => Ok(None),
             Some(text) => {
-                text.trim().parse::<usize>().map(Some).map_err(|_| format!("{name}={text} is no whole number"))
+                text.trim().parse::<usize>().map(Some).map_err(|_| format!("{name}={text} is not a whole number"))
             }
         };
         let (index, count, names) = if let Some(id) = number("SLURM_ARRAY_TASK_ID")? {
@@ -68,14 +68,14 @@ impl Shard {
         } else if let Some(index) = number("JOB_COMPLETION_INDEX")? {
             let count = number("FLOTILLA_SHARDS")?.ok_or(
                 "JOB_COMPLETION_INDEX is set, but not FLOTILLA_SHARDS, which has to be the job's `completions`; \
-                 or say --shard I/N",
+                 or pass --shard I/N",
             )?;
             (index, count, "JOB_COMPLETION_INDEX and FLOTILLA_SHARDS")
         } else {
             return Ok(None);
         };
         let shard = Shard::new(index.saturating_add(1), count);
-        shard.map(Some).map_err(|error| format!("{names}: {error}; say --shard I/N where the array has gaps"))
+        shard.map(Some).map_err(|error| format!("{names}: {error}; pass --shard I/N if the array has gaps"))
     }
 
     /// Returns the points of this shard in order, see [`assign_to_shards`].

@@ -26,8 +26,12 @@ pub struct Candidates<'a> {
 
 impl Trainer {
     /// Forms the teams of the generation that an experiment plays next, and returns them, one entry per trial.
+    ///
+    /// # Panics
+    /// A backend holds the populations since [`Trainer::advance`].
     pub fn ask(&mut self, experiment: usize) -> Vec<Candidates<'_>> {
         let experiment = &mut self.experiments[experiment];
+        assert!(!experiment.residency.is_on_device(), "ask and advance take turns on one trainer");
         experiment.prepare(self.level);
         let pairs = experiment.trials.iter().zip(&experiment.schedules);
         let asked = pairs.map(|(trial, schedule)| Candidates {
@@ -64,17 +68,17 @@ impl Trainer {
 
     /// Returns G, `[trials][teams]`, and the config's fitness of each leader, `[trials][teams][leaders]`, of the teams
     /// that [`Trainer::play_candidates`] played, as means over episodes.
+    /// Both are empty if only the champions were left to play.
     pub fn played(&self, experiment: usize) -> (Vec<f64>, Vec<f32>) {
+        let (world, teams) = self.candidates_world(experiment);
         let experiment = &self.experiments[experiment];
-        let stage = experiment.stage();
-        let (teams, leaders) = (experiment.teams(), stage.world.leaders());
         let (mut g, mut scores) = (Vec::new(), Vec::new());
         for trial in &experiment.trials {
-            let all = (stage.world.pois.len() * trial.scores.len()) as f64;
+            let all = (world.pois.len() * trial.scores.len()) as f64;
             let observed =
                 |team: usize| trial.scores.iter().map(|episode| u64::from(episode.observed[team])).sum::<u64>();
             g.extend((0..teams).map(|team| observed(team) as f64 / all));
-            scores.extend((0..teams * leaders).map(|place| mean_score(&trial.scores, place)));
+            scores.extend((0..teams * world.leaders()).map(|place| mean_score(&trial.scores, place)));
         }
         (g, scores)
     }
@@ -86,11 +90,15 @@ impl Trainer {
     /// the last.
     ///
     /// # Panics
-    /// `fitness` has the wrong length.
+    /// `fitness` has the wrong length, or a backend holds the populations since [`Trainer::advance`].
     pub fn tell(&mut self, index: usize, fitness: Option<&[f32]>) -> Vec<Row> {
         let level = self.level;
+        let (world, teams) = self.candidates_world(index);
+        let expected = self.experiments[index].trials.len() * teams * world.leaders();
+        assert!(fitness.is_none_or(|fitness| fitness.len() == expected), "there are {expected} scores");
         scope(|_| {
             let experiment: &mut Experiment = &mut self.experiments[index];
+            assert!(!experiment.residency.is_on_device(), "tell and advance take turns on one trainer");
             let mut rows = if experiment.only_champions_left() {
                 experiment.collect_last_rows()
             } else {

@@ -30,7 +30,7 @@ pub(super) struct Experiment {
 /// One trial's populations, and scratch memory for its generations.
 ///
 /// A population has more slots than policies, see [`Learning::slots`]. The slot after the policies holds the previous
-/// champion, which plays in an additional team.
+/// champion, or the mean of an evolution strategy. It plays in an additional team.
 pub(super) struct TrialState {
     /// The trial's number within its config.
     pub index: usize,
@@ -152,8 +152,10 @@ impl Experiment {
         }
         self.generation = generation.min(self.last() + 2);
         self.residency = Residency::on_host(self.generation);
-        if generation == last + 1 && last < self.last() {
-            // The shorter run kept its last policies. This run breeds a next generation from them.
+        if generation > last && last < self.last() {
+            // The shorter run kept its last policies. This run breeds a next generation from them. The shorter run's
+            // last champions may have played already; they play again, in the next generation.
+            self.generation = last + 1;
             self.residency = Residency::on_host(last);
             self.breed_beyond_the_last(level);
         }

@@ -10,6 +10,7 @@
 //! | `residency` | where populations are: on the host or on a device |
 //! | `populations` | moving populations between the two, and breeding them |
 //! | `results` | playing a generation, and its rows and fitness |
+//! | `ask_tell` | training in which the caller scores the policies |
 //! | `size` | estimates of the memory that a trainer needs |
 
 use std::collections::TryReserveError;
@@ -33,7 +34,7 @@ mod size;
 mod stages;
 
 pub use ask_tell::Candidates;
-pub use size::{bytes, next_bytes, snapshot_bytes};
+pub use size::{bytes, next_schedule_bytes, snapshot_bytes};
 
 use experiment::Experiment;
 use schedule::TeamSchedule;
@@ -57,7 +58,7 @@ pub struct Row {
     pub generation: usize,
     /// G of the best team.
     pub best_g: f64,
-    /// G in the mean over teams.
+    /// Mean G over the teams.
     pub mean_g: f64,
     /// G of the team of every population's best policy.
     pub champion_g: f64,
@@ -181,7 +182,7 @@ impl Trainer {
         std::mem::take(&mut self.times)
     }
 
-    /// Reports whether every experiment has played its last generation, and the champions of that.
+    /// Reports whether every experiment has played its last generation, and that generation's champions.
     pub fn is_done(&self) -> bool {
         self.experiments.iter().all(Experiment::is_done)
     }

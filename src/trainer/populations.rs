@@ -71,7 +71,8 @@ impl Experiment {
     }
 
     /// Breeds the next generation, on the host or on the device that holds the populations. After the last generation,
-    /// all policies stay, and the champion is copied to its slot.
+    /// no policy changes. Tournaments then copy the champion to its slot, and evolution strategies move the mean, which is
+    /// in that slot.
     ///
     /// # Errors
     /// The backend that holds the populations failed. The results of this generation are already known. The next call

@@ -2,8 +2,8 @@
 
 use crate::config::{Config, ValidConfig};
 
-/// Bytes per episode of a batch, on any backend.
-const EPISODE: u64 = 40;
+/// Words of 4 bytes per episode of a batch, on any backend.
+const EPISODE_WORDS: u64 = 40;
 
 /// Returns the bytes that the trials of a config take on any backend, in the stage that takes most.
 pub fn bytes(config: &ValidConfig) -> u64 {
@@ -11,7 +11,7 @@ pub fn bytes(config: &ValidConfig) -> u64 {
 }
 
 /// Returns the bytes of the next generation's schedules, drawn while a backend that holds the populations plays.
-pub fn next_bytes(config: &ValidConfig) -> u64 {
+pub fn next_schedule_bytes(config: &ValidConfig) -> u64 {
     max_over_stages(config, schedule_bytes) + previous_stage_bytes(config)
 }
 
@@ -35,7 +35,7 @@ fn bytes_of_stage(config: &Config) -> u64 {
     // Scores are added up in 64 bits.
     let totals =
         if config.learning.partners > 1 || config.learning.hall_of_fame > 0 { 2 * populations * policies } else { 0 };
-    4 * trials * (weights + fitness_and_parents + observed_and_scores + totals + episodes * EPISODE)
+    4 * trials * (weights + fitness_and_parents + observed_and_scores + totals + episodes * EPISODE_WORDS)
         + schedule_bytes(config)
 }
 

@@ -9,7 +9,7 @@ import { seek } from "./views.js";
 
 let asked = 0, written = 0;
 /**
- * Writes the experiment into the address. Returns false if this browser cannot: then the address is none, because the former one is of
+ * Writes the experiment into the address. Returns false if this browser cannot. The address is then empty, because the old one is of
  * another experiment. Packing a config takes a moment, and an older experiment never replaces a newer one.
  */
 export async function remember() {
@@ -62,7 +62,7 @@ export async function recall() {
   const whole = (/** @type {string} */ key) => /^\d{1,7}$/.test(word(key)) ? Number(word(key)) : null;
   for (const key of ["generation", "trial", "play"]) if (words.has(key) && whole(key) === null) unknown.push(`${key}=${words.get(key)}`);
   wanted = whole("play") === 1 ? { generation: whole("generation") ?? Infinity, trial: whole("trial") ?? 0 } : null;
-  const damage = unknown.length ? `This link is damaged: ${unknown.join(", ")} cannot be read. Ask for a new link; what you see is not what it was made for.` : "";
+  const damage = unknown.length ? `This link is damaged: ${unknown.join(", ")} cannot be read. Ask for a new link; this page shows another experiment.` : "";
   const taken = await take(text, { address: !damage });
   if (!taken && !state.views.length) {
     // Show a map even if the config in the link is invalid.

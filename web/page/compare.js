@@ -36,7 +36,7 @@ export function choice_of(compared, population) {
 export const write = ({ key, values }) => `${key}:${values.join(",")}`;
 
 /**
- * Reads a word of a link. Returns null if it is none.
+ * Reads a comparison from a word of a link. Returns null if the word is not one.
  * @param {string} word
  * @returns {Comparison | null}
  */

@@ -3,7 +3,7 @@ import { show_start } from "./arrange.js";
 import { $, count, failure, trouble } from "./dom.js";
 import { keep, take } from "./experiment.js";
 import { leave_guide } from "./guide.js";
-import { settle } from "./machine.js";
+import { renew_failed, settle } from "./machine.js";
 import { mode } from "./modes.js";
 import { intervals } from "./intervals.js";
 import { clerk } from "./pool.js";
@@ -42,6 +42,7 @@ export async function take_files(files) {
 async function take_runs(read, reading) {
   /** @type {Opened[]} */
   const found = [];
+  await renew_failed();
   for (const { file, bytes } of read) {
     reading(file);
     const { words, bytes: numbers } = await state.players[0].ask({ ask: "read", text: null }, bytes, {}, [bytes.buffer]);
@@ -67,7 +68,7 @@ async function take_runs(read, reading) {
   digests();
   seek(training.last);
   await intervals(training);
-  $("message").textContent = found.length > 1 ? `${found.length} runs are compared. Each is whole: its digest is right. The settings are those of ${found[0].name}.` : `${found[0].name}: the run is whole, its digest is right.`;
+  $("message").textContent = found.length > 1 ? `${found.length} runs are compared. Each is complete, and its digest matches. The settings are those of ${found[0].name}.` : `${found[0].name}: the run is complete, and its digest matches.`;
 }
 
 /** Opens policies or a config. @param {Read} read */
@@ -85,7 +86,7 @@ async function take_other({ file, bytes }) {
       only.canvas.ariaLabel = `${only.title.textContent}, step ${step}: ${only.status.textContent}`;
     };
     show(only, data);
-    $("message").textContent = `${file.name}: ${count(words.policies, "policy").replace(/ys$/, "ies")} a leader. Take a leader to play with them.`;
+    $("message").textContent = `${file.name}: ${count(words.policies, "policy").replace(/ys$/, "ies")} per leader. Take a leader to play with them.`;
   } else {
     if (!/\.toml$/i.test(file.name)) throw new Error("not a config (.toml), a run (.zip) or policies (.safetensors)");
     const text = new TextDecoder("utf-8", { fatal: true }).decode(bytes);

@@ -5,6 +5,7 @@ import { state } from "./state.js";
 
 // Opens the chosen backend, or the CPU if no GPU is exact. `auto` also ignores software renderers.
 export async function settle() {
+  await renew_failed();
   const wanted = $("on").value, { gpu } = state;
   if (state.settled === wanted) return;
   let why = "";
@@ -14,7 +15,7 @@ export async function settle() {
       $("machine").textContent = `Testing ${gpu.name} for exactness…`;
       state.machine = (await state.players[0].ask({ ask: "open", gpu: true, pass: null })).words;
       state.machine.adapter = gpu.name;
-      state.machine.description = `${gpu.name} by WebGPU${gpu.software ? ", a software renderer" : ""}, proved exact`;
+      state.machine.description = `${gpu.name}${gpu.software ? ", a software renderer," : ""} with WebGPU, which passed the exactness test`;
       state.settled = wanted;
       return show_machine();
     } catch (thrown) { why = failure(thrown).message; }
@@ -28,7 +29,7 @@ export async function settle() {
 
 export function show_machine() {
   const { training, machine } = state, workers = machine.backend === "cpu" ? `${machine.description.replace(/, \d+ threads?/, "")} in ${count(state.players.length, "worker")}` : machine.description;
-  const speed = training && training.teams ? ` · ${Math.round(training.rate).toLocaleString("en")} teams a second` : "";
+  const speed = training && training.teams ? ` · ${Math.round(training.rate).toLocaleString("en")} teams per second` : "";
   write_text($("machine"), `Runs on ${workers}${speed}${machine.why ? ` (${machine.why})` : ""}`);
 }
 
@@ -38,4 +39,9 @@ export async function renew() {
   state.players = await Promise.all(Array.from({ length: many }, () => pool.open()));
   state.settled = null;
   old.forEach(player => player.stop());
+}
+
+// Replaces the players if one of them has failed, because it answers no further requests.
+export async function renew_failed() {
+  if (state.players.some(player => player.failed)) await renew();
 }

@@ -137,7 +137,7 @@ async function start() {
     [state.gpu] = await Promise.all([pool.gpu(), renew()]);
   } catch (thrown) {
     $("machine").textContent = "";
-    return trouble(`This browser cannot run it: ${failure(thrown).message}. It takes WebAssembly with SIMD, as browsers have had since 2023.`);
+    return trouble(`This browser cannot run flotilla: ${failure(thrown).message}. It needs WebAssembly with SIMD, which browsers have had since 2023.`);
   }
   for (const name of configs.LAYOUTS) state.layouts[name] = (await clerk.ask({ ask: "resolve", text: configs.layout(name), name, changes: [] })).words.config;
   state.version = (await clerk.ask({ ask: "about" })).words.version;

@@ -8,7 +8,7 @@ import { ask, build, clear, controls, follow, position } from "./views.js";
 /** @type {Record<string, string>} */
 const HINTS = {
   watch: "", arrange: "Drag leaders, followers and POIs, then train again.",
-  drive: "Point where your leader shall go, or use the arrow keys; time waits for you.",
+  drive: "Point to where your leader should go, or use the arrow keys. Time passes only while you steer.",
 };
 
 /** @param {"watch" | "arrange" | "drive"} wanted */

@@ -30,15 +30,19 @@ export const pool = (() => {
         const asked = this.asked.get(data.id);
         this.asked.delete(data.id);
         if (!asked) return;
-        if (data.words && data.words.error) asked.reject(new Failure(data.words.error, data.words));
-        else asked.resolve(data);
+        if (!data.words || !data.words.error) return asked.resolve(data);
+        const failure = new Failure(data.words.error, data.words);
+        asked.reject(failure);
+        // A trap leaves the state of the module inconsistent.
+        if (failure.fatal) this.end(failure);
       };
     }
     /** @param {string} reason */
     fail(reason) { this.end(new Failure(reason, { fatal: true })); }
-    /** Fails all requests, and those to come. @param {Failure} failure */
+    /** Terminates the worker. Its requests fail, including later ones. @param {Failure} failure */
     end(failure) {
       this.failed = true;
+      this.worker.terminate();
       for (const { reject } of this.asked.values()) reject(failure);
       this.asked.clear();
     }
@@ -49,32 +53,35 @@ export const pool = (() => {
      * @returns {Promise<{ words: Answers[K], bytes: Bytes }>}
      */
     ask(words, bytes, more = {}, transferred = []) {
-      if (this.failed) return Promise.reject(new Failure("the worker has failed; load the page again", { fatal: true }));
+      if (this.failed) return Promise.reject(new Failure("the worker has failed; try again", { fatal: true }));
       const id = this.count++;
       return new Promise((resolve, reject) => {
         this.asked.set(id, { resolve, reject });
         this.worker.postMessage({ id, words, bytes, ...more }, transferred);
       });
     }
-    stop() {
-      this.worker.terminate();
-      this.end(new Failure("stopped", { stopped: true }));
-    }
+    stop() { this.end(new Failure("stopped", { stopped: true })); }
   }
 
   // Starts a worker, and returns it once it accepts requests.
   async function open() {
-    compiled ??= compile();
+    // If compiling fails, the next worker tries again.
+    compiled ??= compile().catch(thrown => { compiled = null; throw thrown; });
     const player = new Player();
-    await player.ask({ ask: "start" }, undefined, { module: await compiled });
+    try {
+      await player.ask({ ask: "start" }, undefined, { module: await compiled });
+    } catch (thrown) {
+      player.stop();
+      throw thrown;
+    }
     return player;
   }
 
   // Returns the name of the browser's GPU and whether it is a software renderer, or the reason why none can be used.
   /** @returns {Promise<Gpu>} */
   async function gpu() {
-    if (!navigator.gpu) return { reason: "this browser has no WebGPU, or keeps it to pages of https and localhost" };
-    if (typeof WebAssembly.Suspending !== "function") return { reason: "this browser cannot suspend WebAssembly, which waiting for a GPU takes" };
+    if (!navigator.gpu) return { reason: "this browser has no WebGPU, or allows it only for pages from https or localhost" };
+    if (typeof WebAssembly.Suspending !== "function") return { reason: "this browser cannot suspend WebAssembly, which is necessary to wait for a GPU" };
     const adapter = await navigator.gpu.requestAdapter().catch(() => null);
     if (!adapter) return { reason: "this browser offers no GPU" };
     const { vendor, architecture, device, description, isFallbackAdapter } = adapter.info;
@@ -85,13 +92,26 @@ export const pool = (() => {
   return { open, gpu };
 })();
 
-/** The worker that answers requests while the players train. @type {Promise<Player> | null} */
-let opened = null;
-export const clerk = {
-  /**
-   * Asks as a player does.
-   * @template {keyof Answers} K
-   * @param {{ ask: K, [key: string]: unknown }} words @param {Bytes | Bytes[]} [bytes] @param {Transferable[]} [transferred]
-   */
-  ask: async (words, bytes, transferred) => (await (opened ??= pool.open())).ask(words, bytes, {}, transferred),
-};
+/** The worker that answers requests while the players train. */
+export const clerk = (() => {
+  /** The player, once it is open. @type {Player | null} */
+  let player = null;
+  /** The same player, or one that is being opened. @type {Promise<Player> | null} */
+  let opened = null;
+
+  // Returns the player. Opens another one if it has failed or could not be opened.
+  function working() {
+    if (player && player.failed) opened = player = null;
+    opened ??= pool.open().then(made => player = made, thrown => { opened = null; throw thrown; });
+    return opened;
+  }
+
+  return {
+    /**
+     * Sends a request, like `Player.ask`.
+     * @template {keyof Answers} K
+     * @param {{ ask: K, [key: string]: unknown }} words @param {Bytes | Bytes[]} [bytes] @param {Transferable[]} [transferred]
+     */
+    ask: async (words, bytes, transferred) => (await working()).ask(words, bytes, {}, transferred),
+  };
+})();

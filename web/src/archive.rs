@@ -52,7 +52,7 @@ pub fn write(recorded: &Recorded, bytes: &[u8]) -> Result<Answer, Refusal> {
     let weights = if config.learning.extends_from_policies() { 0 } else { slots };
     let (numbers, trial) = (recorded.rows * 7 * size_of::<f64>(), (policies + fitness + weights) * size_of::<f32>());
     if bytes.len() != numbers + trials * trial || recorded.rows != trials * (last + 1) {
-        return Err(refuse("what came out of the run does not fit its config"));
+        return Err(refuse("the results of the run do not fit its config"));
     }
     let (numbers, rest) = bytes.split_at(numbers);
     let rows: Vec<(Row, f64)> = bytemuck::pod_collect_to_vec::<u8, f64>(numbers)
@@ -122,14 +122,23 @@ pub fn read(text: Option<&str>, bytes: &[u8]) -> Result<Answer, Refusal> {
         return Ok((json!({ "policies": found.policies }), numbers));
     }
     let mut zip =
-        ZipArchive::new(Cursor::new(bytes)).map_err(|error| refuse(format!("no archive of a run: {error}")))?;
+        ZipArchive::new(Cursor::new(bytes)).map_err(|error| refuse(format!("not an archive of a run: {error}")))?;
     let names: Vec<String> = zip.file_names().flatten().map(Into::into).collect();
+    // All files are read from the folder of one config. Otherwise, files of several runs could be mixed.
+    let runs: Vec<&str> = names.iter().filter_map(|path| inside(path, folder::CONFIG)).collect();
+    let &[top] = &runs[..] else {
+        return Err(refuse(match runs.len() {
+            0 => format!("it is not the archive of a run (no {})", folder::CONFIG),
+            count => format!("it has {count} runs; unpack it, and open an archive of one of them"),
+        }));
+    };
     let mut file = |name: &str| -> Result<Vec<u8>, Refusal> {
-        // Archives may contain the directory itself, so only the last part of a path is compared.
-        let found = names.iter().find(|found| found.rsplit('/').next() == Some(name));
-        let found = found.ok_or_else(|| refuse(format!("the archive has no {name}: it is no run's")))?;
+        let path = format!("{top}{name}");
+        if !names.contains(&path) {
+            return Err(refuse(format!("the archive has no {path}: it is not a run")));
+        }
         let mut content = Vec::new();
-        let file = zip.by_name(found).map_err(refuse)?;
+        let file = zip.by_name(&path).map_err(refuse)?;
         file.take(MAX_FILE_BYTES).read_to_end(&mut content).map_err(refuse)?;
         Ok(content)
     };
@@ -139,10 +148,11 @@ pub fn read(text: Option<&str>, bytes: &[u8]) -> Result<Answer, Refusal> {
     let run = Run::parse(&String::from_utf8_lossy(&file(folder::RUN)?))
         .map_err(|error| refuse(format!("run.json: {error}")))?;
     if run.origin.is_some_and(|origin| origin != Origin::of(&config)) {
-        return Err(refuse("config.toml is not the config that this run was trained by"));
+        return Err(refuse("config.toml is not the config that this run was trained with"));
     }
-    let expected =
-        run.digest.ok_or_else(|| refuse("run.json has no digest: the run is not finished: the run is not done"))?;
+    let expected = run.digest.ok_or_else(|| {
+        refuse("run.json has no digest: the run is not finished; finish it with `flotilla train --resume`")
+    })?;
     let mut numbers: Vec<f64> = Vec::new();
     let mut rows = metrics::Rows::new(&metrics[..]).map_err(|error| refuse(format!("metrics.csv: {error}")))?;
     let mut plain = Vec::new();
@@ -174,6 +184,12 @@ pub fn read(text: Option<&str>, bytes: &[u8]) -> Result<Answer, Refusal> {
     words["rows"] = count.into();
     words["digest"] = digest.into();
     Ok((words, bytes))
+}
+
+/// Returns the folder of a file in the archive, empty or ending in `/`, if the file has the given name.
+fn inside<'a>(path: &'a str, name: &str) -> Option<&'a str> {
+    let folder = path.strip_suffix(name)?;
+    (folder.is_empty() || folder.ends_with('/')).then_some(folder)
 }
 
 /// Plays the champions, the first policy of every leader, in the world of the last generation.

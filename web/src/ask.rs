@@ -151,7 +151,8 @@ pub fn answer(session: &mut Session, text: &str, bytes: &[u8]) -> Result<Answer,
             words(drive.state()?)
         }
         Ask::Step { turn, speed } => {
-            let drive = session.drive.as_mut().ok_or_else(|| refuse("nobody drives a leader yet"))?;
+            let drive =
+                session.drive.as_mut().ok_or_else(|| refuse("no leader is driven yet; start an episode first"))?;
             drive.step([turn, speed])?;
             words(drive.state()?)
         }

@@ -20,10 +20,13 @@ pub(crate) struct Block<S: Simd> {
     pub(super) world: Lanes<S>,
     /// `[agents]`, leaders first.
     pub agents: Vec<Agent<S>>,
+    /// What leaders sense, `[leaders]`.
     pub inputs: Vec<[S::f32s; INPUTS]>,
+    /// Outputs of the leaders' policies, `[leaders]`.
     pub outputs: Vec<[S::f32s; OUTPUTS]>,
-    /// The wanted speed of each agent.
+    /// Wanted speeds in units per second, `[agents]`.
     pub(super) wanted: Vec<S::f32s>,
+    /// `[followers]`.
     pub(super) followers: Vec<Follower<S>>,
     /// The number of steps at which each follower saw each leader, `[followers][leaders]`.
     pub counts: Vec<S::u32s>,

@@ -9,7 +9,7 @@ use crate::model::policy::PolicyConstants;
 use crate::parallel::*;
 use crate::world::{INPUTS, OUTPUTS};
 
-/// Computes what policies answer to given inputs, to the bit as in an episode.
+/// Computes the outputs of policies for given inputs, with the bits of an episode.
 ///
 /// `weights` are `[policies][parameters]`, each 0 or of size 2^-30 to 2^20. `inputs` are `[rows][8]`. Row `i` is answered
 /// by policy `of(i)`. Writes `outputs`, `[rows][2]`.

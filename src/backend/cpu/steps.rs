@@ -14,8 +14,8 @@ use crate::world::{INPUTS, OUTPUTS, World};
 
 /// Arrays for every step of every team. Empty arrays are not written.
 ///
-/// The teams of all groups follow each other. Index 0 of `inputs`, `outputs`, `actions` and `near` is the first step;
-/// index 0 of the others is the start.
+/// The teams of all groups follow each other. Index 0 of `inputs`, `outputs`, `actions` and `agents_at_poi` is the first
+/// step; index 0 of the others is the start.
 #[derive(Default)]
 pub struct StepArrays<'a> {
     /// `[teams][steps + 1][agents][2]`, in units.
@@ -26,12 +26,12 @@ pub struct StepArrays<'a> {
     pub speeds: &'a mut [f32],
     /// Inputs of the leaders, `[teams][steps][leaders][8]`.
     pub inputs: &'a mut [f32],
-    /// The answers of their policies, `[teams][steps][leaders][2]`.
+    /// Outputs of their policies, `[teams][steps][leaders][2]`.
     pub outputs: &'a mut [f32],
     /// These with noise, before they are clamped to -1..1, `[teams][steps][leaders][2]`.
     pub actions: &'a mut [f32],
     /// The agents within the observation radius of each POI, one bit per agent, `[teams][steps][pois][words]`.
-    pub near: &'a mut [u32],
+    pub agents_at_poi: &'a mut [u32],
     /// The step, from 1, at which each POI was observed, or 0, `[teams][pois]`.
     pub observed_at: &'a mut [u32],
 }
@@ -59,15 +59,16 @@ pub struct Noise<'a> {
 impl<'a> StepArrays<'a> {
     /// Returns the index of the first array that is neither empty nor as long as needed.
     fn wrong_length(&self, sizes: [usize; 8], teams: usize) -> Option<usize> {
-        let StepArrays { positions, headings, speeds, inputs, outputs, actions, near, observed_at } = self;
+        let StepArrays { positions, headings, speeds, inputs, outputs, actions, agents_at_poi, observed_at } = self;
         let found = [positions, headings, speeds, inputs, outputs, actions].map(|array| array.len());
-        let found = found.into_iter().chain([near.len(), observed_at.len()]);
+        let found = found.into_iter().chain([agents_at_poi.len(), observed_at.len()]);
         found.zip(sizes).position(|(found, size)| found != 0 && found != size * teams)
     }
 
     /// Splits off the first teams. Empty arrays stay empty.
     fn split(&mut self, sizes: [usize; 8], teams: usize) -> StepArrays<'a> {
-        let [positions, headings, speeds, inputs, outputs, actions, near, observed_at] = sizes.map(|size| size * teams);
+        let [positions, headings, speeds, inputs, outputs, actions, agents_at_poi, observed_at] =
+            sizes.map(|size| size * teams);
         StepArrays {
             positions: self.positions.split_off_mut(..positions).unwrap_or_default(),
             headings: self.headings.split_off_mut(..headings).unwrap_or_default(),
@@ -75,7 +76,7 @@ impl<'a> StepArrays<'a> {
             inputs: self.inputs.split_off_mut(..inputs).unwrap_or_default(),
             outputs: self.outputs.split_off_mut(..outputs).unwrap_or_default(),
             actions: self.actions.split_off_mut(..actions).unwrap_or_default(),
-            near: self.near.split_off_mut(..near).unwrap_or_default(),
+            agents_at_poi: self.agents_at_poi.split_off_mut(..agents_at_poi).unwrap_or_default(),
             observed_at: self.observed_at.split_off_mut(..observed_at).unwrap_or_default(),
         }
     }
@@ -186,9 +187,9 @@ fn play<S: Simd>(
         }
         episode.advance(world, step);
         write_states(simd, episode, arrays, (step + 1, steps + 1));
-        let near = bytemuck::cast_slice_mut(arrays.near);
+        let agents_at_poi = bytemuck::cast_slice_mut(arrays.agents_at_poi);
         let taken = bytemuck::cast_slice::<u32, f32>(episode.sets_of(step, sets));
-        to_rows(simd, sets, row, near, |column| &taken[column * S::f32s::LEN..][..S::f32s::LEN]);
+        to_rows(simd, sets, row, agents_at_poi, |column| &taken[column * S::f32s::LEN..][..S::f32s::LEN]);
     }
     episode.store_counts();
 }

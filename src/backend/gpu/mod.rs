@@ -26,7 +26,7 @@ pub use self_test::{open, self_test};
 /// The shader that measures a device's arithmetic ceiling.
 pub(crate) const CEILING: &str = include_str!("../../../shaders/ceiling.wgsl");
 
-/// The whole text of every shader, with a name for each: what the lints and the exactness tests walk over.
+/// Returns the name and the text of every shader, for lints and exactness tests.
 pub fn shaders() -> Vec<(&'static str, String)> {
     [vec![("probe", self_test::SHADER.into()), ("ceiling", CEILING.into())], episode::shaders(), population::shaders()]
         .concat()

@@ -30,7 +30,7 @@ gpu_struct! {
     pub struct BreedJob {
         /// The slots' key before the slot is xored in, see [`Key::of_population`](crate::evolve::Key::of_population).
         pub key: [u32; 4],
-        /// Policies, including the champion's slot.
+        /// Slots per population.
         pub slots: u32,
         /// Weights per policy.
         pub parameters: u32,
@@ -293,7 +293,7 @@ impl DevicePopulation for Population {
     fn fetch(&self, weights: &mut [f32]) -> Result<(), BackendError> {
         let gpu = &self.kernels.gpu;
         let largest = self.pieces().next().map_or(0, |bytes| bytes.len() as u64);
-        let landing = gpu.landing(largest + self.status.size())?;
+        let readback_buffer = gpu.readback_buffer(largest + self.status.size())?;
         let policies = weights.chunks_exact_mut(self.population_len());
         for (buffer, policies) in self.buffers.iter().zip(policies) {
             for bytes in self.pieces() {
@@ -303,7 +303,7 @@ impl DevicePopulation for Population {
                 let nonce = bytemuck::bytes_of(&expected[self.done.len()]);
                 gpu.scoped("reading back", || gpu.write(&self.status, nonce_at, nonce))?;
                 let ranges = [(buffer, bytes.start as u64..bytes.end as u64), (&self.status, 0..end)];
-                let is_done = gpu.read_through(&landing, &ranges, |read| {
+                let is_done = gpu.read_through(&readback_buffer, &ranges, |read| {
                     let (piece, status) = read.split_at(bytes.len());
                     // All threads copy, because the host's memory may be new, and the system then clears it page by page.
                     let target = &mut bytemuck::cast_slice_mut::<f32, u8>(policies)[bytes.clone()];

@@ -53,7 +53,7 @@ impl Identity {
         }
         if let Some(file) = [ARMS, CLAIMS, SUMMARY].iter().chain(&FIGURES).find(|file| holds(file)) {
             return refused(
-                format!("{name} holds {file}, but no {PAPER}, which would say that it is a paper's"),
+                format!("{name} holds {file} but no {PAPER}, so it is not the folder of a paper"),
                 "choose another --out",
             );
         }
@@ -77,7 +77,7 @@ impl Identity {
         let text = config::read_file(&path)?;
         let existing: toml::Table = text.parse().map_err(|error: toml::de::Error| RecordError::Damaged {
             path: path.clone(),
-            reason: format!("it is damaged: {}; write over the paper by --force", error.message()),
+            reason: format!("it is damaged: {}; pass --force to overwrite the paper", error.message()),
         })?;
         let differs = |&(key, requested): &(&str, u64)| {
             let found = existing.get(key).and_then(toml::Value::as_integer).and_then(|found| u64::try_from(found).ok());

@@ -227,7 +227,7 @@ fn play_baselines(
     let mut baselines = Baselines::new(configs);
     while !baselines.is_done() {
         if context.is_stopped() {
-            return Err(Error::Stopped("before all that needs no learning was played, with every run done".into()));
+            return Err(Error::Stopped("before the baselines were played; all runs are finished".into()));
         }
         if let Err(error) = baselines.advance(&mut *backend.0) {
             *backend = context.fallback(&error).ok_or(error)?;

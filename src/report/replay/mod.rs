@@ -86,7 +86,7 @@ pub enum ReplayError {
     /// Retraining gives another result than the run's metrics.
     #[error(
         "{folder}: trained again, the {who} of trial {trial}, generation {generation} has G = {found}, but metrics.csv \
-         says {expected}: it was made with another config or another version of this program; repeat the run, then \
+         has {expected}: it was made with another config or another version of this program; repeat the run, then \
          replay it"
     )]
     Differs {
@@ -168,7 +168,7 @@ pub struct Replayed {
     pub scores: Scores,
     /// The leader to whose group each agent belongs for Df, or [`credit::UNASSIGNED`]. `[agents]`.
     pub owner: Vec<u32>,
-    /// The leaders of each follower at each step, as [`credit::lead`] writes them. Empty unless the run's fitness is
+    /// The leaders of each follower at each step, as [`credit::find_leading`] writes them. Empty unless the run's fitness is
     /// Dt.
     pub led: Vec<u32>,
     /// The step at which each POI was first observed, `[pois]`.
@@ -475,7 +475,7 @@ pub fn one(group: &Group<'_>, backend: &mut dyn Backend) -> Result<Replayed, Bac
     let mut owner = Vec::new();
     credit::assign(&episode.seen, world, &mut owner);
     let mut led = Vec::new();
-    credit::lead(&episode.sights, world, &mut led);
+    credit::find_leading(&episode.sights, world, &mut led);
     let observed = credit::observed_at(episode.sets, world);
     let team_g = f64::from(scores.observed) / world.pois.len() as f64;
     // POIs are drawn where this episode had them.
@@ -541,7 +541,7 @@ impl Replayed {
         let (pois, words, leaders) = (world.pois.len(), world.constants.words as usize, world.leaders());
         let follows = |step: usize, agent: usize| match agent.checked_sub(leaders) {
             None => false,
-            Some(follower) if !led.is_empty() => credit::leads(led, world, step, follower, leader),
+            Some(follower) if !led.is_empty() => credit::is_led_by(led, world, step, follower, leader),
             Some(_) => owner[agent] as usize == leader,
         };
         let mut sets = trace.sets.clone();
@@ -568,7 +568,7 @@ impl Replayed {
         match agent.checked_sub(leaders).filter(|_| !self.led.is_empty()) {
             // The start shows the groups of the first step, whose sights precede any motion.
             Some(follower) => (0..leaders)
-                .find(|&leader| credit::leads(&self.led, &self.world, step.saturating_sub(1), follower, leader)),
+                .find(|&leader| credit::is_led_by(&self.led, &self.world, step.saturating_sub(1), follower, leader)),
             None => (self.owner[agent] != credit::UNASSIGNED).then_some(self.owner[agent] as usize),
         }
     }

@@ -149,7 +149,7 @@ pub fn compiler(backend: &str) -> String {
 /// Selects the adapter to open.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum AdapterChoice {
-    /// A GPU, never a software renderer.
+    /// An adapter that is certainly a GPU.
     Real,
     /// By its index in [`adapters`] if this is a number, else by a part of its name, in any case. The first match wins.
     Named(String),

@@ -89,26 +89,26 @@ impl Gpu {
     /// # Errors
     /// The device was lost, or has too little memory for the copy.
     pub fn read<T: Pod>(&self, ranges: &[(&wgpu::Buffer, Range<u64>)]) -> Result<Vec<T>, DeviceError> {
-        let landing = self.landing(ranges.iter().map(|(_, bytes)| bytes.end - bytes.start).sum())?;
-        self.read_through(&landing, ranges, bytemuck::pod_collect_to_vec)
+        let readback_buffer = self.readback_buffer(ranges.iter().map(|(_, bytes)| bytes.end - bytes.start).sum())?;
+        self.read_through(&readback_buffer, ranges, bytemuck::pod_collect_to_vec)
     }
 
     /// Creates a buffer of `bytes` bytes for [`Gpu::read_through`].
     ///
     /// # Errors
     /// It exceeds the device's limits, or there is too little memory.
-    pub(in crate::backend::gpu) fn landing(&self, bytes: u64) -> Result<wgpu::Buffer, DeviceError> {
+    pub(in crate::backend::gpu) fn readback_buffer(&self, bytes: u64) -> Result<wgpu::Buffer, DeviceError> {
         self.buffer("reading back", bytes, wgpu::BufferUsages::COPY_DST | wgpu::BufferUsages::MAP_READ)
     }
 
-    /// Reads like [`Gpu::read`], through a buffer of [`Gpu::landing`] that several reads share, because drivers take long
+    /// Reads like [`Gpu::read`], through a buffer of [`Gpu::readback_buffer`] that several reads share, because drivers take long
     /// to create one. Calls `show` with the bytes of all ranges.
     ///
     /// # Errors
     /// The device was lost, or the buffer cannot be read.
     pub(in crate::backend::gpu) fn read_through<T>(
         &self,
-        landing: &wgpu::Buffer,
+        readback_buffer: &wgpu::Buffer,
         ranges: &[(&wgpu::Buffer, Range<u64>)],
         show: impl FnOnce(&[u8]) -> T,
     ) -> Result<T, DeviceError> {
@@ -116,13 +116,13 @@ impl Gpu {
         self.scoped("reading back", || {
             let mut encoder = self.device.create_command_encoder(&Default::default());
             for (buffer, bytes) in ranges {
-                encoder.copy_buffer_to_buffer(buffer, bytes.start, landing, size, bytes.end - bytes.start);
+                encoder.copy_buffer_to_buffer(buffer, bytes.start, readback_buffer, size, bytes.end - bytes.start);
                 size += bytes.end - bytes.start;
             }
             self.submit_commands("reading back", 0, encoder);
         })?;
         self.wait()?;
-        self.mapped(landing, 0..size, show)
+        self.mapped(readback_buffer, 0..size, show)
     }
 
     /// Calls `show` with a range of a buffer (in bytes, multiples of 4; usage `MAP_READ`). All work that writes it must

@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 use std::time::Duration;
 
-use super::{Compiled, DeviceError, Gpu};
+use super::{DeviceError, Gpu, PipelineKey};
 use crate::backend::gpu::exact;
 use crate::host::Instant;
 use crate::parallel::lock;
@@ -98,7 +98,7 @@ impl Gpu {
         layout: &Bindings,
     ) -> Result<wgpu::ComputePipeline, DeviceError> {
         let key = (self.text(wgsl).into_owned(), entry.to_owned(), self.pass);
-        let kept = |key: &Compiled| lock(&self.kept).get(key).cloned();
+        let kept = |key: &PipelineKey| lock(&self.kept).get(key).cloned();
         if let Some(pipeline) = kept(&key) {
             return Ok(pipeline);
         }
@@ -254,8 +254,8 @@ impl Gpu {
         })?;
         use wgpu::BufferUsages as Usage;
         let ticks = self.buffer("timestamps", bytes, Usage::QUERY_RESOLVE | Usage::COPY_SRC)?;
-        let landing = self.buffer("timestamps, read back", bytes, Usage::COPY_DST | Usage::MAP_READ)?;
-        Ok(Some(Stopwatch { queries, ticks, landing }))
+        let readback_buffer = self.buffer("timestamps, read back", bytes, Usage::COPY_DST | Usage::MAP_READ)?;
+        Ok(Some(Stopwatch { queries, ticks, readback_buffer }))
     }
 }
 
@@ -263,14 +263,14 @@ impl Gpu {
 pub(in crate::backend::gpu) struct Stopwatch {
     queries: wgpu::QuerySet,
     ticks: wgpu::Buffer,
-    landing: wgpu::Buffer,
+    readback_buffer: wgpu::Buffer,
 }
 
 impl Stopwatch {
     /// Copies the times of the pass to the host, after it.
     pub fn stop(&self, encoder: &mut wgpu::CommandEncoder) {
         encoder.resolve_query_set(&self.queries, 0..2, &self.ticks, 0);
-        encoder.copy_buffer_to_buffer(&self.ticks, 0, &self.landing, 0, self.ticks.size());
+        encoder.copy_buffer_to_buffer(&self.ticks, 0, &self.readback_buffer, 0, self.ticks.size());
     }
 
     /// Returns how long the last submitted pass took, which must have been waited for.
@@ -279,7 +279,7 @@ impl Stopwatch {
     /// The device was lost.
     pub fn read(&self, gpu: &Gpu) -> Result<Duration, DeviceError> {
         let read = |bytes: &[u8]| bytemuck::pod_collect_to_vec::<u8, u64>(bytes);
-        let ticks = gpu.mapped(&self.landing, 0..self.landing.size(), read)?;
+        let ticks = gpu.mapped(&self.readback_buffer, 0..self.readback_buffer.size(), read)?;
         let period = f64::from(gpu.queue.get_timestamp_period());
         Ok(Duration::from_nanos((ticks[1].saturating_sub(ticks[0]) as f64 * period) as u64))
     }

@@ -10,7 +10,7 @@ pub enum DeviceError {
     /// There is no adapter.
     #[error("no GPU adapter found: {}", absent::reasons())]
     NoAdapter,
-    /// There are only software renderers, which are opened only by name or number.
+    /// There are only adapters that are not certainly GPUs. They are opened only by name or number.
     #[error("no GPU among the adapters, only {}{}", list(.found), absent::hints())]
     NoRealAdapter {
         /// The adapters.

@@ -70,7 +70,7 @@ pub struct Gpu {
     nonce: Arc<AtomicU32>,
     wait_limit: WaitLimit,
     /// Pipelines that the self-test has compiled.
-    kept: Arc<Mutex<HashMap<Compiled, wgpu::ComputePipeline>>>,
+    kept: Arc<Mutex<HashMap<PipelineKey, wgpu::ComputePipeline>>>,
     /// Whether this clone adds to them.
     keeps: bool,
     /// Faults that tests inject.
@@ -78,7 +78,7 @@ pub struct Gpu {
 }
 
 /// Everything that a pipeline depends on: the text and entry point of its shader, and the pass.
-type Compiled = (String, String, Pass);
+type PipelineKey = (String, String, Pass);
 
 impl fmt::Debug for Gpu {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {

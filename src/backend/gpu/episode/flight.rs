@@ -22,7 +22,7 @@ const _: () = assert!(BINDING_ALIGNMENT.is_multiple_of(size_of::<Task>()));
 /// Initial share of all sets that a packed record has room for.
 pub(super) const KEPT_SHARE: f64 = 1.0 / 16.0;
 /// Words of a packed record beyond that share.
-const MIN_KEPT_SETS: usize = 256;
+const SPARE_PACKED_WORDS: usize = 256;
 
 const INPUT: Usage = Usage::STORAGE.union(Usage::COPY_DST);
 const OUTPUT: Usage = Usage::STORAGE.union(Usage::COPY_SRC);
@@ -76,7 +76,7 @@ impl Buffers {
 pub(super) struct PackedReadback {
     /// Words that there is room for, including tables and owners.
     pub(super) room: usize,
-    /// Bytes that are copied: everything, or only how many words were used.
+    /// Bytes that are copied: the whole record, or only its header.
     pub(super) bytes: u64,
 }
 
@@ -212,7 +212,7 @@ impl GpuBackend {
         let most = batch.used.record - PACKED_HEAD - 1;
         let room = match self.records {
             Records::Packed => most,
-            _ => head + (batch.sets as f64 * self.kept_share) as usize + MIN_KEPT_SETS,
+            _ => head + (batch.sets as f64 * self.kept_share) as usize + SPARE_PACKED_WORDS,
         };
         // If nearly all sets are kept, packing only measures when that changes.
         let (room, words) = if room <= most { (room, PACKED_HEAD + room) } else { (head, PACKED_HEAD) };
@@ -329,7 +329,7 @@ impl GpuBackend {
         Ok((readback, copies))
     }
 
-    /// Adds the dispatches of a run to the queue, and submits those that take long enough together.
+    /// Adds a run's dispatches to the queue. Submits the queue whenever its estimated time reaches the target.
     fn enqueue(
         &mut self,
         flight: usize,

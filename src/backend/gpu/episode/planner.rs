@@ -154,7 +154,8 @@ impl PlannedTask {
     }
 }
 
-/// Numbers of elements in the buffers that grow with the teams. Every other such buffer is smaller than one of them.
+/// Numbers of elements in the buffers that grow with the teams. [`BatchPlan::is_full`] counts those that grow with the
+/// groups.
 #[derive(Clone, Copy, Default)]
 pub(super) struct Elements {
     /// Words of records.
@@ -255,10 +256,18 @@ pub(super) struct BatchPlan {
 }
 
 impl BatchPlan {
-    /// Reports whether `teams` more teams of a group exceed the capacity.
+    /// Reports whether `teams` more teams of a group exceed the capacity, with the group's world and positions.
     fn is_full(&self, plan: &GroupPlan<'_>, teams: usize, capacity: Capacity) -> bool {
         let more = teams as u64 * plan.bytes_per_team;
+        let world = plan.group.world;
+        let places = self.places.len() + plan.group.starts.len() + world.pois.len() + world.headings.len();
+        let of_groups = [
+            places * size_of::<Vec2>(),
+            (self.worlds.len() + 1) * size_of::<Constants>(),
+            (self.tasks.len() + 1) * size_of::<Task>(),
+        ];
         self.used.bytes().into_iter().any(|used| used + more > capacity.target())
+            || of_groups.into_iter().any(|bytes| bytes as u64 > capacity.target())
             || self.shapes.len() >= capacity.kernels && !self.shapes.contains(&plan.template.shape)
     }
 
@@ -429,5 +438,31 @@ mod tests {
             assert_eq!(teams as usize, population);
         }
         assert_eq!(state_bytes(&world, group.records()), 256 * 20);
+    }
+
+    /// With one team per group, worlds and positions take more than records and weights.
+    #[test]
+    fn groups_of_one_team_do_not_outgrow_a_buffer() {
+        let text = "[world]\nleaders = [[1, 1]]\nfollowers = [FOLLOWERS]\npois = [[9, 9]]\nsteps = 1\n";
+        let text = text.replace("FOLLOWERS", &vec!["[2, 2]"; 255].join(", "));
+        let world = World::new(&Config::parse(&text, "large").unwrap());
+        let policies = vec![0.0; world.parameters()];
+        let group = Group {
+            world: &world,
+            starts: &world.starts,
+            weights: Weights::OnHost(&policies),
+            policies: 1,
+            teams: &[0],
+            sharing: crate::config::Sharing::PerLeader,
+            fitnesses: &[crate::config::Fitness::Df],
+        };
+        let (groups, buffer) = (vec![group; 1000], 1 << 20);
+        let capacity = Capacity { batch: BATCH_BYTES, buffer, ..Capacity::of_workgroups(256) };
+        let batches = plan(&groups, false, Records::Whole, capacity, &HashSet::new()).unwrap();
+        for batch in &batches {
+            let bytes = [size_of_val(&batch.places[..]), size_of_val(&batch.worlds[..])];
+            assert!(bytes.iter().all(|&bytes| bytes as u64 <= buffer), "{bytes:?}");
+        }
+        assert_eq!(batches.iter().map(|batch| batch.tasks.len()).sum::<usize>(), groups.len());
     }
 }

@@ -72,7 +72,7 @@ impl Recorded {
     }
 }
 
-/// Knowledge of a kernel about its worlds at compile time.
+/// The sizes that a kernel is compiled for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub(super) enum Sizes {
     /// The widest layer, inputs included and rounded up to save compilations, and whether the outputs choose a
