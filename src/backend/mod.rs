@@ -45,7 +45,7 @@ pub trait Backend: Send {
     /// A group is inconsistent or exceeds a limit of the device, or the device failed.
     fn play(&mut self, groups: &[Group<'_>]) -> Result<Vec<GroupScores>, BackendError>;
 
-    /// Plays one group and returns every stage of every step.
+    /// Plays one group and returns all quantities of every step.
     ///
     /// # Errors
     /// See [`Backend::play`].

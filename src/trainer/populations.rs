@@ -90,6 +90,7 @@ impl Experiment {
         bred
     }
 
+    /// Plans the next generation, and lets the device breed it.
     fn breed_on_device(&mut self, level: Level) -> Result<(), BackendError> {
         let generation = self.residency.generation();
         let Experiment { stages, trials, residency, .. } = self;

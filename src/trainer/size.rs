@@ -21,10 +21,12 @@ pub fn snapshot_bytes(config: &Config) -> u64 {
     4 * trials * populations * (slots * parameters + policies)
 }
 
+/// Returns the largest number of bytes that any stage takes.
 fn max_over_stages(config: &ValidConfig, bytes: fn(&Config) -> u64) -> u64 {
     config.stages().iter().map(|(_, config)| bytes(config)).max().unwrap_or(0)
 }
 
+/// Returns the bytes of all trials in one stage.
 fn bytes_of_stage(config: &Config) -> u64 {
     let ([trials, populations, policies, parameters], leaders) = (sizes(config), config.learners() as u64);
     let (slots, episodes) = (config.learning.slots() as u64, config.learning.episodes_per_team as u64);
@@ -39,17 +41,19 @@ fn bytes_of_stage(config: &Config) -> u64 {
         + schedule_bytes(config)
 }
 
-/// Start positions of the previous stage's champions, kept while the next stage begins.
+/// Returns the bytes of the start positions of the previous stage's champions, kept while the next stage begins.
 fn previous_stage_bytes(config: &ValidConfig) -> u64 {
     if config.stages.is_empty() { 0 } else { max_over_stages(config, start_bytes) }
 }
 
+/// Returns the bytes of the team schedules of all trials.
 fn schedule_bytes(config: &Config) -> u64 {
     let ([trials, populations, ..], leaders) = (sizes(config), config.learners() as u64);
     let teams = config.learning.teams() as u64;
     4 * trials * (populations * teams + leaders * config.max_teams() as u64) + start_bytes(config)
 }
 
+/// Returns the bytes of the start positions, and of the POI positions if they move.
 fn start_bytes(config: &Config) -> u64 {
     let agents = (config.world.leaders.len() + config.world.followers.len()) as u64;
     let moved = if config.learning.poi_jitter > 0.0 { config.world.pois.len() as u64 } else { 0 };

@@ -47,6 +47,7 @@ pub(crate) struct BlockState<S: Simd> {
 pub(super) struct Follower<S: Simd> {
     sums: follow::Sums<S>,
     force: follow::SteeringForce<S>,
+    /// The squared size of the force, and the inverse of its size.
     sizes: (S::f32s, S::f32s),
 }
 

@@ -112,6 +112,7 @@ impl Cpu {
     }
 }
 
+/// Plays and scores the teams of a batch, and writes every step to the arrays.
 fn record<S: Simd>(
     simd: S,
     batch: &WorldBatch<'_>,

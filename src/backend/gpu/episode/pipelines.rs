@@ -36,6 +36,7 @@ fn worth_compiling(work: BTreeMap<Shape, u64>, compiled: &HashSet<Shape>) -> Has
 }
 
 impl GpuBackend {
+    /// Returns the limits of the device and of this backend for a batch.
     pub(super) fn capacity(&self) -> Capacity {
         let limits = &self.gpu.limits;
         Capacity {
@@ -67,6 +68,7 @@ impl GpuBackend {
         }
     }
 
+    /// Compiles the kernel that packs records, unless that was done before.
     pub(super) fn prepare_packing(&mut self) -> Result<(), DeviceError> {
         use Binding::{Read, Write};
         if self.pack.is_none() {

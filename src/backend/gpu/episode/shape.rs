@@ -50,6 +50,7 @@ impl fmt::Display for Kernel {
 /// Everything that a pipeline is compiled for. Pipelines are cached by it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub(super) struct Shape {
+    /// Threads per workgroup.
     pub(super) workgroup: usize,
     /// Agents that a thread plays, one after another.
     pub(super) slots: usize,
@@ -60,7 +61,7 @@ pub(super) struct Shape {
 /// Additional records of a kernel, besides sets and counts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub(super) struct Recorded {
-    /// Whether it records every stage of every step.
+    /// Whether it records all quantities of every step.
     pub(super) trace: bool,
     /// Whether it records which leaders each follower sees at each step.
     pub(super) sights: bool,
@@ -85,10 +86,12 @@ pub(super) enum Sizes {
 pub(super) const WIDTHS: usize = MAX_HIDDEN_LAYERS + 2;
 
 impl Shape {
+    /// Reports whether the kernel is for worlds of these sizes only.
     pub(super) fn is_specialised(&self) -> bool {
         matches!(self.sizes, Sizes::Fixed { .. })
     }
 
+    /// Returns the shape of the kernel that plays any world with policies up to this width.
     pub(super) fn generic(world: &World, workgroup: Workgroup, records: Recorded) -> Shape {
         let policy = &world.constants.policy;
         let chooses = policy.actions() == Some(Actions::Behaviours);
@@ -96,12 +99,13 @@ impl Shape {
         Shape { workgroup: workgroup.threads, slots: workgroup.slots, records, sizes }
     }
 
-    /// Returns the specialised shape, if it is asked for and possible.
+    /// Returns the specialised shape, if it is requested and possible.
     pub(super) fn asked_for(world: &World, kernel: Kernel, capacity: Capacity, records: Recorded) -> Option<Shape> {
         let workgroup = Workgroup::specialised(world, capacity).filter(|_| kernel != Kernel::Generic);
         workgroup.map(|workgroup| Shape::specialised(world, workgroup, records))
     }
 
+    /// Returns the shape of the kernel that plays worlds of these sizes only.
     pub(super) fn specialised(world: &World, workgroup: Workgroup, records: Recorded) -> Shape {
         let Constants { leaders, followers, pois, variant, policy: PolicyConstants { widths, .. }, .. } =
             world.constants;

@@ -78,6 +78,7 @@ pub fn guarded(module: &Module) -> Result<Module, ShaderError> {
     Ok(guarded)
 }
 
+/// Guards the sums and products of a function that [`exposed`] marks.
 fn guard_function(function: &mut Function, info: &FunctionInfo, module: &Module, guard: Handle<GlobalVariable>) {
     let mut expressions = Arena::new();
     let mut append = |expression, span| expressions.append(expression, span);
@@ -196,6 +197,7 @@ pub fn unguarded(module: &Module) -> Result<usize, ShaderError> {
     Ok(functions(module, &info).map(count).sum())
 }
 
+/// Replaces expressions in the statements of a block, pairs of old and new handles.
 fn replace_in_block(block: &mut Block, replaced: &[(Handle<Expression>, Handle<Expression>)]) {
     for statement in block.iter_mut() {
         if let Statement::Emit(range) = statement
