@@ -38,8 +38,8 @@ pub struct Scores {
     /// D++: D, or the gain per added copy of this leader if that is larger (Rahmattalabi et al., the paper's reference
     /// 12).
     pub dpp: Vec<f32>,
-    /// Dt: G minus G without the leader and, at each step, the followers that it [leads](lead) at that step. Empty if
-    /// the [sightings](Episode::sights) were not recorded. Without followers it is D.
+    /// Dt: G minus G without the leader and, at each step, the followers that it [leads](find_leading) at that step.
+    /// Empty if the [sightings](Episode::sights) were not recorded. Without followers it is D.
     pub dt: Vec<f32>,
 }
 

@@ -168,8 +168,8 @@ pub struct Replayed {
     pub scores: Scores,
     /// The leader to whose group each agent belongs for Df, or [`credit::UNASSIGNED`]. `[agents]`.
     pub owner: Vec<u32>,
-    /// The leaders of each follower at each step, as [`credit::find_leading`] writes them. Empty unless the run's fitness is
-    /// Dt.
+    /// The leaders of each follower at each step, as [`credit::find_leading`] writes them. Empty unless the run's
+    /// fitness is Dt.
     pub led: Vec<u32>,
     /// The step at which each POI was first observed, `[pois]`.
     pub observed: Vec<Option<usize>>,
