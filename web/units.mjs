@@ -55,7 +55,7 @@ test("requests open another worker after one has failed or could not be opened",
   const packed = content => deflateSync(content).toString("base64");
   const texts = { wasm: packed("no module"), worker: "" }, workers = [];
   const started = { words: { suspends: false } }, about = { words: { version: "1" } };
-  // What workers post in response to `start` and to other requests.
+  // Messages that workers post in response to `start` and to other requests.
   let on_start = started, on_request = about;
   globalThis.matchMedia = () => ({ matches: false });
   globalThis.document = { getElementById: id => ({ textContent: texts[id] }) };

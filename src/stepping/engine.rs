@@ -15,28 +15,28 @@ use super::state::Saved;
 
 /// The arrays that a stepper shows, of all teams.
 pub(super) struct Observations {
-    /// What leaders sense, `[teams][leaders][8]`.
+    /// Inputs of the leaders, `[teams][leaders][8]`.
     pub(super) inputs: Vec<f32>,
     /// The agents at each POI, one bit per agent, `[teams][pois][words]`.
     pub(super) agents_at_poi: Vec<u32>,
-    /// Whether the last step observed a POI first, `[teams][pois]`.
+    /// Whether a POI was first observed in the last step, `[teams][pois]`.
     pub(super) newly: Vec<bool>,
     /// Whether a POI was observed, `[teams][pois]`.
     pub(super) observed: Vec<bool>,
     /// The steps that each team has played, `[teams]`.
     pub(super) steps: Vec<u32>,
-    /// In units, `[teams][agents][2]`.
+    /// Positions in units, `[teams][agents][2]`.
     pub(super) positions: Vec<f32>,
-    /// Unit vectors, `[teams][agents][2]`.
+    /// Headings as unit vectors, `[teams][agents][2]`.
     pub(super) headings: Vec<f32>,
-    /// In units per second, `[teams][agents]`.
+    /// Speeds in units per second, `[teams][agents]`.
     pub(super) speeds: Vec<f32>,
 }
 
 /// Vectors of teams of any instruction set.
 pub(super) trait Vectors: Send + Sync {
-    /// Resets the `chosen` teams, `[teams]`, or all, to `starts`, `[teams][agents]`, or to the world's. `moved` as for
-    /// [`Vectors::step`].
+    /// Resets the `chosen` teams, `[teams]`, or all, to `starts`, `[teams][agents]`, or to the world's. `moved` are
+    /// POI positions, as for [`Vectors::step`].
     fn reset(
         &mut self,
         world: &World,

@@ -20,7 +20,7 @@ pub(crate) struct Block<S: Simd> {
     pub(super) world: Lanes<S>,
     /// `[agents]`, leaders first.
     pub agents: Vec<Agent<S>>,
-    /// What leaders sense, `[leaders]`.
+    /// Inputs of the leaders, `[leaders]`.
     pub inputs: Vec<[S::f32s; INPUTS]>,
     /// Outputs of the leaders' policies, `[leaders]`.
     pub outputs: Vec<[S::f32s; OUTPUTS]>,
