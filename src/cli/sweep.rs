@@ -15,6 +15,7 @@ use crate::ops::sweep::{Request, Results, claim};
 use crate::ops::{self, output};
 use crate::record::disk::Disk;
 use crate::record::folder::SWEEP;
+use crate::record::ownership;
 use crate::report::curves::Band;
 use crate::report::runs::TeamKind;
 use crate::shell;
@@ -307,6 +308,7 @@ fn write_script(args: &Args, sweep: &Sweep, out: &Path, file: Option<&Path>) -> 
     };
     let script = job.script().map_err(|error| Error::Usage(error.into()))?;
     // Slurm writes the tasks' logs to this folder, but does not create it.
+    ownership::create_output_folder(&Disk::default(), &out, args.out.is_some())?;
     claim(&Disk::default(), sweep, &out)?;
     match file {
         None => print(&script),
