@@ -44,7 +44,8 @@ pub fn state(root: &Path) -> (Option<String>, Vec<PathBuf>) {
 }
 
 /// The files and folders that a build reads.
-const SOURCES: [&str; 7] = ["Cargo.toml", "Cargo.lock", "build.rs", "configs", "shaders", "src", "python/src"];
+const SOURCES: [&str; 10] =
+    ["Cargo.toml", "Cargo.lock", "app", "build.rs", "cli/src", "configs", "python/src", "shaders", "src", "studies"];
 
 /// Returns whether tracked files differ from the commit, or `None` if git fails.
 fn differs(root: &Path) -> Option<bool> {

@@ -14,7 +14,7 @@ import sys
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 NAMES = ("LICENSE", "LICENCE", "COPYING", "NOTICE", "UNLICENSE", "COPYRIGHT")
 # Parts that are not crates: a description, and the file with their licence.
-OTHERS = [("DejaVu Sans, the font of pictures", ROOT / "src/report/font/LICENSE")]
+OTHERS = [("DejaVu Sans, the font of pictures", ROOT / "app/src/report/font/LICENSE")]
 
 
 def linked(metadata, package):

@@ -1,13 +1,13 @@
 //! Escaping of names and values for one line of text: nothing in them may end the line or control a terminal.
 //!
-//! Pictures escape in [`crate::report::scene`], pages in [`crate::report::replay`], tables by the `csv` crate.
+//! Pictures and pages escape for themselves, tables by the `csv` crate.
 
 use std::borrow::Cow;
 use std::fmt::{self, Display};
 use std::path::Path;
 
 /// Returns whether a character can end the line, control a terminal or reverse the text direction.
-pub(crate) fn is_control(c: char) -> bool {
+pub fn is_control(c: char) -> bool {
     c.is_control() || matches!(c, '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
 }
 
@@ -22,7 +22,7 @@ pub fn lines(text: &str) -> Cow<'_, str> {
 }
 
 /// Paths as text in which different paths look different.
-pub(crate) trait PathExt {
+pub trait PathExt {
     /// Returns the path as text, with every byte that is not UTF-8 as `\xff`.
     fn escaped(&self) -> EscapedPath<'_>;
 }
@@ -34,7 +34,7 @@ impl PathExt for Path {
 }
 
 /// A path that is written as [`PathExt::escaped`] says.
-pub(crate) struct EscapedPath<'a>(&'a Path);
+pub struct EscapedPath<'a>(&'a Path);
 
 impl Display for EscapedPath<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -48,7 +48,7 @@ impl Display for EscapedPath<'_> {
 
 /// Returns a text as a cell of a CSV file. Spreadsheets run a text that starts with `=`, `+`, `-` or `@` as a formula,
 /// so an apostrophe precedes it. Numbers stay numbers.
-pub(crate) fn csv_cell(text: &str) -> Cow<'_, str> {
+pub fn csv_cell(text: &str) -> Cow<'_, str> {
     match text.starts_with(['=', '+', '-', '@', '\t', '\r']) && text.parse::<f64>().is_err() {
         true => format!("'{text}").into(),
         false => text.into(),

@@ -16,7 +16,7 @@ use crate::world::World;
 pub use crate::evolve::aligned_teams;
 
 /// The fitnesses of an evaluation, besides G.
-pub(crate) const SCORES: &[Fitness] = &[Fitness::D, Fitness::Df, Fitness::Dpp];
+pub const SCORES: &[Fitness] = &[Fitness::D, Fitness::Df, Fitness::Dpp];
 /// [`SCORES`] and Dt, which needs a record of who was seen at every step.
 pub const SCORES_AND_DT: &[Fitness] = &[Fitness::D, Fitness::Df, Fitness::Dpp, Fitness::Dt];
 
@@ -26,7 +26,7 @@ pub fn scores_beside(fitness: Fitness) -> &'static [Fitness] {
 }
 
 /// Maximum number of episodes per evaluation.
-pub(crate) const MAX_EPISODES: u32 = 1_000_000;
+pub const MAX_EPISODES: u32 = 1_000_000;
 /// Limits per batch: bytes of scores that wait to be summed, and number of episodes.
 const BATCH_BYTES: usize = 1 << 26;
 const BATCH_EPISODES: usize = 256;
@@ -214,7 +214,7 @@ pub struct Batch<'a> {
 
 /// [`evaluate`], which calls `each` several times per second, from this thread and in the order of episodes. If that
 /// breaks, the evaluation ends after the episodes reported so far.
-pub(crate) fn evaluate_until(
+pub fn evaluate_until(
     backend: &mut dyn Backend,
     group: &Group<'_>,
     starts: &Starts,

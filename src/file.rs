@@ -25,7 +25,7 @@ pub fn open(path: &Path) -> io::Result<File> {
 
 /// The reason why a text could not be read.
 #[derive(Debug, thiserror::Error)]
-pub(crate) enum TextError {
+pub enum TextError {
     /// Reading failed.
     #[error(transparent)]
     Read(#[from] io::Error),
@@ -55,7 +55,7 @@ pub fn text(file: impl Read, max_bytes: u64) -> Result<String, TextError> {
 
 /// Returns a file's name without its extension. A name made of dots alone would be the current folder or the one above,
 /// so `default` takes its place.
-pub(crate) fn stem(path: &Path, default: &str) -> String {
+pub fn stem(path: &Path, default: &str) -> String {
     let stem = path.file_stem().unwrap_or_default().to_string_lossy();
     if stem.trim_matches('.').is_empty() { default.into() } else { stem.into_owned() }
 }
@@ -73,7 +73,7 @@ pub fn exists(path: &Path) -> io::Result<bool> {
 }
 
 /// Returns the error for a file whose folder does not exist.
-pub(crate) fn no_folder(path: &Path) -> io::Error {
+pub fn no_folder(path: &Path) -> io::Error {
     io::Error::new(ErrorKind::NotFound, format!("the folder {} does not exist; make it first", folder(path).escaped()))
 }
 
@@ -83,7 +83,7 @@ pub fn folder(path: &Path) -> &Path {
 }
 
 /// Returns a path with all links resolved, even if its last component does not exist yet.
-pub(crate) fn resolved(path: &Path) -> PathBuf {
+pub fn resolved(path: &Path) -> PathBuf {
     let in_folder = || Some(fs::canonicalize(folder(path)).ok()?.join(path.file_name()?));
     fs::canonicalize(path).ok().or_else(in_folder).unwrap_or_else(|| path.into())
 }

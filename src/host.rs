@@ -144,7 +144,7 @@ mod threads {
 
     impl Threads {
         /// Reports whether there are fewer threads than were asked for.
-        pub(crate) fn is_short(&self) -> bool {
+        pub fn is_short(&self) -> bool {
             self.started < self.wanted
         }
     }

@@ -5,13 +5,13 @@
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 #[cfg(feature = "parallel")]
-pub(crate) use rayon::{current_num_threads, join, prelude::*, scope};
+pub use rayon::{current_num_threads, join, prelude::*, scope};
 
 #[cfg(all(feature = "parallel", not(target_family = "wasm")))]
 pub use crate::host::{Threads, start};
 
 #[cfg(not(feature = "parallel"))]
-pub(crate) use sequential::*;
+pub use sequential::*;
 
 /// Locks a mutex, also after another thread panicked while it held the lock.
 pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -19,16 +19,14 @@ pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 /// Work on a thread of its own. If no thread can be started, [`BackgroundTask::start`] does the work itself.
-#[cfg(feature = "record")]
-pub(crate) enum BackgroundTask<T> {
+pub enum BackgroundTask<T> {
     Running(std::thread::JoinHandle<T>),
     Done(T),
 }
 
-#[cfg(feature = "record")]
 impl<T: Send + 'static> BackgroundTask<T> {
     /// Starts the work on another thread. If none can be started, returns after the work is done.
-    pub(crate) fn start<W: FnOnce() -> T + Send + 'static>(work: W) -> BackgroundTask<T> {
+    pub fn start<W: FnOnce() -> T + Send + 'static>(work: W) -> BackgroundTask<T> {
         // A thread that fails to start drops its closure, and `work` with it. So the closure only shares `work`.
         let shared = std::sync::Arc::new(Mutex::new(Some(work)));
         let of_thread = shared.clone();
@@ -43,7 +41,7 @@ impl<T: Send + 'static> BackgroundTask<T> {
     }
 
     /// Reports whether [`BackgroundTask::finish`] returns without waiting.
-    pub(crate) fn is_finished(&self) -> bool {
+    pub fn is_finished(&self) -> bool {
         match self {
             BackgroundTask::Running(thread) => thread.is_finished(),
             BackgroundTask::Done(_) => true,
@@ -51,14 +49,14 @@ impl<T: Send + 'static> BackgroundTask<T> {
     }
 
     /// Waits for the work, and ignores its result and whether it panicked.
-    pub(crate) fn end(self) {
+    pub fn end(self) {
         if let BackgroundTask::Running(thread) = self {
             let _ = thread.join();
         }
     }
 
     /// Waits for the work, and returns its result.
-    pub(crate) fn finish(self) -> T {
+    pub fn finish(self) -> T {
         match self {
             BackgroundTask::Running(thread) => thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)),
             BackgroundTask::Done(result) => result,
@@ -73,7 +71,7 @@ mod sequential {
     use std::slice::{ChunksExact, ChunksExactMut, ChunksMut, IterMut};
 
     /// Returns the number of threads, 1.
-    pub(crate) fn current_num_threads() -> usize {
+    pub fn current_num_threads() -> usize {
         1
     }
 

@@ -48,10 +48,9 @@ pub enum Why {
     },
 }
 
-#[cfg(all(feature = "gpu", feature = "report"))]
 impl Unreachable {
     /// Reports whether a message gives the same reason for another POI, after rounding.
-    pub(crate) fn same_reason(&self, other: &Unreachable) -> bool {
+    pub fn same_reason(&self, other: &Unreachable) -> bool {
         self.to_string() == Unreachable { poi: self.poi, why: other.why.clone() }.to_string()
     }
 }
@@ -88,7 +87,7 @@ impl Display for Unreachable {
 /// Returns the maximum distance that an agent travels after each step, in units: `[steps + 1]`, 0 at the start.
 ///
 /// The agent accelerates as fast as it can and never turns. Walls can only shorten its path.
-pub(crate) fn travel(world: &World, steps: usize) -> Vec<f64> {
+pub fn travel(world: &World, steps: usize) -> Vec<f64> {
     let motion = &world.constants.motion;
     let [change, least, most, dt] =
         [motion.max_speed_change, motion.min_speed, motion.max_speed, motion.dt].map(f64::from);
@@ -151,7 +150,7 @@ pub fn unreachable(config: &Config) -> Vec<Unreachable> {
 }
 
 /// Returns the smallest number of steps in which every POI could be reached. None if longer episodes would not help.
-pub(crate) fn fewest_steps(config: &Config, unreachable: &[Unreachable]) -> Option<usize> {
+pub fn fewest_steps(config: &Config, unreachable: &[Unreachable]) -> Option<usize> {
     let far = unreachable.iter().filter_map(|unreachable| match unreachable.why {
         Why::Far { distance, radius, .. } => Some(distance - radius),
         Why::After { .. } => None,

@@ -18,9 +18,9 @@ use serde::Serialize;
 use special::{Beta, Error};
 
 /// Confidence level of all intervals.
-pub(crate) const CONFIDENCE: f64 = 0.95;
+pub const CONFIDENCE: f64 = 0.95;
 /// Number of samples that [`bootstrap`] draws.
-pub(crate) const RESAMPLES: usize = 9999;
+pub const RESAMPLES: usize = 9999;
 /// Maximum number of values, counting both samples, for exact p-values. Larger samples use the normal distribution.
 pub(crate) const EXACT: usize = 100;
 
@@ -127,7 +127,7 @@ fn interval_at(confidence: f64, value: f64, error: f64, count: usize, step: f64)
 }
 
 /// Returns the half-width of the 95 % interval of a mean of `count` values, in standard errors. 0 for fewer than two.
-pub(crate) fn half_width(count: usize) -> f64 {
+pub fn half_width(count: usize) -> f64 {
     half_width_at(CONFIDENCE, count)
 }
 
@@ -141,7 +141,7 @@ pub fn share(count: usize, of: usize) -> Option<Estimate> {
 }
 
 /// Returns the same as [`share`], with an interval of any confidence level.
-pub(crate) fn share_at(confidence: f64, count: usize, of: usize) -> Option<Estimate> {
+pub fn share_at(confidence: f64, count: usize, of: usize) -> Option<Estimate> {
     let (some, others) = (count as f64, of.checked_sub(count)? as f64);
     let bound = |a: f64, b: f64, at: f64| at.inv_inc_beta(a, b, a.ln_beta(b));
     let tail = (1.0 - confidence) / 2.0;
@@ -297,7 +297,7 @@ pub fn rank_sum(one: &[f64], other: &[f64]) -> Option<Tested> {
 }
 
 /// Returns a power by multiplication. The precision of `powi` is not specified, so it could differ between systems.
-pub(crate) fn power_of(base: f64, exponent: usize) -> f64 {
+pub fn power_of(base: f64, exponent: usize) -> f64 {
     (0..exponent).fold(1.0, |power, _| power * base)
 }
 

@@ -9,7 +9,7 @@ use glam::Vec2;
 
 use crate::backend::compare::{Mismatch, first_mismatch};
 use crate::backend::{Backend, BackendError, Group, GroupScores};
-use crate::config::{Config, Fitness, Paradigm, Sharing, ValidConfig};
+use crate::config::{Config, Fitness, LAYOUTS, Paradigm, Sharing, ValidConfig};
 use crate::credit::RecordRequest;
 use crate::evaluate::{SCORES, SCORES_AND_DT};
 use crate::evolve::{self, Breeding, Key, Purpose, UNCHANGED};
@@ -45,11 +45,6 @@ impl Plan {
 /// Returns short trainings of the paper's six experiments, each with its name. Their results are the same on every
 /// machine, so machines can be compared by digests.
 pub fn short_trainings() -> Vec<(String, Config)> {
-    const LAYOUTS: [(&str, &str); 3] = [
-        ("generally forward", include_str!("../configs/generally_forward.toml")),
-        ("strictly forward", include_str!("../configs/strictly_forward.toml")),
-        ("chaotic", include_str!("../configs/chaotic.toml")),
-    ];
     let mut trainings = Vec::new();
     for (name, text) in LAYOUTS {
         for paradigm in [Paradigm::LeaderFollower, Paradigm::AllLeaders] {

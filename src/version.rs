@@ -8,3 +8,8 @@ pub const COMMIT: Option<&str> = {
 
 /// The version of this crate, as recorded in `run.json`.
 pub const VERSION: &str = env!("CARGO_PKG_VERSION");
+
+/// The target that this build was made for.
+pub const TARGET: &str = env!("FLOTILLA_TARGET");
+/// The compiler of this build.
+pub const COMPILER: &str = env!("FLOTILLA_RUSTC");

@@ -4,8 +4,7 @@
 //! Statistical tests use seeded draws. Counts and means must be within five standard deviations of their expected
 //! values.
 
-mod support;
-
+use crate::support;
 use std::collections::HashSet;
 
 use fearless_simd::Level;

@@ -4,7 +4,7 @@
 //! Constants that follow from a definition must be exact. `tests/math.rs` measures the errors of results over every
 //! float.
 //!
-//! `cargo test --test fit -- --nocapture` prints the best coefficients next to those in use. Last digits differ: the
+//! `cargo test fit:: -- --nocapture` prints the best coefficients next to those in use. Last digits differ: the
 //! best are best in exact arithmetic, and rounding to f32 causes errors as large as those of the fit.
 
 use std::f64::consts::{LN_2, PI, SQRT_2, TAU};

@@ -3,8 +3,7 @@
 //! They have to be equal bit for bit, with every instruction set, number of teams and order of resets. Invalid input is
 //! refused and changes nothing.
 
-mod support;
-
+use crate::support;
 use fearless_simd::Level;
 use flotilla::backend::cpu::{Cpu, level_name};
 use flotilla::backend::{Backend, BackendError, Group, Moment, Trace};

@@ -1,7 +1,6 @@
 //! Tests evolution strategies against their papers' equations, written here in float64, on every instruction set.
 
-mod support;
-
+use crate::support;
 use fearless_simd::Level;
 use flotilla::backend::cpu::{Cpu, level_name};
 use flotilla::config::{Config, Learning, MAX_POPULATION, Method};

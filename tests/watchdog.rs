@@ -2,10 +2,7 @@
 //!
 //! Faults are injected. Every fault must either be reported or leave all results unchanged.
 
-#![cfg(feature = "gpu")]
-
-mod support;
-
+use crate::support;
 use std::collections::{HashMap, HashSet};
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering::SeqCst};
 use std::sync::{Arc, Mutex, mpsc};

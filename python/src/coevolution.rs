@@ -2,9 +2,9 @@
 
 use std::sync::{Mutex, MutexGuard, TryLockError};
 
-use flotilla::choice::Work;
 use flotilla::front;
 use flotilla::trainer::{Row, Snapshot};
+use flotilla_app::choice::Work;
 use numpy::{PyArray1, PyArray2, PyArray3, PyArray4, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray3};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;

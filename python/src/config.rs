@@ -3,8 +3,8 @@
 use std::path::PathBuf;
 
 use flotilla::config::{self, Definition, Override};
-use flotilla::report::paper::{Experiment, arms};
-use flotilla::sweep::Sweep;
+use flotilla_app::sweep::Sweep;
+use flotilla_studies::paper::{Experiment, arms};
 use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyBool, PyDict, PyFloat, PyInt, PyList, PyString, PyTuple};
@@ -110,7 +110,7 @@ pub fn sweep<'py>(
     skip_impossible: bool,
 ) -> PyResult<(Vec<String>, Vec<(usize, Vec<Bound<'py, PyAny>>, Config)>, String)> {
     let sweep = Sweep::read(text, name, &[], skip_impossible).raise()?;
-    let values = |point: &flotilla::sweep::Point| {
+    let values = |point: &flotilla_app::sweep::Point| {
         let pairs = sweep.axes.iter().zip(&point.values);
         pairs.map(|(axis, &value)| to_python(py, axis.values[value].clone())).collect::<PyResult<Vec<_>>>()
     };

@@ -4,11 +4,11 @@ use flotilla::backend::BackendError;
 use flotilla::backend::gpu::device::DeviceError;
 use flotilla::config::{ConfigError, Problem};
 use flotilla::front::Failure;
-use flotilla::ops;
-use flotilla::record::RecordError;
-use flotilla::report::runs;
-use flotilla::run::RunError;
 use flotilla::stepping::StepError;
+use flotilla_app::ops;
+use flotilla_app::record::RecordError;
+use flotilla_app::report::runs;
+use flotilla_app::run::RunError;
 use pyo3::exceptions::{PyFileExistsError, PyKeyboardInterrupt, PyMemoryError, PyValueError};
 use pyo3::prelude::*;
 
@@ -69,8 +69,6 @@ impl Raised for Failure {
         match self {
             Failure::Config(error) => error.raised(),
             Failure::Step(error) => error.raised(),
-            Failure::Run(error) => error.raised(),
-            Failure::Record(error) => error.raised(),
             Failure::TooLittle(_) | Failure::Memory { .. } => PyMemoryError::new_err(text),
             Failure::Backend(error) => error.raised(),
             _ => PyValueError::new_err(text),

@@ -4,13 +4,13 @@ use std::ops::ControlFlow;
 use std::time::{Duration, Instant};
 
 use flotilla::backend::cpu::{self, StepArrays};
-use flotilla::choice::Work;
 use flotilla::config::MAX_HIDDEN_UNITS;
 use flotilla::evaluate::{self, Batch, Spread, Starts};
 use flotilla::evolve::{self, MAX_WEIGHT};
 use flotilla::front::{self, ActionNoise, Failure, Played};
 use flotilla::model::policy::{MAX_HIDDEN_LAYERS, PolicyConstants};
 use flotilla::world::{INPUTS, OUTPUTS, World};
+use flotilla_app::choice::Work;
 use numpy::{
     Element, PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3,
     PyReadwriteArray2, PyReadwriteArrayDyn, PyUntypedArrayMethods,

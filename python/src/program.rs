@@ -7,10 +7,10 @@ use std::time::{Duration, Instant};
 
 use flotilla::backend::OpenBackend;
 use flotilla::backend::gpu::device;
-use flotilla::choice::Work;
-use flotilla::cli;
-use flotilla::ops::{self, BackendSource, Context, Event, Request};
 use flotilla::trainer::Row;
+use flotilla_app::choice::Work;
+use flotilla_app::ops::{self, BackendSource, Context, Event};
+use flotilla_cli::request::{self, Request};
 use pyo3::exceptions::{PyRuntimeWarning, PyValueError};
 use pyo3::prelude::*;
 
@@ -21,7 +21,7 @@ use crate::workers::{self, Lent};
 #[pyfunction]
 pub fn main(py: Python<'_>, words: Vec<OsString>) -> u8 {
     // Without `workers::aside`, because the program starts as many threads as the command line asks for.
-    py.detach(|| cli::main(Some(words)))
+    py.detach(|| flotilla_cli::main(Some(words)))
 }
 
 /// Returns the available adapters: name, driver, graphics API and kind.
@@ -34,12 +34,14 @@ pub fn adapters(py: Python<'_>) -> Vec<(String, String, String, String)> {
 /// Minimum time between checks for Ctrl-C.
 const PATIENCE: Duration = Duration::from_millis(50);
 
-/// Runs a use case of `flotilla::ops`. The request and the outcome are JSON.
+/// Runs a use case of `flotilla_app::ops`. The request and the outcome are JSON.
 #[pyfunction]
 pub fn answer(py: Python<'_>, request: &str, backend: &str, command: &str) -> PyResult<String> {
     let request: Request = serde_json::from_str(request).map_err(|error| PyValueError::new_err(error.to_string()))?;
-    perform(py, backend, command, &|_, _, _| Ok(false), |backends, context| ops::answer(&request, backends, context))
-        .map(|outcome| outcome.to_string())
+    perform(py, backend, command, &|_, _, _| Ok(false), |backends, context| {
+        request::answer(&request, backends, context)
+    })
+    .map(|outcome| outcome.to_string())
 }
 
 /// Receives the rows of a generation, the number of the last one, and champions if they were asked for. Reports whether

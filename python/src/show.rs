@@ -2,14 +2,14 @@
 
 use std::path::PathBuf;
 
-use flotilla::ops::replay::{Played, play};
-use flotilla::ops::{self, output};
-use flotilla::record::RecordError;
-use flotilla::record::digests::Verification;
-use flotilla::report::curves::{Band, PRINT};
-use flotilla::report::replay::{self as again, Film, Replayed, Which};
-use flotilla::report::runs;
-use flotilla::report::scene::{Format, Scene};
+use flotilla_app::ops::replay::{Played, play};
+use flotilla_app::ops::{self, output};
+use flotilla_app::record::RecordError;
+use flotilla_app::record::digests::Verification;
+use flotilla_app::report::curves::{Band, PRINT};
+use flotilla_app::report::replay::{self as again, Film, Replayed, Which};
+use flotilla_app::report::runs;
+use flotilla_app::report::scene::{Format, Scene};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;

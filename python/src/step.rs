@@ -4,10 +4,10 @@ use std::sync::{Mutex, MutexGuard, TryLockError};
 
 use flotilla::config::{Choice, Fitness};
 use flotilla::front;
-use flotilla::report::map::{self, Marker, Poi, Team, Viewport};
-use flotilla::report::scene::Scene;
 use flotilla::stepping;
 use flotilla::world::{INPUTS, OUTPUTS};
+use flotilla_app::report::map::{self, Marker, Poi, Team, Viewport};
+use flotilla_app::report::scene::Scene;
 use glam::{DVec2, Vec2};
 use numpy::{
     Element, PyArray1, PyArray2, PyArray3, PyArrayDyn, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray3,

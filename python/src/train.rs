@@ -3,14 +3,14 @@
 use std::path::PathBuf;
 
 use flotilla::front::Trained;
-use flotilla::ops::train::{InMemory, Request};
-use flotilla::ops::{self, ConfigText, Processor};
-use flotilla::record::digests::Verification;
-use flotilla::record::disk::Disk;
-use flotilla::record::finished::Finished;
-use flotilla::record::folder::{self, Folder, METRICS, Start, StartFrom};
-use flotilla::record::{RecordError, metrics, policies};
 use flotilla::trainer::{Ending, Row};
+use flotilla_app::ops::train::{InMemory, Request};
+use flotilla_app::ops::{self, ConfigText, Processor};
+use flotilla_app::record::digests::Verification;
+use flotilla_app::record::disk::Disk;
+use flotilla_app::record::finished::Finished;
+use flotilla_app::record::folder::{self, Folder, METRICS, Start, StartFrom};
+use flotilla_app::record::{RecordError, metrics, policies, runs};
 use numpy::{
     PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3,
     PyUntypedArrayMethods,
@@ -230,7 +230,7 @@ pub fn train_into(
 #[pyfunction]
 pub fn open(py: Python<'_>, folder: PathBuf, unverified: bool) -> PyResult<(Outcomes<'_>, Played, Vec<f64>)> {
     let (trained, digest, run, times) = workers::aside(py, || {
-        let trained = Trained::read(&folder, Verification::unless(unverified)).raise()?;
+        let trained = runs::trained(&folder, Verification::unless(unverified)).raise()?;
         let run = folder::Run::read(&folder.join(folder::RUN)).raise()?;
         let digest = trained.digest();
         let path = folder.join(METRICS);

@@ -4,9 +4,9 @@ use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::sync::{Mutex, PoisonError};
 
 use flotilla::backend::OpenBackend;
-use flotilla::choice::{self, Chosen, Work, WorkTotal};
 use flotilla::front::{self, Processor};
 use flotilla::parallel;
+use flotilla_app::choice::{self, Chosen, Work, WorkTotal};
 use pyo3::exceptions::PyRuntimeWarning;
 use pyo3::prelude::*;
 

@@ -33,12 +33,12 @@ pub struct Group<'a> {
 
 impl<'a> Group<'a> {
     /// Returns the number of teams.
-    pub(crate) fn team_count(&self) -> usize {
+    pub fn team_count(&self) -> usize {
         self.teams.len() / self.world.leaders()
     }
 
     /// Returns the POI positions, if they are not the world's.
-    pub(crate) fn moved_pois(&self) -> Option<&'a [Vec2]> {
+    pub fn moved_pois(&self) -> Option<&'a [Vec2]> {
         Some(&self.starts[self.world.agents()..]).filter(|pois| !pois.is_empty())
     }
 

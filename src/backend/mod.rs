@@ -30,7 +30,7 @@ pub use batch::{Group, Weights};
 pub use error::BackendError;
 pub use scores::GroupScores;
 pub use size::HELD_FROM;
-pub(crate) use size::{BATCH_BYTES, PACKED_FROM, held_bytes, record_bytes, state_bytes, weight_bytes};
+pub use size::{BATCH_BYTES, PACKED_FROM, held_bytes, record_bytes, state_bytes, weight_bytes};
 #[cfg(feature = "gpu")]
 use size::{FOUR, check_sizes, fours, record_words};
 pub use trace::{Moment, Trace};
@@ -109,7 +109,7 @@ impl Machine {
 
     /// Describes the GPU of a backend.
     #[cfg(feature = "gpu")]
-    pub(crate) fn of_gpu(backend: &gpu::episode::GpuBackend) -> Machine {
+    pub fn of_gpu(backend: &gpu::episode::GpuBackend) -> Machine {
         let adapter = &backend.gpu().adapter;
         Machine {
             backend: "gpu".into(),

@@ -11,10 +11,10 @@ pub const HELD_FROM: u64 = 1 << 17;
 
 /// Default minimum bytes of a batch's records to be packed on a GPU: about what the bus transfers in the time of one
 /// more dispatch. An estimate, not a measurement. Software renderers pack none.
-pub(crate) const PACKED_FROM: u64 = 1 << 20;
+pub const PACKED_FROM: u64 = 1 << 20;
 
 /// Target bytes of one buffer of a batch on a GPU: enough to fill the device, small enough to overlap batches.
-pub(crate) const BATCH_BYTES: u64 = 256 << 20;
+pub const BATCH_BYTES: u64 = 256 << 20;
 /// Weights that a GPU thread loads at once.
 pub(super) const FOUR: usize = 4;
 
@@ -25,7 +25,7 @@ pub(super) fn record_words(world: &World, records: RecordRequest<'_>) -> usize {
 }
 
 /// Returns the bytes of the record of a team that is scored by a fitness.
-pub(crate) fn record_bytes(world: &World, fitness: Fitness) -> u64 {
+pub fn record_bytes(world: &World, fitness: Fitness) -> u64 {
     (record_words(world, RecordRequest(&[fitness])) * size_of::<u32>()) as u64
 }
 
@@ -35,12 +35,12 @@ pub(super) fn fours(world: &World) -> usize {
 }
 
 /// Returns the bytes of a team's weights as an episode on a GPU loads them.
-pub(crate) fn weight_bytes(world: &World) -> u64 {
+pub fn weight_bytes(world: &World) -> u64 {
     (fours(world) * size_of::<[f32; FOUR]>()) as u64
 }
 
 /// Returns the bytes of a team's states that a GPU keeps between dispatches, 0 if one dispatch plays the whole episode.
-pub(crate) fn state_bytes(world: &World, fitness: Fitness) -> u64 {
+pub fn state_bytes(world: &World, fitness: Fitness) -> u64 {
     #[cfg(feature = "gpu")]
     let bytes = super::gpu::episode::state_bytes(world, RecordRequest(&[fitness]));
     #[cfg(not(feature = "gpu"))]
@@ -53,7 +53,7 @@ pub(crate) fn state_bytes(world: &World, fitness: Fitness) -> u64 {
 
 /// Returns the bytes of a trial's populations, `[populations, slots, parameters]`, on a GPU that holds them: one buffer
 /// per population, one more, and every slot's parent. 0 if they are too small to be held by default.
-pub(crate) fn held_bytes([populations, slots, parameters]: [usize; 3]) -> u64 {
+pub fn held_bytes([populations, slots, parameters]: [usize; 3]) -> u64 {
     let [populations, population, parents] =
         [populations, 4 * slots * parameters, 4 * populations * slots].map(|count| count as u64);
     if populations * population < HELD_FROM { 0 } else { (populations + 1) * population + parents }

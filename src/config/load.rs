@@ -21,7 +21,7 @@ impl Config {
 }
 
 /// Reports whether a path is `-`, which means standard input.
-pub(crate) fn is_standard_input(path: &Path) -> bool {
+pub fn is_standard_input(path: &Path) -> bool {
     path.as_os_str() == "-"
 }
 
@@ -34,7 +34,7 @@ pub fn name(path: &Path) -> String {
 ///
 /// # Errors
 /// Fails if the file cannot be read, is a folder, is larger than [`MAX_FILE_BYTES`] or is not UTF-8.
-pub(crate) fn read_file(path: &Path) -> Result<String, ConfigError> {
+pub fn read_file(path: &Path) -> Result<String, ConfigError> {
     let fail = |reason: String| ConfigError::Unreadable { name: name(path), reason, is_missing: false };
     let missing = |error: std::io::Error| ConfigError::Unreadable {
         name: name(path),

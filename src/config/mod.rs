@@ -25,8 +25,8 @@ pub use learning::{
     MAX_PARTNERS, MAX_POPULATION, MAX_TRIALS, Method, Mutation, Paradigm, Parents, Sharing,
 };
 pub use load::name;
-pub(crate) use load::{is_standard_input, read_file};
-pub(crate) use stages::MAX_STAGES;
+pub use load::{is_standard_input, read_file};
+pub use stages::MAX_STAGES;
 pub use stages::{GENERATIONS, STAGES, Stage};
 pub use valid::ValidConfig;
 pub use world::{MAX_AGENTS, MAX_POIS, MAX_STEPS, WorldConfig};
@@ -37,6 +37,12 @@ mod stages;
 mod valid;
 mod world;
 
+/// The configs of the paper's layouts, each with its name.
+pub const LAYOUTS: [(&str, &str); 3] = [
+    ("generally forward", include_str!("../../configs/generally_forward.toml")),
+    ("strictly forward", include_str!("../../configs/strictly_forward.toml")),
+    ("chaotic", include_str!("../../configs/chaotic.toml")),
+];
 /// Maximum size of the policies of all trials of a run, in bytes.
 pub(crate) const MAX_POLICY_BYTES: u64 = 1 << 38;
 /// The name in errors of a config that does not come from a file.
@@ -44,7 +50,7 @@ const OWN_NAME: &str = "the config";
 /// The section that makes a config a sweep: lists of values to combine.
 pub const GRID: &str = "grid";
 /// The section of a sweep with values to try one at a time.
-pub(crate) const VARY: &str = "vary";
+pub const VARY: &str = "vary";
 
 /// Returns every key of a config, in the order of [`Config::to_toml`].
 pub fn keys() -> Vec<Definition> {

@@ -16,7 +16,7 @@ use crate::reader::{Document, LineNumbers, Number};
 /// The list of stages in a config.
 pub const STAGES: &str = "stages";
 /// Maximum number of stages in a config.
-pub(crate) const MAX_STAGES: usize = 256;
+pub const MAX_STAGES: usize = 256;
 /// The key with the length of a run.
 pub const GENERATIONS: &str = "learning.generations";
 /// Keys that stages cannot change. A name that ends with a dot is a whole section.

@@ -5,13 +5,13 @@ use crate::config::LedBy;
 use crate::world::{Led, World};
 
 /// The owner of an agent that belongs to no group.
-pub(crate) const UNASSIGNED: u32 = u32::MAX;
+pub const UNASSIGNED: u32 = u32::MAX;
 
 /// Assigns each follower to the leader that it saw at most steps. Ties go to the lower index. Followers that saw no
 /// leader get [`UNASSIGNED`].
 ///
 /// Writes the owner of every agent, `[agents]`. A leader owns itself.
-pub(crate) fn assign(seen: &Seen<'_>, world: &World, owner: &mut Vec<u32>) {
+pub fn assign(seen: &Seen<'_>, world: &World, owner: &mut Vec<u32>) {
     let leaders = world.constants.leaders;
     owner.clear();
     owner.extend(0..leaders);

@@ -15,7 +15,7 @@ mod fast;
 mod record;
 mod replay;
 
-pub(crate) use assignment::{UNASSIGNED, assign};
+pub use assignment::{UNASSIGNED, assign};
 pub use assignment::{find_leading, is_led_by};
 pub use record::{Episode, RecordRequest, Seen, Strided, owner_bits};
 pub use replay::observed_at;

@@ -5,8 +5,6 @@ use crate::config::{ConfigError, MAX_POPULATION};
 use crate::evaluate::MAX_EPISODES;
 use crate::evolve::MAX_WEIGHT;
 use crate::memory::TooLittle;
-#[cfg(feature = "record")]
-use crate::record::{RecordError, runs};
 use crate::stepping::StepError;
 
 /// The error of a function in [`crate::front`]. A failed call changes nothing.
@@ -102,12 +100,4 @@ pub enum Failure {
     /// The teams could not be created.
     #[error(transparent)]
     Step(#[from] StepError),
-    /// A run's folder could not be read.
-    #[cfg(feature = "record")]
-    #[error(transparent)]
-    Run(#[from] runs::ReadError),
-    /// A run's files could not be read or written.
-    #[cfg(feature = "record")]
-    #[error(transparent)]
-    Record(#[from] RecordError),
 }

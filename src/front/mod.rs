@@ -1,10 +1,10 @@
-//! The functions that most programs need: train with a callback, play and trace given policies, step teams by given
-//! actions, and read runs.
+//! The functions that most programs need: train with a callback, play and trace given policies, and step teams by given
+//! actions.
 //!
 //! All functions check their arguments and return flat arrays. The documentation gives their shapes, for example
 //! `[teams][leaders][8]`; the last index changes fastest. The functions build on [`crate::trainer`],
-//! [`crate::evaluate`], [`crate::stepping`] and [`crate::record`]. Training that saves its files as it goes, and can be
-//! resumed, is in [`crate::run`].
+//! [`crate::evaluate`] and [`crate::stepping`]. Training that saves its files as it goes, and can be resumed, is in the
+//! package `flotilla-app`.
 //!
 //! | module | contents |
 //! |---|---|

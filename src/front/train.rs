@@ -1,8 +1,6 @@
 //! Training with a callback, and its results.
 
 use std::ops::ControlFlow;
-#[cfg(feature = "record")]
-use std::path::Path;
 
 use super::Failure;
 use crate::backend::{Backend, BackendError};
@@ -10,15 +8,7 @@ use crate::config::{Config, ValidConfig};
 use crate::evolve;
 use crate::memory::{self, Peaks};
 use crate::parallel::current_num_threads;
-#[cfg(feature = "record")]
-use crate::record::{
-    RecordError,
-    digests::{Digests, Verification},
-    finished,
-    folder::POLICIES,
-    hex, metrics, policies, runs,
-};
-use crate::trainer::{self, Ending, Row, Snapshot, Trainer};
+use crate::trainer::{self, Ending, Row, Snapshot, Trainer, digest};
 
 /// One generation of all trials, reported after its teams and champions have played.
 #[derive(Clone, Copy, Debug)]
@@ -53,7 +43,8 @@ pub struct Trained {
 }
 
 impl Trained {
-    fn new(config: Config, rows: &[Row], policies: Vec<Vec<f32>>, ending: Option<Ending>) -> Trained {
+    /// Creates the results from all rows, the policies of every trial, and the state to continue from.
+    pub fn new(config: Config, rows: &[Row], policies: Vec<Vec<f32>>, ending: Option<Ending>) -> Trained {
         let columns = config.learning.generations + 1;
         let mut trained = Trained {
             best_g: vec![0.0; config.learning.trials * columns],
@@ -80,45 +71,8 @@ impl Trained {
         Ok(Trained::new(config, rows, policies, Some(Ending { weights, fitness })))
     }
 
-    /// Reads the results of a finished run from its folder.
-    ///
-    /// # Errors
-    /// The folder has no finished run, or its files are damaged or were changed after the run.
-    #[cfg(feature = "record")]
-    pub fn read(folder: &Path, verification: Verification) -> Result<Trained, Failure> {
-        let config = runs::config(folder, verification)?;
-        let (mut rows, mut next) = (Vec::new(), vec![0; config.learning.trials]);
-        let mut in_order = true;
-        runs::metrics(folder, &config, verification, |row| {
-            in_order &= next[row.trial] == row.generation;
-            next[row.trial] += 1;
-            rows.push(*row);
-        })?;
-        if !in_order {
-            let path = folder.join(crate::record::folder::METRICS);
-            let reason = "it must have one row per trial and generation, in order".into();
-            return Err(RecordError::Damaged { path, reason }.into());
-        }
-        let (found, expected) = (rows.len(), config.learning.trials * (config.learning.generations + 1));
-        if found != expected {
-            let reason = format!("its {} has {found} rows of {expected}", crate::record::folder::METRICS);
-            return Err(runs::ReadError::Unfinished { folder: folder.into(), reason }.into());
-        }
-        let path = folder.join(POLICIES);
-        let policies = policies::read_all(&path, &config)?;
-        let digests = Digests::read(folder, verification)?;
-        let ending = finished::read_ending(folder, &config);
-        let trained = Trained::new(config, &rows, policies, ending);
-        // The config and the metrics match their digests, so the policies must differ.
-        match digests.run {
-            Some(digest) if digest != trained.digest() => Err(RecordError::Differs { path }.into()),
-            _ => Ok(trained),
-        }
-    }
-
     /// Returns the digest of the metrics and all policies, equal to the one that `run.json` records for the same
     /// results.
-    #[cfg(feature = "record")]
     pub fn digest(&self) -> String {
         let trials = self.config.learning.trials;
         let rows = (0..=self.config.learning.generations).flat_map(|generation| {
@@ -128,7 +82,7 @@ impl Trained {
                 Row { experiment: 0, trial, generation, best_g, mean_g, champion_g }
             })
         });
-        hex(&metrics::digest(rows, &self.policies))
+        digest::hex(&digest::digest(rows, &self.policies))
     }
 }
 

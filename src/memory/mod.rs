@@ -11,7 +11,7 @@ use crate::config::{Config, Method, ValidConfig};
 use crate::trainer;
 use crate::world::World;
 
-#[cfg(any(test, not(all(feature = "cli", any(target_os = "macos", windows)))))]
+#[cfg(any(test, not(any(target_os = "macos", windows))))]
 mod linux;
 
 /// Bytes for the program itself: its code, the stacks of its threads and its input. The driver of a GPU is not
@@ -148,15 +148,15 @@ fn checkpoint_bytes(config: &Config) -> u64 {
 /// On macOS and Windows, only the program (the feature `cli`) can query it.
 pub fn available() -> Option<u64> {
     match () {
-        #[cfg(all(feature = "cli", any(target_os = "macos", windows)))]
+        #[cfg(any(target_os = "macos", windows))]
         () => free_of_system(),
-        #[cfg(not(all(feature = "cli", any(target_os = "macos", windows))))]
+        #[cfg(not(any(target_os = "macos", windows)))]
         () => linux::available(std::path::Path::new("/")),
     }
 }
 
 /// Returns the bytes that macOS or Windows has free.
-#[cfg(all(feature = "cli", any(target_os = "macos", windows)))]
+#[cfg(any(target_os = "macos", windows))]
 fn free_of_system() -> Option<u64> {
     let mut system = sysinfo::System::new();
     system.refresh_memory_specifics(sysinfo::MemoryRefreshKind::nothing().with_ram());

@@ -12,7 +12,7 @@ pub(crate) mod follow;
 pub(crate) mod motion;
 pub mod policy;
 pub mod rule;
-pub(crate) mod sense;
+pub mod sense;
 pub mod start;
 
 use couple::{CoupleConstants, CoupleLanes};
@@ -67,7 +67,7 @@ gpu_struct! {
 
 impl Variant {
     /// Returns the density.
-    pub(crate) fn density(&self) -> Density {
+    pub fn density(&self) -> Density {
         Density::of(self.density)
     }
 }

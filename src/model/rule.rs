@@ -231,7 +231,7 @@ impl Rule {
     }
 
     /// Returns the first and last step of a POI's window, if it has one.
-    pub(crate) fn window(&self, poi: usize) -> Option<[u32; 2]> {
+    pub fn window(&self, poi: usize) -> Option<[u32; 2]> {
         self.windows.get(poi).copied()
     }
 

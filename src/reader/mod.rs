@@ -60,7 +60,7 @@ impl Override {
     }
 
     /// Sets `key` to the value of a TOML text. Errors call it `name`.
-    pub(crate) fn of_text(key: impl Into<String>, text: impl Into<String>, name: impl Into<String>) -> Override {
+    pub fn of_text(key: impl Into<String>, text: impl Into<String>, name: impl Into<String>) -> Override {
         Override { key: key.into(), text: text.into(), name: name.into() }
     }
 }
@@ -109,7 +109,6 @@ pub struct Document<'a> {
 impl<'a> Document<'a> {
     /// Parses a text. [`read`] reports its syntax errors.
     pub fn parse(text: &'a str) -> Document<'a> {
-        #[cfg(test)]
         work::add(text.len());
         let (table, errors) = DeTable::parse_recoverable(text);
         Document { text, table: table.into_inner(), errors, lines: LineNumbers::of(text) }
@@ -516,8 +515,8 @@ fn hint(name: &str, known: &[&str]) -> String {
 }
 
 /// Counts the bytes given to the TOML parser, so that tests can bound the work independently of time.
-#[cfg(test)]
-pub(crate) mod work {
+#[doc(hidden)]
+pub mod work {
     use std::cell::Cell;
 
     thread_local! {
@@ -528,9 +527,8 @@ pub(crate) mod work {
         PARSED.set(PARSED.get() + bytes);
     }
 
-    /// Returns the bytes parsed by this thread since the last call. Only sweeps' tests need it.
-    #[cfg(feature = "report")]
-    pub(crate) fn take() -> usize {
+    /// Returns the bytes parsed by this thread since the last call. Only tests need it.
+    pub fn take() -> usize {
         PARSED.take()
     }
 }

@@ -25,6 +25,7 @@ use crate::parallel::*;
 use crate::world::World;
 
 mod ask_tell;
+pub mod digest;
 mod experiment;
 mod populations;
 mod residency;

@@ -12,9 +12,9 @@ use std::{env, fs};
 use flotilla::backend::cpu::Cpu;
 use flotilla::backend::{Machine, OpenBackend};
 use flotilla::config::Config;
-use flotilla::record::disk::Disk;
-use flotilla::record::folder::{METRICS, POLICIES, Start};
-use flotilla::run::{SessionEnd, Options, Session};
+use flotilla_app::record::disk::Disk;
+use flotilla_app::record::folder::{METRICS, POLICIES, Start};
+use flotilla_app::run::{SessionEnd, Options, Session};
 
 const TEST: &str = "a_killed_process_resumes_to_the_same_bytes";
 /// The environment variable with the directory to train in. If it is set, this process is one that will be killed.

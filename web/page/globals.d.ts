@@ -53,7 +53,7 @@ interface Look {
 }
 interface Removed { leader: number, group: boolean }
 interface OnCanvas { wide: number, tall: number, scale: number, X: (x: number) => number, Y: (y: number) => number }
-/** The build puts this before the modules: src/report/stage.js, which every page that shows episodes shares. */
+/** The build puts this before the modules: app/src/report/stage.js, which every page that shows episodes shares. */
 declare const stage: {
   night: MediaQueryList,
   unpack(data: Packed): Scene,

@@ -9,8 +9,8 @@ use flotilla::backend::gpu::{self, exact::Pass};
 use flotilla::backend::{Machine, OpenBackend};
 use flotilla::config::{Config, Override};
 use flotilla::front;
-use flotilla::report::{replay, runs};
 use flotilla::verify::{self, Plan};
+use flotilla_app::report::{replay, runs};
 use serde::Deserialize;
 use serde_json::{Value, json};
 

@@ -96,7 +96,7 @@ mod page {
             texts.push((format!("gallery-{name}"), source(&format!("gallery/{name}.toml"))?));
         }
         texts.push(("opening".into(), source("page/opening.json")?));
-        let mut script = Script { text: source("../src/report/stage.js")?, ..Script::default() };
+        let mut script = Script { text: source("../app/src/report/stage.js")?, ..Script::default() };
         script.join("main")?;
         let mut page = source("page/index.html")?;
         page = page.replacen("/* STYLE */", &source("page/style.css")?, 1).replacen("/* SCRIPTS */", &script.text, 1);

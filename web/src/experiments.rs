@@ -3,9 +3,9 @@
 use std::path::PathBuf;
 
 use flotilla::config::Config;
-use flotilla::report::comparison::{self, At, Cohort, Question, Trial};
-use flotilla::report::curves::{Band, Curve};
 use flotilla::statistics::Average;
+use flotilla_app::report::comparison::{self, At, Cohort, Question, Trial};
+use flotilla_app::report::curves::{Band, Curve};
 use serde::Deserialize;
 use serde_json::{Value, json};
 

@@ -6,8 +6,8 @@ use flotilla::backend::Backend;
 use flotilla::backend::cpu::Cpu;
 use flotilla::config::{Config, Fitness, ValidConfig};
 use flotilla::host::Instant;
-use flotilla::report::replay;
 use flotilla::trainer::{Row, Snapshot, Trainer};
+use flotilla_app::report::replay;
 use serde::Deserialize;
 use serde_json::{Value, json};
 

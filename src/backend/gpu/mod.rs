@@ -24,7 +24,7 @@ pub mod self_test;
 pub use self_test::{open, self_test};
 
 /// The shader that measures a device's arithmetic ceiling.
-pub(crate) const CEILING: &str = include_str!("../../../shaders/ceiling.wgsl");
+pub const CEILING: &str = include_str!("../../../shaders/ceiling.wgsl");
 
 /// Returns the name and the text of every shader, for lints and exactness tests.
 pub fn shaders() -> Vec<(&'static str, String)> {

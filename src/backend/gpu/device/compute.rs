@@ -90,7 +90,7 @@ impl Gpu {
     }
 
     /// Compiles one of the crate's own shaders, see [`Gpu::pipeline`].
-    pub(crate) fn own_pipeline(
+    pub fn own_pipeline(
         &self,
         label: &str,
         wgsl: &str,

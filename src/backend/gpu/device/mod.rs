@@ -215,7 +215,7 @@ impl Gpu {
     ///
     /// # Errors
     /// wgpu reported an error, or the device was lost.
-    pub(crate) fn scoped<T>(&self, what: &str, make: impl FnOnce() -> T) -> Result<T, DeviceError> {
+    pub fn scoped<T>(&self, what: &str, make: impl FnOnce() -> T) -> Result<T, DeviceError> {
         use wgpu::ErrorFilter::{Internal, OutOfMemory, Validation};
         let [memory, validation, internal] =
             [OutOfMemory, Validation, Internal].map(|f| self.device.push_error_scope(f));

@@ -244,7 +244,7 @@ impl GpuBackend {
     }
 
     /// Starts to time rollouts by the GPU's clock, if it has one.
-    pub(crate) fn use_clock(&mut self) {
+    pub fn use_clock(&mut self) {
         self.clock = self.gpu.has_clock();
     }
 

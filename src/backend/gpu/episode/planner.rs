@@ -98,7 +98,7 @@ fn steps_per_dispatch(world: &World, workgroup: Workgroup, records: Recorded) ->
 
 /// Returns the bytes of a team's states between two dispatches, 0 if one dispatch plays the whole episode. This is an
 /// upper bound: adapters with larger workgroups may need none.
-pub(crate) fn state_bytes(world: &World, request: RecordRequest<'_>) -> u64 {
+pub fn state_bytes(world: &World, request: RecordRequest<'_>) -> u64 {
     let recorded = Recorded { trace: false, sights: request.sights() && world.followers() > 0 };
     let generic = Workgroup::generic(world, WORKGROUPS[2]);
     let specialised = Workgroup::specialised(world, Capacity::of_workgroups(MAX_THREADS));

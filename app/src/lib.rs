@@ -1,0 +1,27 @@
+//! What flotilla's command, its Python package, its page and its studies share, on top of the engine
+//! ([`flotilla`]).
+//!
+//! Each module imports only modules above it.
+//!
+//! | module | contents |
+//! |---|---|
+//! | [`shell`] | command lines for people to copy |
+//! | [`script`] | teams whose leaders drive to given places |
+//! | [`record`] | files: policies, metrics, checkpoints, folders |
+//! | [`run`] | a trainer together with its runs' folders |
+//! | [`report`] | pictures, films and pages |
+//! | [`sweep`] | many runs of a parameter grid |
+//! | [`choice`] | the processor that is expected to finish first |
+//! | [`ops`] | the use cases of the program, and their errors |
+
+#![deny(missing_docs)]
+
+pub mod choice;
+pub mod ops;
+pub mod record;
+pub mod report;
+pub mod run;
+pub mod script;
+#[doc(hidden)]
+pub mod shell;
+pub mod sweep;

@@ -1,0 +1,158 @@
+//! Plays teams that do not learn.
+
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+
+use super::{BackendSource, ConfigText, Context, Error, Processor};
+use crate::choice::Work;
+use flotilla::backend::Backend;
+use flotilla::baseline::{self, Baselines, SPEEDS};
+use flotilla::config::{Actions, Config, Paradigm};
+use flotilla::statistics;
+
+/// Request of baselines.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Request {
+    /// The config.
+    pub config: ConfigText,
+    /// Independent repetitions of the random baselines.
+    pub seeds: u32,
+    /// Held-out episodes per team, if starts or POIs vary. As many others choose the team.
+    pub episodes: u32,
+}
+
+/// Results of baselines, in POIs observed.
+#[derive(Clone, Debug, Serialize)]
+pub struct Outcome {
+    /// Who learns.
+    pub paradigm: Paradigm,
+    /// Number of POIs.
+    pub pois: usize,
+    /// Number of random teams of each kind per seed.
+    pub teams: usize,
+    /// Number of seeds.
+    pub seeds: usize,
+    /// Episodes per team.
+    pub episodes: u32,
+    /// Every constant action.
+    pub constants: Vec<Constant>,
+    /// The best constant action of each seed.
+    pub chosen: Vec<Value>,
+    /// The best constant action.
+    pub constant: Found,
+    /// The best random constant actions.
+    pub action: Found,
+    /// The best random networks.
+    pub network: Found,
+    /// The processor.
+    #[serde(flatten)]
+    pub processor: Processor,
+    /// The meaning of the policies' outputs.
+    #[serde(skip)]
+    pub actions: Actions,
+    /// Whether starts or POIs move. If they do, some episodes choose a team and others measure it.
+    #[serde(skip)]
+    pub moves: bool,
+}
+
+/// A constant action.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub struct Constant {
+    /// The share of the largest speed, if policies choose the speed.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub speed: Option<f64>,
+    /// The behaviour, if policies choose one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub behaviour: Option<usize>,
+    /// POIs observed, as a mean over seeds.
+    pub pois: f64,
+}
+
+/// A baseline.
+#[derive(Clone, Debug, Serialize)]
+pub struct Found {
+    /// The mean over seeds.
+    pub mean: f64,
+    /// The 95 % interval of the mean. Constant actions have none if nothing moves, because all seeds are the same.
+    pub interval_95: Option<[f64; 2]>,
+    /// Each seed.
+    pub seeds: Vec<f64>,
+}
+
+/// Plays the baselines of a config, one repetition after the other.
+///
+/// # Errors
+/// The config is invalid, or the backend fails.
+pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
+    if request.seeds == 0 {
+        return Err(Error::Usage("--seeds 0: allowed 1 or more".into()));
+    }
+    let config = request.config.read()?;
+    let ((backend, machine), on) = backends.open(Work::of([&config]))?;
+    context.message(format_args!("playing on {on}"));
+    let outcomes = play(&config, request.seeds as usize, request.episodes, &mut **backend, context);
+    context.pause();
+    let outcomes = outcomes?;
+    let (learning, pois, actions) = (&config.learning, config.world.pois.len(), config.policy.actions);
+    let moves = learning.start_jitter > 0.0 || learning.poi_jitter > 0.0;
+    let observed = |g: &dyn Fn(&baseline::Outcome) -> f64| -> Vec<f64> {
+        outcomes.iter().map(|outcome| g(outcome) * pois as f64).collect()
+    };
+    let mean = |observed: &[f64]| observed.iter().sum::<f64>() / observed.len() as f64;
+    let found = |seeds: Vec<f64>, differ: bool| {
+        let interval = statistics::mean(&seeds, 1.0).filter(|_| differ).map(|mean| mean.within(0.0, pois as f64));
+        Found { mean: mean(&seeds), interval_95: interval.map(|mean| [mean.low, mean.high]), seeds }
+    };
+    let speed = |index: usize| (index + 1) as f64 / SPEEDS as f64;
+    let constant = |index: usize| {
+        let (speed, behaviour) = match actions {
+            Actions::Direct => (Some(speed(index)), None),
+            Actions::Behaviours => (None, Some(index)),
+        };
+        Constant { speed, behaviour, pois: mean(&observed(&|outcome| outcome.constants[index])) }
+    };
+    let chosen = |outcome: &baseline::Outcome| match actions {
+        Actions::Direct => json!(speed(outcome.best_constant)),
+        Actions::Behaviours => json!(outcome.best_constant),
+    };
+    Ok(Outcome {
+        paradigm: learning.paradigm,
+        pois,
+        teams: learning.teams() * (learning.generations + 1),
+        seeds: outcomes.len(),
+        episodes: if moves { request.episodes } else { 1 },
+        constants: (0..baseline::constants(actions).len()).map(constant).collect(),
+        chosen: outcomes.iter().map(chosen).collect(),
+        constant: found(observed(&|outcome| outcome.constants[outcome.best_constant]), moves),
+        action: found(observed(&|outcome| outcome.action), true),
+        network: found(observed(&|outcome| outcome.network), true),
+        processor: Processor::of(machine, &backend.describe()),
+        actions,
+        moves,
+    })
+}
+
+/// Plays the baselines of a config from several seeds.
+pub fn play(
+    config: &Config,
+    seeds: usize,
+    episodes: u32,
+    backend: &mut dyn Backend,
+    context: Context<'_>,
+) -> Result<Vec<baseline::Outcome>, Error> {
+    let generations = config.learning.generations + 1;
+    let mut outcomes = Vec::new();
+    for seed in 0..seeds {
+        let mut baselines = Baselines::of_trial(config.clone(), seed);
+        while !baselines.is_done() {
+            baselines.advance(backend)?;
+            let done = seed * generations + baselines.generation();
+            let part = done as f64 / (seeds * generations) as f64;
+            context.fraction(part, format!("playing random teams of seed {seed}"));
+            context.check_not_stopped()?;
+        }
+        outcomes.extend(baselines.outcomes(backend, episodes)?.concat());
+    }
+    Ok(outcomes)
+}

@@ -1,0 +1,325 @@
+//! The use cases of the program, below the command line, Python and the page.
+//!
+//! Each use case takes a request and reports its progress to a [`Context`]. It returns an outcome, or an [`Error`] with a
+//! stable code. Requests and outcomes can be serialised, and [`answer`] takes any request as data.
+//!
+//! # Example
+//!
+//! ```
+//! use flotilla_app::ops::{self, ConfigText, Context, check};
+//!
+//! let text = include_str!("../../configs/chaotic.toml").into();
+//! let config = ConfigText { text, name: "chaotic.toml".into(), set: vec![] };
+//! let request = check::Request { config, name: "chaotic".into(), out: None };
+//! let found = check::run(&request, Context::new(&|_| ()))?;
+//! println!("{} teams play {} steps", found.cost.teams, found.cost.team_steps);
+//! # Ok::<(), ops::Error>(())
+//! ```
+//!
+//! The same as data, from any source, with a processor:
+//!
+//! ```
+//! use flotilla_app::ops::{self, Context};
+//!
+//! let request = r#"{"use_case": "check", "name": "mine", "config": {"text": "[world]", "name": "mine.toml"}}"#;
+//! let error = ops::answer(&serde_json::from_str(request)?, &mut &mut flotilla::front::cpu(), Context::new(&|_| ()));
+//! assert_eq!(error.unwrap_err().code(), "config_invalid");
+//! # Ok::<(), serde_json::Error>(())
+//! ```
+//!
+//! | module | use case |
+//! |---|---|
+//! | [`error`] | the error of all of them |
+//! | [`output`] | which files may be written |
+//! | [`train`] | training of one config |
+//! | [`check`] | the values and the cost of a config |
+//! | [`rollout`] | scores of trained or given policies |
+//! | [`replay`] | a page, a film or a picture of an episode |
+//! | [`plot`] | learning curves |
+//! | [`baseline`] | teams that do not learn |
+//! | [`sweep`] | training of a grid of runs, and collection of its results |
+//! | [`compare`] | comparison of runs |
+//! | [`verify`] | comparison of GPUs with the CPU |
+
+use std::ffi::OsString;
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
+
+use serde::{Deserialize, Serialize};
+
+use crate::choice::Work;
+use crate::record::folder::Run;
+use crate::run::{Options, Progress, RunError};
+use flotilla::backend::{BackendError, Machine, OpenBackend};
+use flotilla::config::{Config, Override, ValidConfig};
+use flotilla::escape::PathExt;
+use flotilla::front;
+use flotilla::memory::Peaks;
+use flotilla::parallel;
+use flotilla::reader::Document;
+use flotilla::trainer::Row;
+
+pub mod baseline;
+pub mod check;
+pub mod compare;
+pub mod error;
+pub mod output;
+pub mod plot;
+mod points;
+mod remedy;
+pub mod replay;
+pub mod rollout;
+pub mod sweep;
+pub mod train;
+pub mod verify;
+
+pub use error::{Error, MessageWithRemedy, with_remedy};
+pub use remedy::{RUNS, device as advice_on_device};
+
+/// An event while a use case runs.
+pub enum Event<'a> {
+    /// Progress, for people.
+    Message(String),
+    /// A remark, shown also to people who want no progress.
+    Note(String),
+    /// A warning, shown also to people who want no progress.
+    Warning(String),
+    /// Training of these experiments begins: their names and numbers of POIs, the next and the last generation.
+    Begin(Vec<(String, Option<usize>)>, usize, usize),
+    /// Experiments have played.
+    Rows {
+        /// The next generation.
+        next: usize,
+        /// The rows that became complete.
+        rows: &'a [Row],
+        /// The best policy of each population of that generation, `[trials][populations][parameters]`, if they were
+        /// asked for.
+        champions: Option<&'a [f32]>,
+    },
+    /// The fraction of the work that is done, 0 to 1, and what is done now.
+    Fraction(f64, String),
+    /// No more progress is reported for now.
+    Pause,
+}
+
+/// How a use case reports to its caller, and how the caller stops it.
+#[derive(Clone, Copy)]
+pub struct Context<'a> {
+    /// Receives events.
+    pub report: &'a dyn Fn(Event<'_>),
+    /// Set by the caller to save and stop.
+    pub stop: &'a AtomicBool,
+    /// Set by the caller to save and continue.
+    pub save: &'a AtomicBool,
+    /// Set by the caller together with `stop` to make the generation that plays next the last. See [`Session::end`].
+    ///
+    /// [`Session::end`]: crate::run::Session::end
+    pub end: &'a AtomicBool,
+    /// Command that is recorded in `run.json`.
+    pub command: &'a str,
+    /// Flags that choose the processor, for commands in advice.
+    pub flags: &'a [OsString],
+    /// Whether the CPU continues if a device fails during a run.
+    pub falls_back: bool,
+}
+
+impl<'a> Context<'a> {
+    /// Returns a context that reports to `report`, and never stops.
+    pub fn new(report: &'a dyn Fn(Event<'_>)) -> Context<'a> {
+        static NEVER: AtomicBool = AtomicBool::new(false);
+        Context { report, stop: &NEVER, save: &NEVER, end: &NEVER, command: "", flags: &[], falls_back: false }
+    }
+}
+
+impl Context<'_> {
+    /// Returns this context without reports.
+    pub fn quiet(self) -> Self {
+        Context { report: &|_| (), ..self }
+    }
+
+    /// Reports progress, for people.
+    pub fn message(&self, text: impl ToString) {
+        (self.report)(Event::Message(text.to_string()));
+    }
+
+    pub(crate) fn note(&self, text: impl ToString) {
+        (self.report)(Event::Note(text.to_string()));
+    }
+
+    /// Reports rows that became complete.
+    pub fn rows(&self, next: usize, rows: &[Row]) {
+        (self.report)(Event::Rows { next, rows, champions: None });
+    }
+
+    /// Reports the fraction of the work that is done.
+    pub(crate) fn fraction(&self, part: f64, text: impl ToString) {
+        (self.report)(Event::Fraction(part, text.to_string()));
+    }
+
+    /// Reports notes for the author of a config.
+    fn notes(&self, notes: &[String]) {
+        notes.iter().for_each(|note| self.note(format_args!("note: {note}")));
+    }
+
+    /// Reports that no more progress follows for now.
+    pub fn pause(&self) {
+        (self.report)(Event::Pause);
+    }
+
+    /// Warns about every POI of a config that no team can observe.
+    pub(crate) fn warn_of_unreachable(&self, config: &ValidConfig) {
+        sweep::unreachable(config).iter().for_each(|line| self.warn(format_args!("warning: {line}")));
+    }
+
+    /// Reports a warning.
+    pub fn warn(&self, text: impl ToString) {
+        (self.report)(Event::Warning(text.to_string()));
+    }
+
+    /// Reports whether the caller asked to stop.
+    pub fn is_stopped(&self) -> bool {
+        self.stop.load(Relaxed)
+    }
+
+    /// Fails if the caller asked to stop work that leaves nothing to resume.
+    fn check_not_stopped(&self) -> Result<(), Error> {
+        let stopped = || Error::Stopped("before everything was played; nothing was written".into());
+        if self.is_stopped() { Err(stopped()) } else { Ok(()) }
+    }
+
+    /// Reports whether a stopped training ends with the generation that plays next. If so, it continues until then.
+    fn ends(&self) -> bool {
+        let ends = self.end.swap(false, Relaxed);
+        self.stop.fetch_and(!ends, Relaxed);
+        ends
+    }
+
+    /// Returns the CPU backend to continue with after another backend failed, if that is allowed.
+    pub fn fallback(&self, error: &BackendError) -> Option<OpenBackend> {
+        self.falls_back.then(|| {
+            let (backend, machine) = front::cpu();
+            self.warn(format_args!("{error}\ncontinuing on {}, with the same results", backend.describe()));
+            (backend, machine)
+        })
+    }
+
+    /// Reports that populations moved to the host.
+    pub fn on_recovery(&self, error: &BackendError) {
+        self.warn(format_args!("{error}\nthe populations are kept by the host from here on, to the same results"));
+    }
+
+    /// Calls `work` with the options of a training that calls `watch` after every generation.
+    pub fn train<R>(&self, watch: &mut dyn FnMut(&Progress<'_>), work: impl FnOnce(&mut Options<'_>) -> R) -> R {
+        work(&mut Options {
+            command: self.command,
+            stop: self.stop,
+            save: self.save,
+            fallback: &mut |error| self.fallback(error),
+            on_recovery: &mut |error| self.on_recovery(error),
+            watch,
+        })
+    }
+}
+
+/// Opens the backend when it is needed, so that requests are checked first.
+pub trait BackendSource {
+    /// Returns the backend that plays some work, and its description for people.
+    ///
+    /// # Errors
+    /// It cannot be opened.
+    fn open(&mut self, work: Work) -> Result<(&mut OpenBackend, String), Error>;
+}
+
+impl BackendSource for &mut OpenBackend {
+    fn open(&mut self, _: Work) -> Result<(&mut OpenBackend, String), Error> {
+        let description = self.0.describe();
+        Ok((self, description))
+    }
+}
+
+/// A config as a request carries it.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ConfigText {
+    /// The text of the file.
+    pub text: String,
+    /// The file's name in errors.
+    pub name: String,
+    /// Config keys to set.
+    #[serde(default)]
+    pub set: Vec<Override>,
+}
+
+impl ConfigText {
+    /// Reads the config.
+    ///
+    /// # Errors
+    /// The text or a key is invalid. The error lists the problems.
+    pub fn read(&self) -> Result<Config, Error> {
+        Ok(Config::read(&self.text, &self.name, &[], &self.set)?)
+    }
+
+    /// Reads the config. Reports notes for its author, and returns them, too.
+    fn read_noted(&self, context: Context<'_>) -> Result<(ValidConfig, Vec<String>), Error> {
+        let (config, notes) = Config::read_noted(&Document::parse(&self.text), &self.name, &[], &self.set)?;
+        context.notes(&notes);
+        Ok((config, notes))
+    }
+}
+
+/// Serialises a path as in messages, with control characters escaped.
+fn escaped<S: serde::Serializer>(path: &Path, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_str(&path.escaped())
+}
+
+/// Refuses configs that need more memory than there is, each alone.
+///
+/// # Errors
+/// A config needs more memory than there is.
+pub fn check_memory<'a>(
+    configs: impl IntoIterator<Item = &'a ValidConfig>,
+    (_, machine): &OpenBackend,
+) -> Result<(), Error> {
+    for config in configs {
+        let plan = Peaks::of([config], parallel::current_num_threads());
+        plan.check(machine.backend == "gpu").map_err(RunError::from)?;
+    }
+    Ok(())
+}
+
+/// The processor that episodes were played on, with the names that `run.json` has.
+#[derive(Clone, Debug, Serialize)]
+pub struct Processor {
+    /// "cpu" or "gpu".
+    pub backend: String,
+    /// The processor in words.
+    pub description: String,
+    /// The GPU's name.
+    pub adapter: Option<String>,
+    /// The GPU's driver.
+    pub driver: Option<String>,
+    /// CPU threads.
+    pub threads: usize,
+}
+
+impl Processor {
+    /// Describes the processor of an open backend.
+    pub fn of(machine: &Machine, description: &str) -> Processor {
+        let Machine { backend, adapter, driver, threads } = machine.clone();
+        Processor { backend, description: description.into(), adapter, driver, threads }
+    }
+
+    /// Returns the processor of a run's last session.
+    pub fn of_run(run: &Run) -> Processor {
+        let Run { backend, description, adapter, driver, threads, .. } = run.clone();
+        Processor { backend, description, adapter, driver, threads }
+    }
+
+    /// Adds the fields to a JSON object.
+    pub fn add_to(&self, object: &mut serde_json::Value) {
+        let fields = serde_json::to_value(self).expect("texts and numbers are JSON");
+        for (name, value) in fields.as_object().into_iter().flatten() {
+            object[name] = value.clone();
+        }
+    }
+}

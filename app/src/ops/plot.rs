@@ -1,0 +1,92 @@
+//! Draws the curves of one run, or of several side by side.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+
+use super::output::Destination;
+use super::{Context, Error, escaped, with_remedy};
+use crate::record::RecordError;
+use crate::record::archive::RunFolder;
+use crate::record::digests::{self, Verification};
+use crate::record::ownership::CURVES;
+use crate::report::curves::{Band, PRINT};
+use crate::report::runs::{self, MAX_RUNS, TeamKind};
+use crate::report::scene::{Format, Scene};
+use flotilla::escape::PathExt;
+
+/// Request of a picture of learning curves.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Request {
+    /// Folders or zip files of runs.
+    pub runs: Vec<PathBuf>,
+    /// The picture. By default `curves.svg` in the folder of one run, or `comparison.svg` here of several.
+    #[serde(default)]
+    pub out: Option<PathBuf>,
+    /// Team whose G is shown. By default all three of one run, and the best of several.
+    #[serde(default)]
+    pub measure: Option<TeamKind>,
+    /// Range that is shown around a mean.
+    #[serde(default)]
+    pub band: Band,
+    /// Whether files that differ from their digests are read.
+    #[serde(default)]
+    pub unverified: bool,
+}
+
+/// The picture.
+#[derive(Clone, Debug, Serialize)]
+pub struct Outcome {
+    /// The file.
+    #[serde(serialize_with = "escaped")]
+    pub out: PathBuf,
+    /// The runs as they were named.
+    pub runs: Vec<String>,
+    /// Whether files were read that differ from their digests.
+    pub unverified: bool,
+}
+
+/// Draws the curves of runs.
+///
+/// # Errors
+/// A run cannot be read, or the picture cannot be written.
+pub fn run(request: &Request, context: Context<'_>) -> Result<Outcome, Error> {
+    let verification = Verification::unless(request.unverified);
+    if request.runs.len() > MAX_RUNS {
+        let text = format!("{} runs are too many to tell apart", request.runs.len());
+        return Err(Error::Usage(with_remedy(text, format!("name {MAX_RUNS} at most"))));
+    }
+    let opened = request.runs.iter().map(|run| RunFolder::open(run)).collect::<Result<Vec<_>, _>>()?;
+    let runs: Vec<PathBuf> = opened.iter().map(|run| run.path().into()).collect();
+    let place = match (&request.out, &*opened) {
+        (Some(out), _) => Destination::Named(out.clone()),
+        (None, [run]) if run.is_unpacked() => Destination::Here(CURVES.into()),
+        (None, [run]) => Destination::OfRun(run.path().join(CURVES)),
+        (None, _) => Destination::Here("comparison.svg".into()),
+    };
+    let out = place.path();
+    let kind = kind_of(out)?;
+    let scene = runs::figure(&runs, request.measure, request.band, verification)?.scene();
+    digests::without(runs.iter().map(|run| &**run)).into_iter().for_each(|note| context.note(note));
+    place.check()?;
+    place.write(&content(&scene, kind, out)?)?;
+    if runs::paired(&runs, verification)? {
+        context.note(
+            "note: these runs have one seed, so their trials are pairs: compare trial with trial, not only the means",
+        );
+    }
+    let named = request.runs.iter().map(|run| run.escaped().to_string()).collect();
+    Ok(Outcome { out: out.into(), runs: named, unverified: request.unverified })
+}
+
+/// Returns the format of a picture, from the extension of its file name.
+pub(super) fn kind_of(path: &Path) -> Result<Format, Error> {
+    let wrong = || Error::Usage(format!("--out {}: its name must end in .svg, .pdf or .png", path.escaped()).into());
+    Format::of(path).ok_or_else(wrong)
+}
+
+/// Returns the content of a picture's file.
+pub(super) fn content(scene: &Scene, kind: Format, path: &Path) -> Result<Vec<u8>, RecordError> {
+    scene.file(kind, PRINT).map_err(RecordError::write(path))
+}

@@ -1,0 +1,413 @@
+//! Replays the episode of a team from any trial and generation, as a page, a film or a picture.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+
+use super::output::{self, Destination};
+use super::{BackendSource, Context, Error, escaped, points, with_remedy};
+use crate::choice::Work;
+use crate::record::RecordError;
+use crate::record::archive::RunFolder;
+use crate::record::digests::{self, Verification};
+use crate::record::disk::Disk;
+use crate::record::ownership::{self, REPLAY};
+use crate::report::curves::PRINT;
+use crate::report::replay::{self, FPS, Film, History, ReplayError, Replayed, Which};
+use crate::report::scene::Format;
+use flotilla::config::{Config, Learning, ValidConfig};
+use flotilla::escape::PathExt;
+use flotilla::file;
+
+/// Request of a replay.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Request {
+    /// A run's folder or zip file.
+    pub folder: PathBuf,
+    /// The trial. The first by default.
+    #[serde(default)]
+    pub trial: WhichTrial,
+    /// The generation. The newest by default.
+    #[serde(default)]
+    pub generation: Option<usize>,
+    /// The team. The best of the generation by default.
+    #[serde(default)]
+    pub team: Which,
+    /// Another generation of the trial, side by side.
+    #[serde(default)]
+    pub compare: Option<usize>,
+    /// The step that a still picture shows. The last by default.
+    #[serde(default)]
+    pub step: Option<usize>,
+    /// The file. `replay.html` in the run's folder by default.
+    #[serde(default)]
+    pub out: Option<PathBuf>,
+    /// Width in pixels.
+    #[serde(default)]
+    pub width: Option<u32>,
+    /// Pictures per second.
+    #[serde(default)]
+    pub fps: Option<u32>,
+    /// Whether files that differ from their digests are read.
+    #[serde(default)]
+    pub unverified: bool,
+}
+
+/// Results of a replay.
+#[derive(Clone, Debug, Serialize)]
+pub struct Outcome {
+    /// The written files.
+    #[serde(flatten)]
+    pub written: Written,
+    /// The played episodes.
+    pub episodes: Vec<Episode>,
+    /// Whether files were read that differ from their digests.
+    pub unverified: bool,
+}
+
+/// The files that a replay wrote.
+#[derive(Clone, Debug, Serialize)]
+#[serde(untagged)]
+pub enum Written {
+    /// One file.
+    File {
+        /// The file.
+        #[serde(serialize_with = "escaped")]
+        out: PathBuf,
+        /// Size of the file.
+        bytes: usize,
+    },
+    /// Numbered pictures.
+    Film {
+        /// The first picture.
+        #[serde(serialize_with = "escaped")]
+        first: PathBuf,
+        /// The last picture.
+        #[serde(serialize_with = "escaped")]
+        last: PathBuf,
+        /// Number of pictures.
+        frames: usize,
+    },
+}
+
+/// An episode that was played.
+#[derive(Clone, Debug, Serialize)]
+pub struct Episode {
+    /// The trial.
+    pub trial: usize,
+    /// The generation.
+    pub generation: usize,
+    /// The team as it was requested: best, champion or number.
+    pub which: &'static str,
+    /// The team's number in its generation. The champion has none.
+    pub team: Option<usize>,
+    /// G of the team as `best_g`, `champion_g` or `g`.
+    #[serde(flatten)]
+    pub g: BTreeMap<&'static str, f64>,
+    /// The episode for people.
+    #[serde(skip)]
+    pub text: String,
+}
+
+impl Episode {
+    fn of(played: &Replayed) -> Episode {
+        let &Replayed { trial, generation, which, team, team_g, .. } = played;
+        let (which, team, g) = match which {
+            Which::Best => ("best", Some(team), "best_g"),
+            Which::Champion => ("champion", None, "champion_g"),
+            Which::Number(_) => ("number", Some(team), "g"),
+        };
+        Episode { trial, generation, which, team, g: [(g, team_g)].into(), text: described(played) }
+    }
+}
+
+/// The trial to show.
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum WhichTrial {
+    /// The one with the largest G.
+    Best,
+    /// The one with the smallest G.
+    Worst,
+    /// The one with this number, from 0.
+    Number(usize),
+}
+
+impl Default for WhichTrial {
+    fn default() -> WhichTrial {
+        WhichTrial::Number(0)
+    }
+}
+
+impl std::str::FromStr for WhichTrial {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<WhichTrial, String> {
+        match text {
+            "best" => Ok(WhichTrial::Best),
+            "worst" => Ok(WhichTrial::Worst),
+            number => number
+                .parse()
+                .map(WhichTrial::Number)
+                .map_err(|_| "allowed best, worst or a whole number, from 0".into()),
+        }
+    }
+}
+
+impl WhichTrial {
+    /// Returns the trial's number in a run.
+    fn find(
+        self,
+        folder: &Path,
+        config: &Config,
+        generation: Option<usize>,
+        which: Which,
+        verification: Verification,
+    ) -> Result<usize, Error> {
+        let extremes = || replay::extreme_trials(folder, config, generation, which, verification);
+        Ok(match self {
+            WhichTrial::Number(trial) => trial,
+            WhichTrial::Best => extremes()?[0],
+            WhichTrial::Worst => extremes()?[1],
+        })
+    }
+}
+
+/// Replays episodes, and writes them.
+///
+/// # Errors
+/// The run cannot be read, the request does not fit it, the backend fails, or a file cannot be written.
+pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
+    let Request { generation, team, compare, step, width, fps, unverified, .. } = *request;
+    let verification = Verification::unless(unverified);
+    let opened = RunFolder::open_with_checkpoints(&request.folder)?;
+    let folder = opened.path();
+    let place = match &request.out {
+        Some(out) => Destination::Named(out.clone()),
+        None if opened.is_unpacked() => Destination::Here(REPLAY.into()),
+        None => Destination::OfRun(folder.join(REPLAY)),
+    };
+    let out = place.path();
+    let kind = Form::of(out)?;
+    kind.takes(out, request)?;
+    let config = points::config(folder, verification)?.validate()?;
+    digests::without([folder]).into_iter().for_each(|note| context.note(note));
+    let trial = request.trial.find(folder, &config, generation, team, verification)?;
+    let generation = match generation {
+        Some(generation) => generation,
+        None if trial < config.learning.trials => {
+            History::read(folder, &config, trial, verification)?.newest().unwrap_or(0)
+        }
+        None => 0,
+    };
+    let generations: Vec<usize> = compare.into_iter().chain([generation]).collect();
+    let steps = stage(&config, &generations)?.world.steps;
+    if let Some(step) = step.filter(|&step| step > steps) {
+        return Err(Error::Usage(format!("--step {step}: the episode has steps 0 to {steps}").into()));
+    }
+    prepare_output(&place, &kind, &request.folder)?;
+    let Played { config, episodes: played } = play(folder, trial, &generations, team, verification, backends, context)?;
+
+    let name = folder.canonicalize().ok().and_then(|path| Some(path.file_name()?.to_string_lossy().into_owned()));
+    let name = name.unwrap_or_else(|| folder.escaped().to_string());
+    let motion = Film { width, fps: fps.unwrap_or(FPS) };
+    let content = match kind {
+        Form::Page => Ok(replay::page(&name, &config, &played).into_bytes()),
+        Form::Gif => replay::gif(&config, &played, motion),
+        Form::Still(kind) => {
+            let scene = replay::still(&config, &played, step.unwrap_or(steps));
+            scene.file(kind, width.map_or(PRINT, |width| f64::from(width) / scene.width))
+        }
+        Form::Film(numbered) => {
+            let written = write_film(&numbered, out, &replay::Frames::new(&config, &played, motion))?;
+            return Ok(outcome(written, &played));
+        }
+    };
+    let content = content.map_err(RecordError::write(out))?;
+    place.write(&content)?;
+    Ok(outcome(Written::File { out: out.into(), bytes: content.len() }, &played))
+}
+
+/// Replayed episodes, and the config of their stage.
+pub struct Played {
+    /// The config of the stage that all the generations belong to.
+    pub config: Config,
+    /// The episodes, in the order of the requested generations.
+    pub episodes: Vec<Replayed>,
+}
+
+/// Replays the episode of one team in each given generation of a trial.
+///
+/// # Errors
+/// The run cannot be read, the request does not fit it, the generations cannot be shown side by side, the backend
+/// fails, or the caller stops the replay.
+pub fn play(
+    folder: &Path,
+    trial: usize,
+    generations: &[usize],
+    team: Which,
+    verification: Verification,
+    backends: &mut dyn BackendSource,
+    context: Context<'_>,
+) -> Result<Played, Error> {
+    let config = stage(&points::config(folder, verification)?.validate()?, generations)?.clone();
+    let learning = Learning { trials: 1, ..config.learning.clone() };
+    let ((backend, _), _) = backends.open(Work::of([&Config { learning, ..config.clone() }]))?;
+    let last = generations.iter().max().copied().unwrap_or(0);
+    let mut watch = |generation: usize| {
+        let text = format!("training trial {trial} again: generation {generation} of {last}");
+        context.fraction(generation as f64 / (last + 1) as f64, text);
+        !context.is_stopped()
+    };
+    let played = replay::replay(folder, trial, generations, team, verification, &mut **backend, &mut watch);
+    context.pause();
+    let episodes = played.map_err(|error| match error {
+        ReplayError::Stopped => Error::Stopped("before the episode was played; nothing was written".into()),
+        error => error.into(),
+    })?;
+    Ok(Played { config, episodes })
+}
+
+/// Returns the config that all the generations play with.
+///
+/// # Errors
+/// The generations cannot be shown side by side, because their worlds differ.
+fn stage<'a>(config: &'a ValidConfig, generations: &[usize]) -> Result<&'a Config, Error> {
+    let refused = |text: String| Err(Error::Usage(text.into()));
+    let first = generations.first().copied().unwrap_or(0);
+    if let Some(other) = generations.iter().find(|&&other| config.stage_of(other) != config.stage_of(first)) {
+        return refused(format!("generations {first} and {other} are of different stages: show one alone"));
+    }
+    let stage = config.at(first);
+    if generations.len() > 1 && stage.learning.poi_jitter > 0.0 {
+        return refused("POIs are elsewhere in every generation (learning.poi_jitter): show one alone".into());
+    }
+    Ok(stage)
+}
+
+/// Checks the output, and creates the folder of a film. Called before the trial is trained again, which may take hours.
+/// `run` is the run's folder or zip file.
+///
+/// # Errors
+/// The file cannot be written, or would overwrite a file of the run.
+fn prepare_output(place: &Destination, kind: &Form, run: &Path) -> Result<(), Error> {
+    let Destination::Named(out) = place else { return Ok(place.check()?) };
+    if matches!(kind, Form::Film(_)) {
+        Disk::default().create_folder(file::folder(out)).map_err(RecordError::write(out))?;
+    }
+    output::check(&[("--out", Some(out.as_path()))], &[run])
+}
+
+fn outcome(written: Written, played: &[Replayed]) -> Outcome {
+    let unverified = played.iter().any(|played| played.unverified);
+    Outcome { written, episodes: played.iter().map(Episode::of).collect(), unverified }
+}
+
+/// Writes one numbered picture per moment. The folder must exist.
+fn write_film(numbered: &Numbered, out: &Path, frames: &replay::Frames<'_>) -> Result<Written, Error> {
+    let place = |number: usize| out.with_file_name(numbered.name(number));
+    let count = frames.places.len();
+    if let Some(path) =
+        (0..count).map(place).find(|path| path.symlink_metadata().is_ok() && !ownership::is_drawing(path))
+    {
+        return Err(RecordError::NotOurs { path }.into());
+    }
+    let disk = ownership::open_output_folder(&Disk::default(), file::folder(out), true)?;
+    for (number, &moment) in frames.places.iter().enumerate() {
+        let (scene, per_mm) = frames.scene(moment);
+        let (path, content) = (place(number), scene.png(per_mm));
+        let written = content.and_then(|content| disk.replace(&path, |output| output.write_all(&content)));
+        written.map_err(RecordError::write(&path))?;
+    }
+    Ok(Written::Film { first: place(0), last: place(count - 1), frames: count })
+}
+
+/// Returns what was played, for people.
+fn described(played: &Replayed) -> String {
+    let Replayed { team_g, episodes, world, which, .. } = played;
+    let (pois, digits) = (world.pois.len(), if *episodes > 1 { 2 } else { 0 });
+    format!(
+        "{} of {}: observed {:.digits$} of {pois} POIs{}{}",
+        played.name(),
+        played.place(),
+        team_g * pois as f64,
+        if *episodes > 1 { format!(" (mean of {episodes} episodes)") } else { String::new() },
+        if matches!(which, Which::Number(_)) { "" } else { ", as in metrics.csv" },
+    )
+}
+
+/// The kind of file that an episode is written as.
+enum Form {
+    Page,
+    Gif,
+    Still(Format),
+    Film(Numbered),
+}
+
+impl Form {
+    fn of(path: &Path) -> Result<Form, Error> {
+        let extension = path.extension().map(|extension| extension.to_ascii_lowercase());
+        match (extension.as_ref().and_then(|extension| extension.to_str()), Format::of(path)) {
+            (Some("html"), _) => Ok(Form::Page),
+            (Some("gif"), _) => Ok(Form::Gif),
+            (_, Some(kind)) => {
+                let numbered = path.file_name().and_then(|name| Numbered::of(name.to_str()?));
+                Ok(numbered.filter(|_| kind == Format::Png).map_or(Form::Still(kind), Form::Film))
+            }
+            _ => {
+                let path = path.escaped();
+                Err(Error::Usage(format!("--out {path}: its name must end in .html, .gif, .svg, .pdf or .png").into()))
+            }
+        }
+    }
+
+    /// Rejects flags that have no effect.
+    fn takes(&self, out: &Path, request: &Request) -> Result<(), Error> {
+        let Request { width, fps, step, .. } = request;
+        let moves = matches!(self, Form::Gif | Form::Film(_));
+        let pixels = moves || matches!(self, Form::Still(Format::Png));
+        let unused = [
+            ("--width", width.is_some() && !pixels, "a .gif or .png"),
+            ("--fps", fps.is_some() && !moves, "a .gif, or pictures like %04d.png"),
+            ("--step", step.is_some() && !matches!(self, Form::Still(_)), "a still picture (.svg, .pdf or .png)"),
+        ];
+        match unused.into_iter().find(|(_, unused, _)| *unused) {
+            Some((flag, _, of)) => {
+                let text = format!("{flag} does not apply to --out {}", out.escaped());
+                Err(Error::Usage(with_remedy(text, format!("use it with {of}"))))
+            }
+            None => Ok(()),
+        }
+    }
+}
+
+/// A file name with one place for a number: `%d`, or `%04d` for at least four digits.
+struct Numbered {
+    before: String,
+    digits: usize,
+    after: String,
+}
+
+impl Numbered {
+    /// Finds the first place for a number. A letter or digit after it makes it an ordinary part of the name, as in
+    /// `100%done`.
+    fn of(name: &str) -> Option<Numbered> {
+        name.match_indices('%').find_map(|(at, _)| {
+            let rest = &name[at + 1..];
+            let (digits, after) = match rest.as_bytes() {
+                [b'd', ..] => (1, &rest[1..]),
+                [b'0', digit @ b'1'..=b'9', b'd', ..] => (usize::from(digit - b'0'), &rest[3..]),
+                _ => return None,
+            };
+            let ends = !after.starts_with(|next: char| next.is_alphanumeric());
+            ends.then(|| Numbered { before: name[..at].into(), digits, after: after.into() })
+        })
+    }
+
+    fn name(&self, number: usize) -> String {
+        let Numbered { before, digits, after } = self;
+        format!("{before}{number:0digits$}{after}")
+    }
+}

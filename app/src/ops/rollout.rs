@@ -1,0 +1,303 @@
+//! Plays teams of policies from a file, and scores every leader.
+
+use std::io::{self, Write};
+use std::ops::ControlFlow::{Break, Continue};
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+
+use super::{BackendSource, ConfigText, Context, Error, Processor, output, points, with_remedy};
+use crate::choice::Work;
+use crate::record::archive::RunFolder;
+use crate::record::digests::{self, Digests, Verification};
+use crate::record::{folder, policies, tensors};
+use crate::report::map;
+use crate::report::replay::numbered;
+use flotilla::backend::{Backend, Group, Moment};
+use flotilla::config::{self, Config, Override};
+use flotilla::escape::PathExt;
+use flotilla::evaluate::{self, Batch, Evaluation, Spread, Starts};
+use flotilla::file;
+use flotilla::world::World;
+
+/// Columns of a trace. Only leaders fill `SENSED`: the eight inputs and two outputs of their policies.
+const STATES: &str = "team,step,agent,role,x,y,heading_x,heading_y,speed";
+const SENSED: &str = "pois_back_right,pois_front_right,pois_front_left,pois_back_left,\
+                      agents_back_right,agents_front_right,agents_front_left,agents_back_left,turn_output,speed_output";
+
+/// Request of a rollout.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Request {
+    /// A run's folder or zip file, or a config file.
+    pub path: PathBuf,
+    /// Config keys to set.
+    #[serde(default)]
+    pub set: Vec<Override>,
+    /// The file of policies. The run's own by default.
+    #[serde(default)]
+    pub policies: Option<PathBuf>,
+    /// The trial whose policies play, if the file has several.
+    #[serde(default)]
+    pub trial: Option<usize>,
+    /// The config's stage to play in. The world before any stage by default.
+    #[serde(default)]
+    pub stage: Option<usize>,
+    /// A file to write every agent's states to.
+    #[serde(default)]
+    pub trace: Option<PathBuf>,
+    /// A file to write every leader's scores to.
+    #[serde(default)]
+    pub scores: Option<PathBuf>,
+    /// Whether files that differ from their digests are read.
+    #[serde(default)]
+    pub unverified: bool,
+    /// Number of held-out starts. The config's own start by default.
+    #[serde(default)]
+    pub episodes: Option<u32>,
+    /// Random seed of held-out starts, 0 by default.
+    #[serde(default)]
+    pub seed: Option<u64>,
+}
+
+/// Results of a rollout.
+#[derive(Clone, Debug, Serialize)]
+pub struct Outcome {
+    /// Number of teams.
+    pub teams: usize,
+    /// Leaders per team.
+    pub leaders: usize,
+    /// Number of POIs.
+    pub pois: usize,
+    /// Episodes per team.
+    pub episodes: usize,
+    /// Random seed of held-out starts.
+    pub seed: Option<u64>,
+    /// Largest offset of a start.
+    pub start_jitter: Option<f64>,
+    /// Largest offset of a POI.
+    pub poi_jitter: Option<f64>,
+    /// POIs that the first team observes.
+    pub team_0: Spread,
+    /// POIs that the best team observes.
+    pub best: Best,
+    /// POIs that all teams observe.
+    pub mean: Spread,
+    /// Whether files were read that differ from their digests.
+    pub unverified: bool,
+    /// The processor.
+    #[serde(flatten)]
+    pub processor: Processor,
+}
+
+/// The best team.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub struct Best {
+    /// Number of the team.
+    pub team: usize,
+    /// POIs that it observes.
+    #[serde(flatten)]
+    pub spread: Spread,
+}
+
+impl Request {
+    /// Returns where episodes start, given the config's jitters.
+    fn starts(&self, jitter: f64, poi_jitter: f64) -> Result<Starts, Error> {
+        let (Some(episodes), seed) = (self.episodes, self.seed.unwrap_or(0)) else { return Ok(Starts::Own) };
+        if jitter == 0.0 && poi_jitter == 0.0 && (episodes > 1 || self.seed.is_some()) {
+            return Err(Error::Usage(with_remedy(
+                format!("--episodes {episodes}: learning.start_jitter is 0, so all episodes are the same"),
+                "set it or learning.poi_jitter in the config, or give --start-jitter or --poi-jitter",
+            )));
+        }
+        Ok(Starts::Drawn { episodes, seed, jitter, poi_jitter })
+    }
+}
+
+/// Plays the teams. Team j consists of policy j of every leader.
+///
+/// # Errors
+/// The config or the policies cannot be used, the backend fails, or a file cannot be written.
+pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
+    let opened = RunFolder::open(&request.path)?;
+    let (config_path, trained) = match opened.path() {
+        path if path.is_dir() => {
+            points::config(path, Verification::unless(request.unverified))?;
+            (path.join(folder::CONFIG), Some(path.join(folder::POLICIES)))
+        }
+        path => (path.to_path_buf(), None),
+    };
+    let Some(policies) = request.policies.clone().or(trained) else {
+        return Err(Error::Usage(with_remedy(
+            "--policies: a config file needs a file of policies",
+            format!("or name a run's folder in place of {}", request.path.escaped()),
+        )));
+    };
+    let outputs = [("--scores", request.scores.as_deref()), ("--trace", request.trace.as_deref())];
+    output::check(&outputs, &[&config_path, &policies])?;
+    let (text, name) = (config::read_file(&config_path)?, config::name(&config_path));
+    let config = ConfigText { text, name, set: request.set.clone() }.read()?;
+    let config = match request.stage {
+        None => config,
+        Some(stage) => {
+            let config = config.validate()?;
+            let Some((_, config)) = config.stages().get(stage) else {
+                let stages = numbered(config.stages().len(), "stage");
+                return Err(Error::Usage(format!("--stage {stage}: the config has {stages}").into()));
+            };
+            config.clone()
+        }
+    };
+    let starts = request.starts(config.learning.start_jitter, config.learning.poi_jitter)?;
+    verify(&config_path, &policies, request.unverified, context)?;
+    let policies = policies::read(&policies, &config, request.trial)?;
+    let world = World::new(&config);
+    let work = Work::of_teams(&config, policies.policies * request.episodes.unwrap_or(1) as usize);
+    let ((backend, machine), on) = backends.open(work)?;
+    context.message(format_args!("playing on {on}"));
+    let teams = evaluate::aligned_teams(policies.policies, world.leaders());
+    let group = Group {
+        world: &world,
+        starts: &world.starts,
+        weights: policies.weights[..].into(),
+        policies: policies.policies,
+        teams: &teams,
+        // The config may be that of another layout, so the file decides whether its leaders share a policy.
+        sharing: policies.sharing,
+        fitnesses: if request.scores.is_some() { evaluate::SCORES_AND_DT } else { evaluate::SCORES },
+    };
+    let playing = format!("playing {}", counted(policies.policies, starts.episodes()));
+    let share = &mut |part| context.fraction(part, &playing);
+    let until = &mut |_: Batch<'_>| if context.is_stopped() { Break(()) } else { Continue(()) };
+    let evaluation = evaluate::evaluate_until(&mut **backend, &group, &starts, share, until);
+    context.pause();
+    let evaluation = evaluation?;
+    context.check_not_stopped()?;
+    if let Some(path) = &request.scores {
+        output::write_with(path, |file| write_scores(file, &evaluation))?;
+    }
+    if let Some(path) = &request.trace {
+        write_trace(path, &mut **backend, &group, &starts, context)?;
+    }
+    let (seed, start_jitter, poi_jitter) = match starts {
+        Starts::Drawn { seed, jitter, poi_jitter, .. } => (Some(seed), Some(jitter), Some(poi_jitter)),
+        Starts::Own => (None, None, None),
+    };
+    let best = evaluation.best();
+    Ok(Outcome {
+        teams: evaluation.observed.len(),
+        leaders: evaluation.leaders,
+        pois: evaluation.pois,
+        episodes: evaluation.episodes,
+        seed,
+        start_jitter,
+        poi_jitter,
+        team_0: evaluation.team(0),
+        best: Best { team: best, spread: evaluation.team(best) },
+        mean: evaluation.mean(),
+        unverified: request.unverified,
+        processor: Processor::of(machine, &backend.describe()),
+    })
+}
+
+/// Compares a config and policies with the digests in `run.json`, if they belong to a run.
+fn verify(config: &Path, policies: &Path, unverified: bool, context: Context<'_>) -> Result<(), Error> {
+    let verification = Verification::unless(unverified);
+    let mut folders = Vec::new();
+    if config.ends_with(folder::CONFIG) {
+        Digests::read(file::folder(config), verification)?.compare_config(config, &Config::load(config)?)?;
+        folders.push(file::folder(config));
+    }
+    if policies.ends_with(folder::POLICIES) {
+        let checksum = tensors::open(policies)?.checksum().map(String::from);
+        Digests::read(file::folder(policies), verification)?.compare_policies(policies, checksum.as_deref())?;
+        folders.push(file::folder(policies));
+    }
+    folders.dedup();
+    digests::without(folders).into_iter().for_each(|note| context.note(note));
+    Ok(())
+}
+
+/// Returns the number of teams and of episodes, for people.
+pub fn counted(teams: usize, episodes: usize) -> String {
+    match episodes {
+        1 => map::counted(teams, "team"),
+        _ => format!("{}, {episodes} episodes each", map::counted(teams, "team")),
+    }
+}
+
+/// Writes the scores as CSV. Floats have the fewest digits that read back to the same bits.
+fn write_scores(file: &mut dyn Write, evaluation: &Evaluation) -> io::Result<()> {
+    let Evaluation { episodes, leaders, observed, .. } = evaluation;
+    let several = if *episodes > 1 { ",episodes,pois,pois_deviation,pois_low,pois_high" } else { "" };
+    writeln!(file, "team,leader,g,d,df,dpp,dt{several}")?;
+    for team in 0..observed.len() {
+        let several = match evaluation.team(team) {
+            Spread { mean, deviation: Some(deviation), interval: Some([low, high]) } => {
+                format!(",{episodes},{mean},{deviation},{low},{high}")
+            }
+            _ => String::new(),
+        };
+        for leader in 0..*leaders {
+            let [g, d, df, dpp] = evaluation.scores(team, leader);
+            let dt = evaluation.dt(team, leader).unwrap_or(f32::NAN);
+            writeln!(file, "{team},{leader},{g},{d},{df},{dpp},{dt}{several}")?;
+        }
+    }
+    Ok(())
+}
+
+/// Writes a trace as CSV, with one row per episode, team, step and agent.
+fn write_trace(
+    path: &Path,
+    backend: &mut dyn Backend,
+    group: &Group<'_>,
+    starts: &Starts,
+    context: Context<'_>,
+) -> Result<(), Error> {
+    let (leaders, agents, steps) = (group.world.leaders(), group.world.agents(), group.world.steps());
+    let (whole, episodes) = (group.team_count(), starts.episodes());
+    let mut failed = None;
+    let written = output::write_with(path, |file| {
+        writeln!(file, "{STATES},{SENSED}{}", if episodes > 1 { ",episode" } else { "" })?;
+        for episode in 0..episodes {
+            let starts = starts.of(episode, group.world);
+            let last = if episodes > 1 { format!(",{episode}") } else { String::new() };
+            for (first, part) in evaluate::parts(&Group { starts: &starts, fitnesses: &[], ..*group }) {
+                let trace = match backend.trace(&part) {
+                    Ok(trace) => trace,
+                    Err(error) => {
+                        failed = Some(error);
+                        return Err(io::ErrorKind::Other.into());
+                    }
+                };
+                for team in 0..trace.teams {
+                    for step in 0..=steps {
+                        for agent in 0..agents {
+                            let moment = trace.moment(step, team, agent);
+                            let ([x, y], [hx, hy], speed) = (moment.position, moment.heading, moment.speed);
+                            let role = if agent < leaders { "leader" } else { "follower" };
+                            let index = first + team;
+                            write!(file, "{index},{step},{agent},{role},{x},{y},{hx},{hy},{speed}")?;
+                            // The inputs and outputs of a leader in this state are stored with the next state.
+                            let next = (agent < leaders && step < steps).then(|| trace.moment(step + 1, team, agent));
+                            match next {
+                                Some(Moment { inputs, outputs, .. }) => {
+                                    inputs.iter().chain(outputs).try_for_each(|value| write!(file, ",{value}"))?;
+                                }
+                                None => write!(file, ",,,,,,,,,,")?,
+                            }
+                            writeln!(file, "{last}")?;
+                        }
+                    }
+                }
+                let done = episode * whole + first + trace.teams;
+                context
+                    .fraction(done as f64 / (whole * episodes) as f64, format!("tracing {}", counted(whole, episodes)));
+            }
+        }
+        Ok(())
+    });
+    context.pause();
+    failed.map_or(written, |error| Err(error.into()))
+}

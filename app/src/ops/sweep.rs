@@ -1,0 +1,544 @@
+//! Trains a grid of runs, and collects their results.
+
+use std::collections::{BTreeMap, HashSet};
+use std::fmt::Write as _;
+use std::io;
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+use super::{BackendSource, Context, Error, Event, check_memory};
+use crate::choice::Work;
+use crate::record::RecordError;
+use crate::record::digests::{self, UNVERIFIED, Verification};
+use crate::record::disk::Disk;
+use crate::record::folder::{self, CONFIG, RUN, Run, SWEEP, Start};
+use crate::record::ownership;
+use crate::record::runs;
+use crate::report::curves::Band;
+use crate::report::runs::TeamKind;
+use crate::run::{self as training, SessionEnd};
+use crate::sweep::pictures;
+use crate::sweep::results::{self, Missing};
+use crate::sweep::run::{self, SweepProgress};
+use crate::sweep::shard::Shard;
+use crate::sweep::{Point, Sweep};
+use flotilla::backend::OpenBackend;
+use flotilla::config::{self, ConfigError, Override, Problem, ValidConfig};
+use flotilla::escape::PathExt;
+use flotilla::memory;
+use flotilla::reach::{self, Unreachable};
+
+/// Request to train or collect a sweep.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Request {
+    /// The text of the sweep file.
+    pub text: String,
+    /// The file's name in errors.
+    pub name: String,
+    /// Config keys to set in all points.
+    #[serde(default)]
+    pub set: Vec<Override>,
+    /// Whether impossible points are left out.
+    #[serde(default)]
+    pub skip_impossible: bool,
+    /// The folder.
+    pub out: PathBuf,
+    /// Whether the user chose the folder.
+    pub named: bool,
+    /// Treatment of points that are in the folder.
+    pub start: Start,
+    /// The part to train, as index from 1 and count. Everything by default.
+    #[serde(default)]
+    pub shard: Option<(usize, usize)>,
+    /// Memory in bytes for points that train side by side. Half of what is free by default.
+    #[serde(default)]
+    pub memory: Option<usize>,
+    /// How results are collected.
+    #[serde(default)]
+    pub results: Results,
+}
+
+/// How the results of a sweep are collected.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Results {
+    /// Generations per row of `results.csv`.
+    pub every: usize,
+    /// G whose first generation is reported, 0 to 1.
+    pub reach: f64,
+    /// Whether files that differ from their digests are read.
+    pub unverified: bool,
+    /// The axes of the pictures, across and down. The first two by default.
+    pub axes: Vec<String>,
+    /// Team whose G the pictures show.
+    pub measure: TeamKind,
+    /// Range that pictures show around a mean.
+    pub band: Band,
+}
+
+impl Default for Results {
+    fn default() -> Results {
+        let (measure, band) = (TeamKind::default(), Band::default());
+        Results { every: 1, reach: 0.75, unverified: false, axes: vec![], measure, band }
+    }
+}
+
+impl Request {
+    /// Reads the sweep.
+    ///
+    /// # Errors
+    /// The text or a point is invalid.
+    pub fn read(&self) -> Result<Sweep, Error> {
+        Ok(Sweep::read(&self.text, &self.name, &self.set, self.skip_impossible)?)
+    }
+}
+
+/// The results of a point.
+#[derive(Clone, Debug, Serialize)]
+pub struct PointOutcome {
+    /// The number among all combinations.
+    pub point: usize,
+    /// The run's folder.
+    pub folder: String,
+    /// The values by axis.
+    pub values: BTreeMap<String, Value>,
+    /// Why there are no results.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub missing: Option<String>,
+    /// The results.
+    #[serde(flatten)]
+    pub found: Option<Found>,
+    /// The values for people.
+    #[serde(skip)]
+    pub described: String,
+}
+
+/// Results of a finished point.
+#[derive(Clone, Debug, Serialize)]
+pub struct Found {
+    /// The run's digest.
+    pub digest: Option<String>,
+    /// G of the best team in the last generation, mean over trials.
+    pub best_g: f64,
+    /// Standard error of `best_g` over trials.
+    pub best_g_error: f64,
+    /// G of the champion, mean over trials.
+    pub champion_g: f64,
+    /// The number of trials that reached the G.
+    pub reached: usize,
+    /// The median generation that reached it.
+    pub median: Option<f64>,
+}
+
+/// The files that were written.
+#[derive(Clone, Debug, Serialize)]
+pub struct Files {
+    /// The sweep as it was run.
+    pub sweep: String,
+    /// Every point, trial and generation.
+    pub results: String,
+    /// Every point.
+    pub points: String,
+    /// The pictures.
+    pub pictures: Vec<String>,
+}
+
+/// The results of a sweep.
+#[derive(Clone, Debug, Serialize)]
+pub struct Outcome {
+    /// The folder.
+    pub folder: String,
+    /// The sweep's name.
+    pub sweep: String,
+    /// The G whose first generation is reported.
+    pub reach: f64,
+    /// Whether files were read that differ from their digests.
+    pub unverified: bool,
+    /// The points.
+    pub points: Vec<PointOutcome>,
+    /// The files.
+    pub files: Files,
+    /// The results for people.
+    #[serde(skip)]
+    pub text: String,
+}
+
+impl Outcome {
+    /// Returns an error that names the points without results, if there are any.
+    pub fn missing(&self) -> Option<Error> {
+        let missing = |point: &PointOutcome| {
+            let why = point.missing.as_ref()?;
+            Some(format!("\n  point {:04} ({}): {why}", point.point, point.described))
+        };
+        let lines: Vec<_> = self.points.iter().filter_map(missing).collect();
+        let more = if lines.len() > 20 { "\n  …" } else { "" };
+        (!lines.is_empty()).then(|| {
+            Error::Missing(
+                format!(
+                    "{} of {} points are missing from the results:{}{more}",
+                    lines.len(),
+                    self.points.len(),
+                    lines[..lines.len().min(20)].concat(),
+                )
+                .into(),
+            )
+        })
+    }
+}
+
+/// Trains all points, and collects their results.
+///
+/// # Errors
+/// The sweep is invalid, the folder cannot be used, or training fails or is stopped.
+pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
+    let sweep = request.read()?;
+    let axes = picture_axes(&sweep, &request.results.axes)?;
+    train(request, &sweep, backends, context)?;
+    collect(request, &sweep, &axes, context)
+}
+
+/// Returns the axes that pictures have across and down.
+///
+/// # Errors
+/// A name is no axis of the sweep.
+pub fn picture_axes(sweep: &Sweep, names: &[String]) -> Result<Vec<usize>, Error> {
+    let find = |name: &String| {
+        let keys = || sweep.axes.iter().map(|axis| &*axis.key).collect::<Vec<_>>().join(", ");
+        let unknown = || Error::Usage(format!("--axes: {name} is not an axis of the grid; it has {}", keys()).into());
+        sweep.axis(name).ok_or_else(unknown)
+    };
+    if !names.is_empty() && sweep.axes.iter().any(|axis| axis.varied) {
+        return Err(Error::Usage("--axes: a sweep with [vary] has one picture, of all its keys".into()));
+    }
+    let axes: Vec<usize> = names.iter().map(find).collect::<Result<_, _>>()?;
+    match axes[..] {
+        [a, b] if a == b => Err(Error::Usage(format!("--axes: {} twice", sweep.axes[a].key).into())),
+        _ => Ok(axes),
+    }
+}
+
+/// Refuses a folder with other content than this sweep.
+pub fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
+    let path = out.join(SWEEP);
+    if out.is_file() {
+        return Err(RecordError::NoFolder { path: out.into() }.into());
+    }
+    let refuse = |message: String| {
+        let problems = vec![Problem { line: None, key: String::new(), message }];
+        Err(ConfigError::Invalid { name: path.escaped().to_string(), problems, unlisted: 0 }.into())
+    };
+    if !runs::exists(&path)? {
+        let holds = match runs::exists(&out.join(CONFIG))? {
+            true => Some("a run"),
+            false => folder::collection(out),
+        };
+        if let Some(what) = holds {
+            return refuse(format!("{} holds {what}, not a sweep; choose another --out", out.escaped()));
+        }
+        return match pictures::names()
+            .chain([folder::RESULTS, folder::POINTS].map(String::from))
+            .find(|name| out.join(name).exists())
+        {
+            Some(theirs) => refuse(format!(
+                "{} holds {theirs} but no {SWEEP}, so it is not the folder of a sweep; choose another --out",
+                out.escaped()
+            )),
+            None => Ok(()),
+        };
+    }
+    let existing = config::read_file(&path)?;
+    // A person may have written the file, so the same sweep may be formatted differently.
+    let normal = |text: &str| Some(Sweep::read(text, SWEEP, &[], sweep.skipped > 0).ok()?.text);
+    if existing == sweep.text || normal(&existing).as_ref() == Some(&sweep.text) {
+        return Ok(());
+    }
+    let missing = |from: &str, other: &str, where_: &str| {
+        let known: HashSet<&str> = other.lines().collect();
+        let lines: Vec<_> = from.lines().filter(|line| !known.contains(line)).collect();
+        let more = if lines.len() > 8 { "\n  …" } else { "" };
+        let lines: Vec<_> = lines.iter().take(8).map(|line| format!("\n  {where_}: {line}")).collect();
+        lines.concat() + more
+    };
+    refuse(format!(
+        "{} holds another sweep; what differs:{}{}\nchoose another --out",
+        out.escaped(),
+        missing(&existing, &sweep.text, "there"),
+        missing(&sweep.text, &existing, "here"),
+    ))
+}
+
+/// Marks the folder as this sweep's. Shards that start at the same moment write the same content.
+pub fn claim(disk: &Disk, sweep: &Sweep, out: &Path) -> Result<(), Error> {
+    let path = out.join(SWEEP);
+    disk.create_folder(out).map_err(RecordError::write(out))?;
+    let disk = disk.within(out).map_err(RecordError::write(out))?;
+    if disk.kind(&path).map_err(RecordError::write(&path))?.is_none() {
+        let text = |output: &mut dyn io::Write| output.write_all(sweep.text.as_bytes());
+        disk.replace_shared(&path, text, || Ok(())).map_err(RecordError::write(&path))?;
+    }
+    same_sweep(sweep, out)
+}
+
+/// Checks the numbers of a request. The command line checks its own flags, other callers may not.
+fn check(results: &Results) -> Result<(), Error> {
+    match results.every {
+        0 => Err(Error::Usage("--every 0: allowed 1 or more".into())),
+        _ => Ok(()),
+    }
+}
+
+/// Opens a sweep's folder for writing. Refuses it if a file to be written there was not made by flotilla.
+fn open_folder(out: &Path, named: bool) -> Result<Disk, Error> {
+    let disk = ownership::open_output_folder(&Disk::default(), out, named)?;
+    let products = pictures::names().chain([folder::RESULTS, folder::POINTS].map(String::from));
+    ownership::check(&disk, products.map(|name| out.join(name)))?;
+    Ok(disk)
+}
+
+/// Trains the points of a request's shard.
+///
+/// # Errors
+/// The folder cannot be used, or training fails or is stopped.
+pub fn train(
+    request: &Request,
+    sweep: &Sweep,
+    backends: &mut dyn BackendSource,
+    context: Context<'_>,
+) -> Result<(), Error> {
+    let out = &*request.out;
+    check(&request.results)?;
+    let shard = request.shard.map_or(Ok(Shard::WHOLE), |(index, count)| Shard::new(index, count));
+    let shard = shard.map_err(|error| Error::Usage(error.into()))?;
+    same_sweep(sweep, out)?;
+    let points = shard.take(&sweep.points);
+    let (backend, on) = backends.open(Work::of(points.iter().map(|point| &*point.config)))?;
+    check_memory(points.iter().map(|point| &point.config), backend)?;
+    warn_of_unreachable(sweep, &points, context);
+    // Before anything is written: the folder may be of another user.
+    ownership::create_output_folder(&Disk::default(), out, request.named)?;
+    claim(&Disk::default(), sweep, out)?;
+    let disk = open_folder(out, request.named)?;
+    let memory = request.memory.unwrap_or_else(free_memory);
+    let skipped =
+        if sweep.skipped > 0 { format!(", {} impossible ones left out", sweep.skipped) } else { String::new() };
+    let batches = run::batches(&points, memory).len();
+    let batches = if batches > 1 { format!(" in {batches} batches") } else { String::new() };
+    let (all, taken) = (sweep.points.len(), points.len());
+    let part =
+        if shard.count > 1 { format!("shard {shard}: {taken} of {all} points") } else { format!("{all} points") };
+    context.message(format_args!("{part}{skipped}{batches}, on {on}, into {}", out.escaped()));
+    let share = |progress: &SweepProgress| {
+        let SweepProgress { done, points, batch, generation, last, played, total } = *progress;
+        let text =
+            format!("{done}/{points} points done, {batch} side by side at generation {}/{last}", generation.min(last));
+        (context.report)(Event::Fraction(played as f64 / total.max(1) as f64, text));
+    };
+    match train_points(context, sweep, &points, out, request.start, &disk, memory, backend, &share)? {
+        SessionEnd::Finished => Ok(()),
+        SessionEnd::Stopped => Err(Error::Stopped("everything is saved".into())),
+    }
+}
+
+/// Trains points of a sweep in a folder, and reports their progress.
+#[expect(clippy::too_many_arguments, reason = "the two callers have no more of them in common")]
+pub fn train_points(
+    context: Context<'_>,
+    sweep: &Sweep,
+    points: &[&Point],
+    out: &Path,
+    start: Start,
+    disk: &Disk,
+    memory: usize,
+    backend: &mut OpenBackend,
+    share: &dyn Fn(&SweepProgress),
+) -> Result<SessionEnd, Error> {
+    let mut options = run::SweepOptions {
+        start,
+        disk,
+        memory,
+        runs: training::Options {
+            command: context.command,
+            stop: context.stop,
+            save: context.save,
+            fallback: &mut |error| context.fallback(error),
+            on_recovery: &mut |error| context.on_recovery(error),
+            watch: &mut |_| {},
+        },
+        watch: &mut |progress| share(progress),
+        note: &mut |point, note| {
+            // Every resumed point has a note. Only damage is reported.
+            if note.is_damage() {
+                context.warn(format_args!("{}: {note}", sweep.describe(point)));
+            }
+        },
+    };
+    let ended = run::run(points, out, backend, &mut options);
+    (context.report)(Event::Pause);
+    Ok(ended?)
+}
+
+/// Maximum number of POIs that are named one by one.
+const MAX_NAMED_POIS: usize = 6;
+
+/// Warns about every POI of a sweep's points that no team can observe, each warning once.
+fn warn_of_unreachable(sweep: &Sweep, points: &[&Point], context: Context<'_>) {
+    let mut found: BTreeMap<String, (usize, String)> = BTreeMap::new();
+    for point in points {
+        for line in unreachable(&point.config) {
+            found.entry(line).or_insert_with(|| (0, sweep.describe(point))).0 += 1;
+        }
+    }
+    for (line, (count, first)) in found.iter().take(2 * MAX_NAMED_POIS) {
+        context.warn(format_args!("warning: {line}; at {count} of {} points, the first {first}", points.len()));
+    }
+    if let more @ 1.. = found.len().saturating_sub(2 * MAX_NAMED_POIS) {
+        context.warn(format_args!("warning: … and {more} more; `flotilla check` lists those of one config"));
+    }
+}
+
+/// Returns a line for each POI of a config that no team can observe, and advice.
+pub(crate) fn unreachable(config: &ValidConfig) -> Vec<String> {
+    let staged = config.stages();
+    let mut lines = Vec::new();
+    for (index, (_, config)) in staged.iter().enumerate() {
+        let place = if staged.len() > 1 { format!("stage {index}: ") } else { String::new() };
+        let found = reach::unreachable(config);
+        let mut reasons: Vec<(&Unreachable, Vec<usize>)> = vec![];
+        for unreachable in &found {
+            match reasons.iter_mut().find(|(first, _)| first.same_reason(unreachable)) {
+                Some((_, others)) => others.push(unreachable.poi),
+                None => reasons.push((unreachable, vec![])),
+            }
+        }
+        lines.extend(
+            reasons
+                .iter()
+                .take(MAX_NAMED_POIS)
+                .map(|(first, others)| format!("{place}{first}{}", further_pois(others))),
+        );
+        if let more @ 1.. = reasons.iter().skip(MAX_NAMED_POIS).map(|(_, others)| 1 + others.len()).sum::<usize>() {
+            lines.push(format!("{place}{more} more POIs cannot be observed"));
+        }
+        if let Some(steps) = reach::fewest_steps(config, &found) {
+            lines.push(format!(
+                "{place}to reach these POIs, set world.steps to at least {steps}, raise motion.max_speed, or let agents \
+                 start nearer"
+            ));
+        }
+    }
+    lines
+}
+
+/// Names more POIs to which a warning applies: "; the same holds for POIs 1, 2 and 3".
+fn further_pois(pois: &[usize]) -> String {
+    match pois {
+        [] => String::new(),
+        [poi] => format!("; the same holds for POI {poi}"),
+        [pois @ .., last] => {
+            let pois: Vec<String> = pois.iter().map(ToString::to_string).collect();
+            format!("; the same holds for POIs {} and {last}", pois.join(", "))
+        }
+    }
+}
+
+/// Returns half of the memory that is free now in bytes, or 2 GiB if the system does not report it.
+pub fn free_memory() -> usize {
+    memory::available().map_or(2 << 30, |bytes| (bytes / 2) as usize)
+}
+
+/// Collects the results that exist, and draws them.
+///
+/// # Errors
+/// The folder holds no such sweep, or files cannot be written.
+pub fn collect(request: &Request, sweep: &Sweep, axes: &[usize], context: Context<'_>) -> Result<Outcome, Error> {
+    let out = &*request.out;
+    if !runs::exists(&out.join(SWEEP))? {
+        return Err(Error::Usage(format!("{} holds no sweep", out.escaped()).into()));
+    }
+    same_sweep(sweep, out)?;
+    check(&request.results)?;
+    open_folder(out, request.named)?;
+    let Results { every, reach, unverified, measure, band, .. } = request.results;
+    let options = results::Detail { every, reach, verification: Verification::unless(unverified), measure, band };
+    let folders: Vec<PathBuf> = sweep.points.iter().map(|point| results::point_folder(out, point)).collect();
+    digests::without(folders.iter().map(|folder| &**folder)).into_iter().for_each(|note| context.warn(note));
+    let outcomes = results::write(sweep, out, &options)?;
+    let (pictures, note) = pictures::draw(sweep, &outcomes, &options, axes, out)?;
+    let mut text = summary(sweep, &outcomes, &options);
+    let rows = if every == 1 { "generation by generation".into() } else { format!("every {every} generations") };
+    let _ = write!(
+        text,
+        "\nFiles in {}:\n  points/      the runs themselves\n  results.csv  every point and trial, {rows}\n  points.csv   the result of each point\n",
+        out.escaped(),
+    );
+    if pictures.is_empty() {
+    } else if sweep.axes.iter().any(|axis| axis.varied) {
+        text += "  final (.svg, .png, .pdf)   G at the end, by each value of each varied key\n";
+    } else {
+        text +=
+            "  final, reach, curves (.svg, .png, .pdf)   G at the end, generations to reach one, and learning curves\n";
+    }
+    text.extend(note.map(|note| note + "\n"));
+    text += &if unverified { format!("{UNVERIFIED}\n") } else { String::new() };
+    let path = |name: &str| out.join(name).escaped().to_string();
+    let point = |((point, outcome), folder): ((&Point, &Result<results::Outcome, Missing>), &PathBuf)| PointOutcome {
+        point: point.index,
+        folder: folder.escaped().to_string(),
+        values: (sweep.axes.iter().zip(&point.values))
+            .map(|(axis, &value)| (axis.key.clone(), serde_json::json!(axis.values[value])))
+            .collect(),
+        missing: outcome.as_ref().err().map(ToString::to_string),
+        found: outcome.as_ref().ok().map(|outcome| Found {
+            digest: Run::read(&folder.join(RUN)).ok().and_then(|run| run.digest),
+            best_g: outcome.best().mean(),
+            best_g_error: outcome.best().error(),
+            champion_g: outcome.champion().mean(),
+            reached: outcome.reached.iter().flatten().count(),
+            median: outcome.median_reached(),
+        }),
+        described: sweep.describe(point),
+    };
+    Ok(Outcome {
+        folder: out.escaped().to_string(),
+        sweep: sweep.name.clone(),
+        reach,
+        unverified,
+        points: sweep.points.iter().zip(&outcomes).zip(&folders).map(point).collect(),
+        files: Files {
+            sweep: path(SWEEP),
+            results: path(folder::RESULTS),
+            points: path(folder::POINTS),
+            pictures: pictures.iter().map(|name| path(name)).collect(),
+        },
+        text,
+    })
+}
+
+/// Returns the results for people: the best and the worst points.
+fn summary(sweep: &Sweep, outcomes: &[Result<results::Outcome, Missing>], options: &results::Detail) -> String {
+    const LISTED: usize = 12;
+    let done = sweep.points.iter().zip(outcomes).filter_map(|(point, outcome)| Some((point, outcome.as_ref().ok()?)));
+    let mut done: Vec<_> = done.map(|(point, outcome)| (outcome.best(), point, outcome)).collect();
+    done.sort_by(|(a, ..), (b, ..)| b.mean().total_cmp(&a.mean()));
+    let mut text = format!(
+        "{} of {} points are done. G of the best team in the last generation, mean over trials ± standard error,\n\
+         and the median generation that reached G = {}:\n",
+        done.len(),
+        sweep.points.len(),
+        options.reach
+    );
+    for (at, (best, point, outcome)) in done.iter().enumerate() {
+        if done.len() > LISTED && at == LISTED / 2 {
+            let _ = writeln!(text, "  … ({} more)", done.len() - LISTED);
+        }
+        if done.len() <= LISTED || at < LISTED / 2 || at >= done.len() - LISTED / 2 {
+            let reached = outcome.median_reached().map_or("never".into(), |median| median.to_string());
+            let (mean, error) = (best.mean(), best.error());
+            let _ = writeln!(text, "  {mean:.3} ± {error:.3}  {reached:>6}  {}", sweep.describe(point));
+        }
+    }
+    text
+}

@@ -1,0 +1,441 @@
+//! Trains the teams of a config in a run's folder.
+
+use std::collections::BTreeMap;
+use std::ffi::OsString;
+use std::fs;
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+
+use super::remedy::RUNS;
+use super::{BackendSource, ConfigText, Context, Error, Event, Processor, check_memory, escaped, with_remedy};
+use crate::choice::Work;
+use crate::record::RecordError;
+use crate::record::archive;
+use crate::record::digests::Verification;
+use crate::record::disk::Disk;
+use crate::record::finished::{Finished, Storage};
+use crate::record::folder::{self, CONFIG, FirstAndLastRows, METRICS, POLICIES, RUN, Start};
+use crate::record::ownership::{self, CURVES};
+use crate::record::policies::{self, Init};
+use crate::report::curves::Band;
+use crate::report::replay::History;
+use crate::report::runs;
+use crate::report::scene::Scene;
+use crate::report::tensorboard::Events;
+use crate::run::{Progress, RunError, Session, SessionEnd};
+use crate::shell;
+use flotilla::backend::OpenBackend;
+use flotilla::config::Config;
+use flotilla::escape::PathExt;
+use flotilla::file;
+use flotilla::front::{self, Generation, Trained};
+use flotilla::host::Instant;
+use flotilla::trainer::Row;
+
+/// The folder of event files for TensorBoard, in a run's folder.
+const TENSORBOARD: &str = "tensorboard";
+
+/// The files of a run by their content.
+const FILES: [(&str, &str); 5] =
+    [("config", CONFIG), ("run", RUN), ("metrics", METRICS), ("policies", POLICIES), ("curves", CURVES)];
+
+/// Request of a training.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Request {
+    /// The config.
+    pub config: ConfigText,
+    /// The name of the run. Its folder has this name by default.
+    pub name: String,
+    /// The folder. `runs/NAME`, or the next that is free, by default.
+    #[serde(default)]
+    pub out: Option<PathBuf>,
+    /// Treatment of a run that is in the folder.
+    pub start: Start,
+    /// A file with the policies to start from.
+    #[serde(default)]
+    pub init: Option<PathBuf>,
+    /// Whether event files for TensorBoard are written.
+    #[serde(default)]
+    pub tensorboard: bool,
+}
+
+/// Results of a run.
+#[derive(Clone, Debug, Serialize)]
+pub struct Outcome {
+    /// The run's folder.
+    #[serde(serialize_with = "escaped")]
+    pub folder: PathBuf,
+    /// The run's name.
+    pub config: String,
+    /// The run's digest.
+    pub digest: String,
+    /// Random seed.
+    pub seed: u64,
+    /// Number of trials.
+    pub trials: usize,
+    /// Policies per population.
+    pub population: usize,
+    /// Generations after the random start.
+    pub generations: usize,
+    /// Number of POIs, if it is the same in all stages.
+    pub pois: Option<usize>,
+    /// Generations that were trained now.
+    pub trained_generations: usize,
+    /// Seconds that this took.
+    pub seconds: f64,
+    /// Notes for the config's author.
+    pub notes: Vec<String>,
+    /// Scores of the random start.
+    pub first: GenerationScores,
+    /// Scores of the last generation.
+    pub last: GenerationScores,
+    /// The files by their content.
+    pub files: BTreeMap<&'static str, String>,
+    /// The processor of the run's last session.
+    #[serde(flatten)]
+    pub processor: Processor,
+    /// The rows of the random start and of the last generation.
+    #[serde(skip)]
+    pub rows: FirstAndLastRows,
+    /// Number of teams per generation.
+    #[serde(skip)]
+    pub teams: usize,
+    /// The processor in words, or `None` if the run was finished before.
+    #[serde(skip)]
+    pub trained_on: Option<String>,
+}
+
+/// Scores of a generation, over trials.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub struct GenerationScores {
+    /// G of the best team.
+    pub best_g: Extremes,
+    /// G of the mean team.
+    pub mean_g: Extremes,
+    /// G of the champion.
+    pub champion_g: Extremes,
+}
+
+impl GenerationScores {
+    fn of(rows: &[Row]) -> GenerationScores {
+        let of = |share: fn(&Row) -> f64| Extremes::of(rows.iter().map(share));
+        GenerationScores {
+            best_g: of(|row| row.best_g),
+            mean_g: of(|row| row.mean_g),
+            champion_g: of(|row| row.champion_g),
+        }
+    }
+}
+
+/// The mean, lowest and highest value over trials.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub struct Extremes {
+    /// The mean.
+    pub mean: f64,
+    /// The lowest value.
+    pub lowest: f64,
+    /// The highest value.
+    pub highest: f64,
+}
+
+impl Extremes {
+    /// Returns the extremes of shares, which are at least 0.
+    pub fn of(shares: impl Iterator<Item = f64>) -> Extremes {
+        let (mut count, mut spread) = (0.0, Extremes { mean: 0.0, lowest: f64::INFINITY, highest: 0.0 });
+        for share in shares {
+            count += 1.0;
+            spread.mean += share;
+            spread.lowest = spread.lowest.min(share);
+            spread.highest = spread.highest.max(share);
+        }
+        Extremes { mean: spread.mean / count, ..spread }
+    }
+}
+
+impl Request {
+    /// Returns the command that resumes the run.
+    fn command_to_resume(&self, folder: &Path, context: Context<'_>) -> String {
+        let words: [OsString; 3] = ["flotilla".into(), "train".into(), shell::argument(&folder.join(CONFIG))];
+        let out = ["--out".into(), shell::argument(folder), "--resume".into()];
+        let events = self.tensorboard.then(|| "--tensorboard".into());
+        shell::command(words.into_iter().chain(out).chain(events).chain(context.flags.iter().cloned()))
+    }
+
+    /// Returns the run's folder.
+    fn folder(&self) -> Result<PathBuf, Error> {
+        let runs = Path::new(RUNS);
+        Ok(match (&self.out, self.start) {
+            (Some(out), _) => out.clone(),
+            (None, Start::Resume) => folder::latest(runs, &self.name),
+            (None, Start::Force) => runs.join(&self.name),
+            (None, Start::Fresh) => folder::next_free(runs, &self.name)?,
+        })
+    }
+}
+
+/// Refuses a run in a zip file, because its folder would be removed at the end. The message shows the commands
+/// that unpack and resume it.
+pub fn refuse_zip(path: &Path) -> Result<(), Error> {
+    let Some(top) = archive::run_prefix(path) else { return Ok(()) };
+    let inner = if top.is_empty() { file::stem(path, "run") } else { top.clone() };
+    let mut unpack = vec!["unzip".into(), shell::argument(path)];
+    if top.is_empty() {
+        unpack.extend(["-d".into(), inner.clone().into()]);
+    }
+    let [config, folder] = [Path::new(&inner).join(CONFIG), inner.into()].map(|path| shell::argument(&path));
+    let resume = ["flotilla".into(), "train".into(), config, "--out".into(), folder, "--resume".into()];
+    Err(Error::Usage(with_remedy(
+        format!("{} is a run in a zip file, and a run resumes in a folder", path.escaped()),
+        format!("unpack it, and resume it there:\n  {}\n  {}", shell::command(unpack), shell::command(resume)),
+    )))
+}
+
+/// Starts or resumes a run, trains it to its end, and draws its curves.
+///
+/// # Errors
+/// The config is invalid, the folder cannot be used, or training fails or is stopped.
+pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
+    request.out.iter().try_for_each(|path| refuse_zip(path))?;
+    let (config, notes) = request.config.read_noted(context)?;
+    let (backend, on) = backends.open(Work::of([&*config]))?;
+    check_memory([&config], backend)?;
+    context.warn_of_unreachable(&config);
+    // Read before a folder is chosen, which is created.
+    let init = request.init.as_deref().map(|path| policies::read_init(path, &config)).transpose()?;
+    let folder = request.folder()?;
+    let mut session = open_session(request, &config, init, &folder, context)?;
+    let mut events = EventFiles::open(request, &folder, config.learning.trials, session.disk(0), context);
+    let (since, from, was_done) = (Instant::now(), session.generations()[0], session.is_done());
+    if !was_done {
+        context.message(format_args!("training on {on}, into {}", folder.escaped()));
+        (context.report)(Event::Begin(vec![(String::new(), config.pois())], from, config.learning.generations));
+    }
+    let last = train(&mut session, &mut events, request, &folder, backend, context)?;
+    let (config, results) = (session.config(0), session.results(0).expect("the run is done"));
+    // A session that ended after the run but before its picture left an older picture, or none.
+    let is_drawn = || fs::read_to_string(folder.join(CURVES)).is_ok_and(|svg| Scene::shows(&svg, &results.digest));
+    if let Some(error) = (!was_done || !is_drawn()).then(|| draw(session.disk(0), &folder).err()).flatten() {
+        // Everything that was learned is already saved.
+        context.warn(format_args!("{}: not drawn: {}", folder.join(CURVES).escaped(), error.message()));
+    }
+    warn_if_nothing_was_observed(&folder, config, context);
+    let learning = &config.learning;
+    Ok(Outcome {
+        config: request.name.clone(),
+        digest: results.digest.clone(),
+        seed: learning.seed,
+        trials: learning.trials,
+        population: learning.population,
+        generations: learning.generations,
+        pois: config.validate()?.pois(),
+        trained_generations: if was_done { 0 } else { (last + 1).saturating_sub(from) },
+        seconds: if was_done { 0.0 } else { since.elapsed().as_secs_f64() },
+        notes,
+        first: GenerationScores::of(&results.rows.first),
+        last: GenerationScores::of(&results.rows.last),
+        files: FILES.into_iter().map(|(name, file)| (name, folder.join(file).escaped().to_string())).collect(),
+        processor: Processor::of_run(session.run(0)),
+        rows: results.rows.clone(),
+        teams: config.max_teams() - 1,
+        trained_on: (!was_done).then_some(on),
+        folder,
+    })
+}
+
+/// Opens the run's folder, and reports what it found. `policies` are those of [`Request::init`].
+fn open_session(
+    request: &Request,
+    config: &Config,
+    policies: Option<Init>,
+    folder: &Path,
+    context: Context<'_>,
+) -> Result<Session, Error> {
+    let (init, start) = (request.init.as_deref(), request.start);
+    if let Some(what) = folder::collection(folder) {
+        let text = format!("{} holds {what}, not a run", folder.escaped());
+        return Err(Error::Refused(with_remedy(text, "choose another --out")));
+    }
+    if let Some(path) = init.filter(|path| file::resolved(path) == file::resolved(&folder.join(POLICIES))) {
+        let text = format!("--init {}: this run would be written over it", path.escaped());
+        return Err(Error::Usage(with_remedy(text, "choose another --out")));
+    }
+    let disk = Disk::default();
+    if folder.is_dir() {
+        let disk = ownership::open_output_folder(&disk, folder, request.out.is_some())?;
+        // A foreign picture must not prevent a run from being resumed.
+        if start != Start::Resume {
+            ownership::check(&disk, [folder.join(CURVES)])?;
+        }
+    }
+    let opened = Session::open_from(vec![(config.clone(), folder.to_path_buf(), policies)], start, &disk);
+    let (session, found) = opened.map_err(|error| match error {
+        RunError::Record(RecordError::Exists { .. }) if request.tensorboard => Error::Refused(with_remedy(
+            format!("{error}\nfor event files of the run that is there:"),
+            format!("  {}", request.command_to_resume(folder, context)),
+        )),
+        // This avoids the advice to use `--resume`. Until the run's origin is recorded, a resumed run would start from
+        // random policies.
+        RunError::Record(error) if init.is_some() => error.into(),
+        error => error.into(),
+    })?;
+    for (_, note) in found {
+        if note.is_damage() { context.warn(note) } else { context.note(note) }
+    }
+    Ok(session)
+}
+
+/// Trains a run to its end, or until the user ends it. Returns the last generation, which is earlier in that case.
+fn train(
+    session: &mut Session,
+    events: &mut EventFiles<'_>,
+    request: &Request,
+    folder: &Path,
+    backend: &mut OpenBackend,
+    context: Context<'_>,
+) -> Result<usize, Error> {
+    let mut last = session.config(0).learning.generations;
+    while !session.is_done() {
+        let mut watch = |progress: &Progress<'_>| {
+            context.rows(progress.generations[0], progress.rows);
+            events.add(progress.rows);
+        };
+        let ended = context.train(&mut watch, |options| session.train(backend, options));
+        context.pause();
+        events.flush();
+        if ended? == SessionEnd::Finished {
+            break;
+        }
+        if !context.ends() {
+            let next = session.generations()[0];
+            return Err(Error::Stopped(with_remedy(
+                format!("before generation {next} of {last}, with everything saved"),
+                format!("continue with\n  {}", request.command_to_resume(folder, context)),
+            )));
+        }
+        last = session.end()?;
+    }
+    Ok(last)
+}
+
+/// Warns if no team observed a POI in any generation.
+fn warn_if_nothing_was_observed(folder: &Path, config: &Config, context: Context<'_>) {
+    let ever = |all: Vec<History>| all.iter().any(|history| history.most() > 0.0);
+    if History::all(folder, config, Verification::Required).is_ok_and(|all| !ever(all)) {
+        context.warn(format_args!(
+            "warning: no team observed any POI in any generation, so there was nothing to learn from; try more \
+             world.steps, a smaller world.coupling, POIs nearer to the starts, or a larger learning.population; \
+             `flotilla replay {}` shows what teams do",
+            shell::quoted(shell::argument(folder))
+        ));
+    }
+}
+
+/// The results of a training in memory.
+pub struct InMemory {
+    /// The results. If the caller ended the training early, their config has fewer generations.
+    pub trained: Trained,
+    /// Seconds since the start at which each generation was complete.
+    pub seconds: Vec<f64>,
+    /// The processor that trained.
+    pub processor: Processor,
+}
+
+/// Trains without a folder. [`save`] writes the results later. `champions` asks for the champions of every generation.
+///
+/// # Errors
+/// The config is invalid, memory is too small, training fails, or it is stopped.
+pub fn in_memory(
+    config: &Config,
+    champions: bool,
+    backends: &mut dyn BackendSource,
+    context: Context<'_>,
+) -> Result<InMemory, Error> {
+    let config = &config.validate()?;
+    let (backend, on) = backends.open(Work::of([&**config]))?;
+    context.notes(&config.notes());
+    context.warn_of_unreachable(config);
+    (context.report)(Event::Begin(vec![(String::new(), config.pois())], 0, config.learning.generations));
+    let (since, mut seconds, mut stopped) = (Instant::now(), Vec::new(), false);
+    let watch = |generation: Generation<'_>| {
+        seconds.push(since.elapsed().as_secs_f64());
+        let Generation { generation: number, rows, champions, .. } = generation;
+        (context.report)(Event::Rows { next: number + 1, rows, champions });
+        if !context.is_stopped() {
+            return ControlFlow::Continue(());
+        }
+        stopped = !context.ends();
+        ControlFlow::Break(())
+    };
+    let trained = match champions {
+        true => front::train_with_champions(config, &mut *backend.0, watch),
+        false => front::train(config, &mut *backend.0, watch),
+    };
+    let trained = trained.map_err(Error::of_training)?;
+    if stopped {
+        return Err(Error::Stopped("before the last generation; nothing was saved".into()));
+    }
+    // After an early end, one more generation is played and not reported.
+    seconds.resize(trained.config.learning.generations + 1, since.elapsed().as_secs_f64());
+    Ok(InMemory { trained, seconds, processor: Processor::of(&backend.1, &on) })
+}
+
+/// Writes a finished run that was trained in memory, with the files of [`run`]. Returns its digest.
+///
+/// # Errors
+/// A file cannot be written.
+pub fn save(finished: Finished<'_>, storage: &mut dyn Storage) -> Result<String, RecordError> {
+    let (config, rows) = (finished.config, finished.rows);
+    let digest = finished.write(storage)?;
+    let figure = runs::figure_of(config, rows.iter().map(|(row, _)| row), &digest);
+    storage.publish(CURVES, figure.scene().svg().as_bytes())?;
+    Ok(digest)
+}
+
+/// Draws the run's curves.
+fn draw(disk: &Disk, folder: &Path) -> Result<(), Error> {
+    let runs = [folder.to_path_buf()];
+    let svg = runs::figure(&runs, None, Band::Interval, Verification::Required)?.scene().svg();
+    Ok(ownership::publish(disk, &folder.join(CURVES), |output| output.write_all(svg.as_bytes()))?)
+}
+
+/// The event files of a run, if they are wanted and can be written. A failure is only reported.
+struct EventFiles<'a> {
+    open: Option<Events>,
+    path: PathBuf,
+    context: Context<'a>,
+}
+
+impl<'a> EventFiles<'a> {
+    fn open(request: &Request, folder: &Path, trials: usize, disk: &Disk, context: Context<'a>) -> EventFiles<'a> {
+        let mut files = EventFiles { open: None, path: folder.join(TENSORBOARD), context };
+        if request.tensorboard {
+            let opened = Events::create(disk, &files.path, trials, &folder.join(METRICS));
+            files.open = opened.map_err(|error| files.failed(&error)).ok();
+        } else if request.start == Start::Force {
+            // The event files belong to the run that was overwritten.
+            Events::clear(disk, &files.path).unwrap_or_else(|error| files.failed(&error));
+        }
+        files
+    }
+
+    fn add(&mut self, rows: &[Row]) {
+        if let Some(Err(error)) = self.open.as_mut().map(|events| events.add(rows)) {
+            self.failed(&error);
+            self.open = None;
+        }
+    }
+
+    fn flush(&mut self) {
+        if let Some(Err(error)) = self.open.as_mut().map(Events::flush) {
+            self.failed(&error);
+        }
+    }
+
+    fn failed(&self, error: &std::io::Error) {
+        self.context
+            .warn(format_args!("{}: cannot be written: {error}; there are no event files", self.path.escaped()));
+    }
+}

@@ -1,0 +1,397 @@
+//! Compares every adapter with the CPU, bit for bit.
+
+use std::ops::ControlFlow::Continue;
+use std::process::Command;
+use std::time::Duration;
+
+use fearless_simd::Level;
+use serde::{Deserialize, Serialize};
+
+use super::{Context, Error, Event, with_remedy};
+use crate::record::evidence::{Compared, MachineReport, ShortTraining, Tier};
+use flotilla::backend::Backend;
+use flotilla::backend::cpu::{Cpu, level_name};
+use flotilla::backend::gpu;
+use flotilla::backend::gpu::device::{self, AdapterChoice, AdapterInfo, DeviceError};
+use flotilla::backend::gpu::episode::{GpuBackend, Kernel, Records, ResidencyPolicy};
+use flotilla::backend::gpu::exact::Pass;
+use flotilla::config::{Config, Override};
+use flotilla::escape;
+use flotilla::front;
+use flotilla::host::Instant;
+use flotilla::verify::{Agreement, Plan, compare, short_trainings};
+
+/// Request of a verification.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Request {
+    /// The name and the text of a config to compare, instead of random worlds.
+    pub config: Option<(String, String)>,
+    /// Config keys to set.
+    pub set: Vec<Override>,
+    /// Random teams per world.
+    pub teams: u32,
+    /// Random worlds. By default as many of the first 200 as take about a minute.
+    pub worlds: Option<u32>,
+    /// Random seed.
+    pub seed: u32,
+    /// The only adapter to compare, by its number or a part of its name.
+    pub adapter: Option<String>,
+    /// The only pass to compare.
+    pub pass: Option<String>,
+    /// The only kernel to compare.
+    pub kernel: Option<String>,
+    /// Whether to collect evidence: also compare the processor's instruction sets, and train.
+    pub evidence: bool,
+    /// A remark about the machine, for the evidence.
+    pub note: Option<String>,
+}
+
+/// Default number of random teams of each world.
+pub const TEAMS: u32 = 48;
+
+impl Default for Request {
+    fn default() -> Request {
+        Request {
+            config: None,
+            set: vec![],
+            teams: TEAMS,
+            worlds: None,
+            seed: 0,
+            adapter: None,
+            pass: None,
+            kernel: None,
+            evidence: false,
+            note: None,
+        }
+    }
+}
+
+/// Results of a verification.
+#[derive(Clone, Debug, Serialize)]
+pub struct Outcome {
+    /// Whether all comparisons are equal.
+    pub equal: bool,
+    /// The comparisons.
+    pub comparisons: Vec<Compared>,
+    /// The evidence, if it was requested.
+    #[serde(skip)]
+    pub evidence: Option<MachineReport>,
+}
+
+impl Outcome {
+    /// Returns an error if a comparison differs.
+    pub fn difference(&self) -> Option<Error> {
+        let failed = self.comparisons.iter().filter(|line| !line.equal).count();
+        (failed > 0).then(|| {
+            Error::Different(with_remedy(
+                format!("{failed} of {} comparisons found other bits than the CPU's", self.comparisons.len()),
+                "until this is fixed, use --backend cpu",
+            ))
+        })
+    }
+}
+
+/// Compares adapters, passes and kernels with the CPU.
+///
+/// # Errors
+/// There is nothing to compare, or the request is invalid. A difference is an outcome.
+pub fn run(args: &Request, context: Context<'_>) -> Result<Outcome, Error> {
+    let (plan, budget) = plan(args)?;
+    let mut lines = Vec::new();
+    if args.evidence {
+        lines.extend(instruction_sets(&plan, context));
+    }
+    let adapters = match adapters(args.adapter.as_deref()) {
+        // The report still contains the comparison of the processor's instruction sets.
+        Err(Error::NoneToVerify(DeviceError::NoAdapter)) if args.evidence => vec![],
+        adapters => adapters?,
+    };
+    let mut combinations = Vec::new();
+    for (choice, info) in &adapters {
+        for pass in passes(args.pass.as_deref(), info) {
+            for kernel in kernels(args.kernel.as_deref()) {
+                combinations.push(Combination { choice, info, pass, kernel });
+            }
+        }
+    }
+    if !combinations.is_empty() {
+        context.message(expected(&plan, budget, combinations.len()));
+    }
+    for (place, combination) in combinations.iter().enumerate() {
+        if context.is_stopped() {
+            return Err(Error::Stopped("before everything was compared".into()));
+        }
+        let mut shown = |done: f64, outcome: &Agreement| {
+            let Combination { info, pass, kernel, .. } = combination;
+            let of = if budget.is_some() { String::new() } else { format!(" of {}", plan.worlds.len()) };
+            let text = format!("{}, {pass} pass, {kernel} kernel: {}{of} worlds", info.name, outcome.worlds);
+            (context.report)(Event::Fraction((place as f64 + done) / combinations.len() as f64, text));
+        };
+        let result = verify(&plan, budget.map(|all| all / combinations.len() as u32), combination, &mut shown);
+        lines.push(Compared {
+            pass: Some(combination.pass.to_string()),
+            kernel: Some(combination.kernel.to_string()),
+            ..line(combination.info.to_string(), &Cpu::default(), result)
+        });
+    }
+    (context.report)(Event::Pause);
+    let evidence = args.evidence.then(|| evidence(&lines, args.note.clone(), context)).transpose()?;
+    Ok(Outcome { equal: lines.iter().all(|line| line.equal), comparisons: lines, evidence })
+}
+
+/// Default number of random worlds. A time budget may leave out the last ones.
+const WORLDS: u32 = 200;
+/// Number of worlds that are compared between two checks of the clock: one of each layout.
+const PART: usize = 10;
+/// Time for all comparisons, if no config, number of worlds or report is requested.
+const BUDGET: Duration = Duration::from_secs(60);
+
+/// A combination that is compared with the CPU.
+struct Combination<'a> {
+    choice: &'a AdapterChoice,
+    info: &'a AdapterInfo,
+    pass: Pass,
+    kernel: Kernel,
+}
+
+/// Returns a message about what is compared and how long that takes.
+fn expected(plan: &Plan, budget: Option<Duration>, combinations: usize) -> String {
+    let by = format!(
+        "{combinations} {} of adapter, pass and kernel",
+        if combinations == 1 { "combination" } else { "combinations" }
+    );
+    match budget {
+        Some(budget) => format!(
+            "comparing random worlds by {by}, at least {PART} by each, for about {} s; --worlds N sets how many",
+            budget.as_secs()
+        ),
+        None => format!(
+            "comparing {} worlds by each of {by}, which can take minutes; the time left is shown every now and then",
+            plan.worlds.len()
+        ),
+    }
+}
+
+/// Compares a plan part by part until the budget is spent, but at least one part. Without a budget, it compares the
+/// whole plan at once.
+fn compare_within<E>(
+    plan: &Plan,
+    budget: Option<Duration>,
+    mut compare: impl FnMut(&Plan, &Agreement) -> Result<Agreement, E>,
+) -> Result<Agreement, E> {
+    let since = Instant::now();
+    let mut all = Agreement::default();
+    let part = if budget.is_some() { PART } else { plan.worlds.len() };
+    for (index, worlds) in plan.worlds.chunks(part.max(1)).enumerate() {
+        let begun = Instant::now();
+        let part = Plan { worlds: worlds.to_vec(), seed: plan.seed + (index * PART) as u64, ..plan.clone() };
+        let found = compare(&part, &all)?;
+        all.worlds += found.worlds;
+        all.agent_steps += found.agent_steps;
+        all.mismatch = found.mismatch;
+        let is_spent = budget.is_some_and(|budget| since.elapsed() + begun.elapsed() > budget);
+        if all.mismatch.is_some() || is_spent {
+            break;
+        }
+    }
+    Ok(all)
+}
+
+/// Returns one line of the table. An error of the device counts as a difference.
+fn line(adapter: String, reference: &Cpu, result: Result<Agreement, Error>) -> Compared {
+    let against = reference.describe();
+    let outcome =
+        result.unwrap_or_else(|error| Agreement { mismatch: Some(error.to_string()), ..Agreement::default() });
+    let Agreement { worlds, agent_steps, mismatch: failure } = outcome;
+    let equal = failure.is_none();
+    Compared { adapter, pass: None, kernel: None, against, worlds, agent_steps, equal, failure }
+}
+
+/// Compares every instruction set of the processor with the narrowest.
+fn instruction_sets(plan: &Plan, context: Context<'_>) -> Vec<Compared> {
+    let levels = Cpu::levels();
+    let wider = levels[1..].iter().map(|&level| {
+        let (mut reference, mut wider) = (Cpu::at_level(levels[0]), Cpu::at_level(level));
+        let compared = compare(plan, &mut reference, &mut wider, |outcome| {
+            let (done, all) = (outcome.worlds, plan.worlds.len());
+            let text = format!("{}: {done} of {all} worlds", level_name(level));
+            (context.report)(Event::Fraction(done as f64 / all as f64, text));
+        });
+        (context.report)(Event::Pause);
+        line(wider.describe(), &reference, compared.map_err(Error::from))
+    });
+    wider.collect()
+}
+
+/// Returns the comparisons, the hardware and the digests of short trainings, for a report.
+fn evidence(lines: &[Compared], note: Option<String>, context: Context<'_>) -> Result<MachineReport, Error> {
+    let mut trained = Vec::new();
+    let trainings = short_trainings();
+    for (index, (name, config)) in trainings.iter().enumerate() {
+        (context.report)(Event::Fraction(index as f64 / trainings.len() as f64, format!("training {name}")));
+        let run = front::train(config, &mut Cpu::default(), |_| Continue(())).map_err(Error::of_training)?;
+        trained.push(ShortTraining { config: name.clone(), digest: run.digest() });
+    }
+    (context.report)(Event::Pause);
+    Ok(MachineReport {
+        processor: processor(),
+        instructions: Some(level_name(Level::new()).into()),
+        note,
+        comparisons: lines.to_vec(),
+        trained,
+        ..MachineReport::new(Tier::Executed)
+    })
+}
+
+/// Returns the processor's name, if the system reports it.
+fn processor() -> Option<String> {
+    let processor = match std::env::consts::OS {
+        "linux" => std::fs::read_to_string("/proc/cpuinfo").ok().and_then(|text| {
+            let names = text.lines().filter_map(|line| line.split_once(':'));
+            names.into_iter().find(|(key, _)| key.trim() == "model name").map(|(_, name)| name.to_string())
+        }),
+        "macos" => Command::new("/usr/sbin/sysctl")
+            .args(["-n", "machdep.cpu.brand_string"])
+            .output()
+            .ok()
+            .map(|output| String::from_utf8_lossy(&output.stdout).into_owned()),
+        _ => std::env::var("PROCESSOR_IDENTIFIER").ok(),
+    };
+    processor.map(|name| escape::line(name.trim()).into_owned()).filter(|name| !name.is_empty())
+}
+
+/// Returns what to compare, and the time budget if no amount is requested.
+fn plan(args: &Request) -> Result<(Plan, Option<Duration>), Error> {
+    let (seed, teams) = (u64::from(args.seed), args.teams as usize);
+    let is_open = args.config.is_none() && args.worlds.is_none() && !args.evidence;
+    let plan = match &args.config {
+        None if !args.set.is_empty() => {
+            return Err(Error::Usage(with_remedy(
+                "--set changes a config, and none is given",
+                "name a config to compare",
+            )));
+        }
+        None => Plan::random(seed..seed + u64::from(args.worlds.unwrap_or(WORLDS)), teams),
+        Some((name, text)) => {
+            let config = Config::read(text, name, &[], &args.set)?.validate()?;
+            let later = config.stages().iter().enumerate().skip(1);
+            let later = later.map(|(stage, (_, config))| (format!("{name}, stage {stage}"), config.clone()));
+            let worlds = [(name.clone(), Config::clone(&config))].into_iter().chain(later).collect();
+            Plan { worlds, teams, seed, generations: 5 }
+        }
+    };
+    Ok((plan, is_open.then_some(BUDGET)))
+}
+
+/// Returns the adapters to verify, each with the request that opens it.
+fn adapters(name: Option<&str>) -> Result<Vec<(AdapterChoice, AdapterInfo)>, Error> {
+    let found = device::adapters();
+    let all = found.iter().cloned().enumerate().map(|(index, info)| (AdapterChoice::Named(index.to_string()), info));
+    match name {
+        Some(name) => {
+            let named = AdapterChoice::Named(name.into());
+            let index = device::position(&named, &found).map_err(|error| match found.is_empty() {
+                true => Error::NoneToVerify(error),
+                false => error.into(),
+            })?;
+            Ok(vec![(named, found[index].clone())])
+        }
+        None if found.is_empty() => Err(Error::NoneToVerify(DeviceError::NoAdapter)),
+        None => Ok(all.collect()),
+    }
+}
+
+fn passes(name: Option<&str>, info: &AdapterInfo) -> Vec<Pass> {
+    let all = [Pass::NoContraction, Pass::Guarded, Pass::Plain];
+    match name {
+        Some(name) => all.into_iter().filter(|pass| pass.to_string() == name).collect(),
+        None if info.backend == "vulkan" => vec![Pass::NoContraction, Pass::Guarded],
+        None => vec![Pass::Guarded],
+    }
+}
+
+fn kernels(name: Option<&str>) -> impl Iterator<Item = Kernel> {
+    let all = [Kernel::Generic, Kernel::Specialised];
+    all.into_iter().filter(move |kernel| name.is_none_or(|name| kernel.to_string() == name))
+}
+
+/// Compares a combination with the CPU. `shown` receives the fraction that is done, and the result so far.
+fn verify(
+    plan: &Plan,
+    budget: Option<Duration>,
+    combination: &Combination<'_>,
+    shown: &mut dyn FnMut(f64, &Agreement),
+) -> Result<Agreement, Error> {
+    let since = Instant::now();
+    let gpu = gpu::open(device::Request { pass: Some(combination.pass), ..combination.choice.clone().into() })?;
+    if let Some(mismatch) = gpu::self_test(&gpu)? {
+        return Ok(Agreement { mismatch: Some(mismatch.to_string()), ..Agreement::default() });
+    }
+    let gpu = GpuBackend::new(gpu)?.with_kernel(combination.kernel);
+    let mut gpu = gpu.with_residency(ResidencyPolicy::Always).with_records(Records::Packed);
+    Ok(compare_within(plan, budget, |part, before| {
+        compare(part, &mut Cpu::default(), &mut gpu, |now| {
+            let now = Agreement { worlds: before.worlds + now.worlds, ..now.clone() };
+            let done = match budget {
+                Some(budget) => (since.elapsed().as_secs_f64() / budget.as_secs_f64()).min(1.0),
+                None => now.worlds as f64 / plan.worlds.len() as f64,
+            };
+            shown(done, &now);
+        })
+    })?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_budget_is_kept_by_whole_parts() {
+        let plan = Plan::random(0..35, 1);
+        let found = |budget: Option<Duration>, wrong: usize| {
+            let mut sizes = vec![];
+            let compare = |part: &Plan, before: &Agreement| {
+                assert_eq!(before.worlds, sizes.iter().sum::<usize>());
+                assert_eq!(part.worlds[0].0, format!("random world {}", part.seed));
+                sizes.push(part.worlds.len());
+                let mismatch = (sizes.len() == wrong).then(|| "differs".to_string());
+                Ok::<_, ()>(Agreement { worlds: part.worlds.len(), agent_steps: 7, mismatch })
+            };
+            let all = compare_within(&plan, budget, compare).unwrap();
+            assert_eq!(all.agent_steps, 7 * sizes.len() as u64);
+            assert_eq!((all.worlds, all.mismatch.is_some()), (sizes.iter().sum(), sizes.len() == wrong));
+            sizes
+        };
+        assert_eq!(found(None, 0), [35]);
+        assert_eq!(found(Some(Duration::ZERO), 0), [10]);
+        assert_eq!(found(Some(BUDGET), 0), [10, 10, 10, 5]);
+        assert_eq!(found(Some(BUDGET), 2), [10, 10]);
+        assert!(expected(&plan, Some(BUDGET), 4).contains("about 60 s"));
+        assert!(expected(&plan, None, 1).contains("35 worlds by each of 1 combination "));
+    }
+
+    #[test]
+    fn only_a_bare_request_has_a_budget() {
+        let config = ("small".to_string(), flotilla::config::LAYOUTS[0].1.to_string());
+        let budget = |request: Request| plan(&request).unwrap().1;
+        assert_eq!(budget(Request::default()), Some(BUDGET));
+        assert_eq!(budget(Request { worlds: Some(3), ..Request::default() }), None);
+        assert_eq!(budget(Request { evidence: true, ..Request::default() }), None);
+        assert_eq!(budget(Request { config: Some(config), ..Request::default() }), None);
+    }
+
+    #[test]
+    fn a_different_comparison_is_an_error_with_its_own_exit_code() {
+        let compared = |failures: &[Option<&str>]| {
+            let agreement =
+                |failure: &Option<&str>| Agreement { mismatch: failure.map(String::from), ..Agreement::default() };
+            let lines = failures.iter().map(|failure| line("a GPU".into(), &Cpu::default(), Ok(agreement(failure))));
+            Outcome { equal: false, comparisons: lines.collect(), evidence: None }
+        };
+        assert!(compared(&[None, None]).difference().is_none());
+        let error = compared(&[Some("stage credit"), None, None]).difference().unwrap();
+        assert_eq!((error.exit_code(), error.code()), (3, "different"));
+        assert!(error.to_string().starts_with("1 of 3 comparisons found other bits than the CPU's"), "{error}");
+    }
+}

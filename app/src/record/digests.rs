@@ -1,0 +1,108 @@
+//! Comparison of a run's files with the digests in its `run.json`.
+//!
+//! A digest covers the content that matters for results, not every byte of a file:
+//!
+//! - the config without `[checkpoint]` and comments,
+//! - the metrics without the columns `seconds` and `stage`,
+//! - the policies, through the checksum in their file.
+
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
+
+use sha2::{Digest, Sha256};
+
+use super::folder::{FileSums, Origin, RUN, Run, Status};
+use super::{RecordError, hex};
+use flotilla::config::Config;
+
+/// Warning for output made from files that were not compared.
+pub const UNVERIFIED: &str = "Unverified: files were not compared with the digests in run.json";
+
+/// Whether the files of a run are compared with their digests.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Verification {
+    /// A file with another digest is an error.
+    #[default]
+    Required,
+    /// No file is compared.
+    Skipped,
+}
+
+impl Verification {
+    /// Returns the value for a flag `--unverified`.
+    pub fn unless(unverified: bool) -> Verification {
+        if unverified { Verification::Skipped } else { Verification::Required }
+    }
+
+    /// Reports whether no file is compared.
+    pub(crate) fn is_skipped(self) -> bool {
+        self == Verification::Skipped
+    }
+}
+
+/// Digests of a finished run. Unfinished runs have no digests. Runs of earlier versions have no digests of their files.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Digests {
+    /// See [`Run::digest`].
+    pub run: Option<String>,
+    origin: Option<Origin>,
+    files: Option<FileSums>,
+}
+
+impl Digests {
+    /// Reads the digests of the run in a folder. They are empty if nothing is to be compared.
+    ///
+    /// # Errors
+    /// `run.json` is damaged or cannot be read.
+    pub fn read(folder: &Path, verification: Verification) -> Result<Digests, RecordError> {
+        if verification.is_skipped() {
+            return Ok(Digests::default());
+        }
+        match Run::read(&folder.join(RUN)) {
+            Ok(Run { state: Status::Done, digest, origin, files, .. }) => Ok(Digests { run: digest, origin, files }),
+            Ok(_) => Ok(Digests::default()),
+            Err(RecordError::Read { error, .. }) if error.kind() == ErrorKind::NotFound => Ok(Digests::default()),
+            Err(error) => Err(error),
+        }
+    }
+
+    /// Compares a config that was read from a file.
+    ///
+    /// # Errors
+    /// The config differs.
+    pub(crate) fn compare_config(&self, path: &Path, config: &Config) -> Result<(), RecordError> {
+        same(path, self.origin.as_ref().is_none_or(|origin| *origin == Origin::of(config)))
+    }
+
+    /// Compares metrics that were read from a file. See [`super::metrics::Rows::digest`].
+    ///
+    /// # Errors
+    /// The metrics differ.
+    pub(crate) fn compare_metrics(&self, path: &Path, found: Sha256) -> Result<(), RecordError> {
+        same(path, self.files.as_ref().is_none_or(|files| files.metrics == hex(&found.finalize())))
+    }
+
+    /// Compares the checksum of policies that were read from a file.
+    ///
+    /// # Errors
+    /// The checksum differs.
+    pub(crate) fn compare_policies(&self, path: &Path, checksum: Option<&str>) -> Result<(), RecordError> {
+        same(path, self.files.as_ref().is_none_or(|files| Some(&*files.policies) == checksum))
+    }
+}
+
+fn same(path: &Path, same: bool) -> Result<(), RecordError> {
+    if same { Ok(()) } else { Err(RecordError::Differs { path: path.into() }) }
+}
+
+/// Returns one note about all finished runs that have no digests of their files, or `None` if all have them.
+pub fn without<'a>(folders: impl IntoIterator<Item = &'a Path>) -> Option<String> {
+    let lacks =
+        |folder: &&Path| Run::read(&folder.join(RUN)).is_ok_and(|run| run.state == Status::Done && run.files.is_none());
+    let all: Vec<PathBuf> = folders.into_iter().filter(lacks).map(Path::to_path_buf).collect();
+    let first = all.first()?.display();
+    let more = if all.len() > 1 { format!(" and {} more", all.len() - 1) } else { String::new() };
+    Some(format!(
+        "note: {first}{more}: an earlier version made this run, without digests of its files, so these are not verified"
+    ))
+}

@@ -1,0 +1,378 @@
+//! Access to the disk for everything that is written. Files are replaced whole or not at all, and tests can make any
+//! single operation fail.
+
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, BufWriter, Seek, SeekFrom, Write};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
+
+use super::rooted_folder::{FileKind, FolderEntry, RootedFolder, is_link};
+use flotilla::file;
+
+/// Kind of operation on a disk.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Operation {
+    /// Creates a folder and its missing parents.
+    CreateFolder,
+    /// Creates a file for writing.
+    Create,
+    /// Writes some bytes to a file.
+    Write,
+    /// Flushes a file or a folder to the disk.
+    Flush,
+    /// Truncates a file to a length.
+    Truncate,
+    /// Renames a file to its final name.
+    Rename,
+    /// Removes a file.
+    Remove,
+}
+
+/// Called before each operation. If it returns an error, the operation fails with that error.
+pub(crate) type FaultHook = dyn Fn(Operation, &Path) -> io::Result<()> + Send + Sync;
+
+/// The file system, optionally limited to one folder. Tests can add a hook that makes operations fail.
+#[derive(Clone, Default)]
+pub struct Disk {
+    fault_hook: Option<Arc<FaultHook>>,
+    root: Option<Arc<RootedFolder>>,
+}
+
+impl Disk {
+    /// Returns a disk whose operations fail if `fault_hook` returns an error. A failed write still writes the first half
+    /// of its bytes.
+    pub fn failing(fault_hook: impl Fn(Operation, &Path) -> io::Result<()> + Send + Sync + 'static) -> Disk {
+        Disk { fault_hook: Some(Arc::new(fault_hook)), root: None }
+    }
+
+    /// Returns the same disk limited to a folder, which must exist. No symbolic link below the folder is followed, and
+    /// nothing outside of it is written.
+    ///
+    /// Links in the path of the folder are followed. A disk that is already limited to a parent folder keeps that
+    /// limit. In that case, the path is only checked for links.
+    ///
+    /// # Errors
+    /// The folder cannot be opened, or the disk is limited to a parent folder and the path contains a link.
+    pub fn within(&self, folder: &Path) -> io::Result<Disk> {
+        if let Some(root) = &self.root {
+            // All folders of a sweep share one handle, because the number of open files per process is limited.
+            root.entry(&folder.join("x"))?;
+            return Ok(self.clone());
+        }
+        Ok(Disk { fault_hook: self.fault_hook.clone(), root: Some(Arc::new(RootedFolder::open(folder)?)) })
+    }
+
+    /// Returns the folder that the disk is limited to, if any.
+    pub(super) fn root(&self) -> Option<&RootedFolder> {
+        self.root.as_deref()
+    }
+
+    fn check(&self, operation: Operation, path: &Path) -> io::Result<()> {
+        self.fault_hook.as_ref().map_or(Ok(()), |fault_hook| fault_hook(operation, path))
+    }
+
+    /// Returns the entry of a path. Without a root folder, the path may be in any folder.
+    pub(super) fn entry(&self, path: &Path) -> io::Result<FolderEntry> {
+        match &self.root {
+            Some(root) => root.entry(path),
+            None => {
+                let name = path.file_name().ok_or(io::ErrorKind::InvalidInput)?;
+                let root = RootedFolder::open(file::folder(path))?;
+                root.entry(&root.path().join(name))
+            }
+        }
+    }
+
+    /// Returns the type of the entry at a path, or `None` if there is none. Links are not followed.
+    ///
+    /// # Errors
+    /// Returns the system's error.
+    pub fn kind(&self, path: &Path) -> io::Result<Option<FileKind>> {
+        match self.entry(path) {
+            Ok(entry) => entry.kind(),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+            Err(error) => Err(error),
+        }
+    }
+
+    /// Fails if the entry at a path is a link.
+    ///
+    /// # Errors
+    /// It is one, or the system returns an error.
+    pub(crate) fn refuse_link(&self, path: &Path) -> io::Result<()> {
+        if self.kind(path)? == Some(FileKind::Link) { Err(is_link(path)) } else { Ok(()) }
+    }
+
+    /// Creates a folder and its missing parents.
+    pub fn create_folder(&self, path: &Path) -> io::Result<()> {
+        self.check(Operation::CreateFolder, path)?;
+        if let Some(root) = &self.root {
+            return root.create_folder(path);
+        }
+        fs::create_dir_all(path).map_err(|error| match error.kind() {
+            kind @ (io::ErrorKind::AlreadyExists | io::ErrorKind::NotADirectory) => {
+                io::Error::new(kind, "a part of this path is a file, not a folder; choose another path")
+            }
+            _ => error,
+        })
+    }
+
+    /// Creates a file and replaces any plain file at its path. A link is an error.
+    ///
+    /// # Errors
+    /// Returns the system's error.
+    pub fn create(&self, path: &Path) -> io::Result<Output> {
+        self.remove(path)?;
+        self.create_new(path)
+    }
+
+    /// Creates a file. Fails if the name is taken.
+    pub(crate) fn create_new(&self, path: &Path) -> io::Result<Output> {
+        self.check(Operation::Create, path)?;
+        let file = self.entry(path)?.create_new()?;
+        Ok(Output { disk: self.clone(), path: path.into(), file })
+    }
+
+    /// Opens an existing file, truncates it to `length` bytes and continues writing from there. A link is an error.
+    ///
+    /// # Errors
+    /// Returns the system's error.
+    pub fn append(&self, path: &Path, length: u64) -> io::Result<Output> {
+        let mut file = self.entry(path)?.write()?;
+        self.check(Operation::Truncate, path)?;
+        file.set_len(length)?;
+        file.seek(SeekFrom::End(0))?;
+        Ok(Output { disk: self.clone(), path: path.into(), file })
+    }
+
+    /// Appends bytes to a file, which is created if it is missing. Returns the file, so that the caller can flush it.
+    ///
+    /// # Errors
+    /// Returns the system's error.
+    pub fn extend(&self, path: &Path, bytes: &[u8]) -> io::Result<Output> {
+        self.check(Operation::Create, path)?;
+        let file = self.entry(path)?.extend()?;
+        let mut output = Output { disk: self.clone(), path: path.into(), file };
+        output.write_all(bytes)?;
+        Ok(output)
+    }
+
+    /// Replaces the content of a file. After a crash at any moment, the file has either all of the old content or all
+    /// of the new. Only one process at a time may replace a file.
+    ///
+    /// # Errors
+    /// Returns the system's error.
+    pub fn replace(&self, path: &Path, content: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> io::Result<()> {
+        // A killed process may have left a temporary file, which is replaced.
+        let open = |temporary: &Path| self.create(temporary);
+        self.replace_by(path, temporary(path), open, content, || Ok(()))
+    }
+
+    /// Replaces a file like [`Disk::replace`], but several processes may do so at the same time. `before` is called
+    /// after the new content is on the disk and before the file gets its name.
+    ///
+    /// # Errors
+    /// Returns the error of the system or of `before`.
+    pub(crate) fn replace_shared(
+        &self,
+        path: &Path,
+        content: impl FnOnce(&mut dyn Write) -> io::Result<()>,
+        before: impl FnOnce() -> io::Result<()>,
+    ) -> io::Result<()> {
+        static NEXT: AtomicUsize = AtomicUsize::new(0);
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        let mut taken = None;
+        for _ in 0..1000 {
+            let number = NEXT.fetch_add(1, Relaxed);
+            let temporary = path.with_file_name(format!("{PREFIX}{}-{number}-{name}.tmp", std::process::id()));
+            match self.create_new(&temporary) {
+                // A process on another machine may have the same id.
+                Err(error) if error.kind() == io::ErrorKind::AlreadyExists => continue,
+                Err(error) => return Err(error),
+                Ok(output) => taken = Some((temporary, output)),
+            }
+            break;
+        }
+        let (temporary, output) = taken.ok_or(io::ErrorKind::AlreadyExists)?;
+        self.replace_by(path, temporary, |_| Ok(output), content, before)
+    }
+
+    fn replace_by(
+        &self,
+        path: &Path,
+        temporary: PathBuf,
+        open: impl FnOnce(&Path) -> io::Result<Output>,
+        content: impl FnOnce(&mut dyn Write) -> io::Result<()>,
+        before: impl FnOnce() -> io::Result<()>,
+    ) -> io::Result<()> {
+        let write = || {
+            let mut output = BufWriter::with_capacity(1 << 20, open(&temporary)?);
+            content(&mut output)?;
+            output.into_inner().map_err(|error| error.into_error())?.sync()?;
+            before()?;
+            self.rename(&temporary, path)
+        };
+        write().inspect_err(|_| {
+            // The first error is the one to report, so a failed removal is ignored.
+            let _ = self.remove(&temporary);
+        })
+    }
+
+    /// Writes a file that the user named, whole or not at all. A link to a file is followed, except on a disk that is
+    /// limited to a folder. A device or a pipe, such as `/dev/stdout`, is written to directly.
+    pub(crate) fn write_user_file(
+        &self,
+        path: &Path,
+        content: impl FnOnce(&mut dyn Write) -> io::Result<()>,
+    ) -> io::Result<()> {
+        if self.root.is_some() && self.kind(path)? != Some(FileKind::Other) {
+            if self.kind(path)?.is_some() {
+                // A link must not be replaced, nor a file without write permission.
+                self.entry(path)?.write()?;
+            }
+            return self.replace_shared(path, content, || Ok(()));
+        }
+        let existing = fs::metadata(path);
+        if existing.as_ref().is_ok_and(|existing| !existing.is_file() && !existing.is_dir()) {
+            let mut output = BufWriter::new(OpenOptions::new().write(true).open(path)?);
+            content(&mut output)?;
+            return output.flush();
+        }
+        if existing.is_ok() {
+            // A file without write permission must not be replaced.
+            OpenOptions::new().write(true).open(path)?;
+        }
+        let path = &file::resolved(path);
+        if !file::folder(path).is_dir() {
+            return Err(file::no_folder(path));
+        }
+        self.check(Operation::Create, path)?;
+        // A random name, because the folder may contain any files of the user.
+        let mut builder = tempfile::Builder::new();
+        #[cfg(unix)]
+        builder.permissions(match &existing {
+            Ok(existing) => existing.permissions(),
+            Err(_) => std::os::unix::fs::PermissionsExt::from_mode(0o666),
+        });
+        let temporary = builder.prefix(".flotilla-").suffix(".tmp").tempfile_in(file::folder(path));
+        let temporary = temporary.map_err(without_path)?;
+        let mut output = BufWriter::with_capacity(1 << 20, temporary.as_file());
+        content(&mut output)?;
+        output.into_inner().map_err(|error| error.into_error())?.sync_all()?;
+        self.check(Operation::Rename, path)?;
+        temporary.persist(path).map_err(|error| error.error)?;
+        self.sync_folder(file::folder(path))
+    }
+
+    /// Renames a file and flushes the new name to the disk.
+    ///
+    /// # Errors
+    /// Returns the system's error.
+    pub(crate) fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
+        self.check(Operation::Rename, to)?;
+        let target = self.entry(to)?;
+        self.entry(from)?.rename(&target)?;
+        self.check(Operation::Flush, file::folder(to))?;
+        target.sync_folder()
+    }
+
+    /// Removes a file if it exists.
+    ///
+    /// # Errors
+    /// The entry is not a plain file, or the system returns an error.
+    pub fn remove(&self, path: &Path) -> io::Result<()> {
+        if self.kind(path)?.is_none() {
+            return Ok(());
+        }
+        self.check(Operation::Remove, path)?;
+        self.entry(path)?.remove()
+    }
+
+    /// Opens a plain file for reading. A link is an error.
+    ///
+    /// # Errors
+    /// Returns the system's error.
+    pub fn read(&self, path: &Path) -> io::Result<File> {
+        self.entry(path)?.read()
+    }
+
+    /// Opens a lock file, and creates it if it is missing.
+    ///
+    /// # Errors
+    /// The entry is not a plain file, or the system returns an error.
+    pub(crate) fn open_lock(&self, path: &Path) -> io::Result<File> {
+        self.entry(path)?.extend()
+    }
+
+    /// Flushes the names in a folder to the disk, if the system can.
+    fn sync_folder(&self, path: &Path) -> io::Result<()> {
+        self.check(Operation::Flush, path)?;
+        RootedFolder::open(path)?.entry(&path.join("x"))?.sync_folder()
+    }
+}
+
+/// Removes the path of a temporary file from an error, because the user does not know that file.
+pub(crate) fn without_path(error: io::Error) -> io::Error {
+    if error.get_ref().is_some() { error.kind().into() } else { error }
+}
+
+/// Prefix of the names of temporary files, which only flotilla creates.
+const PREFIX: &str = ".flotilla-";
+
+/// Returns the path of the temporary file in which the new content of a file is written.
+pub(crate) fn temporary(path: &Path) -> PathBuf {
+    let name = path.file_name().unwrap_or_default();
+    let name = [PREFIX.as_ref(), name, ".tmp".as_ref()].into_iter().collect::<std::ffi::OsString>();
+    path.with_file_name(name)
+}
+
+/// Returns the name of the file to which a [`temporary`] path belongs, or `None` for other paths.
+pub(crate) fn of_temporary(path: &Path) -> Option<&str> {
+    path.file_name()?.to_str()?.strip_prefix(PREFIX)?.strip_suffix(".tmp")
+}
+
+/// A file that is being written.
+pub struct Output {
+    disk: Disk,
+    path: PathBuf,
+    file: File,
+}
+
+impl Output {
+    /// Waits until all written bytes are on the disk.
+    ///
+    /// # Errors
+    /// Returns the system's error.
+    pub fn sync(&self) -> io::Result<()> {
+        self.disk.check(Operation::Flush, &self.path)?;
+        self.file.sync_all()
+    }
+
+    /// Returns the path of the file.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Returns a second handle of the same file, so that another thread can flush it.
+    ///
+    /// # Errors
+    /// Returns the system's error.
+    pub fn share(&self) -> io::Result<Output> {
+        Ok(Output { disk: self.disk.clone(), path: self.path.clone(), file: self.file.try_clone()? })
+    }
+}
+
+impl Write for Output {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        if let Err(error) = self.disk.check(Operation::Write, &self.path) {
+            self.file.write_all(&bytes[..bytes.len() / 2])?;
+            return Err(error);
+        }
+        self.file.write(bytes)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}

@@ -1,0 +1,367 @@
+//! The folder of a run: its lock and its files.
+//!
+//! | module | contents |
+//! |---|---|
+//! | [`run`] | `run.json` |
+//! | [`resume`] | where a run resumes, and whether it is finished |
+//! | [`paths`] | recognition and numbering of folders |
+
+use std::fmt;
+use std::fs::{File, TryLockError};
+use std::io::{self, ErrorKind};
+use std::path::{Path, PathBuf};
+
+use super::checkpoint::{self, Checkpoint};
+use super::disk::Disk;
+pub(crate) use super::ownership::CHECKPOINTS;
+use super::ownership::{self, CURVES, REPLAY};
+pub use super::ownership::{ARMS, PAPER, POINTS, RESULTS};
+pub use super::ownership::{CONFIG, METRICS, POLICIES, RUN, SWEEP};
+use super::{RecordError, metrics, read_text};
+use flotilla::config::Config;
+use flotilla::file;
+
+mod paths;
+mod resume;
+mod run;
+
+pub use paths::{around, collection, owner};
+pub use paths::{holds_run, latest, next_free};
+pub use resume::{FirstAndLastRows, differences};
+pub(crate) use run::RunSums;
+pub use run::{FileSums, Origin, Run, Status, now};
+
+/// Exists while a run from given policies starts in a folder, until `run.json` records those policies.
+const INIT_MARK: &str = ".init";
+/// Locked by the process that trains in the folder. The system releases the lock when the process ends, even after a
+/// crash.
+const LOCK: &str = ".lock";
+/// Maximum size in bytes of a `config.toml` that is kept before another replaces it.
+const MAX_KEPT_BYTES: u64 = 1 << 20;
+
+/// The way to treat a folder that already holds a run.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Start {
+    /// Fails if the folder holds a run.
+    Fresh,
+    /// Replaces the run.
+    Force,
+    /// Resumes the run, or starts one if there is none.
+    Resume,
+}
+
+/// Policies from which a run should start.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum StartFrom<'a> {
+    /// Not specified: a resumed run keeps its own start.
+    Unspecified,
+    /// Random policies. The caller knows that the run cannot have started from others.
+    Random,
+    /// Given policies with this [`super::policies::Init::digest`].
+    Policies(&'a str),
+}
+
+impl StartFrom<'_> {
+    /// Returns the digest of the given policies.
+    fn digest(self) -> Option<String> {
+        if let StartFrom::Policies(digest) = self { Some(digest.into()) } else { None }
+    }
+}
+
+/// A folder in which this process trains. No other process can, if the file system supports locks.
+pub struct Folder {
+    /// Path of the folder.
+    pub path: PathBuf,
+    /// Disk that writes in the folder.
+    pub disk: Disk,
+    lock: Option<File>,
+}
+
+/// State of a run that was found in its folder.
+pub struct Resumed {
+    /// Newest usable checkpoint, and the metrics truncated to match it.
+    pub checkpoint: Option<(Checkpoint, metrics::Writer)>,
+    /// Generations of all usable checkpoints, oldest first.
+    pub kept: Vec<usize>,
+    /// Content of `run.json` after the folder was opened.
+    pub run: Option<Run>,
+    /// Results of a finished run, if all its files match their digests. Checkpoints are not searched in that case.
+    pub finished: Option<FirstAndLastRows>,
+    /// Notes for the user.
+    pub notes: Vec<Note>,
+}
+
+/// Observation about a folder and the resulting action, for the user.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Note {
+    /// A checkpoint cannot be used, for this reason.
+    SetAside(String),
+    /// A small file cannot be read, for this reason.
+    Rewritten(String),
+    /// The text of `config.toml` was written by hand, and another text replaces it.
+    ConfigKept {
+        /// Path of the copy of the old text.
+        path: PathBuf,
+    },
+    /// The replacement of a run was interrupted.
+    Replacing,
+    /// The run resumes from a checkpoint.
+    Resuming {
+        /// Generation that is played next.
+        generation: usize,
+    },
+    /// None of the checkpoints can be used.
+    StartingOver,
+    /// There are no checkpoints.
+    Starting,
+    /// The file system does not support locks.
+    NotLocked,
+}
+
+impl Note {
+    /// Reports whether the user must be warned. The other notes are normal for a resumed run.
+    pub fn is_damage(&self) -> bool {
+        matches!(self, Note::SetAside(_) | Note::Rewritten(_) | Note::StartingOver | Note::NotLocked)
+    }
+}
+
+impl fmt::Display for Note {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Note::SetAside(reason) => write!(f, "{reason}; set aside, and the one before is used"),
+            Note::Rewritten(reason) => write!(f, "{reason}; it is rewritten"),
+            Note::ConfigKept { path } => {
+                write!(f, "{CONFIG} has changed; its old text is kept as {}", path.display())
+            }
+            Note::Replacing => f.write_str("the replacement of a run was interrupted: the rest of that run is removed"),
+            Note::Resuming { generation } => write!(f, "resuming at generation {generation}"),
+            Note::StartingOver => f.write_str("no checkpoint can be used: starting over, to the same results"),
+            Note::NotLocked => {
+                f.write_str("this file system has no locks, so start only one process at a time in this folder")
+            }
+            Note::Starting => f.write_str("no checkpoint yet: starting from the beginning"),
+        }
+    }
+}
+
+impl Folder {
+    /// Opens a folder for a run of a config, and creates the folder if needed. The policies that the run starts from
+    /// are recorded before anything else is written.
+    ///
+    /// # Errors
+    /// Fails in these cases:
+    ///
+    /// - The folder holds a run that must not be overwritten, or another process trains in it.
+    /// - The run belongs to another config or to a newer version.
+    /// - The run started from other or unknown policies, or needs the policies that it started from.
+    /// - The folder cannot be read or written.
+    pub fn open(
+        path: &Path,
+        start: Start,
+        config: &Config,
+        from: StartFrom<'_>,
+        disk: Disk,
+    ) -> Result<(Folder, Resumed), RecordError> {
+        if path.is_file() {
+            return Err(RecordError::NoFolder { path: path.into() });
+        }
+        let holds_run = || match ownership::holds_run(path, config)? {
+            true if start == Start::Fresh => Err(RecordError::Exists { path: path.into() }),
+            holds => Ok(holds),
+        };
+        holds_run()?;
+        disk.create_folder(path).map_err(RecordError::write(path))?;
+        let disk = ownership::open_output_folder(&disk, path, true)?;
+        ownership::refuse_links(&disk, path)?;
+        let mark = path.join(INIT_MARK);
+        if from.digest().is_some() && !file::exists(&path.join(RUN)).map_err(RecordError::read(path))? {
+            // If the process is killed before `run.json` is complete, a resumed run must not start from random
+            // policies.
+            disk.create(&mark).map_err(RecordError::write(&mark))?;
+        }
+        let lock = lock(&disk, path)?;
+        // Another process may have written here before the lock was taken, so the check is repeated.
+        let holds_run = holds_run()?;
+        let folder = Folder { path: path.into(), disk, lock };
+        let mut found = Resumed { checkpoint: None, kept: vec![], run: None, finished: None, notes: vec![] };
+        found.notes.extend(folder.lock.is_none().then_some(Note::NotLocked));
+        let interrupted = Run::read(&folder.file(RUN)).ok().filter(|run| run.state == Status::Replacing);
+        match (start, interrupted) {
+            (Start::Force, _) if holds_run => {
+                folder.clear(&Run { init: from.digest(), ..Run::new(config) }, config, &mut found)?;
+            }
+            (Start::Resume, Some(run)) => {
+                found.notes.push(Note::Replacing);
+                folder.clear(&run, config, &mut found)?;
+            }
+            _ => {}
+        }
+        if start == Start::Resume {
+            folder.find(config, from, &mut found)?;
+        }
+        if found.finished.is_some() {
+            if Config::load(&folder.file(CONFIG)).is_err() {
+                found.notes.extend(folder.write_config(config)?);
+            }
+            return Ok((folder, found));
+        }
+        folder.record_origin(config, from, &mut found)?;
+        folder.disk.remove(&mark).map_err(RecordError::write(&mark))?;
+        let checkpoints = folder.file(CHECKPOINTS);
+        folder.disk.create_folder(&checkpoints).map_err(RecordError::write(&checkpoints))?;
+        // A config with the same content may have the user's comments, so it is not replaced.
+        if Config::load(&folder.file(CONFIG)).ok().as_ref() != Some(config) {
+            found.notes.extend(folder.write_config(config)?);
+        }
+        Ok((folder, found))
+    }
+
+    /// Records in `run.json` what a run starts from. A finished run that is extended is marked as running, so that its
+    /// files are no longer compared with outdated digests.
+    fn record_origin(&self, config: &Config, from: StartFrom<'_>, found: &mut Resumed) -> Result<(), RecordError> {
+        let init = found.checkpoint.as_ref().and_then(|(checkpoint, _)| checkpoint.init.clone());
+        let before = found.run.clone();
+        let mut run = before.clone().unwrap_or_else(|| Run::new(config));
+        run.init = from.digest().or(init).or(run.init);
+        if run.state == Status::Done {
+            run = Run { state: Status::Running, digest: None, files: None, ..run };
+        }
+        // Earlier versions did not write the origin.
+        run.origin = run.origin.or_else(|| Some(Origin::of(config)));
+        if before.as_ref() != Some(&run) {
+            self.write_run(&run)?;
+        }
+        found.run = Some(run);
+        Ok(())
+    }
+
+    /// Writes `config.toml`. A text that was written by hand is copied first, and the returned note names the copy.
+    pub(crate) fn write_config(&self, config: &Config) -> Result<Option<Note>, RecordError> {
+        let kept = self.keep_config()?;
+        self.write_text(CONFIG, &config.to_toml())?;
+        Ok(kept.map(|path| Note::ConfigKept { path }))
+    }
+
+    /// Copies `config.toml` unless flotilla wrote its text. Returns the path of the copy.
+    fn keep_config(&self) -> Result<Option<PathBuf>, RecordError> {
+        let Ok(text) = read_text(&self.file(CONFIG), MAX_KEPT_BYTES) else { return Ok(None) };
+        if Config::parse(&text, CONFIG).is_ok_and(|config| config.to_toml() == text) {
+            return Ok(None);
+        }
+        for number in 1.. {
+            let path = self.file(&numbered_config(number));
+            if self.disk.kind(&path).map_err(RecordError::write(&path))?.is_none() {
+                self.disk
+                    .replace(&path, |output| output.write_all(text.as_bytes()))
+                    .map_err(RecordError::write(&path))?;
+                return Ok(Some(path));
+            }
+            // An interrupted session already made this copy.
+            if read_text(&path, MAX_KEPT_BYTES).is_ok_and(|existing| existing == text) {
+                return Ok(Some(path));
+            }
+        }
+        unreachable!("there are more numbers than files")
+    }
+
+    /// Removes a run and keeps all other files in the folder. During the removal, `run.json` has the state `Replacing`
+    /// and the data of the new run.
+    fn clear(&self, by: &Run, config: &Config, found: &mut Resumed) -> Result<(), RecordError> {
+        self.write_run(&Run { state: Status::Replacing, ..by.clone() })?;
+        let checkpoints = self.file(CHECKPOINTS);
+        let generations = checkpoint::remove_temporary_files(&self.disk, &checkpoints)?;
+        let old = generations.into_iter().map(|generation| checkpoint::path(&checkpoints, generation));
+        for path in old.chain([METRICS, POLICIES].map(|name| self.file(name))) {
+            self.disk.remove(&path).map_err(RecordError::write(&path))?;
+        }
+        for name in [CURVES, REPLAY] {
+            ownership::remove_published(&self.disk, &self.file(name))?;
+        }
+        // The config is replaced as a whole, because the new run may have been read from it.
+        if Config::load(&self.file(CONFIG)).ok().as_ref() != Some(config) {
+            found.notes.extend(self.write_config(config)?);
+        }
+        self.write_run(&Run { state: Status::Running, ..by.clone() })
+    }
+
+    /// Writes a small text file, whole or not at all.
+    fn write_text(&self, name: &str, text: &str) -> Result<(), RecordError> {
+        let path = self.file(name);
+        self.disk.replace(&path, |output| output.write_all(text.as_bytes())).map_err(RecordError::write(&path))
+    }
+
+    /// Writes `run.json`.
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    pub fn write_run(&self, run: &Run) -> Result<(), RecordError> {
+        self.write_text(RUN, &run.to_json())
+    }
+
+    /// Returns the path of a file in the folder.
+    pub fn file(&self, name: &str) -> PathBuf {
+        self.path.join(name)
+    }
+}
+
+/// Returns the name of the copy of a replaced `config.toml`.
+fn numbered_config(number: usize) -> String {
+    if number == 1 { "config.old.toml".into() } else { format!("config.old-{number}.toml") }
+}
+
+/// Checks whether runs may be started in folders, without changing them. With `Start::Fresh`, no folder may hold a run.
+/// Otherwise no other process may train in them.
+///
+/// # Errors
+/// One of the folders may not be used or cannot be read.
+pub fn check<'a>(
+    disk: &Disk,
+    folders: impl IntoIterator<Item = (&'a Path, &'a Config)>,
+    start: Start,
+) -> Result<(), RecordError> {
+    for (path, config) in folders {
+        if ownership::holds_run(path, config)? && start == Start::Fresh {
+            return Err(RecordError::Exists { path: path.into() });
+        }
+        // Without a lock file, no process trains in the folder.
+        if start != Start::Fresh && path.join(LOCK).exists() {
+            // Closing the file may not release the lock, because a process that is being started can briefly hold a
+            // copy of the file.
+            if let Some(lock) = lock(&disk.within(path).map_err(RecordError::write(path))?, path)? {
+                let _ = lock.unlock();
+            }
+        }
+    }
+    Ok(())
+}
+
+impl Drop for Folder {
+    fn drop(&mut self) {
+        // The lock is released explicitly for the same reason as in `check`.
+        if let Some(lock) = &self.lock {
+            let _ = lock.unlock();
+        }
+    }
+}
+
+/// Locks a folder for this process while the returned file is open. Returns `None` if the file system has no locks.
+///
+/// # Errors
+/// Another process holds the lock, or the file cannot be written.
+pub fn lock(disk: &Disk, path: &Path) -> Result<Option<File>, RecordError> {
+    let name = path.join(LOCK);
+    let file = disk.open_lock(&name).map_err(RecordError::write(&name))?;
+    match file.try_lock() {
+        Ok(()) => Ok(Some(file)),
+        Err(TryLockError::WouldBlock) => Err(RecordError::Locked { path: path.into() }),
+        Err(TryLockError::Error(error)) if has_no_locks(&error) => Ok(None),
+        Err(TryLockError::Error(error)) => Err(RecordError::write(&name)(error)),
+    }
+}
+
+/// Reports whether the file system does not support locks. NFS without its lock service returns `ENOLCK`.
+fn has_no_locks(error: &io::Error) -> bool {
+    const ENOLCK: i32 = if cfg!(target_os = "linux") { 37 } else { 77 };
+    error.kind() == ErrorKind::Unsupported || cfg!(unix) && error.raw_os_error() == Some(ENOLCK)
+}

@@ -1,0 +1,96 @@
+//! Recognition and numbering of folders.
+
+use std::fs;
+use std::io::ErrorKind;
+use std::path::{Component, Path, PathBuf};
+
+use super::{ARMS, CHECKPOINTS, CONFIG, LOCK, METRICS, PAPER, POINTS, POLICIES, RESULTS, RUN, SWEEP};
+use crate::record::RecordError;
+use flotilla::file;
+
+/// Reports whether a folder contains any file of a run.
+pub fn holds_run(path: &Path) -> Result<bool, RecordError> {
+    for name in [CONFIG, RUN, METRICS, POLICIES, CHECKPOINTS] {
+        let name = path.join(name);
+        if file::exists(&name).map_err(RecordError::read(&name))? {
+            return Ok(true);
+        }
+    }
+    Ok(false)
+}
+
+/// Returns "a paper" or "a sweep" if the folder contains the runs of one.
+pub fn collection(path: &Path) -> Option<&'static str> {
+    let all = [(PAPER, "a paper"), (SWEEP, "a sweep")];
+    all.into_iter().find(|(name, _)| path.join(name).exists()).map(|(_, what)| what)
+}
+
+/// Returns the folder of the run, sweep or paper that needs a file. Pictures and pages are not needed.
+pub fn owner(path: &Path) -> Option<PathBuf> {
+    let path = file::resolved(path);
+    let (folder, name) = (file::folder(&path), path.file_name()?.to_str()?);
+    let has = |folder: &Path, names: &[&str]| names.iter().any(|name| folder.join(name).exists());
+    let is_run = |folder: &Path| has(folder, &[CONFIG]) && has(folder, &[RUN, METRICS, CHECKPOINTS]);
+    let of_run = [CONFIG, RUN, METRICS, POLICIES, LOCK].contains(&name) && is_run(folder);
+    let of_sweep = [SWEEP, RESULTS, POINTS].contains(&name) && has(folder, &[SWEEP]);
+    let of_paper = name == PAPER && has(folder, &[ARMS]);
+    let checkpoint = folder.ends_with(CHECKPOINTS) && is_run(file::folder(folder));
+    match (of_run || of_sweep || of_paper, checkpoint) {
+        (true, _) => Some(folder.into()),
+        (_, true) => Some(file::folder(folder).into()),
+        _ => None,
+    }
+}
+
+/// Returns the outermost folder of a run, sweep or paper that a path lies in, as the path names it.
+pub fn around(path: &Path) -> Option<&Path> {
+    let is_ours = |folder: &Path| {
+        let has = |name: &str| folder.join(name).exists();
+        has(CONFIG) && [RUN, METRICS, CHECKPOINTS].into_iter().any(has)
+            || has(SWEEP) && has("points")
+            || has(PAPER) && has(ARMS)
+    };
+    let descends = |folder: &&Path| {
+        let below = path.strip_prefix(folder).unwrap_or(path);
+        below.components().all(|part| matches!(part, Component::Normal(_)))
+    };
+    let folders =
+        path.ancestors().skip(1).map(|folder| if folder.as_os_str().is_empty() { Path::new(".") } else { folder });
+    folders.filter(descends).filter(|folder| is_ours(folder)).last()
+}
+
+/// Creates the next folder after the last existing one of `stem`, `stem-2`, `stem-3`, … and returns its path.
+///
+/// # Errors
+/// The folder cannot be created.
+pub fn next_free(parent: &Path, stem: &str) -> Result<PathBuf, RecordError> {
+    fs::create_dir_all(parent).map_err(RecordError::write(parent))?;
+    let mut number = newest(parent, stem) + 1;
+    loop {
+        let path = numbered(parent, stem, number);
+        match fs::create_dir(&path) {
+            Ok(()) => return Ok(path),
+            Err(error) if error.kind() == ErrorKind::AlreadyExists => number += 1,
+            Err(error) => return Err(RecordError::write(&path)(error)),
+        }
+    }
+}
+
+/// Returns the last existing path of `stem`, `stem-2`, …, or `stem` if none exists.
+pub fn latest(parent: &Path, stem: &str) -> PathBuf {
+    numbered(parent, stem, newest(parent, stem).max(1))
+}
+
+/// Returns the largest number of the existing folders, or 0 if there is none.
+fn newest(parent: &Path, stem: &str) -> usize {
+    let number = |name: &str| match name.strip_prefix(stem)? {
+        "" => Some(1),
+        rest => rest.strip_prefix('-')?.parse().ok().filter(|&number| name == format!("{stem}-{number}") && number > 1),
+    };
+    let entries = fs::read_dir(parent).into_iter().flatten().flatten();
+    entries.filter_map(|entry| number(entry.file_name().to_str()?)).max().unwrap_or(0)
+}
+
+fn numbered(parent: &Path, stem: &str, number: usize) -> PathBuf {
+    parent.join(if number == 1 { stem.to_string() } else { format!("{stem}-{number}") })
+}

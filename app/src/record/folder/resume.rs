@@ -1,0 +1,315 @@
+//! Where a run in a folder resumes, and whether it is finished.
+
+use std::io::ErrorKind;
+use std::path::Path;
+
+use sha2::{Digest, Sha256};
+
+use super::{
+    CHECKPOINTS, CONFIG, Checkpoint, Folder, INIT_MARK, METRICS, Note, Origin, POLICIES, RUN, Resumed, Run, RunSums,
+};
+use super::{StartFrom, Status};
+use crate::record::metrics::{self, RowsError};
+use crate::record::{RecordError, checkpoint, config_digest, hex, policies, tensors, without_checkpoint};
+use flotilla::config::{Config, MAX_STAGES};
+use flotilla::escape::PathExt;
+use flotilla::file;
+use flotilla::trainer::Row;
+
+/// Rows of a run's first and last generation, `[trials]` each.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FirstAndLastRows {
+    /// Rows of generation 0.
+    pub first: Vec<Row>,
+    /// Rows of the last generation.
+    pub last: Vec<Row>,
+}
+
+impl Folder {
+    /// Finds the checkpoint from which the run resumes. Unusable checkpoints are renamed or removed.
+    pub(super) fn find(&self, config: &Config, from: StartFrom<'_>, found: &mut Resumed) -> Result<(), RecordError> {
+        let (checkpoints, init) = (self.file(CHECKPOINTS), from.digest());
+        let init = init.as_deref();
+        self.refuse_newer(&checkpoints)?;
+        let mut kept = checkpoint::remove_temporary_files(&self.disk, &checkpoints)?;
+        let before = self.compare(config, found, !kept.is_empty())?;
+        match Run::read(&self.file(RUN)) {
+            Ok(run) => found.run = Some(run),
+            Err(RecordError::Read { error, .. }) if error.kind() == ErrorKind::NotFound => {}
+            Err(error @ RecordError::Damaged { .. }) => found.notes.push(Note::Rewritten(error.to_string())),
+            Err(error) => return Err(error),
+        }
+        found.finished = found.run.as_ref().map_or(Ok(None), |run| self.finished(run, config))?;
+        if let Some(run) = found.run.as_ref().filter(|_| found.finished.is_some()) {
+            return self.check_init(run.init.clone(), init);
+        }
+        let origin_error = self.origin_error(config, found.run.as_ref(), before.is_some());
+        let (is_other, had_checkpoints) = (origin_error.is_some(), !kept.is_empty());
+        found.checkpoint =
+            self.find_checkpoint(config, before.as_ref(), is_other, init, &mut kept, &mut found.notes)?;
+        if found.checkpoint.is_none() {
+            if let Some(error) = origin_error {
+                return Err(error);
+            }
+            self.check_start(found.run.as_ref(), from, had_checkpoints)?;
+        }
+        found.notes.push(match &found.checkpoint {
+            Some((checkpoint, _)) => Note::Resuming { generation: checkpoint.snapshot.generation },
+            None if had_checkpoints => Note::StartingOver,
+            None => Note::Starting,
+        });
+        found.kept = kept;
+        Ok(())
+    }
+
+    /// Returns an error if the run's origin does not allow the given config. `has_config` says that `config.toml` could
+    /// be read. It then agrees with the given config, so that a mismatch means that it was edited.
+    fn origin_error(&self, config: &Config, run: Option<&Run>, has_config: bool) -> Option<RecordError> {
+        let origin = run?.origin.as_ref().filter(|origin| !origin.allows(config))?;
+        let (path, existing, requested) = (self.path.clone(), origin.generations, config.learning.generations);
+        Some(match existing > requested {
+            true => RecordError::Shorter { path, existing, requested },
+            false if has_config => RecordError::Edited { path: self.file(CONFIG) },
+            false => {
+                let differences = vec![format!("  {} has another digest", self.file(RUN).display())];
+                RecordError::ConfigDiffers { path, differences }
+            }
+        })
+    }
+
+    /// Returns the newest usable checkpoint among the generations in `kept`. Unusable ones are renamed or removed, and
+    /// leave `kept`.
+    ///
+    /// `before` is the config in the folder, if it can be read. `is_other` says that the run's origin does not allow
+    /// the given config. A checkpoint of another config is no damage then: it is kept, and the search ends there.
+    fn find_checkpoint(
+        &self,
+        config: &Config,
+        before: Option<&Config>,
+        is_other: bool,
+        init: Option<&str>,
+        kept: &mut Vec<usize>,
+        notes: &mut Vec<Note>,
+    ) -> Result<Option<(Checkpoint, metrics::Writer)>, RecordError> {
+        let checkpoints = self.file(CHECKPOINTS);
+        while let Some(&generation) = kept.last() {
+            let path = checkpoint::path(&checkpoints, generation);
+            // Checkpoints of earlier versions lack the number of generations. The config in the folder has it.
+            let reason = match checkpoint::read(&path, &self.file(POLICIES), before.unwrap_or(config)) {
+                Ok(Some(checkpoint)) if checkpoint.is_of(config) => {
+                    self.check_init(checkpoint.init.clone(), init)?;
+                    let metrics = self.file(METRICS);
+                    let resumed = metrics::Writer::resume(&self.disk, &metrics, &checkpoint.metrics, config);
+                    match resumed.map_err(RecordError::write(&metrics))? {
+                        Some(metrics) => return Ok(Some((checkpoint, metrics))),
+                        None => format!("{}: {} has changed since this was written", path.escaped(), metrics.escaped()),
+                    }
+                }
+                Ok(Some(_)) if is_other => break,
+                Ok(Some(_)) if before.is_some() => format!("{}: it is of another run", path.escaped()),
+                Ok(Some(_)) => {
+                    let differences = vec![format!("  {} has another digest", path.escaped())];
+                    return Err(RecordError::ConfigDiffers { path: self.path.clone(), differences });
+                }
+                Ok(None) => {
+                    // Only the end of a run writes such a checkpoint. Its policies were not written yet, or others
+                    // replaced them.
+                    self.disk.remove(&path).map_err(RecordError::write(&path))?;
+                    kept.pop();
+                    continue;
+                }
+                Err(error @ RecordError::Damaged { .. }) => error.to_string(),
+                Err(error) => return Err(error),
+            };
+            notes.push(Note::SetAside(reason));
+            let damaged = checkpoint::quarantine_path(&path);
+            self.disk.rename(&path, &damaged).map_err(RecordError::write(&damaged))?;
+            kept.pop();
+        }
+        Ok(None)
+    }
+
+    /// Fails if a run without usable checkpoints cannot start over as it began. `run` is the content of `run.json`, if
+    /// it can be read.
+    fn check_start(&self, run: Option<&Run>, from: StartFrom<'_>, had_checkpoints: bool) -> Result<(), RecordError> {
+        let path = self.path.clone();
+        let Some(run) = run else {
+            let exists = |name: &str| file::exists(&self.file(name)).map_err(RecordError::read(&self.file(name)));
+            if from == StartFrom::Unspecified
+                && (had_checkpoints || exists(INIT_MARK)? || exists(RUN)? || exists(METRICS)? || exists(POLICIES)?)
+            {
+                return Err(RecordError::OriginUnknown { path });
+            }
+            return Ok(());
+        };
+        let init = from.digest();
+        self.check_init(run.init.clone(), init.as_deref())?;
+        match run.init.clone().filter(|_| init.is_none()) {
+            Some(existing) => Err(RecordError::InitNeeded { path, existing }),
+            None => Ok(()),
+        }
+    }
+
+    /// Fails if a newer version of the program wrote any of the files. Callers check this before they change a file.
+    fn refuse_newer(&self, checkpoints: &Path) -> Result<(), RecordError> {
+        let generations = checkpoint::list(checkpoints)?.into_iter();
+        let files = generations.map(|generation| checkpoint::path(checkpoints, generation));
+        for path in files.chain([self.file(POLICIES)]) {
+            if let Some(version) = tensors::newer(&path) {
+                // Only checkpoints contain the version that wrote them.
+                let recorded = || Some(Run::read(&self.file(RUN)).ok()?.version);
+                return Err(RecordError::Newer { path, version: version.or_else(recorded) });
+            }
+        }
+        Ok(())
+    }
+
+    /// Fails if the given policies are not those that the run started from.
+    fn check_init(&self, existing: Option<String>, requested: Option<&str>) -> Result<(), RecordError> {
+        match requested {
+            Some(requested) if existing.as_deref() != Some(requested) => {
+                Err(RecordError::InitDiffers { path: self.path.clone(), existing, requested: requested.into() })
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Fails if the given config differs from the one in the folder. Only more generations are allowed. Returns the
+    /// config in the folder, if it can be read.
+    fn compare(&self, config: &Config, found: &mut Resumed, checkpoints: bool) -> Result<Option<Config>, RecordError> {
+        let path = self.file(CONFIG);
+        match Config::load(&path) {
+            Ok(before) => {
+                let (existing, requested) = (before.learning.generations, config.learning.generations);
+                let mut as_long = before.clone();
+                as_long.learning.generations = requested;
+                if existing > requested && differences(&as_long, config).is_empty() {
+                    return Err(RecordError::Shorter { path: self.path.clone(), existing, requested });
+                }
+                let differences = differences(if existing < requested { &as_long } else { &before }, config);
+                if !differences.is_empty() {
+                    return Err(RecordError::ConfigDiffers { path: self.path.clone(), differences });
+                }
+                Ok(Some(before))
+            }
+            Err(_) if !path.exists() && !checkpoints => Ok(None),
+            Err(error) => {
+                found.notes.push(Note::Rewritten(error.to_string()));
+                Ok(None)
+            }
+        }
+    }
+
+    /// Reads all metrics of a finished run. Returns the first and the last generation, and the digests.
+    ///
+    /// The run digest is the SHA-256 of `metrics.csv` without `seconds` and `stage`, then of the policies of every
+    /// trial as in their file (f32, little-endian). All runs of a config have the same digest, on any backend and after
+    /// any number of resumes.
+    ///
+    /// # Errors
+    /// The metrics cannot be read, or they do not have exactly one row per trial and generation.
+    pub fn digest(
+        &self,
+        config: &Config,
+        policies: &[impl AsRef<[f32]>],
+    ) -> Result<(FirstAndLastRows, RunSums), RecordError> {
+        let path = self.file(METRICS);
+        let damaged = |reason: String| RecordError::damaged(&path, reason);
+        let mut rows = metrics::open(&path)?;
+        let (trials, last) = (config.learning.trials, config.learning.generations);
+        let mut ends = FirstAndLastRows { first: vec![], last: vec![] };
+        let mut count = 0;
+        for row in &mut rows {
+            let (row, _) = row.map_err(|error| match error {
+                RowsError::Read(error) => RecordError::read(&path)(error),
+                wrong => RecordError::damaged(&path, wrong),
+            })?;
+            if (row.generation, row.trial) != (count / trials, count % trials) {
+                let (generation, trial) = (count / trials, count % trials);
+                return Err(damaged(format!("line {} is not trial {trial}, generation {generation}", count + 2)));
+            }
+            if row.generation == 0 {
+                ends.first.push(row);
+            }
+            if row.generation == last {
+                ends.last.push(row);
+            }
+            count += 1;
+        }
+        if count != trials * (last + 1) {
+            return Err(damaged(format!("it has {count} rows, not {}", trials * (last + 1))));
+        }
+        let mut hash: Sha256 = rows.digest();
+        let metrics = hex(&hash.clone().finalize());
+        policies.iter().for_each(|weights| hash.update(bytemuck::cast_slice::<f32, u8>(weights.as_ref())));
+        Ok((ends, RunSums { run: hex(&hash.finalize()), metrics }))
+    }
+
+    /// Returns the results of a finished run, or `None` if a file has changed since the run ended.
+    fn finished(&self, run: &Run, config: &Config) -> Result<Option<FirstAndLastRows>, RecordError> {
+        let Some(digest) = run.digest.as_ref().filter(|_| run.state == Status::Done) else { return Ok(None) };
+        if run.generations != config.learning.generations + 1 {
+            return Ok(None);
+        }
+        if run.origin.as_ref().is_some_and(|origin| *origin != Origin::of(config)) {
+            return Ok(None);
+        }
+        let path = self.file(POLICIES);
+        let policies = policies::read_all(&path, config);
+        let (of_config, checksum) = policies::digests_in(&path);
+        if policies.is_ok() && of_config != Some(config_digest(config)) {
+            return Ok(None);
+        }
+        let same = |found: &RunSums| {
+            let files = run.files.as_ref();
+            let same = files.is_none_or(|it| it.metrics == found.metrics && Some(&it.policies) == checksum.as_ref());
+            found.run == *digest && same
+        };
+        match policies.and_then(|policies| self.digest(config, &policies)) {
+            Ok((rows, found)) => Ok(same(&found).then_some(rows)),
+            // Missing or damaged files are written again. A file that cannot be read now may still be intact, so that
+            // is an error.
+            Err(RecordError::Read { path, error }) if error.kind() != ErrorKind::NotFound => {
+                Err(RecordError::Read { path, error })
+            }
+            Err(_) => Ok(None),
+        }
+    }
+}
+
+/// Returns a line for each key in which two configs differ. Keys without influence on the results are ignored.
+pub fn differences(old: &Config, new: &Config) -> Vec<String> {
+    let table = |config: &Config| toml::Table::try_from(without_checkpoint(config)).unwrap_or_default();
+    let (old, new) = (table(old), table(new));
+    let mut differences = Vec::new();
+    for (section, keys) in &new {
+        for (key, value) in keys.as_table().into_iter().flatten() {
+            let before = old.get(section).and_then(|keys| keys.get(key));
+            if before != Some(value) {
+                let before = before.map_or("nothing".to_string(), shorten);
+                differences.push(format!("  {section}.{key}: {before} there, {} here", shorten(value)));
+            }
+        }
+    }
+    let stage = |table: &toml::Table, index: usize| table.get("stages")?.as_array()?.get(index).cloned();
+    for index in 0..MAX_STAGES {
+        match [stage(&old, index), stage(&new, index)] {
+            [None, None] => break,
+            [existing, requested] if existing == requested => {}
+            [existing, requested] => {
+                let describe = |stage: Option<toml::Value>| stage.as_ref().map_or("nothing".into(), shorten);
+                differences.push(format!(
+                    "  stages[{index}]: {} there, {} here",
+                    describe(existing),
+                    describe(requested)
+                ));
+            }
+        }
+    }
+    differences
+}
+
+fn shorten(value: &toml::Value) -> String {
+    let text = value.to_string();
+    if text.len() > 60 { text.chars().take(60).chain(['…']).collect() } else { text }
+}

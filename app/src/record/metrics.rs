@@ -1,0 +1,293 @@
+//! `metrics.csv`: the scores of every trial in every generation.
+//!
+//! The file has one line per trial and generation, sorted by generation and then by trial. G is in 0..1. `seconds` is
+//! the training time until the line was complete, including earlier sessions of a resumed run.
+//!
+//! If the config has stages, a last column `stage` gives the stage of the generation, from 0. G then refers to the POIs
+//! of that stage. All columns except `seconds` have the same bits on every backend.
+
+use std::fs::File;
+use std::io::{self, BufRead, BufReader, BufWriter, Read, Write};
+use std::path::Path;
+
+use sha2::{Digest, Sha256};
+
+use super::disk::{Disk, Output};
+use super::{RecordError, hex};
+use flotilla::config::{Config, MAX_GENERATIONS, MAX_TRIALS};
+use flotilla::file;
+use flotilla::trainer::Row;
+pub use flotilla::trainer::digest::digest;
+use flotilla::trainer::digest::line as shared;
+
+/// Header of the file.
+pub const HEADER: &str = "trial,generation,best_g,mean_g,champion_g,seconds";
+/// Header of the file if the config has stages.
+pub(crate) const STAGED: &str = "trial,generation,best_g,mean_g,champion_g,seconds,stage";
+/// Maximum number of bytes per line.
+const MAX_LINE: u64 = 256;
+
+/// Length and hash of a file at some moment. A resumed run uses them to find that place again.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Extent {
+    /// Length in bytes.
+    pub bytes: u64,
+    /// SHA-256 of these bytes.
+    pub sha256: String,
+}
+
+impl Extent {
+    /// Returns the extent of a whole text.
+    pub fn after(text: &str) -> Extent {
+        Extent { bytes: text.len() as u64, sha256: hex(&Sha256::digest(text)) }
+    }
+}
+
+/// Formatter for the lines of a config's file. Each line includes its line break.
+pub struct Lines {
+    /// First generation of each stage after stage 0, and whether the file has the column `stage`.
+    stages: Vec<usize>,
+    staged: bool,
+}
+
+impl Lines {
+    /// Creates the formatter for runs of this config.
+    pub fn of(config: &Config) -> Lines {
+        let stages = config.stages.iter().map(|stage| stage.from).filter(|&from| from > 0).collect();
+        Lines { stages, staged: !config.stages.is_empty() }
+    }
+
+    /// Returns the header.
+    pub fn header(&self) -> String {
+        format!("{}\n", if self.staged { STAGED } else { HEADER })
+    }
+
+    /// Returns the line of a row. `seconds` is the training time until the row was complete.
+    pub fn line(&self, row: &Row, seconds: f64) -> String {
+        let stage = self.stages.partition_point(|&from| from <= row.generation);
+        let stage = if self.staged { format!(",{stage}") } else { String::new() };
+        format!("{},{seconds:.3}{stage}\n", shared(row))
+    }
+}
+
+/// A metrics file that is being written.
+pub struct Writer {
+    output: BufWriter<Output>,
+    bytes: u64,
+    hash: Sha256,
+    lines: Lines,
+}
+
+impl Writer {
+    /// Creates a file with its header and replaces any other file.
+    ///
+    /// # Errors
+    /// Returns the system's error.
+    pub fn create(disk: &Disk, path: &Path, config: &Config) -> io::Result<Writer> {
+        let output = BufWriter::new(disk.create(path)?);
+        let mut writer = Writer { output, bytes: 0, hash: Sha256::new(), lines: Lines::of(config) };
+        writer.write(&writer.lines.header())?;
+        writer.output.flush()?;
+        Ok(writer)
+    }
+
+    /// Continues a file at a mark and drops everything after it. Returns `None` if the file is missing or its content
+    /// up to the mark has changed.
+    ///
+    /// # Errors
+    /// Returns the system's error.
+    pub fn resume(disk: &Disk, path: &Path, mark: &Extent, config: &Config) -> io::Result<Option<Writer>> {
+        let mut hash = Sha256::new();
+        let mut file = match file::open(path) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+            file => BufReader::new(file?).take(mark.bytes),
+        };
+        // A run that was shortened to end before its later stages keeps the column `stage`.
+        let mut first = Vec::new();
+        file.by_ref().take(MAX_LINE).read_until(b'\n', &mut first)?;
+        hash.update(&first);
+        let lines = Lines { staged: first.starts_with(STAGED.as_bytes()), ..Lines::of(config) };
+        let mut chunk = [0; 1 << 14];
+        loop {
+            match file.read(&mut chunk)? {
+                0 => break,
+                read => hash.update(&chunk[..read]),
+            }
+        }
+        if file.limit() > 0 || hex(&hash.clone().finalize()) != mark.sha256 {
+            return Ok(None);
+        }
+        let output = BufWriter::new(disk.append(path, mark.bytes)?);
+        Ok(Some(Writer { output, bytes: mark.bytes, hash, lines }))
+    }
+
+    fn write(&mut self, line: &str) -> io::Result<()> {
+        self.bytes += line.len() as u64;
+        self.hash.update(line);
+        self.output.write_all(line.as_bytes())
+    }
+
+    /// Adds rows that became complete after `seconds` of training.
+    ///
+    /// # Errors
+    /// Returns the system's error.
+    pub fn add(&mut self, rows: &[Row], seconds: f64) -> io::Result<()> {
+        rows.iter().try_for_each(|row| self.write(&self.lines.line(row, seconds)))
+    }
+
+    /// Passes all lines to the system, so that other processes can read them.
+    ///
+    /// # Errors
+    /// Returns the system's error.
+    pub fn flush(&mut self) -> io::Result<()> {
+        self.output.flush()
+    }
+
+    /// Returns the current extent, and the file, so that the caller can flush this part to the disk.
+    ///
+    /// # Errors
+    /// Returns the system's error.
+    pub fn mark(&mut self) -> io::Result<(Extent, Output)> {
+        self.output.flush()?;
+        let sha256 = hex(&self.hash.clone().finalize());
+        Ok((Extent { bytes: self.bytes, sha256 }, self.output.get_ref().share()?))
+    }
+}
+
+/// Reports whether a file starts like a metrics file. The header may be incomplete.
+///
+/// # Errors
+/// Returns the system's error.
+pub(crate) fn begins(path: &Path) -> io::Result<bool> {
+    let mut start = Vec::new();
+    file::open(path)?.take("trial,generation,".len() as u64).read_to_end(&mut start)?;
+    Ok(HEADER.as_bytes().starts_with(&start))
+}
+
+/// Reason why the rows of a file are rejected.
+#[derive(Debug, thiserror::Error)]
+pub enum RowsError {
+    /// An incomplete or overlong line, such as the last line of a file that is still being written.
+    #[error("line {0} is cut short or longer than {MAX_LINE} bytes")]
+    CutShort(usize),
+    /// A line that is not a row, or a row in the wrong place.
+    #[error("line {line} is not {what}")]
+    Wrong {
+        /// Line number, from 1.
+        line: usize,
+        /// The columns that the line should contain.
+        what: String,
+    },
+    /// The system returned an error.
+    #[error("cannot be read: {0}")]
+    Read(#[from] io::Error),
+}
+
+/// Iterator over the rows of a file, each with its seconds. It stops at the first error.
+pub struct Rows<R> {
+    source: R,
+    line: usize,
+    done: bool,
+    /// Whether each line has a stage after the seconds.
+    staged: bool,
+    /// SHA-256 of all lines without their seconds and stages.
+    hash: Sha256,
+}
+
+impl<R: BufRead> Rows<R> {
+    /// Reads the header of a metrics file.
+    ///
+    /// # Errors
+    /// The first line is not the header.
+    pub fn new(source: R) -> Result<Rows<R>, RowsError> {
+        let mut rows = Rows { source, line: 0, done: false, staged: false, hash: Sha256::new() };
+        match rows.line() {
+            Ok(Some(header)) if header == HEADER => Ok(rows),
+            Ok(Some(header)) if header == STAGED => {
+                // The digest must not depend on the column `stage`, so the plain header is hashed.
+                let mut hash = Sha256::new();
+                hash.update(without_last(HEADER));
+                hash.update("\n");
+                Ok(Rows { staged: true, hash, ..rows })
+            }
+            Err(error @ RowsError::Read(_)) => Err(error),
+            _ => Err(RowsError::Wrong { line: 1, what: HEADER.into() }),
+        }
+    }
+
+    fn line(&mut self) -> Result<Option<String>, RowsError> {
+        self.line += 1;
+        let mut line = Vec::new();
+        if (&mut self.source).take(MAX_LINE).read_until(b'\n', &mut line)? == 0 {
+            return Ok(None);
+        }
+        if line.pop() != Some(b'\n') {
+            return Err(RowsError::CutShort(self.line));
+        }
+        let line = String::from_utf8(line).map_err(|_| self.wrong("UTF-8 text"))?;
+        self.hash.update(without_last(if self.staged { without_last(&line) } else { &line }));
+        self.hash.update("\n");
+        Ok(Some(line))
+    }
+
+    fn wrong(&self, what: impl Into<String>) -> RowsError {
+        RowsError::Wrong { line: self.line, what: what.into() }
+    }
+
+    fn row(&mut self) -> Result<Option<(Row, f64)>, RowsError> {
+        let Some(line) = self.line()? else { return Ok(None) };
+        let parse = || {
+            let mut fields = line.split(',');
+            let mut field = || fields.next();
+            let row = Row {
+                experiment: 0,
+                trial: field()?.parse().ok().filter(|&trial| trial < MAX_TRIALS)?,
+                generation: field()?.parse().ok().filter(|&generation| generation <= MAX_GENERATIONS)?,
+                best_g: share(field()?)?,
+                mean_g: share(field()?)?,
+                champion_g: share(field()?)?,
+            };
+            let seconds = field()?.parse().ok().filter(|seconds: &f64| seconds.is_finite() && *seconds >= 0.0)?;
+            let whole = !self.staged || field()?.parse::<usize>().is_ok();
+            (whole && fields.next().is_none()).then_some((row, seconds))
+        };
+        let header = if self.staged { STAGED } else { HEADER };
+        parse().map(Some).ok_or_else(|| self.wrong(format!("{header} with every G in 0..1")))
+    }
+
+    /// Returns the SHA-256 of all lines that were read, without seconds and stages.
+    pub fn digest(self) -> Sha256 {
+        self.hash
+    }
+}
+
+/// Returns a line without its last field.
+fn without_last(line: &str) -> &str {
+    line.rsplit_once(',').map_or("", |(before, _)| before)
+}
+
+fn share(text: &str) -> Option<f64> {
+    text.parse().ok().filter(|share| (0.0..=1.0).contains(share))
+}
+
+impl<R: BufRead> Iterator for Rows<R> {
+    type Item = Result<(Row, f64), RowsError>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        if self.done {
+            return None;
+        }
+        let row = self.row().transpose();
+        self.done = !matches!(row, Some(Ok(_)));
+        row
+    }
+}
+
+/// Opens the metrics of a run.
+///
+/// # Errors
+/// The file is missing or has another header.
+pub fn open(path: &Path) -> Result<Rows<BufReader<File>>, RecordError> {
+    let file = file::open(path).map_err(RecordError::read(path))?;
+    Rows::new(BufReader::new(file)).map_err(|reason| RecordError::damaged(path, reason))
+}

@@ -1,0 +1,227 @@
+//! `policies.safetensors`: the policies that a run learned.
+//!
+//! The file has one f32 tensor `weights.N` per trial, `[leaders, policies, parameters]`. The first size is 1 if all
+//! leaders share a policy. Each population is sorted with the best policy first. The first policies of all populations
+//! therefore form the champion team of the trial.
+//!
+//! The metadata key `layers` is the shape of the network, such as "8,10,2". The key `config` is the digest of the
+//! config of the training. Other programs may write such files too, also with a single tensor `weights`.
+
+use std::collections::BTreeMap;
+use std::io::{self, Read, Seek, Write};
+use std::path::Path;
+
+use safetensors::tensor::Dtype;
+use sha2::{Digest, Sha256};
+
+use super::RecordError;
+use super::disk::Disk;
+use super::tensors::{self, Tensor, TensorFile};
+use flotilla::config::{Config, MAX_POPULATION, Sharing};
+use flotilla::escape;
+use flotilla::evolve::{MAX_WEIGHT, flush_and_validate};
+
+const KIND: &str = "policies 1";
+/// Name of a tensor that applies to all trials.
+const ALL: &str = "weights";
+/// Metadata key of the config's [`super::config_digest`].
+pub(super) const CONFIG: &str = "config";
+
+/// Policies of one trial.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Policies {
+    /// Number of policies per population.
+    pub policies: usize,
+    /// Whether all leaders share a policy.
+    pub sharing: Sharing,
+    /// Parameters, `[leaders][policies][parameters]`, or `[1][policies][parameters]` if all leaders share a policy.
+    pub weights: Vec<f32>,
+}
+
+/// Returns the name of the tensor of a trial.
+fn tensor(trial: usize) -> String {
+    format!("weights.{trial}")
+}
+
+/// Returns the layer widths of a config's policies, such as "8,10,2".
+pub fn layers(config: &Config) -> String {
+    config.policy.widths().iter().map(ToString::to_string).collect::<Vec<_>>().join(",")
+}
+
+/// Writes the policies of all trials of a config, each `[populations][population][parameters]`. Returns the file's
+/// checksum.
+///
+/// # Errors
+/// The file cannot be written. The previous file remains in that case.
+pub fn write(disk: &Disk, path: &Path, config: &Config, trials: &[impl AsRef<[f32]>]) -> Result<String, RecordError> {
+    let mut checksum = String::new();
+    let content = |output: &mut dyn Write| put(output, config, trials).map(|sum| checksum = sum);
+    disk.replace(path, content).map_err(RecordError::write(path))?;
+    Ok(checksum)
+}
+
+/// Reports whether a file can be read and belongs to a run of this config.
+pub(crate) fn belongs_to(path: &Path, config: &Config) -> bool {
+    digests_in(path).0 == Some(super::config_digest(config))
+}
+
+/// Returns the config digest and the checksum in a file. Each is `None` if it is missing or the file cannot be read.
+pub(crate) fn digests_in(path: &Path) -> (Option<String>, Option<String>) {
+    let Ok(file) = tensors::open(path) else { return (None, None) };
+    (file.metadata(CONFIG).map(String::from), file.checksum().map(String::from))
+}
+
+/// Writes the content of such a file to a stream. Returns its checksum.
+///
+/// # Errors
+/// Returns the stream's error.
+pub fn put(output: &mut dyn Write, config: &Config, trials: &[impl AsRef<[f32]>]) -> io::Result<String> {
+    let shape = vec![config.populations(), config.learning.population, config.parameters()];
+    let of_trial = |(trial, weights)| Tensor::floats(tensor(trial), shape.clone(), [weights]);
+    let tensors: Vec<_> = trials.iter().map(AsRef::as_ref).enumerate().map(of_trial).collect();
+    let metadata =
+        BTreeMap::from([("layers".to_string(), layers(config)), (CONFIG.to_string(), super::config_digest(config))]);
+    tensors::put(output, KIND, &metadata, &tensors)
+}
+
+/// Reads the policies of one trial for teams of a config. Trial N is read from the tensor `weights.N`. Without a trial,
+/// the tensor is `weights`, or else `weights.0`. A policy that all leaders share fits any number of leaders.
+///
+/// # Errors
+/// The file is missing or damaged, its shape does not match the config, or its weights are not allowed.
+pub fn read(path: &Path, config: &Config, trial: Option<usize>) -> Result<Policies, RecordError> {
+    let mut file = tensors::open(path)?;
+    from_file(&mut file, config, &[config.learners(), 1], trial).map_err(|reason| match trial {
+        Some(trial) if file.kind().is_none_or(|kind| kind == KIND) && file.info(&tensor(trial)).is_none() => {
+            RecordError::NoTrial { path: path.into(), reason }
+        }
+        _ => RecordError::damaged(path, reason),
+    })
+}
+
+/// Initial policies of a run, instead of random ones.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Init {
+    /// SHA-256 of the file.
+    pub digest: String,
+    /// Policies of each trial. Each has as many populations as the config.
+    pub trials: Vec<Policies>,
+}
+
+/// Reads the initial policies of all trials of a config. Trial i is read from the tensor `weights.i`, or from `weights`
+/// if there is no `weights.i`.
+///
+/// # Errors
+/// See [`read`].
+pub fn read_init(path: &Path, config: &Config) -> Result<Init, RecordError> {
+    let mut hash = Sha256::new();
+    io::copy(&mut flotilla::file::open(path).map_err(RecordError::read(path))?, &mut HashWriter(&mut hash))
+        .map_err(RecordError::read(path))?;
+    let mut file = tensors::open(path)?;
+    let trial = |trial| {
+        let own = file.info(&tensor(trial)).is_some() || file.info(ALL).is_none();
+        from_file(&mut file, config, &[config.populations()], own.then_some(trial))
+    };
+    let trials = (0..config.learning.trials).map(trial).collect::<Result<_, String>>();
+    let trials = trials.map_err(|reason| RecordError::damaged(path, reason))?;
+    Ok(Init { digest: super::hex(&hash.finalize()), trials })
+}
+
+/// Writer that only hashes what is written.
+struct HashWriter<'a>(&'a mut Sha256);
+
+impl Write for HashWriter<'_> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.0.update(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+/// Reads the policies of all trials that a run of this config wrote.
+///
+/// # Errors
+/// See [`read`]. It is also an error if the number of policies is not the config's population size.
+pub fn read_all(path: &Path, config: &Config) -> Result<Vec<Vec<f32>>, RecordError> {
+    let mut file = tensors::open(path)?;
+    let trial = |trial| {
+        let Policies { policies, weights, .. } = from_file(&mut file, config, &[config.populations()], Some(trial))?;
+        let population = config.learning.population;
+        match policies == population {
+            true => Ok(weights),
+            false => Err(format!("{} has {policies} policies of each leader, not {population}", tensor(trial))),
+        }
+    };
+    (0..config.learning.trials)
+        .map(trial)
+        .collect::<Result<_, String>>()
+        .map_err(|reason| RecordError::damaged(path, reason))
+}
+
+/// Reads like [`read`], from any source.
+///
+/// # Errors
+/// Returns a description of the problem.
+pub fn from_source(source: impl Read + Seek, config: &Config, trial: Option<usize>) -> Result<Policies, String> {
+    from_file(&mut TensorFile::open(source)?, config, &[config.learners(), 1], trial)
+}
+
+/// Reads like [`read`], from an open file. `populations` lists the accepted numbers of populations.
+///
+/// # Errors
+/// Returns a description of the problem.
+pub(crate) fn from_file(
+    file: &mut TensorFile<impl Read + Seek>,
+    config: &Config,
+    populations: &[usize],
+    trial: Option<usize>,
+) -> Result<Policies, String> {
+    if let Some(kind) = file.kind().filter(|kind| *kind != KIND) {
+        return Err(format!("it holds {kind:?}, not {KIND:?}"));
+    }
+    let name = match trial {
+        None if file.info(ALL).is_some() => ALL.to_string(),
+        trial => tensor(trial.unwrap_or(0)),
+    };
+    let Some(info) = file.info(&name) else {
+        let mut names = file.names();
+        let more = if names.len() > 8 { ", …" } else { "" };
+        names.truncate(8);
+        names.iter_mut().for_each(|name| *name = escape::line(name).into());
+        return Err(format!("it has no tensor {name}; it has {}{more}", names.join(", ")));
+    };
+    let parameters = config.parameters();
+    let fits = info.dtype == Dtype::F32
+        && matches!(info.shape[..], [l, p, w] if populations.contains(&l) && w == parameters && (1..=MAX_POPULATION).contains(&p));
+    if !fits {
+        return Err(format!(
+            "{name} is {:?} {:?}, but the config needs F32 [{}, 1 to {MAX_POPULATION}, {parameters}] \
+             (leaders{}, policies, parameters of layers {})",
+            info.dtype,
+            info.shape,
+            populations[0],
+            if populations.contains(&1) && populations[0] > 1 { ", or 1 for all" } else { "" },
+            layers(config)
+        ));
+    }
+    if let Some(found) = file.metadata("layers").filter(|found| *found != layers(config)) {
+        return Err(format!("its policies have layers {found:?}, but the config's have {:?}", layers(config)));
+    }
+    let shape = info.shape.clone();
+    let mut weights: Vec<f32> = file.read(&name, Dtype::F32, &shape, 1)?.pop().unwrap_or_default();
+    if let Some(index) = flush_and_validate(&mut weights) {
+        let (policy, parameter) = (index / parameters, index % parameters);
+        return Err(format!(
+            "{name}[{}, {}, {parameter}] is {}, allowed are numbers of size up to {MAX_WEIGHT}",
+            policy / shape[1],
+            policy % shape[1],
+            weights[index]
+        ));
+    }
+    // A single leader shares its policy with nobody.
+    let sharing = if shape[0] == config.learners() { Sharing::PerLeader } else { Sharing::Shared };
+    Ok(Policies { policies: shape[1], sharing, weights })
+}

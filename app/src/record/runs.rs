@@ -1,0 +1,172 @@
+//! Reads the configs and metrics of finished and unfinished runs.
+
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
+
+use super::RecordError;
+use super::digests::{Digests, Verification};
+use super::folder::{self, CONFIG, METRICS, POLICIES};
+use super::metrics::{self, RowsError};
+use super::{finished, policies};
+use flotilla::config::{Config, ConfigError};
+use flotilla::escape::PathExt;
+use flotilla::file;
+use flotilla::front::Trained;
+use flotilla::trainer::Row;
+
+/// The reason why a run cannot be read.
+#[derive(Debug, thiserror::Error)]
+pub enum ReadError {
+    /// The path does not exist.
+    #[error("{}: no such folder", .0.escaped())]
+    Missing(PathBuf),
+    /// The path is a file instead of a folder.
+    #[error("{} is a file; name the folder of a run", .0.escaped())]
+    NoFolder(PathBuf),
+    /// The folder is not a run.
+    #[error("{folder}: not a run directory (it has no {name})", folder = folder.escaped())]
+    Foreign {
+        /// The given folder.
+        folder: PathBuf,
+        /// The missing file that every run has.
+        name: &'static str,
+    },
+    /// The run's config is invalid.
+    #[error("{folder}: {error}", folder = folder.escaped())]
+    Config {
+        /// The given folder.
+        folder: PathBuf,
+        /// The error in the config.
+        error: ConfigError,
+    },
+    /// The folder contains several runs.
+    #[error("{folder} holds {what}; name one of the runs in it, as {folder}/{example}", folder = folder.escaped())]
+    Collection {
+        /// The given folder.
+        folder: PathBuf,
+        /// The kind of its contents, such as "a sweep".
+        what: &'static str,
+        /// The path of a run in it.
+        example: &'static str,
+    },
+    /// The run lacks the requested data.
+    #[error("{folder}: {reason}", folder = folder.escaped())]
+    Unfinished {
+        /// The given folder.
+        folder: PathBuf,
+        /// The missing data.
+        reason: String,
+    },
+    /// The run's files cannot be read.
+    #[error(transparent)]
+    Record(#[from] RecordError),
+}
+
+/// Reads a run's config.
+///
+/// # Errors
+/// The folder does not exist, is not a run, or its config is damaged or was changed after the run.
+pub fn config(folder: &Path, verification: Verification) -> Result<Config, ReadError> {
+    let kind = std::fs::metadata(folder).map_err(|error| match error.kind() {
+        ErrorKind::NotFound => ReadError::Missing(folder.into()),
+        _ => ReadError::Record(RecordError::Read { path: folder.into(), error }),
+    })?;
+    if !kind.is_dir() {
+        return Err(ReadError::NoFolder(folder.into()));
+    }
+    let path = folder.join(CONFIG);
+    if !exists(&path)? {
+        if let Some(what) = folder::collection(folder) {
+            let example = if what == "a sweep" { "points/0000" } else { "arms/chaotic-leader-follower-Df" };
+            return Err(ReadError::Collection { folder: folder.into(), what, example });
+        }
+        return Err(ReadError::Foreign { folder: folder.into(), name: CONFIG });
+    }
+    let config = Config::load(&path).map_err(|error| ReadError::Config { folder: folder.into(), error })?;
+    Digests::read(folder, verification)?.compare_config(&path, &config)?;
+    Ok(config)
+}
+
+/// Reports whether a file exists.
+pub(crate) fn exists(path: &Path) -> Result<bool, RecordError> {
+    file::exists(path).map_err(RecordError::read(path))
+}
+
+/// Calls `each` with every complete row of a run's metrics. A partial last line is ignored, because it is still being
+/// written.
+///
+/// # Errors
+/// The metrics are missing, belong to another run, or were changed after the run. The last error may appear only after
+/// all rows.
+pub fn metrics(
+    folder: &Path,
+    config: &Config,
+    verification: Verification,
+    mut each: impl FnMut(&Row),
+) -> Result<(), ReadError> {
+    let path = folder.join(METRICS);
+    // The digests are read before the metrics, because the run may finish in between.
+    let digests = Digests::read(folder, verification)?;
+    let unfinished = |reason: String| ReadError::Unfinished { folder: folder.into(), reason };
+    if !exists(&path)? {
+        return Err(unfinished(format!("it has no {METRICS} yet")));
+    }
+    let damaged = |reason: String| ReadError::Record(RecordError::Damaged { path: path.clone(), reason });
+    let mut count = 0;
+    let mut rows = metrics::open(&path)?;
+    for row in &mut rows {
+        let row = match row {
+            Ok((row, _)) => row,
+            // A partial last line belongs to a run that is still training or was killed.
+            Err(RowsError::CutShort(_)) => break,
+            Err(error) => return Err(damaged(error.to_string())),
+        };
+        let (trials, generations) = (config.learning.trials, config.learning.generations);
+        if row.trial >= trials || row.generation > generations {
+            let (trial, generation) = (row.trial, row.generation);
+            return Err(damaged(format!(
+                "line {} is trial {trial}, generation {generation}, which the run's {CONFIG} does not have",
+                count + 2
+            )));
+        }
+        each(&row);
+        count += 1;
+    }
+    digests.compare_metrics(&path, rows.digest())?;
+    if count == 0 { Err(unfinished(format!("its {METRICS} has no rows yet"))) } else { Ok(()) }
+}
+
+/// Reads the results of a finished run from its folder.
+///
+/// # Errors
+/// The folder has no finished run, or its files are damaged or were changed after the run.
+pub fn trained(folder: &Path, verification: Verification) -> Result<Trained, ReadError> {
+    let config = config(folder, verification)?;
+    let (mut rows, mut next) = (Vec::new(), vec![0; config.learning.trials]);
+    let mut in_order = true;
+    metrics(folder, &config, verification, |row| {
+        in_order &= next[row.trial] == row.generation;
+        next[row.trial] += 1;
+        rows.push(*row);
+    })?;
+    if !in_order {
+        let path = folder.join(METRICS);
+        let reason = "it must have one row per trial and generation, in order".into();
+        return Err(RecordError::Damaged { path, reason }.into());
+    }
+    let (found, expected) = (rows.len(), config.learning.trials * (config.learning.generations + 1));
+    if found != expected {
+        let reason = format!("its {} has {found} rows of {expected}", METRICS);
+        return Err(ReadError::Unfinished { folder: folder.into(), reason }.into());
+    }
+    let path = folder.join(POLICIES);
+    let policies = policies::read_all(&path, &config)?;
+    let digests = Digests::read(folder, verification)?;
+    let ending = finished::read_ending(folder, &config);
+    let trained = Trained::new(config, &rows, policies, ending);
+    // The config and the metrics match their digests, so the policies must differ.
+    match digests.run {
+        Some(digest) if digest != trained.digest() => Err(RecordError::Differs { path }.into()),
+        _ => Ok(trained),
+    }
+}

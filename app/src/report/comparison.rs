@@ -1,0 +1,515 @@
+//! Compares arms: the mean of every measure over trials with its 95 % interval, and a test of every pair of arms.
+
+use std::fmt::Write;
+use std::io;
+use std::path::PathBuf;
+
+use serde::Serialize;
+
+use super::runs::{self, ReadError};
+use super::table;
+use crate::record::digests::Verification;
+use flotilla::escape::{self, PathExt};
+use flotilla::statistics::{self, Estimate, Tested, power_of};
+
+/// The trials of one arm of a comparison.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Cohort {
+    /// The arm's name, such as "fitness Df".
+    pub name: String,
+    /// The directories of the runs that the trials belong to.
+    pub folders: Vec<PathBuf>,
+    /// The largest number of generations that one of the runs was configured to train.
+    pub planned: usize,
+    /// The trials of all runs, run by run.
+    pub trials: Vec<Trial>,
+}
+
+/// One trial of a run.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Trial {
+    /// The run's seed and the trial's number. Trials of two arms with the same key form a pair.
+    pub key: (u64, usize),
+    /// G of the best team and of the champion, `[generations]`.
+    pub scores: Vec<[f64; 2]>,
+    /// The first generation of the run's last stage; 0 without stages.
+    pub from: usize,
+}
+
+impl Cohort {
+    /// Reads the trials of some runs, which may be unfinished.
+    ///
+    /// # Errors
+    /// A run cannot be read.
+    pub fn read(name: String, folders: Vec<PathBuf>, verification: Verification) -> Result<Cohort, ReadError> {
+        let mut arm = Cohort { name, folders, planned: 0, trials: vec![] };
+        for folder in &arm.folders {
+            let config = runs::config(folder, verification)?;
+            let trials = runs::trials(folder, &config, verification)?.into_iter().enumerate();
+            let from = config.last_from();
+            arm.trials.extend(trials.map(|(trial, scores)| Trial { key: (config.learning.seed, trial), scores, from }));
+            arm.planned = arm.planned.max(config.learning.generations);
+        }
+        Ok(arm)
+    }
+
+    /// Returns the arm's name and its directories, for messages.
+    fn described(&self) -> String {
+        const MAX_NAMED_FOLDERS: usize = 3;
+        let folders: Vec<String> = self.folders.iter().map(|folder| folder.escaped().to_string()).collect();
+        match folders.len().checked_sub(MAX_NAMED_FOLDERS) {
+            _ if folders == [&*self.name] || self.name.ends_with(&format!("({})", folders.concat())) => {
+                self.name.clone()
+            }
+            None | Some(0) => format!("{} ({})", self.name, folders.join(", ")),
+            Some(more) => format!("{} ({} and {more} more)", self.name, folders[..MAX_NAMED_FOLDERS].join(", ")),
+        }
+    }
+
+    /// Returns the last generation that all its trials have reached, if any.
+    fn last(&self) -> Option<usize> {
+        self.trials.iter().map(|trial| trial.scores.len()).min()?.checked_sub(1)
+    }
+
+    fn keys(&self) -> Vec<(u64, usize)> {
+        self.trials.iter().map(|trial| trial.key).collect()
+    }
+}
+
+/// Reports whether all arms have the same seeds and trials, so that their trials form pairs.
+pub fn paired(arms: &[Cohort]) -> bool {
+    arms.iter().all(|arm| arm.keys() == arms[0].keys())
+}
+
+/// A generation to compare at.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum At {
+    /// A given generation, from 0.
+    Generation(usize),
+    /// The last generation that all trials of all arms have reached.
+    Last,
+}
+
+/// Options of a comparison.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Question {
+    /// Generations at which G is compared.
+    pub at: Vec<At>,
+    /// G of the best team, in 0..1. The first generation that reaches it is compared.
+    pub reach: f64,
+    /// Whether trials are compared pair by pair.
+    pub paired: bool,
+}
+
+/// Why arms cannot be compared.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum ComparisonError {
+    /// An arm, by its name, has a single trial.
+    #[error("{0} has one trial; an interval needs two or more")]
+    OneTrial(String),
+    /// The trials of an arm, by its name, have no generation in common.
+    #[error("{0} has no generation that every trial has reached")]
+    TooShort(String),
+    /// Some arms have not reached a requested generation.
+    #[error("the arms have only reached generation {last}; choose one up to that")]
+    Beyond {
+        /// The requested generation.
+        at: usize,
+        /// The last generation that all arms have reached.
+        last: usize,
+    },
+    /// Two arms, by their names, cannot be compared pair by pair.
+    #[error("{0} and {1} have different seeds or numbers of trials, so their trials are no pairs")]
+    NoPairs(String, String),
+}
+
+/// A quantity that is measured in every trial.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[serde(tag = "measure", rename_all = "snake_case")]
+pub enum Measure {
+    /// G of the best team at a generation.
+    BestG {
+        /// The generation, from 0.
+        generation: usize,
+    },
+    /// G of the champion at a generation.
+    ChampionG {
+        /// The generation, from 0.
+        generation: usize,
+    },
+    /// The first generation at which the best team's G is at least `reach`. With stages, only the last stage counts.
+    ///
+    /// A trial that does not reach it by `generation` counts as one that reaches it at the next.
+    GenerationsToReach {
+        /// G to reach, in 0..1.
+        reach: f64,
+        /// The last generation to look at.
+        generation: usize,
+    },
+    /// Mean G of the last champion over episodes in which each POI moves by up to `poi_jitter` on both axes.
+    ///
+    /// With a jitter of 0, POIs stay in place and one episode suffices.
+    Played {
+        /// The largest shift per axis, in world units.
+        poi_jitter: f64,
+        /// Number of episodes.
+        episodes: u32,
+    },
+}
+
+impl Measure {
+    /// Returns the measured value of a trial, or none if the trial's scores do not determine it.
+    fn of(self, trial: &Trial) -> Option<f64> {
+        match self {
+            Measure::BestG { generation } => Some(trial.scores[generation][0]),
+            Measure::ChampionG { generation } => Some(trial.scores[generation][1]),
+            Measure::GenerationsToReach { reach, generation } => {
+                let reached = (trial.from..=generation).find(|&at| trial.scores[at][0] >= reach);
+                Some(reached.unwrap_or(generation + 1) as f64)
+            }
+            Measure::Played { .. } => None,
+        }
+    }
+
+    /// Counts the trials that reached G, if this measures when they do.
+    fn reached(self, values: &[f64]) -> Option<usize> {
+        match self {
+            Measure::GenerationsToReach { generation, .. } => {
+                Some(values.iter().filter(|&&value| value <= generation as f64).count())
+            }
+            _ => None,
+        }
+    }
+
+    /// Returns the number of decimals to print.
+    pub fn digits(self) -> usize {
+        if let Measure::GenerationsToReach { .. } = self { 1 } else { 3 }
+    }
+
+    /// Returns the name of the measure in CSV.
+    fn key(self) -> &'static str {
+        match self {
+            Measure::BestG { .. } => "best_g",
+            Measure::ChampionG { .. } => "champion_g",
+            Measure::GenerationsToReach { .. } => "generations_to_reach",
+            Measure::Played { poi_jitter: 0.0, .. } => "fixed_pois_g",
+            Measure::Played { .. } => "moved_pois_g",
+        }
+    }
+}
+
+impl std::fmt::Display for Measure {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Measure::BestG { generation } => write!(f, "best team's G, generation {generation}"),
+            Measure::ChampionG { generation } => write!(f, "champion's G, generation {generation}"),
+            Measure::GenerationsToReach { reach, .. } => write!(f, "generations to G {reach}"),
+            Measure::Played { poi_jitter: 0.0, .. } => f.write_str("champion's G, POIs where they stand"),
+            Measure::Played { poi_jitter, .. } => write!(f, "champion's G, POIs moved by up to {poi_jitter}"),
+        }
+    }
+}
+
+/// The result of a comparison.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Comparison {
+    /// Settings that all arms of a sweep share, such as "coupling 3". Empty when runs are compared.
+    #[serde(rename = "where")]
+    pub place: String,
+    /// The last generation that all arms have reached.
+    pub generation: usize,
+    /// The arms, in the order given.
+    pub arms: Vec<Named>,
+    /// One result per measure.
+    pub measures: Vec<Measured>,
+    /// Remarks for the reader, such as arms that are unfinished.
+    pub notes: Vec<String>,
+}
+
+/// An arm as output names it.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Named {
+    /// The arm's name, such as "fitness Df".
+    pub name: String,
+    /// The directories of the arm's runs, escaped for output.
+    pub folders: Vec<String>,
+    /// Number of trials.
+    pub trials: usize,
+}
+
+/// The result of one measure.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Measured {
+    /// The measure.
+    #[serde(flatten)]
+    pub measure: Measure,
+    /// Means of the arms, `[arms]`.
+    pub arms: Vec<Mean>,
+    /// Differences between arms, one per pair of arms.
+    pub pairs: Vec<Versus>,
+}
+
+/// The mean over an arm's trials.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Mean {
+    /// The mean with its 95 % interval.
+    #[serde(flatten)]
+    pub mean: Estimate,
+    /// Number of trials that reached G, if that was measured.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub reached: Option<usize>,
+}
+
+/// The difference between two arms.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Versus {
+    /// Indices of the two arms.
+    pub arms: [usize; 2],
+    /// The first arm's mean minus the second's.
+    #[serde(flatten)]
+    pub difference: Estimate,
+    /// The test of the difference.
+    #[serde(flatten)]
+    pub test: Tested,
+    /// The p value with Holm's correction for the number of pairs.
+    pub p_holm: f64,
+}
+
+/// Compares every pair of two or more arms. `place` states what the arms have in common.
+///
+/// # Errors
+/// An arm has too few trials or generations, or pairs were requested and the trials do not form pairs.
+pub fn compare(place: &str, arms: &[Cohort], options: &Question) -> Result<Comparison, ComparisonError> {
+    let mut last = usize::MAX;
+    for arm in arms {
+        if arm.trials.len() < 2 {
+            return Err(ComparisonError::OneTrial(arm.described()));
+        }
+        last = last.min(arm.last().ok_or_else(|| ComparisonError::TooShort(arm.described()))?);
+    }
+    if let Some(other) = arms.iter().find(|arm| options.paired && arm.keys() != arms[0].keys()) {
+        return Err(ComparisonError::NoPairs(arms[0].described(), other.described()));
+    }
+    let mut generations = Vec::new();
+    for &at in &options.at {
+        let at = if let At::Generation(at) = at { at } else { last };
+        if at > last {
+            return Err(ComparisonError::Beyond { at, last });
+        }
+        if !generations.contains(&at) {
+            generations.push(at);
+        }
+    }
+    let best = generations.iter().map(|&generation| Measure::BestG { generation });
+    let champion = generations.iter().map(|&generation| Measure::ChampionG { generation });
+    let reach = Measure::GenerationsToReach { reach: options.reach, generation: last };
+    let measures = best.chain(champion).chain([reach]).map(|measure| {
+        let values = |arm: &Cohort| arm.trials.iter().filter_map(|trial| measure.of(trial)).collect();
+        measured(measure, &arms.iter().map(values).collect::<Vec<_>>(), options.paired)
+    });
+    let measures = measures.collect();
+
+    let mut notes: Vec<String> = arms
+        .iter()
+        .filter_map(|arm| Some((arm, arm.last().filter(|&come| come < arm.planned)?)))
+        .map(|(arm, come)| format!("{} has reached generation {come} of {}", arm.name, arm.planned))
+        .collect();
+    if arms.iter().any(|arm| arm.planned > last) {
+        notes.push(format!("arms are compared up to generation {last}, which all have reached"));
+    }
+    let named = |arm: &Cohort| Named {
+        name: arm.name.clone(),
+        folders: arm.folders.iter().map(|folder| folder.escaped().to_string()).collect(),
+        trials: arm.trials.len(),
+    };
+    Ok(Comparison { place: place.into(), generation: last, arms: arms.iter().map(named).collect(), measures, notes })
+}
+
+/// Compares two or more arms by given values per measure, `[arms][trials]` each.
+///
+/// # Errors
+/// An arm has fewer than two trials.
+pub fn of_values(
+    place: &str,
+    generation: usize,
+    arms: Vec<Named>,
+    values: Vec<(Measure, Vec<Vec<f64>>)>,
+) -> Result<Comparison, ComparisonError> {
+    if let Some(arm) = arms.iter().find(|arm| arm.trials < 2) {
+        return Err(ComparisonError::OneTrial(arm.name.clone()));
+    }
+    let measures = values.iter().map(|(measure, values)| measured(*measure, values, false)).collect();
+    Ok(Comparison { place: place.into(), generation, arms, measures, notes: vec![] })
+}
+
+/// Evaluates one measure of values `[arms][trials]` with at least two trials per arm.
+fn measured(measure: Measure, values: &[Vec<f64>], paired: bool) -> Measured {
+    let two = "arms of two trials or more";
+    let means = values
+        .iter()
+        .map(|values| Mean { mean: statistics::bootstrap(&[values]).expect(two), reached: measure.reached(values) });
+    let mut pairs = Vec::new();
+    for (first, one) in values.iter().enumerate() {
+        for (second, other) in values.iter().enumerate().skip(first + 1) {
+            let (difference, test) = if paired {
+                let less: Vec<f64> = one.iter().zip(other).map(|(one, other)| one - other).collect();
+                (statistics::bootstrap(&[&less]), statistics::signed_rank(&less))
+            } else {
+                (statistics::bootstrap(&[one, other]), statistics::rank_sum(one, other))
+            };
+            let (difference, test) = (difference.expect(two), test.expect(two));
+            pairs.push(Versus { arms: [first, second], difference, test, p_holm: 0.0 });
+        }
+    }
+    let corrected = statistics::holm(&pairs.iter().map(|pair| pair.test.p).collect::<Vec<_>>());
+    pairs.iter_mut().zip(corrected).for_each(|(pair, p)| pair.p_holm = p);
+    Measured { measure, arms: means.collect(), pairs }
+}
+
+impl Comparison {
+    /// Returns a table with one row per arm and one column per measure.
+    pub fn means(&self) -> Vec<Vec<String>> {
+        let mut head = vec!["arm".to_string(), "trials".into()];
+        head.extend(self.measures.iter().map(|measured| measured.measure.to_string()));
+        let rows = self.arms.iter().enumerate().map(|(at, arm)| {
+            let cell = |Measured { measure, arms, .. }: &Measured| {
+                let reached = arms[at].reached.map_or(String::new(), |count| format!(" ({count} of {})", arm.trials));
+                estimate(arms[at].mean, measure.digits(), false) + &reached
+            };
+            [arm.name.clone(), arm.trials.to_string()].into_iter().chain(self.measures.iter().map(cell)).collect()
+        });
+        [head].into_iter().chain(rows).collect()
+    }
+
+    /// Returns a table with one row per measure and pair.
+    pub fn pairs(&self) -> Vec<Vec<String>> {
+        let head = ["measure", "pair", "difference", "A", "p", "p (Holm)"].map(String::from).to_vec();
+        let row = |measure: Measure, pair: &Versus| {
+            let names = pair.arms.map(|arm| &*self.arms[arm].name);
+            let difference = estimate(pair.difference, measure.digits(), true);
+            let (a, p) = (format!("{:.2}", pair.test.a), [pair.test.p, pair.p_holm].map(probability));
+            [vec![measure.to_string(), names.join(" − "), difference, a], p.to_vec()].concat()
+        };
+        let rows = self
+            .measures
+            .iter()
+            .flat_map(|Measured { measure, pairs, .. }| pairs.iter().map(|pair| row(*measure, pair)));
+        [head].into_iter().chain(rows).collect()
+    }
+}
+
+/// Formats an estimate as "0.92 [0.86, 0.97]", with typographic minus signs.
+pub fn estimate(Estimate { value, low, high }: Estimate, digits: usize, signed: bool) -> String {
+    // Adding 0.0 turns -0.0 into 0.0, which prints no sign.
+    let [value, low, high] = [value, low, high].map(|x| {
+        let tens = power_of(10.0, digits);
+        (x * tens).round() / tens + 0.0
+    });
+    let value = if signed { format!("{value:+.digits$}") } else { format!("{value:.digits$}") };
+    format!("{value} [{low:.digits$}, {high:.digits$}]").replace('-', "−")
+}
+
+/// Formats a probability as "0.042" or "< 0.001".
+pub fn probability(p: f64) -> String {
+    if p < 0.001 { "< 0.001".into() } else { format!("{p:.3}") }
+}
+
+/// Explains how to read the tables.
+pub fn legend(all: &[Comparison], options: &Question) -> String {
+    let (test, a) = match options.paired {
+        true => ("Wilcoxon's signed-rank test", "the first arm's trial of a pair"),
+        false => ("the Mann-Whitney test", "a random trial of the first arm"),
+    };
+    let mut text = format!(
+        "Values are means over trials, with 95 % bootstrap intervals.\n\
+         Differences are the first arm minus the second.\n\
+         A is the probability that {a} has the larger value; 0.5 means no difference.\n\
+         p is two-sided, by {test}. Holm's correction is for the number of pairs.\n"
+    );
+    let never = |measured: &Measured, all: &Comparison| {
+        measured.arms.iter().zip(&all.arms).any(|(mean, arm)| mean.reached.is_some_and(|reached| reached < arm.trials))
+    };
+    if all.iter().any(|all| all.measures.iter().any(|measured| never(measured, all))) {
+        let _ = writeln!(
+            text,
+            "A trial that never reaches G {} counts as if it reached it one generation after the last.",
+            options.reach
+        );
+    }
+    text
+}
+
+/// Returns the comparisons as Markdown tables with a legend.
+pub fn text(all: &[Comparison], options: &Question) -> String {
+    let mut text = String::new();
+    for comparison in all {
+        if !comparison.place.is_empty() {
+            let _ = writeln!(text, "{}\n", comparison.place);
+        }
+        let _ = writeln!(text, "{}\n{}", table::markdown(&comparison.means()), table::markdown(&comparison.pairs()));
+    }
+    text + &legend(all, options)
+}
+
+/// Returns two LaTeX tables per comparison, with the legend as comments.
+pub fn latex(all: &[Comparison], options: &Question) -> String {
+    let comment = |text: &str| text.lines().map(|line| format!("% {line}\n")).collect::<String>();
+    let mut text = comment(&legend(all, options));
+    for comparison in all {
+        text += &comment(&comparison.place);
+        let _ = writeln!(text, "{}\n{}", table::latex(&comparison.means()), table::latex(&comparison.pairs()));
+    }
+    text
+}
+
+/// Writes the comparisons as CSV: one row per measure and arm, then one per measure and pair.
+///
+/// # Errors
+/// The output cannot be written.
+pub fn csv(all: &[Comparison], output: impl io::Write) -> io::Result<()> {
+    let mut table = csv::Writer::from_writer(output);
+    table.write_record([
+        "where",
+        "measure",
+        "generation",
+        "reach",
+        "arm",
+        "other",
+        "trials",
+        "other_trials",
+        "value",
+        "low",
+        "high",
+        "reached",
+        "a",
+        "p",
+        "p_holm",
+    ])?;
+    for Comparison { place, generation: last, arms: named, measures, .. } in all {
+        for Measured { measure, arms, pairs } in measures {
+            let (generation, reach) = match *measure {
+                Measure::BestG { generation } | Measure::ChampionG { generation } => (generation, String::new()),
+                Measure::GenerationsToReach { reach, generation } => (generation, reach.to_string()),
+                Measure::Played { .. } => (*last, String::new()),
+            };
+            let place =
+                || [escape::csv_cell(place).into_owned(), measure.key().into(), generation.to_string(), reach.clone()];
+            let numbers = |Estimate { value, low, high }| [value, low, high].map(|number: f64| number.to_string());
+            for (arm, Mean { mean, reached }) in named.iter().zip(arms) {
+                let name = escape::csv_cell(&arm.name).into_owned();
+                let whose = [name, String::new(), arm.trials.to_string(), String::new()];
+                let reached = reached.map_or(String::new(), |count| count.to_string());
+                let rest = [reached, String::new(), String::new(), String::new()];
+                table.write_record([&place()[..], &whose, &numbers(*mean), &rest].concat())?;
+            }
+            for Versus { arms, difference, test, p_holm } in pairs {
+                let [one, other] = arms.map(|arm| &named[arm]);
+                let names = [one, other].map(|arm| escape::csv_cell(&arm.name).into_owned());
+                let whose = [names, [one, other].map(|arm| arm.trials.to_string())].concat();
+                let rest = [String::new(), test.a.to_string(), test.p.to_string(), p_holm.to_string()];
+                table.write_record([&place()[..], &whose, &numbers(*difference), &rest].concat())?;
+            }
+        }
+    }
+    table.flush()
+}

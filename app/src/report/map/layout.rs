@@ -1,0 +1,109 @@
+//! The layout of a config before training.
+
+use glam::DVec2;
+
+use super::{Legend, Marker, Poi, Team, Viewport, counted, poi_label};
+use crate::report::scene::{Anchor, BLACK, Scene};
+use flotilla::config::{Config, Observers};
+use flotilla::model::rule::Rule;
+use flotilla::world::World;
+
+/// Draws the layout of a config before training: start positions, headings and the coupling of each POI.
+pub fn layout(name: &str, config: &Config) -> Scene {
+    const LEFT: f64 = 11.0;
+    const EDGE: f64 = 3.0;
+    const HEAD: f64 = 6.5;
+    let world = World::new(config);
+    let leaders = world.leaders();
+    let agent = |(index, start): (usize, &glam::Vec2)| Marker {
+        place: start.as_dvec2(),
+        heading: world.headings[index].as_dvec2(),
+        group: (index < leaders).then_some(index),
+        counts: world.rule.counts(index),
+        trail: vec![],
+    };
+    let none = vec![false; world.pois.len()];
+    let poi = |(poi, (&place, needed)): (usize, (&[f64; 2], &u32))| Poi {
+        place: place.into(),
+        label: poi_label(&world.rule, poi, needed.to_string()),
+        share: None,
+        observed: false,
+        open: world.rule.is_open(poi, 1, &none),
+    };
+    let team = Team {
+        leaders,
+        agents: world.starts.iter().enumerate().map(agent).collect(),
+        pois: config.world.pois.iter().zip(&world.coupling).enumerate().map(poi).collect(),
+    };
+    let map = DVec2::from(config.world.map);
+    let view = Viewport::new(config, [DVec2::ZERO, map], 80.0).moved_to([LEFT, HEAD]);
+    let [width, height] = view.size();
+    let radius = config.world.observation_radius;
+    let mut legend = Legend::new(&view, std::slice::from_ref(&team), "");
+    let alike = world.coupling.windows(2).all(|pair| pair[0] == pair[1]);
+    let needs = match (world.coupling.first(), view.poi_labels(&team)) {
+        (_, Some(_)) if world.rule.is_timed() => {
+            format!("at a POI: its number, agents it needs within {radius} of it, and when")
+        }
+        (_, Some(_)) => format!("number at a POI: agents it needs, within {radius} of it"),
+        (Some(&needed), None) if alike => {
+            format!("each POI needs {} within {radius} of it", counted(needed as usize, "agent"))
+        }
+        _ => format!("what each POI needs has no room here; it counts within {radius} of it"),
+    };
+    legend.note(needs);
+    if config.learning.start_jitter > 0.0 {
+        legend.note(format!("starts move by up to {} on each axis", config.learning.start_jitter));
+    }
+    if config.learning.poi_jitter > 0.0 {
+        legend.note(format!("POIs move by up to {} on each axis", config.learning.poi_jitter));
+    }
+    let whole = LEFT + width.max(50.0) + EDGE;
+    let room = whole - 2.0 * EDGE;
+    let mut scene = Scene::new(whole, HEAD + height + 9.5 + legend.height(room) + 0.5);
+    let followers = world.followers();
+    let described = format!(
+        "{}, {}, {}",
+        counted(leaders, "leader"),
+        counted(followers, "follower"),
+        counted(team.pois.len(), "POI")
+    );
+    scene.bold([EDGE, 4.2], described.clone(), 3.0, Anchor::Start, BLACK);
+    view.draw(&mut scene, &team);
+    view.rule(&mut scene);
+    legend.draw(&mut scene, [EDGE, HEAD + height + 11.8], room);
+    scene.title = format!("The layout of {name}: {described}");
+    let couplings = match (world.coupling.iter().min(), world.coupling.iter().max()) {
+        (Some(least), Some(most)) if least == most => {
+            format!("Each POI needs {} near at once", counted(*least as usize, "agent"))
+        }
+        (Some(least), Some(most)) => format!("A POI needs {least} to {most} agents near at once"),
+        _ => String::new(),
+    };
+    let places = |what: &str, places: &[DVec2]| {
+        let list: Vec<_> = places.iter().take(12).map(|place| format!("({}, {})", place.x, place.y)).collect();
+        let more = if places.len() > 12 { ", …" } else { "" };
+        format!("{what} at {}{more}. ", list.join(", "))
+    };
+    let who = match config.world.observers {
+        Observers::All => String::new(),
+        observers => format!(" Only {observers} observe."),
+    };
+    let timed = if world.rule.is_timed() { pois_in_words(&world.rule, world.pois.len()) } else { String::new() };
+    let starts: Vec<DVec2> = team.agents[..leaders].iter().map(|agent| agent.place).collect();
+    let pois: Vec<DVec2> = team.pois.iter().map(|poi| poi.place).collect();
+    scene.description = format!(
+        "A map of {} by {} units before any training. {}{}{couplings}, within {radius} of it.{who}{timed}",
+        map.x,
+        map.y,
+        places("Leaders", &starts),
+        places("POIs", &pois),
+    );
+    scene
+}
+
+/// Describes when POIs can be observed, for at most 12 of them.
+fn pois_in_words(rule: &Rule, pois: usize) -> String {
+    let list: Vec<_> = (0..pois.min(12)).map(|poi| poi_label(rule, poi, "any time".into())).collect();
+    format!(" POIs can be observed: {}{}.", list.join("; "), if pois > 12 { "; …" } else { "" })
+}

@@ -1,0 +1,406 @@
+//! A team on its map at one moment: agents with trails and numbers, and POIs with their couplings.
+//!
+//! [`Legend`] is below the map. [`layout()`] draws a config before training.
+
+use glam::DVec2;
+
+use super::curves::round_step;
+use super::scene::{Anchor, BLACK, COLORS, Color, Fill, GREY, LIGHT, Pen, Scene, WHITE, text_width};
+use flotilla::config::Config;
+use flotilla::model::rule::Rule;
+
+mod layout;
+mod legend;
+
+pub use layout::layout;
+pub(crate) use legend::Legend;
+
+/// Colours of leaders and their followers on white. Green is reserved for observed POIs and grey for agents without a
+/// group.
+///
+/// Each colour was chosen to be as far as possible from all others for normal and red- or green-blind vision. All have
+/// a contrast of at least 3 to 1 to white.
+pub const GROUPS: [Color; 16] = [
+    [0x00, 0x72, 0xb2],
+    [0xd5, 0x5e, 0x00],
+    [0x99, 0x33, 0x88],
+    [0x66, 0x55, 0x11],
+    [0x99, 0x77, 0xff],
+    [0x55, 0x22, 0x66],
+    [0x00, 0x00, 0xbb],
+    [0xff, 0x11, 0xdd],
+    [0x88, 0x33, 0x55],
+    [0xbb, 0x77, 0xaa],
+    [0x55, 0x44, 0xbb],
+    [0xcc, 0x22, 0x44],
+    [0x88, 0x00, 0x88],
+    [0xff, 0x11, 0x66],
+    [0x66, 0x00, 0xff],
+    [0x00, 0x44, 0x00],
+];
+/// Colours of leaders and their followers on a dark background.
+pub const GROUPS_DARK: [Color; 16] = [
+    [0x4a, 0xa8, 0xe0],
+    [0xf0, 0x88, 0x3e],
+    [0xe3, 0x9c, 0xc4],
+    [0xee, 0xdd, 0x00],
+    [0x33, 0x66, 0xff],
+    [0xdd, 0x22, 0x44],
+    [0xbb, 0x33, 0xbb],
+    [0x99, 0xdd, 0xff],
+    [0x00, 0x88, 0x66],
+    [0x99, 0xee, 0xaa],
+    [0xaa, 0x66, 0x99],
+    [0x88, 0x88, 0xff],
+    [0xff, 0xbb, 0x66],
+    [0xff, 0x55, 0xcc],
+    [0xff, 0x44, 0x00],
+    [0x22, 0xcc, 0xff],
+];
+/// Dashes distinguish groups once all colours are used. Beyond that, only the leaders' numbers do.
+const DASHES: [&[f64]; 3] = [&[], &[0.9, 0.5], &[0.3, 0.35]];
+
+/// Dashes of the circle around a POI that cannot be observed now.
+const CLOSED: &[f64] = &[0.3, 1.2];
+
+/// Usual font size of labels, in millimetres.
+const LABEL: f64 = 2.4;
+/// Minimum font size of labels, in millimetres.
+const MIN_LABEL: f64 = 1.9;
+const PALE: Color = [250, 250, 250];
+/// Colour of secondary text.
+pub(crate) const FAINT: Color = [95, 95, 95];
+
+/// An agent to draw.
+pub struct Marker {
+    /// Position in map units.
+    pub place: DVec2,
+    /// Heading, a vector of any length except 0.
+    pub heading: DVec2,
+    /// The leader in whose group the agent is.
+    pub group: Option<usize>,
+    /// Whether the agent is an observer.
+    pub counts: bool,
+    /// Earlier positions, in map units, up to the current one.
+    pub trail: Vec<DVec2>,
+}
+
+/// A POI to draw.
+pub struct Poi {
+    /// Position in map units.
+    pub place: DVec2,
+    /// Text next to the POI.
+    pub label: String,
+    /// Observers present divided by the coupling. None before an episode.
+    pub share: Option<f64>,
+    /// Whether the POI has been observed.
+    pub observed: bool,
+    /// Whether enough observers would observe the POI now: its window is open, and all POIs that it comes after are
+    /// observed.
+    pub open: bool,
+}
+
+/// Returns a POI's label: `needs`, and for a timed rule also the POI's number and when it can be observed.
+pub fn poi_label(rule: &Rule, poi: usize, needs: String) -> String {
+    if !rule.is_timed() {
+        return needs;
+    }
+    let window = rule.window(poi).map(|[first, last]| match first == last {
+        true => format!(", step {first}"),
+        false => format!(", steps {first} to {last}"),
+    });
+    let after: Vec<_> = rule.after(poi).iter().map(usize::to_string).collect();
+    let after = if after.is_empty() { String::new() } else { format!(", after {}", after.join(" ")) };
+    format!("{poi}: {needs}{}{after}", window.unwrap_or_default())
+}
+
+/// Returns an observed POI's label: the step at which it was observed.
+pub(crate) fn observed_label(rule: &Rule, poi: usize, step: usize) -> String {
+    if rule.is_timed() { format!("{poi}: at step {step}") } else { format!("at step {step}") }
+}
+
+/// A team at one moment, to draw.
+pub struct Team {
+    /// Number of leaders.
+    pub leaders: usize,
+    /// The agents, leaders first.
+    pub agents: Vec<Marker>,
+    /// All POIs of the world.
+    pub pois: Vec<Poi>,
+}
+
+/// The area of a picture in which a part of the map is drawn.
+#[derive(Clone, Copy)]
+pub struct Viewport {
+    left: f64,
+    above: f64,
+    /// Millimetres per map unit.
+    scale: f64,
+    /// Lower left corner of the part, in map units. `to` is the upper right one.
+    from: DVec2,
+    to: DVec2,
+    map: DVec2,
+    /// Observation radius in map units.
+    radius: f64,
+}
+
+impl Viewport {
+    /// Fits a part of a config's map, given by its corners, into a square of `side` millimetres.
+    pub fn new(config: &Config, [from, to]: [DVec2; 2], side: f64) -> Viewport {
+        let scale = side / (to - from).max_element();
+        let (map, radius) = (config.world.map.into(), config.world.observation_radius);
+        Viewport { left: 0.0, above: 0.0, scale, from, to, map, radius }
+    }
+
+    /// Returns the same view with another upper left corner, in millimetres.
+    pub(crate) fn moved_to(self, [left, above]: [f64; 2]) -> Viewport {
+        Viewport { left, above, ..self }
+    }
+
+    /// Returns width and height in millimetres.
+    pub fn size(&self) -> [f64; 2] {
+        ((self.to - self.from) * self.scale).to_array()
+    }
+
+    fn area(&self) -> [f64; 4] {
+        let [width, height] = self.size();
+        [self.left, self.above, width, height]
+    }
+
+    /// Returns the area's corners in millimetres: `[left, above, right, below]`.
+    fn whole(&self) -> [f64; 4] {
+        let [left, above, width, height] = self.area();
+        [left, above, left + width, above + height]
+    }
+
+    fn at(&self, place: DVec2) -> [f64; 2] {
+        let [x, y] = ((place - self.from) * self.scale).to_array();
+        [self.left + x, self.above + self.size()[1] - y]
+    }
+
+    /// Draws the team on its map.
+    pub fn draw(&self, scene: &mut Scene, team: &Team) {
+        scene.rectangle(self.area(), Some(PALE.into()), Some(Pen::new(LIGHT, 0.2)));
+        let labels = self.poi_labels(team);
+        let ring = labels.is_none().then(|| self.ring(team));
+        // Walls and POIs may extend beyond the visible part of the map; agents do not.
+        scene.clipped(self.area(), |scene| {
+            let corners = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]];
+            let walls = corners.map(|corner| self.at(self.map * DVec2::from(corner)));
+            scene.polygon(walls.to_vec(), None, Some(Pen::new(BLACK, 0.5)));
+            team.pois.iter().for_each(|poi| self.poi(scene, poi, ring));
+        });
+        for agent in &team.agents {
+            let trail = agent.trail.iter().map(|&place| self.at(place)).collect();
+            scene.line(trail, Pen { opacity: 0.5, ..group_pen(agent.group, 0.3) });
+        }
+        let size = self.agent_size(team);
+        for (index, agent) in team.agents.iter().enumerate().rev() {
+            let leads = index < team.leaders;
+            let size = if leads { size * 1.35 } else { size };
+            arrow(scene, self.at(agent.place), agent.heading, size, agent.group, leads);
+            if !agent.counts {
+                strike(scene, self.at(agent.place), agent.heading, size);
+            }
+        }
+        let mut taken = Vec::new();
+        for (poi, ([x, y], size)) in team.pois.iter().zip(labels.into_iter().flatten()) {
+            plate(scene, &mut taken, [x, y], &poi.label, size);
+            scene.text([x, y], &*poi.label, size, Anchor::Middle, BLACK);
+        }
+        self.numbers(scene, team, taken);
+    }
+
+    fn agent_size(&self, team: &Team) -> f64 {
+        (self.scale * 1.1).clamp(0.6, 2.2) * if team.agents.len() > 60 { 0.6 } else { 1.0 }
+    }
+
+    fn poi(&self, scene: &mut Scene, poi: &Poi, ring: Option<f64>) {
+        let [x, y] = self.at(poi.place);
+        let color = if poi.observed { COLORS[2] } else { GREY };
+        let opacity = if poi.observed { 0.22 } else { 0.06 };
+        let dash: &[f64] = match self.radius * self.scale {
+            _ if poi.observed => &[],
+            _ if !poi.open => CLOSED,
+            small if small < 2.5 => &[0.5, 0.4],
+            _ => &[1.0, 0.8],
+        };
+        let fill = Fill { color, opacity };
+        scene.circle([x, y], self.radius * self.scale, Some(fill), Some(Pen { dash, ..Pen::new(color, 0.25) }));
+        let (Some(ring), Some(share)) = (ring, poi.share) else {
+            let arm = ring.unwrap_or(0.8).min(0.8);
+            for sign in [1.0, -1.0] {
+                scene.line(vec![[x - arm, y - sign * arm], [x + arm, y + sign * arm]], Pen::new(color, 0.35));
+            }
+            return;
+        };
+        scene.circle([x, y], ring, Some(WHITE.into()), Some(Pen::new(LIGHT, 0.35 * ring)));
+        if share > 0.0 {
+            let full = (share.min(1.0) * 32.0).ceil();
+            let turn = |step: f64| libm::sincos(std::f64::consts::TAU * share.min(1.0) * step / full);
+            let arc =
+                (0..=full as usize).map(|step| turn(step as f64)).map(|(sin, cos)| [x + ring * sin, y - ring * cos]);
+            scene.line(arc.collect(), Pen::new(color, 0.35 * ring));
+        }
+    }
+
+    /// Returns the radius of the rings that replace POI labels when these have no room, in millimetres.
+    fn ring(&self, team: &Team) -> f64 {
+        let apart = |index: usize, poi: &Poi| {
+            team.pois[..index].iter().map(|other| other.place.distance(poi.place)).fold(f64::INFINITY, f64::min)
+        };
+        let nearest = team.pois.iter().enumerate().map(|(index, poi)| apart(index, poi)).fold(f64::INFINITY, f64::min);
+        (nearest * self.scale * 0.4).clamp(0.5, 1.3)
+    }
+
+    /// Returns each POI label's position and font size, or none if labels would overlap.
+    fn poi_labels(&self, team: &Team) -> Option<Vec<([f64; 2], f64)>> {
+        [LABEL, MIN_LABEL].into_iter().find_map(|size| {
+            let crosses: Vec<_> = team.pois.iter().map(|poi| around(self.at(poi.place), 0.8)).collect();
+            let mut taken: Vec<[f64; 4]> = Vec::new();
+            let whole = self.whole();
+            let place = |poi: &Poi| {
+                let [x, y] = self.at(poi.place);
+                let half = text_width(&poi.label, size) / 2.0;
+                // Labels of large circles are at the top, because agents gather in the middle.
+                let top = y - self.radius * self.scale + size + 0.8;
+                let places = [
+                    [x, if top < y - 2.5 { top } else { y - 1.6 }],
+                    [x, y - 1.6],
+                    [x, y + 1.5 + size],
+                    [x + 1.6 + half, y + 0.35 * size],
+                    [x - 1.6 - half, y + 0.35 * size],
+                ];
+                let free = |place: &[f64; 2]| {
+                    let area = label_area(*place, &poi.label, size);
+                    within(area, whole) && !taken.iter().chain(&crosses).any(|other| overlap(area, *other))
+                };
+                let found = places.into_iter().find(free)?;
+                taken.push(label_area(found, &poi.label, size));
+                Some((found, size))
+            };
+            team.pois.iter().map(place).collect()
+        })
+    }
+
+    /// Draws the leaders' numbers beside their arrows, if there is room.
+    fn numbers(&self, scene: &mut Scene, team: &Team, mut taken: Vec<[f64; 4]>) {
+        // More numbers than this never fit, and trying takes time.
+        const MAX_NUMBERS: usize = 256;
+        let arrow = self.agent_size(team) * 1.35;
+        let leaders = &team.agents[..team.leaders.min(MAX_NUMBERS)];
+        let arrows: Vec<_> = leaders.iter().map(|leader| around(self.at(leader.place), arrow * 0.6)).collect();
+        let size = if team.leaders > 20 { MIN_LABEL } else { LABEL };
+        for (number, leader) in leaders.iter().enumerate() {
+            let [x, y] = self.at(leader.place);
+            let text = number.to_string();
+            let aside = arrow + text_width(&text, size) / 2.0;
+            let low = y + 0.36 * size;
+            let places =
+                [[x + aside, low + 1.2], [x - aside, low + 1.2], [x + aside, low - 1.2], [x - aside, low - 1.2]];
+            let whole = self.whole();
+            let inside = |place: &&[f64; 2]| within(label_area(**place, &text, size), whole);
+            let free = |place: &&[f64; 2]| {
+                let area = label_area(**place, &text, size);
+                within(area, whole)
+                    && !taken.iter().any(|other| overlap(area, *other))
+                    && !arrows.iter().enumerate().any(|(at, other)| at != number && overlap(area, *other))
+            };
+            let place = match places.iter().find(free) {
+                Some(place) => *place,
+                None if team.leaders <= 12 => *places.iter().find(inside).unwrap_or(&places[0]),
+                None => continue,
+            };
+            plate(scene, &mut taken, place, &text, size);
+            scene.bold(place, &*text, size, Anchor::Middle, group_color(leader.group));
+        }
+    }
+
+    /// Draws scales in map units at the left and lower edges.
+    pub fn rule(&self, scene: &mut Scene) {
+        let [left, above, width, height] = self.area();
+        let below = above + height;
+        let span = self.to - self.from;
+        let step = round_step(span.max_element() / 6.0);
+        for axis in 0..2 {
+            let first = (self.from[axis] / step).ceil() as usize;
+            for tick in (first..).map(|tick| tick as f64 * step).take_while(|&tick| tick <= self.to[axis] + 1e-9) {
+                let mut place = self.from;
+                place[axis] = tick;
+                let [x, y] = self.at(place);
+                if axis == 0 {
+                    scene.line(vec![[x, below], [x, below + 0.9]], Pen::new(BLACK, 0.2));
+                    scene.text([x, below + 3.4], tick.to_string(), LABEL, Anchor::Middle, BLACK);
+                } else {
+                    scene.line(vec![[left - 0.9, y], [left, y]], Pen::new(BLACK, 0.2));
+                    scene.text([left - 1.4, y + 0.85], tick.to_string(), LABEL, Anchor::End, BLACK);
+                }
+            }
+        }
+        scene.text([left + width / 2.0, below + 6.6], "x, map units", LABEL, Anchor::Middle, BLACK);
+        scene.upright([left - 7.2, above + height / 2.0], "y, map units", LABEL, BLACK);
+    }
+}
+
+/// Formats a count as "1 leader" or "2 leaders".
+pub fn counted(number: usize, what: &str) -> String {
+    format!("{number} {what}{}", if number == 1 { "" } else { "s" })
+}
+
+/// Draws an agent's arrow: filled for a leader, hollow for a follower.
+fn arrow(scene: &mut Scene, [px, py]: [f64; 2], heading: DVec2, size: f64, group: Option<usize>, leads: bool) {
+    let [x, y] = heading.normalize_or(DVec2::Y).to_array();
+    let corner = |ahead: f64, aside: f64| [px + size * (x * ahead - y * aside), py - size * (y * ahead + x * aside)];
+    let corners = vec![corner(1.0, 0.0), corner(-0.75, 0.7), corner(-0.4, 0.0), corner(-0.75, -0.7)];
+    match leads {
+        // A thin outline leaves enough colour in small arrows.
+        true => scene.polygon(corners, Some(group_color(group).into()), Some(Pen::new(BLACK, (size * 0.1).min(0.2)))),
+        false => scene.polygon(corners, Some(WHITE.into()), Some(group_pen(group, 0.35))),
+    }
+}
+
+/// Draws a stroke across the arrow of an agent that does not observe.
+fn strike(scene: &mut Scene, [px, py]: [f64; 2], heading: DVec2, size: f64) {
+    let [x, y] = heading.normalize_or(DVec2::Y).to_array();
+    let end = |side: f64| [px - side * size * y, py - side * size * x];
+    for (color, width) in [(WHITE, 0.32), (BLACK, 0.16)] {
+        scene.line(vec![end(1.1), end(-1.1)], Pen::new(color, size * width));
+    }
+}
+
+/// Returns the colour of a leader and its followers, or grey without a group.
+fn group_color(group: Option<usize>) -> Color {
+    group.map_or(GREY, |group| GROUPS[group % GROUPS.len()])
+}
+
+fn group_pen(group: Option<usize>, width: f64) -> Pen {
+    let dash = group.map_or(DASHES[0], |group| DASHES[group / GROUPS.len() % DASHES.len()]);
+    Pen { dash, ..Pen::new(group_color(group), width) }
+}
+
+/// Returns the area of a label centred on a place of its baseline: `[left, above, right, below]`.
+fn label_area([x, y]: [f64; 2], text: &str, size: f64) -> [f64; 4] {
+    let half = text_width(text, size) / 2.0 + 0.2;
+    [x - half, y - 0.8 * size, x + half, y + 0.12 * size]
+}
+
+/// Makes the background of a label pale for legibility, and marks its area as taken.
+fn plate(scene: &mut Scene, taken: &mut Vec<[f64; 4]>, place: [f64; 2], text: &str, size: f64) {
+    let area = label_area(place, text, size);
+    let [left, above, right, below] = area;
+    let fill = Fill { color: WHITE, opacity: 0.75 };
+    scene.rectangle([left, above, right - left, below - above], Some(fill), None);
+    taken.push(area);
+}
+
+fn around([x, y]: [f64; 2], margin: f64) -> [f64; 4] {
+    [x - margin, y - margin, x + margin, y + margin]
+}
+
+fn overlap(a: [f64; 4], b: [f64; 4]) -> bool {
+    a[0] < b[2] && b[0] < a[2] && a[1] < b[3] && b[1] < a[3]
+}
+
+fn within(inner: [f64; 4], outer: [f64; 4]) -> bool {
+    inner[0] >= outer[0] && inner[1] >= outer[1] && inner[2] <= outer[2] && inner[3] <= outer[3]
+}

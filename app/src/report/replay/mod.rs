@@ -1,0 +1,586 @@
+//! Replays exactly the episode that a team of a generation was scored on.
+//!
+//! Training is a fast, pure function of config and seed, so no generation has to be stored. A replay retrains the trial
+//! up to the generation, from a checkpoint if possible. It then plays the generation's teams again and traces one
+//! team's episode. G of the best team or champion is compared with the run's `metrics.csv`.
+//!
+//! [`page()`] makes a page of the episodes, [`still`] a picture and [`gif()`] a film.
+
+use std::path::Path;
+
+use glam::Vec2;
+
+use super::map;
+use super::runs::{self, ReadError};
+use crate::record::checkpoint;
+use crate::record::digests::Verification;
+use crate::record::folder::{CHECKPOINTS, POLICIES, RUN, Run};
+use flotilla::backend::{Backend, BackendError, Group, Trace};
+use flotilla::config::Config;
+use flotilla::credit::{self, Credit, Scores, Strided};
+use flotilla::escape::PathExt;
+use flotilla::evolve;
+use flotilla::trainer::{Snapshot, Trainer};
+use flotilla::world::World;
+
+mod film;
+mod page;
+
+pub use film::{FPS, Frames};
+pub use film::{Film, animate, gif, still};
+pub use page::{data, detailed, page};
+
+/// The reason why an episode cannot be replayed.
+#[derive(Debug, thiserror::Error)]
+pub enum ReplayError {
+    /// The run cannot be read.
+    #[error(transparent)]
+    Run(#[from] ReadError),
+    /// The generations cannot be played.
+    #[error(transparent)]
+    Backend(#[from] BackendError),
+    /// The run has no such trial.
+    #[error("{folder} has no trial {trial}: its config has {}", numbered(*trials, "trial"))]
+    NoTrial {
+        /// The run's folder.
+        folder: String,
+        /// The requested trial, from 0.
+        trial: usize,
+        /// The number of trials.
+        trials: usize,
+    },
+    /// The run has not reached the generation.
+    #[error(
+        "{folder}: metrics.csv has no generation {generation} of trial {trial}{}",
+        newest.map_or(String::new(), |newest| format!("; the newest is {newest}: choose one up to that"))
+    )]
+    NoGeneration {
+        /// The run's folder.
+        folder: String,
+        /// The requested trial, from 0.
+        trial: usize,
+        /// The requested generation, from 0.
+        generation: usize,
+        /// The trial's newest generation, if any.
+        newest: Option<usize>,
+    },
+    /// A generation has no such team.
+    #[error("no team {team}: a generation has {teams} teams, {}; choose one of them, best or champion", places(*teams))]
+    NoTeam {
+        /// The requested team, from 0.
+        team: usize,
+        /// The number of teams.
+        teams: usize,
+    },
+    /// The policies that the run started from are missing.
+    #[error(
+        "{folder} started from given policies, but no checkpoint is left to start from: it cannot be replayed up to \
+         generation {generation}"
+    )]
+    NoStart {
+        /// The run's folder.
+        folder: String,
+        /// The requested generation, from 0.
+        generation: usize,
+    },
+    /// Retraining gives another result than the run's metrics.
+    #[error(
+        "{folder}: trained again, the {who} of trial {trial}, generation {generation} has G = {found}, but metrics.csv \
+         has {expected}: it was made with another config or another version of this program; repeat the run, then \
+         replay it"
+    )]
+    Differs {
+        /// The run's folder.
+        folder: String,
+        /// Whose G differs: "best team" or "champion".
+        who: &'static str,
+        /// The trial, from 0.
+        trial: usize,
+        /// The generation, from 0.
+        generation: usize,
+        /// G of the replay.
+        found: f64,
+        /// G in the run's metrics.
+        expected: f64,
+    },
+    /// The caller's `watch` stopped the replay.
+    #[error("stopped")]
+    Stopped,
+}
+
+/// Formats a count and its indices as "3 trials, 0 to 2" or "1 trial, 0".
+pub(crate) fn numbered(count: usize, what: &str) -> String {
+    format!("{}, {}", map::counted(count, what), places(count))
+}
+
+/// Formats the indices of a count as "0 to 2" or "0".
+fn places(count: usize) -> String {
+    if count > 1 { format!("0 to {}", count - 1) } else { "0".into() }
+}
+
+/// The team of a generation to replay.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Which {
+    /// The team with the largest G; the first one if several are equal.
+    #[default]
+    Best,
+    /// The team of the best policy of each population after the generation is scored.
+    Champion,
+    /// The team with this index in its generation.
+    Number(usize),
+}
+
+impl std::str::FromStr for Which {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Which, String> {
+        match text {
+            "best" => Ok(Which::Best),
+            "champion" => Ok(Which::Champion),
+            number => {
+                number.parse().map(Which::Number).map_err(|_| "allowed best, champion or a whole number, from 0".into())
+            }
+        }
+    }
+}
+
+/// One team's episode and its scores.
+pub struct Replayed {
+    /// The trial.
+    pub trial: usize,
+    /// The generation.
+    pub generation: usize,
+    /// The team as it was requested.
+    pub which: Which,
+    /// Index of the team in its generation. The champion is none of these teams and has their number instead.
+    pub team: usize,
+    /// The team's mean G over all its episodes. For the best team and the champion it equals the value in
+    /// `metrics.csv`.
+    pub team_g: f64,
+    /// Number of episodes that `team_g` averages. This is the first of them.
+    pub episodes: usize,
+    /// The world of the generation, with the POIs where this episode had them.
+    pub world: World,
+    /// The trace of this team alone.
+    pub trace: Trace,
+    /// The scores of this episode.
+    pub scores: Scores,
+    /// The leader to whose group each agent belongs for Df, or [`credit::UNASSIGNED`]. `[agents]`.
+    pub owner: Vec<u32>,
+    /// The leaders of each follower at each step, as [`credit::find_leading`] writes them. Empty unless the run's
+    /// fitness is Dt.
+    pub led: Vec<u32>,
+    /// The step at which each POI was first observed, `[pois]`.
+    pub observed: Vec<Option<usize>>,
+    /// Whether the comparison of the run's files with their digests was skipped.
+    pub unverified: bool,
+}
+
+/// The metrics of one trial.
+pub(crate) struct History {
+    /// G of the best team and of the champion, `[generations]`.
+    rows: Vec<[f64; 2]>,
+}
+
+impl History {
+    /// Reads one trial's G by generation.
+    ///
+    /// # Errors
+    /// The metrics cannot be read.
+    pub fn read(
+        folder: &Path,
+        config: &Config,
+        trial: usize,
+        verification: Verification,
+    ) -> Result<History, ReadError> {
+        let all = History::all(folder, config, verification)?;
+        Ok(all.into_iter().nth(trial).unwrap_or(History { rows: vec![] }))
+    }
+
+    /// Reads every trial's G by generation, `[trials]`.
+    ///
+    /// # Errors
+    /// The metrics cannot be read.
+    pub fn all(folder: &Path, config: &Config, verification: Verification) -> Result<Vec<History>, ReadError> {
+        let all = runs::trials(folder, config, verification)?;
+        Ok(all.into_iter().map(|rows| History { rows }).collect())
+    }
+
+    /// Returns the newest generation that has a row.
+    pub fn newest(&self) -> Option<usize> {
+        self.rows.len().checked_sub(1)
+    }
+
+    /// Returns the largest G of a best team or champion in any generation; 0 without rows.
+    pub fn most(&self) -> f64 {
+        self.rows.iter().flatten().copied().fold(0.0, f64::max)
+    }
+
+    /// Returns a generation's G of the champion if `which` requests it, otherwise of the best team. None without a row.
+    pub fn get(&self, generation: usize, which: Which) -> Option<f64> {
+        let &[best, champion] = self.rows.get(generation)?;
+        Some(if which == Which::Champion { champion } else { best })
+    }
+}
+
+/// Returns the trials with the largest and the smallest G of a generation. Ties go to the lower index.
+///
+/// G is the champion's if `which` requests it, otherwise the best team's. Without a generation, the newest that all
+/// trials have is used.
+///
+/// # Errors
+/// The run cannot be read or lacks the generation.
+pub(crate) fn extreme_trials(
+    folder: &Path,
+    config: &Config,
+    generation: Option<usize>,
+    which: Which,
+    verification: Verification,
+) -> Result<[usize; 2], ReplayError> {
+    let all = History::all(folder, config, verification)?;
+    let newest = all.iter().map(History::newest).min().flatten();
+    let generation = generation.or(newest).unwrap_or(0);
+    let g = all.iter().map(|history| history.get(generation, which)).collect::<Option<Vec<f64>>>();
+    let Some(g) = g else {
+        let trial = all.iter().position(|history| history.get(generation, which).is_none()).unwrap_or(0);
+        let folder = folder.escaped().to_string();
+        return Err(ReplayError::NoGeneration { folder, trial, generation, newest: all[trial].newest() });
+    };
+    let first = |better: fn(f64, f64) -> bool| (0..g.len()).reduce(|a, b| if better(g[b], g[a]) { b } else { a });
+    Ok([first(|b, a| b > a), first(|b, a| b < a)].map(|trial| trial.unwrap_or(0)))
+}
+
+/// Replays one team of each given generation of a trial, and returns the episodes in the given order.
+///
+/// `watch` is called with each generation before it is trained. If it returns false, the replay stops.
+///
+/// # Errors
+/// The run cannot be read, lacks the generation or team, or its metrics differ from the replay.
+pub fn replay(
+    folder: &Path,
+    trial: usize,
+    generations: &[usize],
+    which: Which,
+    verification: Verification,
+    backend: &mut dyn Backend,
+    watch: &mut dyn FnMut(usize) -> bool,
+) -> Result<Vec<Replayed>, ReplayError> {
+    let name = || folder.escaped().to_string();
+    let config = runs::config(folder, verification)?.validate().map_err(BackendError::from)?;
+    let trials = config.learning.trials;
+    if trial >= trials {
+        return Err(ReplayError::NoTrial { folder: name(), trial, trials });
+    }
+    let teams = generations.iter().map(|&generation| config.at(generation).learning.teams()).min().unwrap_or(0);
+    if let Which::Number(team) = which
+        && team >= teams
+    {
+        return Err(ReplayError::NoTeam { team, teams });
+    }
+    let rows = History::read(folder, &config, trial, verification)?;
+    let newest = rows.newest();
+    for &generation in generations {
+        if rows.get(generation, which).is_none() {
+            return Err(ReplayError::NoGeneration { folder: name(), trial, generation, newest });
+        }
+    }
+    let mut order: Vec<usize> = (0..generations.len()).collect();
+    order.sort_by_key(|&index| generations[index]);
+    let mut played: Vec<Option<Replayed>> = generations.iter().map(|_| None).collect();
+    let mut trainer = Trainer::of_trial(&config, trial);
+    for index in order {
+        let generation = generations[index];
+        // The champion is in its slot only after its generation is over.
+        let wanted = generation + usize::from(which == Which::Champion);
+        // A run that started from given policies has them in checkpoint 0, so a fresh trainer's search includes it.
+        let next = trainer.generation(0);
+        if let Some(snapshot) = nearest(folder, &config, trial, next + usize::from(next > 0)..=wanted) {
+            // A checkpoint of other sizes belongs to another config. It is ignored, and training continues without it.
+            let _ = trainer.restore(0, snapshot);
+        } else if next == 0 && Run::read(&folder.join(RUN)).is_ok_and(|run| run.init.is_some()) {
+            return Err(ReplayError::NoStart { folder: name(), generation });
+        }
+        while trainer.generation(0) < wanted {
+            if !watch(trainer.generation(0)) {
+                return Err(ReplayError::Stopped);
+            }
+            trainer.advance(backend)?;
+        }
+        let (found, g) = match which {
+            Which::Champion => {
+                let found = champion(config.at(generation), &mut trainer, trial, backend)?;
+                let g = found.team_g;
+                (found, g)
+            }
+            _ => team(config.at(generation), &mut trainer, trial, which, backend)?,
+        };
+        let expected = rows.get(generation, which).unwrap_or(f64::NAN);
+        if g != expected {
+            let who = if which == Which::Champion { "champion" } else { "best team" };
+            return Err(ReplayError::Differs { folder: name(), who, trial, generation, found: g, expected });
+        }
+        played[index] = Some(Replayed { unverified: verification.is_skipped(), ..found });
+    }
+    Ok(played.into_iter().flatten().collect())
+}
+
+/// Returns one trial's part of the newest usable checkpoint within a range of generations.
+fn nearest(
+    folder: &Path,
+    config: &Config,
+    trial: usize,
+    generations: std::ops::RangeInclusive<usize>,
+) -> Option<Snapshot> {
+    let checkpoints = folder.join(CHECKPOINTS);
+    let found = checkpoint::list(&checkpoints).ok()?.into_iter().rev().filter(|found| generations.contains(found));
+    found.into_iter().find_map(|generation| {
+        let path = checkpoint::path(&checkpoints, generation);
+        let found = checkpoint::read(&path, &folder.join(POLICIES), config).ok()??;
+        if !found.is_of(config) || found.snapshot.generation != generation {
+            return None;
+        }
+        let Snapshot { last, mut weights, mut fitness, mut pending, .. } = found.snapshot;
+        Some(Snapshot {
+            generation,
+            last,
+            weights: vec![weights.swap_remove(trial)],
+            fitness: vec![fitness.swap_remove(trial)],
+            pending: vec![pending.swap_remove(trial)],
+        })
+    })
+}
+
+/// Plays the current generation of a trainer with a single trial, and traces its best team.
+///
+/// # Errors
+/// The backend fails.
+pub fn best(
+    config: &Config,
+    trainer: &mut Trainer,
+    trial: usize,
+    backend: &mut dyn Backend,
+) -> Result<Replayed, BackendError> {
+    Ok(team(config, trainer, trial, Which::Best, backend)?.0)
+}
+
+/// Plays the current generation of a trainer with a single trial, and traces one team. Also returns the largest G of
+/// all teams.
+fn team(
+    config: &Config,
+    trainer: &mut Trainer,
+    trial: usize,
+    which: Which,
+    backend: &mut dyn Backend,
+) -> Result<(Replayed, f64), BackendError> {
+    let learning = &config.learning;
+    let (generation, world) = (trainer.generation(0), trainer.world(0).clone());
+    let teams = evolve::contemporary_teams(learning, trial, generation, world.leaders());
+    let episodes = Episodes::new(config, &world, trial, generation, trainer.weights(0, 0)?, &teams);
+    let g = episodes.play(backend)?;
+    let first_best = (0..g.len()).reduce(|a, b| if g[b] > g[a] { b } else { a }).unwrap_or(0);
+    let team = if let Which::Number(team) = which { team } else { first_best };
+    let played = episodes.trace(team, backend)?;
+    Ok((Replayed { trial, generation, which, team, team_g: g[team], ..played }, g[first_best]))
+}
+
+/// Plays and traces the champion of the generation that a trainer with a single trial has just finished. `config` is
+/// the config of that generation.
+fn champion(
+    config: &Config,
+    trainer: &mut Trainer,
+    trial: usize,
+    backend: &mut dyn Backend,
+) -> Result<Replayed, BackendError> {
+    // A champion plays with the starts of the next generation, but in the world of its own generation.
+    let (next, world) = (trainer.generation(0), World::new(config));
+    let population = config.learning.population;
+    let teams = vec![population as u32; world.leaders()];
+    let episodes = Episodes::new(config, &world, trial, next, trainer.weights(0, 0)?, &teams);
+    let team_g = episodes.play(backend)?[0];
+    let played = episodes.trace(0, backend)?;
+    Ok(Replayed { trial, generation: next - 1, which: Which::Champion, team: population, team_g, ..played })
+}
+
+/// The teams of one generation, and the episodes that they play.
+struct Episodes<'a> {
+    config: &'a Config,
+    world: &'a World,
+    weights: &'a [f32],
+    teams: &'a [u32],
+    /// The start positions of each episode, `[episodes]`.
+    starts: Vec<Vec<Vec2>>,
+}
+
+impl<'a> Episodes<'a> {
+    fn new(
+        config: &'a Config,
+        world: &'a World,
+        trial: usize,
+        generation: usize,
+        weights: &'a [f32],
+        teams: &'a [u32],
+    ) -> Episodes<'a> {
+        let starts = |episode| {
+            let mut starts = Vec::new();
+            evolve::episode_positions(&config.learning, trial, generation, episode, world, &mut starts);
+            starts
+        };
+        let starts = (0..config.learning.episodes_per_team).map(starts).collect();
+        Episodes { config, world, weights, teams, starts }
+    }
+
+    /// Returns the group of some of the teams in one episode, with sightings if the fitness needs them.
+    fn group<'b>(&'b self, episode: usize, teams: &'b [u32]) -> Group<'b> {
+        let learning = &self.config.learning;
+        Group {
+            world: self.world,
+            starts: &self.starts[episode],
+            weights: self.weights.into(),
+            policies: learning.slots(),
+            sharing: learning.sharing,
+            teams,
+            fitnesses: std::slice::from_ref(&learning.fitness),
+        }
+    }
+
+    /// Returns the mean G of every team over all episodes, `[teams]`.
+    fn play(&self, backend: &mut dyn Backend) -> Result<Vec<f64>, BackendError> {
+        let groups: Vec<_> =
+            (0..self.starts.len()).map(|episode| Group { fitnesses: &[], ..self.group(episode, self.teams) }).collect();
+        let mut observed = vec![0; self.teams.len() / self.world.leaders()];
+        for scores in backend.play(&groups)? {
+            observed.iter_mut().zip(scores.observed).for_each(|(sum, observed)| *sum += observed);
+        }
+        let whole = (self.world.pois.len() * groups.len()) as f64;
+        Ok(observed.into_iter().map(|observed| f64::from(observed) / whole).collect())
+    }
+
+    /// Plays a team's first episode again and traces it.
+    fn trace(&self, team: usize, backend: &mut dyn Backend) -> Result<Replayed, BackendError> {
+        let leaders = self.world.leaders();
+        let played = one(&self.group(0, &self.teams[team * leaders..(team + 1) * leaders]), backend)?;
+        Ok(Replayed { episodes: self.starts.len(), ..played })
+    }
+}
+
+/// Plays and traces a group of a single team. `led` is filled only if Dt is among the group's fitnesses.
+///
+/// # Errors
+/// The backend fails.
+pub fn one(group: &Group<'_>, backend: &mut dyn Backend) -> Result<Replayed, BackendError> {
+    let (world, trace) = (group.world, backend.trace(group)?);
+    let episode = trace.episode(world, 0);
+    let scores = Credit::default().all(&episode, world);
+    let mut owner = Vec::new();
+    credit::assign(&episode.seen, world, &mut owner);
+    let mut led = Vec::new();
+    credit::find_leading(&episode.sights, world, &mut led);
+    let observed = credit::observed_at(episode.sets, world);
+    let team_g = f64::from(scores.observed) / world.pois.len() as f64;
+    // POIs are drawn where this episode had them.
+    let pois = group.moved_pois().unwrap_or(&world.pois).to_vec();
+    let world = World { pois, ..world.clone() };
+    let (trial, generation, which, team, episodes, unverified) = (0, 0, Which::Champion, 0, 1, false);
+    Ok(Replayed {
+        trial,
+        generation,
+        which,
+        team,
+        team_g,
+        episodes,
+        scores,
+        owner,
+        led,
+        observed,
+        trace,
+        world,
+        unverified,
+    })
+}
+
+/// Counts the observers in a set.
+fn near(world: &World, sets: &Strided<'_>, set: usize) -> u32 {
+    let words = world.constants.words as usize;
+    world.rule.count((set * words..(set + 1) * words).map(|word| sets.get(word)))
+}
+
+/// An episode without some agents: the same motion, and what the others observe.
+pub struct Counterfactual<'a> {
+    world: &'a World,
+    /// The remaining agents at each POI after each step, `[steps][pois][words]`.
+    sets: Vec<u32>,
+    /// The step at which each POI would be observed, `[pois]`.
+    pub observed: Vec<Option<usize>>,
+}
+
+impl Replayed {
+    /// Names the team at the start of a sentence: "Best team (number 3)".
+    pub fn name(&self) -> String {
+        match self.which {
+            Which::Best => format!("Best team (number {})", self.team),
+            Which::Champion => "Champion".into(),
+            Which::Number(team) => format!("Team number {team}"),
+        }
+    }
+
+    /// Names the trial and generation: "trial 0, generation 7".
+    pub fn place(&self) -> String {
+        format!("trial {}, generation {}", self.trial, self.generation)
+    }
+
+    /// Counts the observers within the observation radius of a POI after a step. At the start the count is 0.
+    pub fn near(&self, step: usize, poi: usize) -> u32 {
+        let sets = Strided { words: &self.trace.sets, stride: 1, offset: 0 };
+        step.checked_sub(1).map_or(0, |step| near(&self.world, &sets, step * self.world.pois.len() + poi))
+    }
+
+    /// Removes a leader from the record, and with `group` also the followers that it led. All others move as they did.
+    pub fn without(&self, leader: usize, group: bool) -> Counterfactual<'_> {
+        let Replayed { world, trace, owner, led, .. } = self;
+        let (pois, words, leaders) = (world.pois.len(), world.constants.words as usize, world.leaders());
+        let follows = |step: usize, agent: usize| match agent.checked_sub(leaders) {
+            None => false,
+            Some(follower) if !led.is_empty() => credit::is_led_by(led, world, step, follower, leader),
+            Some(_) => owner[agent] as usize == leader,
+        };
+        let mut sets = trace.sets.clone();
+        for (at, set) in sets.chunks_exact_mut(words).enumerate() {
+            let removed = (0..world.agents()).filter(|&agent| agent == leader || group && follows(at / pois, agent));
+            removed.for_each(|agent| set[agent / 32] &= !(1 << (agent % 32)));
+        }
+        let observed = credit::observed_at(Strided { words: &sets, stride: 1, offset: 0 }, world);
+        Counterfactual { world, sets, observed }
+    }
+
+    fn position(&self, step: usize, agent: usize) -> [f32; 2] {
+        self.trace.moment(step, 0, agent).position
+    }
+
+    fn heading(&self, step: usize, agent: usize) -> [f32; 2] {
+        self.trace.moment(step, 0, agent).heading
+    }
+
+    /// Returns the leader to whose group an agent belongs after a step. For Dt it is the first leader at that step,
+    /// otherwise the group is that of Df.
+    fn group(&self, step: usize, agent: usize) -> Option<usize> {
+        let leaders = self.world.leaders();
+        match agent.checked_sub(leaders).filter(|_| !self.led.is_empty()) {
+            // The start shows the groups of the first step, whose sights precede any motion.
+            Some(follower) => (0..leaders)
+                .find(|&leader| credit::is_led_by(&self.led, &self.world, step.saturating_sub(1), follower, leader)),
+            None => (self.owner[agent] != credit::UNASSIGNED).then_some(self.owner[agent] as usize),
+        }
+    }
+
+    /// Returns evenly spaced steps to show, at most `most` but at least 2. The last step is always included.
+    fn shown(&self, most: usize) -> Vec<usize> {
+        let steps = self.world.steps();
+        let every = steps.div_ceil(most.max(2) - 1).max(1);
+        let mut shown: Vec<usize> = (0..=steps).step_by(every).collect();
+        if shown.last() != Some(&steps) {
+            shown.push(steps);
+        }
+        shown
+    }
+}

@@ -1,0 +1,168 @@
+//! The page that plays episodes, and its data.
+
+use base64::Engine;
+use base64::prelude::BASE64_STANDARD;
+use serde_json::json;
+
+use super::{Counterfactual, Replayed, near};
+use crate::report::map::{GROUPS, GROUPS_DARK};
+use crate::report::scene::hex;
+use flotilla::config::Config;
+use flotilla::credit::{self, Strided};
+use flotilla::world::{INPUTS, OUTPUTS};
+
+/// Maximum number of bytes of motion in a page, before base64 adds a third. Longer motion is thinned out.
+const MOTION_BYTES: usize = 1_300_000;
+/// Maximum number of bytes of motion that is stored as the exact f32 values.
+const EXACT_BYTES: usize = 600_000;
+
+/// Maximum number of bytes of the senses of an episode, and of what is observed without its leaders.
+const DETAIL_BYTES: usize = 1_000_000;
+
+impl Counterfactual<'_> {
+    /// Returns the observation steps and the observers near each POI, base64 of u16 `[shown][pois]`.
+    fn json(&self, shown: &[usize]) -> serde_json::Value {
+        let (sets, pois) = (Strided { words: &self.sets, stride: 1, offset: 0 }, self.world.pois.len());
+        let count = |step: usize, poi| step.checked_sub(1).map_or(0, |step| near(self.world, &sets, step * pois + poi));
+        let counts = shown.iter().flat_map(|&step| (0..pois).map(move |poi| count(step, poi) as u16));
+        let near: Vec<u8> = counts.flat_map(u16::to_le_bytes).collect();
+        json!({ "observed": self.observed, "near": BASE64_STANDARD.encode(near) })
+    }
+}
+
+/// Returns a page that plays episodes of one run side by side. `name` is the run's name.
+pub fn page(name: &str, config: &Config, played: &[Replayed]) -> String {
+    // Inside a script element, only "<" could end it early.
+    let data = data(name, config, played).to_string().replace('<', "\\u003c");
+    include_str!("page.html").replacen("\"STAGE\"", STAGE, 1).replacen("\"DATA\"", &data, 1)
+}
+
+/// The script that draws episodes. Every page that shows them includes it.
+pub(crate) const STAGE: &str = include_str!("../stage.js");
+
+/// Returns [`data`], and per episode D++, the senses and actions of leaders, and what the team observes without them.
+///
+/// Per episode that adds `dpp`, `[leaders]`; `senses`, base64 of f32 `[shown][leaders][8 inputs, 2 outputs]`; and
+/// `without`, `[leaders]`. Its entries `alone` and `group` (with the followers that the leader led) have `observed` and
+/// `near` like the episode. Very long episodes have neither of the last two.
+pub fn detailed(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Value {
+    let mut data = data(name, config, played);
+    for (played, episode) in played.iter().zip(data["episodes"].as_array_mut().into_iter().flatten()) {
+        let shown: Vec<usize> =
+            episode["shown"].as_array().into_iter().flatten().flat_map(|step| Some(step.as_u64()? as usize)).collect();
+        let (leaders, pois) = (played.world.leaders(), played.world.pois.len());
+        episode["dpp"] = json!(played.scores.dpp);
+        if shown.len() * leaders * (INPUTS + OUTPUTS) * size_of::<f32>() <= DETAIL_BYTES {
+            let moments = shown.iter().flat_map(|&step| (0..leaders).map(move |leader| (step, leader)));
+            let senses = moments.flat_map(|(step, leader)| {
+                let moment = played.trace.moment(step, 0, leader);
+                moment.inputs.iter().chain(&moment.outputs).flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>()
+            });
+            episode["senses"] = BASE64_STANDARD.encode(senses.collect::<Vec<u8>>()).into();
+        }
+        if shown.len() * leaders * pois * 2 * size_of::<u16>() <= DETAIL_BYTES {
+            let without = (0..leaders).map(|leader| {
+                let [alone, group] = [false, true].map(|group| played.without(leader, group).json(&shown));
+                json!({ "alone": alone, "group": group })
+            });
+            episode["without"] = without.collect();
+        }
+    }
+    data
+}
+
+/// Returns the data that a page needs to play episodes of one run.
+pub fn data(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Value {
+    let count = played.len().max(1);
+    let size = |per_agent: usize, played: &Replayed| {
+        let world = &played.world;
+        world.agents() * per_agent + world.pois.len() * 2 + played.led.len() / world.steps() * 4
+    };
+    let exact = played.iter().map(|p| (p.world.steps() + 1) * size(16, p)).sum::<usize>() <= EXACT_BYTES;
+    let episodes: Vec<_> = played
+        .iter()
+        .map(|played| {
+            let room = if exact { usize::MAX } else { MOTION_BYTES / count / size(5, played) };
+            episode(played, &played.shown(room), exact)
+        })
+        .collect();
+    let world = &config.world;
+    // Moving POIs are listed where the first episode had them.
+    let pois = match played.first().filter(|_| config.learning.poi_jitter > 0.0) {
+        Some(first) => first.world.pois.iter().map(|poi| poi.as_dvec2().to_array()).collect(),
+        None => world.pois.clone(),
+    };
+    let unverified = if played.iter().any(|played| played.unverified) { " (unverified)" } else { "" };
+    json!({
+        "run": format!("{name}{unverified}"),
+        "paradigm": config.learning.paradigm,
+        "fitness": config.learning.fitness,
+        "map": world.map,
+        "pois": pois,
+        "observation_radius": world.observation_radius,
+        "observers": world.observers,
+        "windows": world.windows,
+        "after": world.after,
+        "attraction_radius": config.follow.attraction_radius,
+        "dt": world.dt,
+        "steps": world.steps,
+        "exact": exact,
+        "colors": colors(),
+        "episodes": episodes,
+    })
+}
+
+/// Returns the colours of leaders and their followers for light and dark backgrounds.
+fn colors() -> serde_json::Value {
+    json!({ "light": GROUPS.map(hex), "dark": GROUPS_DARK.map(hex) })
+}
+
+/// Returns one episode as the page reads it. Motion is base64 of little-endian numbers, `[shown][agents]`.
+fn episode(played: &Replayed, shown: &[usize], exact: bool) -> serde_json::Value {
+    let Replayed { world, scores, .. } = played;
+    let map = world.map().to_array();
+    let (mut positions, mut headings, mut near, mut led) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+    for &step in shown {
+        // These are the groups of the step that ended here, as in `Replayed::group`.
+        let words = played.led.len() / world.steps();
+        let of_step = &played.led[step.saturating_sub(1) * words..][..words];
+        led.extend(of_step.iter().flat_map(|word| word.to_le_bytes()));
+        for agent in 0..world.agents() {
+            let (place, heading) = (played.position(step, agent), played.heading(step, agent));
+            if exact {
+                positions.extend(place.iter().flat_map(|at| at.to_le_bytes()));
+                headings.extend(heading.iter().flat_map(|at| at.to_le_bytes()));
+            } else {
+                let share = |axis: usize| (f64::from(place[axis]) / f64::from(map[axis]) * 65535.0).round() as u16;
+                positions.extend([share(0), share(1)].iter().flat_map(|share| share.to_le_bytes()));
+                let turn = libm::atan2(f64::from(heading[1]), f64::from(heading[0])) / std::f64::consts::TAU;
+                headings.push((turn.rem_euclid(1.0) * 256.0).round() as u32 as u8);
+            }
+        }
+        near.extend((0..world.pois.len()).flat_map(|poi| (played.near(step, poi) as u16).to_le_bytes()));
+    }
+    let owner: Vec<i64> =
+        played.owner.iter().map(|&owner| if owner == credit::UNASSIGNED { -1 } else { i64::from(owner) }).collect();
+    json!({
+        "trial": played.trial,
+        "generation": played.generation,
+        "name": played.name(),
+        "team": played.team,
+        "best_g": played.team_g,
+        "means_of": played.episodes,
+        "g": scores.g,
+        "d": scores.d,
+        "df": scores.df,
+        "dt": scores.dt,
+        "leaders": world.leaders(),
+        "agents": world.agents(),
+        "coupling": world.coupling,
+        "owner": owner,
+        "observed": played.observed,
+        "shown": shown,
+        "positions": BASE64_STANDARD.encode(positions),
+        "headings": BASE64_STANDARD.encode(headings),
+        "near": BASE64_STANDARD.encode(near),
+        "led": BASE64_STANDARD.encode(led),
+    })
+}

@@ -1,0 +1,275 @@
+//! The learning curves of finished and unfinished runs.
+
+use std::path::{Path, PathBuf};
+
+use serde::de::IntoDeserializer;
+use serde::{Deserialize, Serialize};
+
+use super::curves::{Band, Curve, Figure, Panel};
+use crate::record::RecordError;
+use crate::record::digests::{Digests, UNVERIFIED, Verification};
+use crate::record::folder::METRICS;
+pub use crate::record::runs::{ReadError, config, metrics};
+use flotilla::config::Config;
+use flotilla::escape::PathExt;
+use flotilla::statistics::Average;
+use flotilla::trainer::Row;
+
+/// Maximum number of runs in one figure.
+pub(crate) const MAX_RUNS: usize = 24;
+
+/// The team of a generation whose G a picture shows.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum TeamKind {
+    /// The team with the largest G.
+    #[default]
+    Best,
+    /// The team of the best policy of each population.
+    Champion,
+    /// The mean over all teams.
+    Mean,
+}
+
+impl TeamKind {
+    /// All kinds.
+    pub const ALL: [TeamKind; 3] = [TeamKind::Best, TeamKind::Champion, TeamKind::Mean];
+
+    /// Returns the kind's name in pictures.
+    pub fn name(self) -> &'static str {
+        match self {
+            TeamKind::Best => "best team",
+            TeamKind::Champion => "champion",
+            TeamKind::Mean => "mean team",
+        }
+    }
+
+    /// Returns the label of G of this kind of team, the same in all pictures.
+    pub fn label(self) -> String {
+        format!("G of the {}", self.name())
+    }
+
+    /// Returns this kind's G from a row of metrics.
+    pub fn of(self, row: &Row) -> f64 {
+        match self {
+            TeamKind::Best => row.best_g,
+            TeamKind::Champion => row.champion_g,
+            TeamKind::Mean => row.mean_g,
+        }
+    }
+}
+
+impl std::fmt::Display for TeamKind {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        self.serialize(f)
+    }
+}
+
+impl std::str::FromStr for TeamKind {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<TeamKind, String> {
+        let read = TeamKind::deserialize(text.into_deserializer());
+        read.map_err(|_: serde::de::value::Error| "allowed best, champion or mean".into())
+    }
+}
+
+/// A run's metrics by generation, as shares of the POIs averaged over trials.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(crate) struct RunMetrics {
+    /// G of the best team.
+    pub best: Vec<Average>,
+    /// G of the mean team.
+    pub mean: Vec<Average>,
+    /// G of the champion.
+    pub champion: Vec<Average>,
+}
+
+impl RunMetrics {
+    /// Returns G of one kind of team.
+    pub fn of(&self, kind: TeamKind) -> &[Average] {
+        match kind {
+            TeamKind::Best => &self.best,
+            TeamKind::Champion => &self.champion,
+            TeamKind::Mean => &self.mean,
+        }
+    }
+
+    /// Reads a run's metrics. Memory grows only with the number of generations.
+    ///
+    /// # Errors
+    /// See [`metrics()`].
+    pub fn read(folder: &Path, config: &Config, verification: Verification) -> Result<RunMetrics, ReadError> {
+        let mut run = RunMetrics::default();
+        metrics(folder, config, verification, |row| run.add(row))?;
+        Ok(run)
+    }
+
+    fn add(&mut self, row: &Row) {
+        let added = [(&mut self.best, row.best_g), (&mut self.mean, row.mean_g), (&mut self.champion, row.champion_g)];
+        for (averages, g) in added {
+            if averages.len() <= row.generation {
+                averages.resize(row.generation + 1, Average::default());
+            }
+            averages[row.generation].add(g);
+        }
+    }
+}
+
+/// Reads G of the best team and of the champion, `[trials][generations]`, as far as the run has progressed.
+///
+/// # Errors
+/// See [`metrics()`]. It also fails if a trial's rows are out of order.
+pub fn trials(folder: &Path, config: &Config, verification: Verification) -> Result<Vec<Vec<[f64; 2]>>, ReadError> {
+    let mut trials = vec![vec![]; config.learning.trials];
+    let mut skipped = None;
+    metrics(folder, config, verification, |row| match &mut trials[row.trial] {
+        trial if trial.len() == row.generation => trial.push([row.best_g, row.champion_g]),
+        _ => skipped = skipped.or(Some((row.trial, row.generation))),
+    })?;
+    match skipped {
+        None => Ok(trials),
+        Some((trial, generation)) => Err(ReadError::Record(RecordError::Damaged {
+            path: folder.join(METRICS),
+            reason: format!("trial {trial} of generation {generation} is out of order"),
+        })),
+    }
+}
+
+/// Returns the figure of G by generation: of one kind of team in each run, or of all kinds in a single run.
+///
+/// By default, one run shows all kinds of teams, and several runs show their best teams. Several runs are labelled by
+/// the config keys that differ.
+///
+/// # Errors
+/// A run cannot be read.
+pub fn figure(
+    folders: &[PathBuf],
+    measure: Option<TeamKind>,
+    band: Band,
+    verification: Verification,
+) -> Result<Figure, ReadError> {
+    let configs = folders.iter().map(|folder| config(folder, verification)).collect::<Result<Vec<_>, _>>()?;
+    let all = folders.iter().zip(&configs).map(|(folder, config)| RunMetrics::read(folder, config, verification));
+    let all = all.collect::<Result<Vec<_>, _>>()?;
+    let shown = Figure {
+        band,
+        source: match folders {
+            [folder] => Digests::read(folder, verification)?.run,
+            _ => None,
+        },
+        warning: verification.is_skipped().then(|| UNVERIFIED.into()),
+        ..figure_of_runs(&all, &configs, || labels(folders, &configs), measure)
+    };
+    Ok(shown)
+}
+
+/// Returns the learning curves of one run as [`figure`] does, from its rows and its digest.
+pub(crate) fn figure_of<'a>(config: &Config, rows: impl Iterator<Item = &'a Row>, digest: &str) -> Figure {
+    let mut run = RunMetrics::default();
+    rows.for_each(|row| run.add(row));
+    let figure = figure_of_runs(&[run], std::slice::from_ref(config), Vec::new, None);
+    Figure { source: Some(digest.into()), ..figure }
+}
+
+fn figure_of_runs(
+    all: &[RunMetrics],
+    configs: &[Config],
+    labels: impl FnOnce() -> Vec<String>,
+    measure: Option<TeamKind>,
+) -> Figure {
+    let (legend, curves): (Vec<String>, Vec<Curve>) = match (all, measure) {
+        ([run], None) => {
+            TeamKind::ALL.into_iter().map(|kind| (kind.name().to_string(), Curve::new(run.of(kind)))).unzip()
+        }
+        ([run], Some(kind)) => (vec![kind.name().to_string()], vec![Curve::new(run.of(kind))]),
+        (all, kind) => {
+            let curves = all.iter().map(|run| Curve::new(run.of(kind.unwrap_or_default())));
+            labels().into_iter().zip(curves).unzip()
+        }
+    };
+    let y_label = match (all.len(), measure) {
+        (1, None) => "G (share of POIs observed)".into(),
+        (_, kind) => kind.unwrap_or_default().label(),
+    };
+    // Only stages that the run has reached are marked. If runs have different stages, none are marked.
+    let last = curves.iter().filter_map(|curve| curve.generation.last()).fold(0.0_f64, |most, &last| most.max(last));
+    let begun = |config: &Config| {
+        let froms = config.stages.iter().map(|stage| stage.from);
+        froms.filter(|from| (1..=last as usize).contains(from)).collect()
+    };
+    let mut staged: Vec<Vec<usize>> = configs.iter().map(begun).collect();
+    staged.dedup();
+    let stages = if staged.len() == 1 { staged.remove(0) } else { vec![] };
+    Figure {
+        panels: vec![Panel { title: String::new(), curves: curves.into_iter().enumerate().collect(), stages }],
+        legend,
+        references: vec![],
+        y_label,
+        y_max: 1.0,
+        shares: true,
+        band: Band::Interval,
+        source: None,
+        warning: None,
+    }
+}
+
+/// Reports whether trials of several runs form pairs, because all runs have the same seed.
+///
+/// Paired trials share their starts and all random numbers. If sizes agree, they also share their first populations.
+///
+/// # Errors
+/// A run cannot be read.
+pub fn paired(folders: &[PathBuf], verification: Verification) -> Result<bool, ReadError> {
+    let seed = |folder: &PathBuf| Ok(config(folder, verification)?.learning.seed);
+    let seeds = folders.iter().map(seed).collect::<Result<Vec<_>, ReadError>>()?;
+    Ok(seeds.len() > 1 && seeds.iter().all(|seed| *seed == seeds[0]))
+}
+
+/// Labels runs by the config keys that differ between them, or by their directories if none differ.
+pub fn labels(folders: &[PathBuf], configs: &[Config]) -> Vec<String> {
+    let table = |config: &Config| toml::Table::try_from(config).unwrap_or_default();
+    let tables: Vec<toml::Table> = configs.iter().map(table).collect();
+    let Some(first) = tables.first() else { return vec![] };
+    let value = |table: &toml::Table, section: &str, key: &str| {
+        let text = table.get(section).and_then(|section| section.get(key)).map_or("-".into(), toml::Value::to_string);
+        text.trim_matches('"').to_string()
+    };
+    let mut keys = Vec::new();
+    for (section, entries) in first {
+        // The checkpoint interval does not affect results.
+        for key in entries.as_table().into_iter().flat_map(toml::Table::keys).filter(|_| section != "checkpoint") {
+            let differs = tables.iter().any(|table| value(table, section, key) != value(first, section, key));
+            if differs {
+                keys.push((section, key));
+            }
+        }
+    }
+    let staged = configs.iter().any(|config| config.stages != configs[0].stages);
+    let label = |((folder, table), config): ((&PathBuf, &toml::Table), &Config)| {
+        let stages = match config.stages.len() {
+            0 => "no stages".into(),
+            1 => "1 stage".into(),
+            several => format!("{several} stages"),
+        };
+        let parts: Vec<String> = keys
+            .iter()
+            .map(|(section, key)| {
+                let value = value(table, section, key);
+                // Long values such as positions are unreadable in a label.
+                if value.len() > 24 { String::new() } else { format!("{key} {value}") }
+            })
+            .filter(|part| !part.is_empty())
+            .chain(Some(stages).filter(|_| staged))
+            .collect();
+        if parts.is_empty() { folder.escaped().to_string() } else { parts.join(", ") }
+    };
+    let labels: Vec<String> = folders.iter().zip(&tables).zip(configs).map(label).collect();
+    // Equal labels mean that only a long value differs. Such labels also get the directory.
+    let twice = |label: &String| labels.iter().filter(|other| *other == label).count() > 1;
+    let full = |(label, folder): (&String, &PathBuf)| {
+        let name = folder.escaped().to_string();
+        if twice(label) && *label != name { format!("{label} ({name})") } else { label.clone() }
+    };
+    labels.iter().zip(folders).map(full).collect()
+}

@@ -1,0 +1,100 @@
+//! Scripted teams: leaders that drive to given places, whatever they sense. They show that a task can be solved.
+//!
+//! A script is a CSV table with the columns `leader,until,x,y,speed`. Until step `until`, the leader drives to (x, y) at
+//! no more than this speed, and waits there. A leader's rows are in ascending order of `until`. After the last it stops.
+
+use std::f32::consts::PI;
+
+use serde::{Deserialize, Serialize};
+
+use flotilla::config::Config;
+use flotilla::stepping::{StepError, Stepper};
+use flotilla::world::World;
+
+/// The places that a team's leaders drive to.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+pub struct Script(Vec<Leg>);
+
+/// A target of one leader, until a step.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Leg {
+    leader: usize,
+    until: u32,
+    /// The target, in units.
+    x: f32,
+    y: f32,
+    /// The largest speed, in units per second.
+    speed: f32,
+}
+
+impl Script {
+    /// Reads a script from a CSV table.
+    ///
+    /// # Errors
+    /// A column is missing or unknown, or a value is not a number.
+    pub fn parse(table: &str) -> Result<Script, csv::Error> {
+        let mut reader = csv::ReaderBuilder::new().trim(csv::Trim::All).from_reader(table.as_bytes());
+        Ok(Script(reader.deserialize().collect::<Result<_, _>>()?))
+    }
+
+    /// Checks that the script is for the leaders of a config.
+    ///
+    /// # Errors
+    /// There are no rows, a leader does not exist, a number is out of range, or a leader's rows are not in order.
+    pub fn check(&self, config: &Config) -> Result<(), String> {
+        if self.0.is_empty() {
+            return Err("there are no rows".into());
+        }
+        let mut last = vec![0; config.learners()];
+        for (row, leg) in (1..).zip(&self.0) {
+            let leaders = last.len();
+            let Some(last) = last.get_mut(leg.leader) else {
+                return Err(format!("row {row}: leader {} of {leaders}; they count from 0", leg.leader));
+            };
+            if ![leg.x, leg.y, leg.speed].iter().all(|number| number.is_finite()) || leg.speed < 0.0 {
+                return Err(format!("row {row}: x, y and speed have to be finite, and speed at least 0"));
+            }
+            if leg.until <= *last {
+                return Err(format!("row {row}: `until` has to be larger than in this leader's row before"));
+            }
+            *last = leg.until;
+        }
+        Ok(())
+    }
+
+    /// Plays one team from the start in the config's own keys, without stages or jitter. Returns the step at which each
+    /// POI was first observed, `[pois]`.
+    ///
+    /// # Errors
+    /// There is too little memory, or a target is not finite, see [`Script::check`].
+    pub fn play(&self, config: &Config) -> Result<Vec<Option<u32>>, StepError> {
+        let mut stepper = Stepper::new(World::new(config), 1)?;
+        let (leaders, max_speed) = (config.learners(), config.motion.max_speed as f32);
+        let mut first = vec![None; config.world.pois.len()];
+        while !stepper.is_over(0) {
+            let step = stepper.steps()[0];
+            let states = stepper.states();
+            let mut actions = [0.0, -1.0].repeat(leaders);
+            for (leader, action) in actions.chunks_exact_mut(2).enumerate() {
+                let leg = self.0.iter().find(|leg| leg.leader == leader && step < leg.until);
+                let Some(leg) = leg else { continue };
+                let vector = |vectors: &[f32]| [vectors[2 * leader], vectors[2 * leader + 1]];
+                let ([x, y], [hx, hy]) = (vector(states.positions), vector(states.headings));
+                let (dx, dy) = (leg.x - x, leg.y - y);
+                // `libm` gives the same bits on every system.
+                let turn = libm::atan2f(hx * dy - hy * dx, hx * dx + hy * dy);
+                // Slow down near the place, and if it is not ahead.
+                let speed = leg.speed.min(2.0 * libm::hypotf(dx, dy)) * libm::cosf(turn).max(0.0);
+                action.copy_from_slice(&[turn / PI, (2.0 * speed / max_speed - 1.0).clamp(-1.0, 1.0)]);
+            }
+            stepper.step(&actions)?;
+            for (first, &observed) in first.iter_mut().zip(stepper.observed()) {
+                if observed && first.is_none() {
+                    *first = Some(step + 1);
+                }
+            }
+        }
+        Ok(first)
+    }
+}

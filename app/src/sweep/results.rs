@@ -1,0 +1,220 @@
+//! The tables of a sweep, from the folders of its points. Their bytes do not depend on which process trained the
+//! points, or in what order.
+
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+use super::{Axis, Point, Sweep};
+use crate::record::digests::{Digests, Verification};
+use crate::record::disk::Disk;
+use crate::record::folder::{CONFIG, METRICS, POINTS, RESULTS};
+use crate::record::{RecordError, without_checkpoint};
+use crate::record::{metrics, ownership};
+use crate::report::curves::Band;
+use crate::report::runs::TeamKind;
+use flotilla::config::Config;
+use flotilla::escape::{self, PathExt};
+use flotilla::file;
+use flotilla::statistics::Average;
+use flotilla::trainer::Row;
+
+/// The options of [`write()`].
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Detail {
+    /// The number of generations per row of `results.csv`. The last generation always has a row.
+    pub every: usize,
+    /// The G in 0..1 whose first generation is reported.
+    pub reach: f64,
+    /// Whether points' files are compared with their digests.
+    pub verification: Verification,
+    /// The team whose G the pictures show.
+    pub measure: TeamKind,
+    /// Meaning of the pictures' bands.
+    pub band: Band,
+}
+
+/// The results of a point's trials.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Outcome {
+    /// The best team's G in the last generation of every trial.
+    pub best: Vec<f64>,
+    /// The champion's G in the last generation of every trial.
+    pub champion: Vec<f64>,
+    /// The first generation of every trial whose best G is at least [`Detail::reach`].
+    pub reached: Vec<Option<usize>>,
+    /// [`Detail::measure`]'s G by generation, averaged over the trials, for each row of `results.csv`. The last
+    /// generation is the last entry.
+    pub curve: Vec<(usize, Average)>,
+}
+
+impl Outcome {
+    /// Returns the average over trials of the best team's G in the last generation.
+    pub fn best(&self) -> Average {
+        self.best.iter().collect()
+    }
+
+    /// Returns the average over trials of the champion's G in the last generation.
+    pub fn champion(&self) -> Average {
+        self.champion.iter().collect()
+    }
+
+    /// Returns the average over trials of [`Detail::measure`]'s G in the last generation.
+    pub fn measured(&self) -> Average {
+        self.curve.last().map_or(Average::default(), |(_, average)| *average)
+    }
+
+    /// Returns the median over trials of the first generation that reaches G. Trials that never reach it count as
+    /// infinite. None if the median is infinite.
+    pub(crate) fn median_reached(&self) -> Option<f64> {
+        let mut reached: Vec<usize> = self.reached.iter().map(|reached| reached.unwrap_or(usize::MAX)).collect();
+        reached.sort_unstable();
+        let middle = [reached[(reached.len() - 1) / 2], reached[reached.len() / 2]];
+        (middle[1] < usize::MAX).then(|| (middle[0] + middle[1]) as f64 / 2.0)
+    }
+}
+
+/// Returns the folder of a point's run.
+pub fn point_folder(out: &Path, point: &Point) -> PathBuf {
+    out.join("points").join(format!("{:04}", point.index))
+}
+
+/// The reason why a point has no results.
+#[derive(Debug, thiserror::Error)]
+pub enum Missing {
+    /// The point's folder has no run.
+    #[error("it was not run")]
+    NotRun,
+    /// The point's run has reached the first of these generations. The second is its last.
+    #[error("it has reached generation {0} of {1}")]
+    Unfinished(usize, usize),
+    /// The point's files cannot be used.
+    #[error("{0}")]
+    Damaged(String),
+}
+
+/// Writes `results.csv` and `points.csv` of the finished points. Returns the results of every point.
+///
+/// # Errors
+/// The files cannot be written.
+pub fn write(sweep: &Sweep, out: &Path, options: &Detail) -> Result<Vec<Result<Outcome, Missing>>, RecordError> {
+    let disk = ownership::open_output_folder(&Disk::default(), out, true)?;
+    let mut outcomes = Vec::new();
+    let path = out.join(RESULTS);
+    let rows = |output: &mut dyn Write| {
+        let mut table = csv::Writer::from_writer(output);
+        let columns = ["point", "trial", "generation", "best_g", "mean_g", "champion_g"];
+        table.write_record(sweep.axes.iter().map(|axis| &*axis.key).chain(columns))?;
+        for point in &sweep.points {
+            outcomes.push(match read(point, out, options) {
+                Ok((rows, outcome)) => {
+                    for row in rows {
+                        let Row { trial, generation, best_g, mean_g, champion_g, .. } = row;
+                        let counts = [point.index, trial, generation].map(|count| count.to_string());
+                        let shares = [best_g, mean_g, champion_g].map(|share| share.to_string());
+                        table.write_record(labels(sweep, point).into_iter().chain(counts).chain(shares))?;
+                    }
+                    Ok(outcome)
+                }
+                Err(missing) => Err(missing),
+            });
+        }
+        table.flush()
+    };
+    ownership::publish(&disk, &path, rows)?;
+
+    let path = out.join(POINTS);
+    let summary = |output: &mut dyn Write| summary(sweep, &outcomes, options, output);
+    ownership::publish(&disk, &path, summary)?;
+    Ok(outcomes)
+}
+
+fn labels(sweep: &Sweep, point: &Point) -> Vec<String> {
+    let label = |(axis, &value): (&Axis, &usize)| escape::csv_cell(&axis.label(value)).into_owned();
+    sweep.axes.iter().zip(&point.values).map(label).collect()
+}
+
+/// Writes `points.csv`, one row per point.
+fn summary(
+    sweep: &Sweep,
+    outcomes: &[Result<Outcome, Missing>],
+    options: &Detail,
+    output: &mut dyn Write,
+) -> io::Result<()> {
+    let mut table = csv::Writer::from_writer(output);
+    let columns =
+        ["point", "trials", "generations", "best_g", "best_g_error", "champion_g", "reach", "reached", "median"];
+    table.write_record(sweep.axes.iter().map(|axis| &*axis.key).chain(columns))?;
+    for (point, outcome) in sweep.points.iter().zip(outcomes) {
+        let Ok(outcome) = outcome else { continue };
+        let best = outcome.best();
+        let fields = [
+            point.index.to_string(),
+            outcome.best.len().to_string(),
+            point.config.learning.generations.to_string(),
+            best.mean().to_string(),
+            best.error().to_string(),
+            outcome.champion().mean().to_string(),
+            options.reach.to_string(),
+            outcome.reached.iter().flatten().count().to_string(),
+            outcome.median_reached().map_or(String::new(), |median| median.to_string()),
+        ];
+        table.write_record(labels(sweep, point).into_iter().chain(fields))?;
+    }
+    table.flush()
+}
+
+/// Reads the rows of a finished point for `results.csv`, by trial and generation, and its results.
+fn read(point: &Point, out: &Path, options: &Detail) -> Result<(Vec<Row>, Outcome), Missing> {
+    let folder = point_folder(out, point);
+    let damaged = |error: &dyn std::fmt::Display| Missing::Damaged(error.to_string());
+    let path = folder.join(METRICS);
+    if !file::exists(&path).map_err(|error| damaged(&format!("{}: cannot be read: {error}", path.escaped())))? {
+        return Err(Missing::NotRun);
+    }
+    let digests = Digests::read(&folder, options.verification).map_err(|error| damaged(&error))?;
+    let config = Config::load(&folder.join(CONFIG)).map_err(|error| damaged(&error))?;
+    if without_checkpoint(&config) != without_checkpoint(&point.config) {
+        return Err(Missing::Damaged(format!("{}: it is of another config", folder.escaped())));
+    }
+    digests.compare_config(&folder.join(CONFIG), &config).map_err(|error| damaged(&error))?;
+    let (trials, last) = (config.learning.trials, config.learning.generations);
+    let mut rows: Vec<Vec<Row>> = vec![Vec::new(); trials];
+    let mut reached = vec![None; trials];
+    let mut next = 0;
+    let mut source = metrics::open(&path).map_err(|error| damaged(&error))?;
+    for row in &mut source {
+        let (row, _) = row.map_err(|error| damaged(&format!("{}: {error}", path.escaped())))?;
+        let Row { trial, generation, best_g, .. } = row;
+        if (generation, trial) != (next / trials, next % trials) || generation > last {
+            return Err(Missing::Damaged(format!(
+                "{}: trial {trial} of generation {generation} is out of order",
+                path.escaped()
+            )));
+        }
+        next += 1;
+        // G of an easier stage is not comparable.
+        if best_g >= options.reach && reached[trial].is_none() && generation >= config.last_from() {
+            reached[trial] = Some(generation);
+        }
+        if generation % options.every == 0 || generation == last {
+            rows[trial].push(row);
+        }
+    }
+    digests.compare_metrics(&path, source.digest()).map_err(|error| damaged(&error))?;
+    if next < trials * (last + 1) {
+        return Err(Missing::Unfinished(next / trials, last));
+    }
+    let ends = || rows.iter().filter_map(|rows| rows.last());
+    let curve = (0..rows[0].len()).map(|at| {
+        let mut average = Average::default();
+        rows.iter().for_each(|rows| average.add(options.measure.of(&rows[at])));
+        (rows[0][at].generation, average)
+    });
+    let outcome = Outcome {
+        best: ends().map(|row| row.best_g).collect(),
+        champion: ends().map(|row| row.champion_g).collect(),
+        reached,
+        curve: curve.collect(),
+    };
+    Ok((rows.concat(), outcome))
+}

@@ -1,0 +1,110 @@
+//! `flotilla baseline`: plays teams that do not learn.
+
+use super::console::Console;
+use super::recovery::Loss;
+use super::{ConfigFile, Error, Overrides, Printed, RunOptions, SetKeys, between, number};
+use clap::builder::PossibleValuesParser as Words;
+use flotilla::baseline::SPEEDS;
+use flotilla::config::{Actions, Choice, Paradigm};
+use flotilla::evaluate::MAX_EPISODES;
+use flotilla_app::ops::baseline::{self, Outcome, Request};
+use flotilla_app::report::table::markdown;
+
+#[derive(clap::Args)]
+pub struct Args {
+    #[command(flatten)]
+    config: ConfigFile,
+    /// Independent repetitions of the random baselines
+    #[arg(long, value_name = "N", default_value_t = 10, value_parser = between(1..=4096u32))]
+    seeds: u32,
+    /// Held-out episodes per team, if starts or POIs vary; as many others choose the team
+    #[arg(long, value_name = "N", default_value_t = 200, value_parser = between(1..=MAX_EPISODES))]
+    episodes: u32,
+    /// Draw as many random teams as a training with this many generations plays [default: the config's]
+    #[arg(long, value_name = "N", value_parser = number)]
+    generations: Option<String>,
+    /// Draw as many random teams as a training with this population plays [default: the config's]
+    #[arg(long, value_name = "N", value_parser = number)]
+    population: Option<String>,
+    /// Who learns [default: the config's]
+    #[arg(long, value_name = "NAME", value_parser = Words::new(Paradigm::names()), ignore_case = true)]
+    paradigm: Option<String>,
+    #[command(flatten)]
+    set: SetKeys,
+    #[command(flatten)]
+    printed: Printed,
+    #[command(flatten)]
+    run: RunOptions,
+}
+
+pub fn run(args: Args) -> Result<(), Error> {
+    let Args { config, seeds, episodes, generations, population, paradigm, set, printed, run } = args;
+    let overrides = Overrides { generations, population, paradigm, set, ..Overrides::default() };
+    let config = config.text(overrides.list())?;
+    let request = Request { config, seeds, episodes };
+    let mut console = Console::new(&run, Loss::default(), printed.quiet);
+    let found = console.play(|backends, context| baseline::run(&request, backends, context))?;
+    printed.outcome(&found, in_words)
+}
+
+fn in_words(found: &Outcome) -> String {
+    let &Outcome { pois, seeds, teams, paradigm, actions, ref constant, ref action, ref network, .. } = found;
+    let head = [&format!("POIs observed, of {pois}"), "mean [95 % interval]", "lowest", "highest"];
+    let mut rows = vec![head.map(|head| head.to_string()).to_vec()];
+    let constants = match actions {
+        Actions::Direct => format!("best of {SPEEDS} constant speeds, straight ahead"),
+        Actions::Behaviours => "best constant behaviour".into(),
+    };
+    for (name, found) in [
+        (constants, constant),
+        (format!("best of {teams} random constant actions"), action),
+        (format!("best of {teams} random networks"), network),
+    ] {
+        let interval = found.interval_95.map_or(String::new(), |[low, high]| format!(" [{low:.2}, {high:.2}]"));
+        let (low, high) = found.seeds.iter().fold((f64::MAX, f64::MIN), |(l, h), &o| (l.min(o), h.max(o)));
+        rows.push(vec![name, format!("{:.2}{interval}", found.mean), format!("{low:.2}"), format!("{high:.2}")]);
+    }
+    let played = match found.moves {
+        true => format!("Each team was chosen by {0} episodes and plays {0} held-out episodes.", found.episodes),
+        false => "Every team plays from the config's starts.".into(),
+    };
+    let all: Vec<bool> = found.constants.iter().map(|constant| constant.pois >= pois as f64).collect();
+    format!(
+        "{paradigm}, {seeds} seeds. N = {teams} random teams per seed, as many as one trial of training evaluates. \
+         {played}\n\n{}\n{}\n",
+        markdown(&rows),
+        solved(actions, &all)
+    )
+}
+
+/// Returns a sentence about which constant actions observe every POI.
+fn solved(actions: Actions, solved: &[bool]) -> String {
+    let unit = |index: usize| match actions {
+        Actions::Direct => format!("{} %", (index + 1) * 100 / SPEEDS),
+        Actions::Behaviours => format!("{index}"),
+    };
+    let mut ranges: Vec<String> = vec![];
+    let mut from = None;
+    for (index, &all) in solved.iter().chain([&false]).enumerate() {
+        match (all, from) {
+            (true, None) => from = Some(index),
+            (false, Some(first)) => {
+                let last = index - 1;
+                ranges.push(if first == last { unit(first) } else { format!("{} to {}", unit(first), unit(last)) });
+                from = None;
+            }
+            _ => {}
+        }
+    }
+    let ranges = ranges.join(", ");
+    match (actions, ranges.is_empty()) {
+        (Actions::Direct, true) => "No constant speed observes every POI.".into(),
+        (Actions::Direct, false) => {
+            format!("A team that drives straight ahead at {ranges} of motion.max_speed observes every POI.")
+        }
+        (Actions::Behaviours, true) => "No constant behaviour observes every POI.".into(),
+        (Actions::Behaviours, false) => {
+            format!("A team that always chooses the behaviour {ranges} observes every POI.")
+        }
+    }
+}

@@ -1,0 +1,140 @@
+//! Runs use cases in a terminal: opens the backend, listens for signals, and shows what happens.
+
+use std::cell::RefCell;
+use std::ffi::OsString;
+
+use super::recovery::{self, Loss, Signals};
+use super::{Error, RunOptions, backend, say};
+use crate::progress::{Meter, ProgressBars};
+use flotilla::backend::OpenBackend;
+use flotilla_app::choice::Work;
+use flotilla_app::ops::{BackendSource, Context, Event};
+
+/// The flags of a command that concern every use case.
+pub struct Console<'a> {
+    machine: Machine<'a>,
+    loss: Loss,
+    quiet: bool,
+}
+
+/// The backend that the flags choose, opened when it is needed.
+struct Machine<'a> {
+    options: &'a RunOptions,
+    open: Option<(OpenBackend, String)>,
+}
+
+impl BackendSource for Machine<'_> {
+    fn open(&mut self, work: Work) -> Result<(&mut OpenBackend, String), Error> {
+        let (open, description) = match &mut self.open {
+            Some(open) => open,
+            closed => closed.insert(backend::open_for(self.options, work)?),
+        };
+        Ok((open, description.clone()))
+    }
+}
+
+impl<'a> Console<'a> {
+    /// Returns a console with a command's flags.
+    pub fn new(options: &'a RunOptions, loss: Loss, quiet: bool) -> Console<'a> {
+        Console { machine: Machine { options, open: None }, loss, quiet }
+    }
+
+    /// Runs a use case that signals stop.
+    ///
+    /// # Errors
+    /// The use case fails, or the system does not allow signal handlers.
+    pub fn run<R>(
+        &mut self,
+        work: impl FnOnce(&mut dyn BackendSource, Context<'_>) -> Result<R, Error>,
+    ) -> Result<R, Error> {
+        self.with(&Signals::listen()?, work)
+    }
+
+    /// Runs a use case that signals end at once, because it leaves nothing to save.
+    ///
+    /// # Errors
+    /// The use case fails.
+    pub fn play<R>(
+        &mut self,
+        work: impl FnOnce(&mut dyn BackendSource, Context<'_>) -> Result<R, Error>,
+    ) -> Result<R, Error> {
+        self.with(&Signals::default(), work)
+    }
+
+    fn with<R>(
+        &mut self,
+        signals: &Signals,
+        work: impl FnOnce(&mut dyn BackendSource, Context<'_>) -> Result<R, Error>,
+    ) -> Result<R, Error> {
+        let flags = recovery::words_of_machine(self.machine.options, self.loss);
+        run_reported(self.quiet, signals, &flags, self.loss.falls_back(), |context| work(&mut self.machine, context))
+    }
+}
+
+/// Runs a use case that needs no backend. A signal ends the process.
+///
+/// # Errors
+/// The use case fails.
+pub fn run_without_backend<R>(quiet: bool, work: impl FnOnce(Context<'_>) -> Result<R, Error>) -> Result<R, Error> {
+    run_reported(quiet, &Signals::default(), &[], false, work)
+}
+
+fn run_reported<R>(
+    quiet: bool,
+    signals: &Signals,
+    flags: &[OsString],
+    falls_back: bool,
+    work: impl FnOnce(Context<'_>) -> Result<R, Error>,
+) -> Result<R, Error> {
+    let (show, command) = (Display::new(quiet), recovery::command_line());
+    let (Signals { stop, save }, report) = (signals, |event: Event<'_>| show.event(event));
+    let done = work(Context { stop, save, command: &command, flags, falls_back, ..Context::new(&report) });
+    show.event(Event::Pause);
+    done
+}
+
+/// Shows events on standard error.
+struct Display {
+    quiet: bool,
+    shown: RefCell<View>,
+}
+
+/// The drawing on the terminal.
+enum View {
+    Nothing,
+    Curves(ProgressBars),
+    Meter(Meter),
+}
+
+impl Display {
+    fn new(quiet: bool) -> Display {
+        Display { quiet, shown: RefCell::new(View::Nothing) }
+    }
+
+    fn event(&self, event: Event<'_>) {
+        let shown = &mut *self.shown.borrow_mut();
+        match (event, &mut *shown) {
+            (Event::Warning(text) | Event::Note(text), _) => say(text),
+            (Event::Message(text), _) if !self.quiet => say(text),
+            (Event::Begin(names, from, last), shown) => {
+                *shown = View::Curves(ProgressBars::new(names, from, last, self.quiet));
+            }
+            (Event::Rows { next, rows, .. }, View::Curves(board)) => board.show(next, rows),
+            (Event::Fraction(part, text), View::Meter(meter)) => meter.show(part, || text),
+            (Event::Fraction(part, text), shown) => {
+                let mut meter = Meter::new(self.quiet);
+                meter.show(part, || text);
+                *shown = View::Meter(meter);
+            }
+            (Event::Pause, shown) => {
+                match shown {
+                    View::Nothing => {}
+                    View::Curves(board) => board.clear(),
+                    View::Meter(meter) => meter.clear(),
+                }
+                *shown = View::Nothing;
+            }
+            (Event::Message(_) | Event::Rows { .. }, _) => {}
+        }
+    }
+}

@@ -1,0 +1,352 @@
+//! The speed of episodes and of whole generations, and the share of the machine's arithmetic ceiling that they reach.
+
+use std::time::Duration;
+
+use fearless_simd::Level;
+
+use flotilla::backend::cpu::Cpu;
+use flotilla::backend::gpu::device::Traffic;
+use flotilla::backend::gpu::episode::{GpuBackend, PhaseTimes};
+use flotilla::backend::{Backend, BackendError, Group, Weights};
+use flotilla::config::{Config, Coupling};
+use flotilla::evolve::{Key, Purpose, contemporary_teams, random_policy};
+use flotilla::host::Instant;
+use flotilla::trainer::{GenerationTimes, Trainer};
+use flotilla::world::World;
+use flotilla_app::sweep::layout::{self, MAX_FOLLOWERS, MAX_GROUPS};
+
+mod ceiling;
+mod gpu_ceiling;
+pub mod operations;
+
+use operations::Reach;
+
+/// Timed repeats, of which the median counts, and the minimum time of each.
+const REPEATS: usize = 5;
+const MIN_REPEAT_TIME: Duration = Duration::from_millis(200);
+/// Repeats of anything that takes longer than this.
+const FEW_REPEATS: usize = 3;
+const MAX_TIME_OF_REPEATS: Duration = Duration::from_secs(2);
+/// Reads of a clock after which it counts as standing still. They take longer than any clock needs to advance.
+const CLOCK_READS: usize = 1 << 22;
+/// Teams that are traced to count neighbours, and the maximum number of pairs in that trace, beyond the first team.
+const TRACED_TEAMS: usize = 64;
+const TRACED_PAIRS: usize = 1 << 28;
+
+/// The hardware that is measured.
+pub(crate) enum Subject {
+    /// The CPU, with an instruction set.
+    Cpu(Cpu, Level),
+    /// A GPU.
+    Gpu(Box<GpuBackend>),
+}
+
+impl Subject {
+    /// Returns the backend.
+    pub fn backend(&mut self) -> &mut dyn Backend {
+        match self {
+            Subject::Cpu(cpu, _) => cpu,
+            Subject::Gpu(gpu) => &mut **gpu,
+        }
+    }
+
+    /// Prepares the measurement of its arithmetic ceiling.
+    ///
+    /// # Errors
+    /// The GPU failed.
+    fn ceiling(&self) -> Result<Box<Peak>, BackendError> {
+        Ok(match self {
+            &Subject::Cpu(_, level) => Box::new(move || Ok(ceiling::measure(level))),
+            Subject::Gpu(gpu) => {
+                let ceiling = gpu_ceiling::Ceiling::new(gpu.gpu())?;
+                Box::new(move || Ok(ceiling.measure()?))
+            }
+        })
+    }
+}
+
+type Peak = dyn FnMut() -> Result<f64, BackendError>;
+
+/// The measurements of one config.
+pub(crate) struct Timing {
+    /// Teams that play at once.
+    pub teams: usize,
+    /// Leaders per team.
+    pub leaders: usize,
+    /// Followers per team.
+    pub followers: usize,
+    /// POIs.
+    pub pois: usize,
+    /// Steps per episode.
+    pub steps: usize,
+    /// Seconds per rollout: episodes, record and scores.
+    pub rollout: f64,
+    /// Seconds per generation: a rollout, selection and mutation. `None` unless requested.
+    pub generation: Option<f64>,
+    /// The time of generations by phase. `None` unless requested.
+    pub profile: Option<Profile>,
+    /// Mean G of the random teams of the rollout.
+    pub mean_g: f64,
+    /// The numbers of entities in reach of agents. The operations depend on them.
+    pub reach: Reach,
+    /// Lane operations per team-step.
+    pub operations: f64,
+    /// Lane operations per second at the arithmetic ceiling.
+    pub ceiling: f64,
+}
+
+/// The time of some generations by phase.
+pub(crate) struct Profile {
+    /// The number of these generations.
+    pub generations: usize,
+    /// The trainer's phases.
+    pub times: GenerationTimes,
+    /// The phases of a GPU's rollouts.
+    pub gpu_times: Option<PhaseTimes>,
+    /// Bytes over the bus, in rollouts and between them.
+    pub traffic: Traffic,
+}
+
+/// The measurements of whole generations.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Generations {
+    /// Nothing: only rollouts.
+    LeftOut,
+    /// The time of a generation.
+    Timed,
+    /// The time of a generation, by phase.
+    Profiled,
+}
+
+impl Timing {
+    /// Returns the agents per team.
+    pub fn agents(&self) -> usize {
+        self.leaders + self.followers
+    }
+
+    /// Returns the steps of all teams together.
+    pub(crate) fn team_steps(&self) -> f64 {
+        (self.teams * self.steps) as f64
+    }
+
+    /// Returns the share of the arithmetic ceiling that rollouts reach.
+    pub(crate) fn ceiling_share(&self) -> f64 {
+        self.operations * self.team_steps() / self.rollout / self.ceiling
+    }
+}
+
+/// Returns the config with another number of agents, laid out in the groups of [`layout`]. The ratio of leaders to
+/// followers stays as close as integers allow. The number of POIs stays; they are ahead of the first groups.
+///
+/// # Errors
+/// There are more leaders than groups, or more followers per leader than positions.
+pub fn with_agents(config: &Config, agents: usize) -> Result<Config, String> {
+    let (leaders, followers) = (config.world.leaders.len(), config.world.followers.len());
+    let groups = ((agents * leaders) as f64 / (leaders + followers) as f64).round().max(1.0) as usize;
+    let followers = agents - groups;
+    if groups > MAX_GROUPS || followers.div_ceil(groups) > MAX_FOLLOWERS {
+        return Err(format!(
+            "{agents} agents in the config's ratio are {groups} leaders and {followers} followers; \
+             allowed {MAX_GROUPS} leaders of {MAX_FOLLOWERS} followers"
+        ));
+    }
+    let places = layout::places();
+    let shares: Vec<_> = (0..groups).map(|g| followers / groups + usize::from(g < followers % groups)).collect();
+    let agents_at = layout::positions(&places, &shares);
+    let pois_at = layout::positions(&places, &vec![0; config.world.pois.len()]);
+    let list = |list: Vec<[i32; 2]>| list.into_iter().map(|place| place.map(f64::from)).collect();
+    let mut config = config.clone();
+    config.world.map = agents_at.map.max(pois_at.map).map(f64::from);
+    config.world.leaders = list(agents_at.leaders);
+    config.world.followers = list(agents_at.followers);
+    config.world.pois = list(pois_at.pois);
+    match &mut config.world.coupling {
+        Coupling::Same(count) => *count = agents.min(*count),
+        Coupling::Each(counts) => counts.iter_mut().for_each(|count| *count = agents.min(*count)),
+    }
+    Ok(config)
+}
+
+/// Times rollouts of one trial's random teams, and its generations.
+///
+/// # Errors
+/// The backend failed.
+pub(crate) fn measure(
+    config: &Config,
+    subject: &mut Subject,
+    generations: Generations,
+) -> Result<Timing, BackendError> {
+    let world = World::new(config);
+    let ceiling = &mut subject.ceiling()?;
+    let ([rollout, ceiling], mean_g, reach) = rollout(config, &world, subject.backend(), ceiling)?;
+    let (generation, profile) = match generations {
+        Generations::LeftOut => (None, None),
+        Generations::Timed => (Some(self::generations(config, subject)?.0), None),
+        Generations::Profiled => {
+            if let Subject::Gpu(gpu) = subject {
+                gpu.use_clock();
+            }
+            let (generation, profile) = self::generations(config, subject)?;
+            (Some(generation), Some(profile))
+        }
+    };
+    Ok(Timing {
+        teams: config.max_teams() - 1,
+        leaders: world.leaders(),
+        followers: world.followers(),
+        pois: world.pois.len(),
+        steps: world.steps(),
+        rollout,
+        generation,
+        profile,
+        mean_g,
+        operations: operations::per_team_step(&world, &reach),
+        reach,
+        ceiling,
+    })
+}
+
+/// Returns seconds per generation, and its phases. The first generation is not counted, because it compiles and
+/// allocates.
+fn generations(config: &Config, subject: &mut Subject) -> Result<(f64, Profile), BackendError> {
+    let mut trainer = Trainer::new([config.validate()?]);
+    trainer.advance(subject.backend())?;
+    let take = |trainer: &mut Trainer, subject: &mut Subject| {
+        let (gpu_times, traffic) = match subject {
+            Subject::Cpu(..) => (None, Traffic::default()),
+            Subject::Gpu(gpu) => (Some(gpu.take_times()), gpu.gpu().traffic()),
+        };
+        Profile { generations: trainer.generation(0), times: trainer.take_times(), gpu_times, traffic }
+    };
+    let before = take(&mut trainer, subject);
+    let [seconds, _] = time(|| trainer.advance(subject.backend()).map(drop), || Ok(0.0))?;
+    let profile = take(&mut trainer, subject);
+    let generations = profile.generations - before.generations;
+    Ok((seconds, Profile { generations, traffic: profile.traffic - before.traffic, ..profile }))
+}
+
+/// Returns seconds per rollout of random policies, scored as in training, and the arithmetic ceiling measured in
+/// between; the mean G; and the entities in reach of agents.
+fn rollout(
+    config: &Config,
+    world: &World,
+    backend: &mut dyn Backend,
+    ceiling: &mut Peak,
+) -> Result<([f64; 2], f64, Reach), BackendError> {
+    let (population, leaders, seed) = (config.learning.population, world.leaders(), config.learning.seed);
+    let mut weights = vec![0.0; config.populations() * population * world.parameters()];
+    let key = Key::new(seed, 0, Purpose::Weights);
+    for (policy, weights) in weights.chunks_exact_mut(world.parameters()).enumerate() {
+        random_policy(Level::new(), key.at(0, policy / population, policy % population), weights);
+    }
+    // Teams with past champions take as long as others, which stand in for them.
+    let count = config.max_teams() - 1;
+    let teams: Vec<u32> =
+        contemporary_teams(&config.learning, 0, 0, leaders).into_iter().cycle().take(count * leaders).collect();
+    // If generations play from the device's memory, so do these rollouts.
+    let held = backend.hold(&weights, [config.populations(), population, world.parameters()])?;
+    let played = held.as_deref().map_or(weights[..].into(), Weights::OnDevice);
+    let group = Group {
+        world,
+        starts: &world.starts,
+        weights: played,
+        policies: population,
+        sharing: config.learning.sharing,
+        teams: &teams,
+        fitnesses: std::slice::from_ref(&config.learning.fitness),
+    };
+    let mut observed = 0;
+    let play = || {
+        observed = backend.play(&[group])?.iter().flat_map(|scores| &scores.observed).sum::<u32>();
+        Ok(())
+    };
+    let times = time(play, ceiling)?;
+    let mean_g = f64::from(observed) / (count * world.pois.len()) as f64;
+    let pairs = world.steps() * world.agents() * world.agents();
+    let traced = (TRACED_PAIRS / pairs).clamp(1, TRACED_TEAMS).min(population);
+    // The CPU traces, because every backend's trace is the same.
+    let traced = Group { weights: weights[..].into(), teams: &teams[..traced * leaders], ..group };
+    let trace = Cpu::default().trace(&traced)?;
+    Ok((times, mean_g, Reach::of(world, &trace)))
+}
+
+/// Reports whether the system's clock advances. No measurement would end without that.
+pub(crate) fn has_clock() -> bool {
+    advances(Instant::now)
+}
+
+/// Reports whether a clock advances while it is read many times.
+fn advances<T: PartialEq>(now: impl Fn() -> T) -> bool {
+    let start = now();
+    (0..CLOCK_READS).any(|_| now() != start)
+}
+
+/// Returns medians over a few repeats: seconds per call, and the measurement between repeats, so that a slow phase of
+/// the machine affects both. Each repeat takes at least [`MIN_REPEAT_TIME`].
+fn time<E>(
+    mut call: impl FnMut() -> Result<(), E>,
+    mut between: impl FnMut() -> Result<f64, E>,
+) -> Result<[f64; 2], E> {
+    let start = Instant::now();
+    call()?;
+    let repeats = if start.elapsed() > MAX_TIME_OF_REPEATS { FEW_REPEATS } else { REPEATS };
+    let (mut seconds, mut others) = (Vec::with_capacity(repeats), Vec::with_capacity(repeats));
+    for _ in 0..repeats {
+        others.push(between()?);
+        let (start, mut calls) = (Instant::now(), 0);
+        while calls == 0 || start.elapsed() < MIN_REPEAT_TIME {
+            call()?;
+            calls += 1;
+        }
+        seconds.push(start.elapsed().as_secs_f64() / f64::from(calls));
+    }
+    Ok([median(seconds), median(others)])
+}
+
+/// Returns the median of finite values; of an even number, the upper one.
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::HashSet;
+
+    use super::*;
+
+    fn config() -> Config {
+        let text = flotilla::config::LAYOUTS[0].1;
+        Config::parse(text, "generally_forward.toml").expect("the project's own config")
+    }
+
+    #[test]
+    fn a_clock_that_stands_still_is_noticed() {
+        use std::cell::Cell;
+        assert!(!advances(|| 7));
+        let reads = Cell::new(0);
+        assert!(advances(|| reads.replace(reads.get() + 1) / 1000));
+        assert!(has_clock());
+    }
+
+    #[test]
+    fn its_own_number_of_agents_is_the_papers_layout() {
+        assert_eq!(World::new(&with_agents(&config(), 12).unwrap()), World::new(&config()));
+    }
+
+    #[test]
+    fn any_number_of_agents_keeps_the_ratio_and_nobody_shares_a_start() {
+        for agents in [1, 2, 3, 12, 24, 100, 256, 768] {
+            let config = with_agents(&config(), agents).unwrap();
+            let world = World::new(&config);
+            assert_eq!(world.agents(), agents);
+            assert!((world.leaders() as f64 - agents as f64 / 3.0).abs() <= 1.0, "{} of {agents}", world.leaders());
+            let starts: HashSet<_> = world.starts.iter().map(|start| start.to_array().map(f32::to_bits)).collect();
+            assert_eq!(starts.len(), agents);
+            // The config is valid.
+            Config::parse(&config.to_toml(), "laid out").unwrap();
+        }
+        let refusal = with_agents(&config(), 1024).unwrap_err();
+        assert!(refusal.contains("341 leaders and 683 followers"), "{refusal}");
+    }
+}

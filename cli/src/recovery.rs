@@ -1,0 +1,141 @@
+//! Shared by the commands that train recorded runs: flags, signals, and reports of failing devices.
+
+use std::ffi::OsString;
+use std::io;
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+use clap::ValueEnum;
+
+use super::{Error, RunOptions, number};
+use flotilla::config::Override;
+use flotilla_app::shell;
+
+/// The reaction to a failing device.
+#[derive(clap::Args, Clone, Copy, Default)]
+pub struct Loss {
+    /// Reaction to a device that fails during a run
+    #[arg(long, value_enum, value_name = "WHAT", default_value_t = OnLoss::Stop)]
+    on_device_loss: OnLoss,
+}
+
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum OnLoss {
+    /// Save, and stop with an error
+    #[default]
+    Stop,
+    /// Continue on the CPU, with the same results
+    Cpu,
+}
+
+impl Loss {
+    /// Reports whether the CPU continues after another backend failed.
+    pub fn falls_back(self) -> bool {
+        self.on_device_loss == OnLoss::Cpu
+    }
+}
+
+/// How often runs are saved. Overrides the config.
+#[derive(clap::Args)]
+pub struct Checkpoints {
+    /// Write a checkpoint every N generations; 0 means never
+    #[arg(long, value_name = "N", value_parser = number)]
+    checkpoint_generations: Option<String>,
+    /// Write a checkpoint every S seconds; 0 means never
+    #[arg(long, value_name = "S", value_parser = number)]
+    checkpoint_seconds: Option<String>,
+}
+
+impl Checkpoints {
+    /// Returns the keys that were set, each with its flag as its name in errors.
+    pub fn list(&self) -> Vec<Override> {
+        let Checkpoints { checkpoint_generations, checkpoint_seconds } = self;
+        let set = |(name, value): (&str, &Option<String>)| {
+            Some(Override::of_text(format!("checkpoint.{name}"), value.clone()?, format!("--checkpoint-{name}")))
+        };
+        [("generations", checkpoint_generations), ("seconds", checkpoint_seconds)].into_iter().filter_map(set).collect()
+    }
+}
+
+/// Returns the flags that set config keys, as typed.
+pub fn words_of(overrides: &[Override]) -> impl Iterator<Item = OsString> {
+    overrides.iter().flat_map(|set| match set.name.split_once(' ') {
+        Some((flag, key)) => [flag.into(), format!("{key}={}", set.text).into()],
+        None => [set.name.clone().into(), set.text.trim_matches(['"', '\'']).into()],
+    })
+}
+
+/// Returns the flags that choose what to run on, as typed, without those at their defaults.
+pub fn words_of_machine(run: &RunOptions, loss: Loss) -> Vec<OsString> {
+    fn word<T: ValueEnum + PartialEq>(value: T, default: T) -> Option<String> {
+        (value != default).then(|| value.to_possible_value()).flatten().map(|value| value.get_name().to_string())
+    }
+    let RunOptions { backend, adapter, breed, threads } = run.clone();
+    let flags = [
+        ("--backend", word(backend, super::BackendChoice::Auto)),
+        ("--adapter", adapter),
+        ("--breed", word(breed, super::Breed::Auto)),
+        ("--threads", threads.map(|threads| threads.to_string())),
+        ("--on-device-loss", word(loss.on_device_loss, OnLoss::Stop)),
+    ];
+    let words = |(flag, value): (&str, Option<String>)| match value? {
+        // As a separate word it would be read as a flag.
+        value if value.starts_with('-') => Some(vec![format!("{flag}={value}").into()]),
+        value => Some(vec![flag.into(), value.into()]),
+    };
+    flags.into_iter().filter_map(words).flatten().collect()
+}
+
+/// Quotes a path as an argument in a shell.
+pub fn quoted(path: &Path) -> String {
+    shell::quoted(shell::argument(path))
+}
+
+/// Maximum number of characters of a command line that are kept.
+const MAX_LINE: usize = 1 << 13;
+
+/// Returns the command line, quoted for a shell.
+pub fn command_line() -> String {
+    let line = shell::command(super::words());
+    match line.char_indices().nth(MAX_LINE) {
+        Some((end, _)) => format!("{} …", &line[..end]),
+        None => line,
+    }
+}
+
+/// Flags that signals set.
+#[derive(Default)]
+pub struct Signals {
+    /// Set if the run should save and stop.
+    pub stop: Arc<AtomicBool>,
+    /// Set if the run should save and continue.
+    pub save: Arc<AtomicBool>,
+}
+
+impl Signals {
+    /// Installs the signal handlers. SIGINT and SIGTERM set `stop`, and SIGUSR1 sets `save`.
+    ///
+    /// A SIGINT after any of the first two ends the process at once, because a person who presses Ctrl-C again does not
+    /// want to wait. Another SIGTERM changes nothing: batch systems send it to a script and to its processes, and to
+    /// these twice at a time limit.
+    ///
+    /// # Errors
+    /// Fails if the system does not allow signal handlers.
+    pub fn listen() -> Result<Signals, Error> {
+        use signal_hook::consts::{SIGINT, SIGTERM};
+        use signal_hook::flag;
+        let signals = Signals { stop: Arc::default(), save: Arc::default() };
+        let listen = || -> io::Result<()> {
+            flag::register_conditional_shutdown(SIGINT, 128 + SIGINT, signals.stop.clone())?;
+            for signal in [SIGINT, SIGTERM] {
+                flag::register(signal, signals.stop.clone())?;
+            }
+            #[cfg(unix)]
+            flag::register(signal_hook::consts::SIGUSR1, signals.save.clone())?;
+            Ok(())
+        };
+        listen().map_err(Error::Signals)?;
+        Ok(signals)
+    }
+}

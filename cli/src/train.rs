@@ -1,0 +1,148 @@
+//! `flotilla train`: trains the teams of a config, and saves the run.
+
+use std::fmt::Write;
+use std::path::PathBuf;
+
+use super::console::Console;
+use super::recovery::{Checkpoints, Loss, quoted};
+use super::{ConfigArgs, Error, ExistingResults, Printed, RunOptions};
+use flotilla::escape::PathExt;
+use flotilla::trainer::Row;
+use flotilla_app::ops::train::{self, Extremes, Outcome, Request};
+use flotilla_app::record::folder::{CONFIG, METRICS, POLICIES, RUN};
+use flotilla_app::record::ownership::CURVES;
+use flotilla_app::report::map::counted;
+
+#[derive(clap::Args)]
+pub struct Args {
+    #[command(flatten)]
+    config: ConfigArgs,
+    #[command(flatten)]
+    run: RunOptions,
+    /// Output directory [default: runs/NAME after the config's file, or the next free runs/NAME-2, …;
+    /// with --resume the latest of them, with --force runs/NAME]
+    #[arg(long, short, value_name = "DIR")]
+    out: Option<PathBuf>,
+    #[command(flatten)]
+    existing: ExistingResults,
+    /// Start from the policies in a safetensors file instead of random ones. Trial i takes the tensor `weights.i`, or
+    /// all take `weights`: f32 [leaders, policies, parameters]. Missing policies are random
+    #[arg(long, value_name = "FILE")]
+    init: Option<PathBuf>,
+    #[command(flatten)]
+    printed: Printed,
+    /// Also write event files for TensorBoard to OUT/tensorboard; with --resume, earlier generations too
+    #[arg(long)]
+    tensorboard: bool,
+    #[command(flatten)]
+    checkpoints: Checkpoints,
+    #[command(flatten)]
+    loss: Loss,
+}
+
+pub fn run(args: Args) -> Result<(), Error> {
+    let Args { config, run, out, existing, init, tensorboard, printed, checkpoints, loss } = args;
+    // Before the config is read: the message names it where it will be.
+    [Some(&config.file.path), out.as_ref()].into_iter().flatten().try_for_each(|path| train::refuse_zip(path))?;
+    let (name, start) = (config.name(), existing.start());
+    let request = Request { config: config.text(checkpoints.list())?, name, out, start, init, tensorboard };
+    let mut console = Console::new(&run, loss, printed.quiet);
+    let found = console.run(|backends, context| train::run(&request, backends, context))?;
+    printed.summary(&found, report)
+}
+
+/// A score of a row, as G in 0..1.
+type Score = fn(&Row) -> f64;
+/// All scores, with their names.
+const SCORES: [(&str, Score); 3] =
+    [("best team", |row| row.best_g), ("mean team", |row| row.mean_g), ("champion", |row| row.champion_g)];
+
+/// Returns a time in seconds, or in milliseconds if it is short.
+fn time(seconds: f64) -> String {
+    match seconds * 1000.0 {
+        short if short < 9.95 => format!("{short:.1} ms"),
+        short if short < 99.5 => format!("{short:.0} ms"),
+        _ => format!("{seconds:.1} s"),
+    }
+}
+
+/// Returns the report of a run for people.
+fn report(found: &Outcome) -> String {
+    let Outcome { folder, rows: ends, digest, .. } = found;
+    let trained = match &found.trained_on {
+        None => "This run was done already".into(),
+        Some(on) => format!(
+            "Trained {} of {} teams, {}, in {} ({:.1} generations/s) on {on}",
+            counted(found.trials, "trial"),
+            found.teams,
+            counted(found.generations, "generation"),
+            time(found.seconds),
+            found.trained_generations as f64 / found.seconds.max(1e-9),
+        ),
+    };
+    // `None` if stages have different numbers of POIs.
+    let pois_of_all = found.pois;
+    let what = pois_of_all.map_or("Share of POIs observed".into(), |pois| format!("POIs observed, of {pois}"));
+    let pois = pois_of_all.unwrap_or(1);
+    let mut text = format!("{trained}.\n\n{what}: mean over trials (lowest to highest trial)\n");
+    let last = format!("generation {}", found.generations);
+    let mut table = vec![["", SCORES[0].0, SCORES[1].0, SCORES[2].0].map(String::from)];
+    let rows = [("start", &ends.first), (&*last, &ends.last)];
+    // A run without generations after the start has one row.
+    let shown = if found.generations == 0 { 1 } else { rows.len() };
+    for (name, rows) in rows.into_iter().take(shown) {
+        let [best, mean, champion] = SCORES.map(|(_, share)| {
+            let Extremes { mean, lowest, highest } = Extremes::of(rows.iter().map(|row| share(row) * pois as f64));
+            format!("{mean:.2} ({lowest:.2} to {highest:.2})")
+        });
+        table.push([name.into(), best, mean, champion]);
+    }
+    // Columns fit their contents, because 100 POIs need more room than 4.
+    let width = |column: usize| table.iter().map(|row| row[column].len()).max().unwrap_or(0);
+    for [name, best, mean, champion] in &table {
+        let line =
+            format!("  {name:<a$}  {best:<b$}   {mean:<c$}   {champion}", a = width(0), b = width(1), c = width(2));
+        let _ = writeln!(text, "{}", line.trim_end());
+    }
+    let replayed = quoted(folder);
+    let film = quoted(&folder.join("champion.gif"));
+    let best = ends.last.iter().reduce(|a, b| if b.champion_g > a.champion_g { b } else { a });
+    let (best, observed) = best.map_or((0, 0.0), |row| (row.trial, row.champion_g * pois as f64));
+    let what = pois_of_all.map_or("share of POIs".into(), |pois| format!("of {pois} POIs"));
+    let _ = match observed > 0.0 {
+        true => write!(text, "\nThe best champion is that of trial {best}: {observed:.2} {what}.\n"),
+        false => write!(text, "\nNo champion observed any POI. The film below shows what that of trial {best} does.\n"),
+    };
+    let _ = write!(
+        text,
+        "
+Files in {}:
+  {METRICS:<22}every trial, generation by generation
+  {POLICIES:<22}what was learned, best policy first
+  {CURVES:<22}its learning curves, to look at
+  {:<22}the config, every default written out
+  {:<22}what it ran on; digest {digest}
+
+Next:
+  flotilla replay {replayed}
+  flotilla replay {replayed} --trial {best} --team champion --out {film}
+  flotilla rollout {replayed} --scores scores.csv
+",
+        folder.escaped(),
+        CONFIG,
+        RUN,
+    );
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn counts_and_times_are_as_people_write_them() {
+        assert_eq!([0, 1, 2].map(|count| counted(count, "trial")), ["0 trials", "1 trial", "2 trials"]);
+        let times = [0.0004, 0.0123, 0.0994, 0.0996, 12.34].map(time);
+        assert_eq!(times, ["0.4 ms", "12 ms", "99 ms", "0.1 s", "12.3 s"]);
+    }
+}

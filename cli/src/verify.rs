@@ -1,0 +1,84 @@
+//! `flotilla verify`: compares every adapter with the CPU, bit for bit.
+
+use std::path::PathBuf;
+
+use super::{Error, Printed, SetKeys, backend, between, console};
+use flotilla::config;
+use flotilla_app::ops::verify::{Request, TEAMS};
+use flotilla_app::ops::{self, output};
+use flotilla_app::record::evidence::Compared;
+
+#[derive(clap::Args)]
+#[command(after_help = EXIT_CODES)]
+pub struct Args {
+    /// Compare only this experiment, instead of random worlds of every kind; - is standard input
+    config: Option<PathBuf>,
+    #[command(flatten)]
+    set: SetKeys,
+    /// Random teams per world
+    #[arg(long, value_name = "N", default_value_t = TEAMS, value_parser = between(1..=65_536u32))]
+    teams: u32,
+    /// Random worlds per adapter, pass and kernel [default: as many of 200 as take about a minute; all 200 with
+    /// --report]
+    #[arg(long, value_name = "N", value_parser = between(1..=100_000u32))]
+    worlds: Option<u32>,
+    /// Random seed
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = between(0..=u32::MAX))]
+    seed: u32,
+    /// Only this adapter: its number or part of its name
+    #[arg(long, value_name = "NAME")]
+    adapter: Option<String>,
+    /// Only this pass, instead of all exact ones; `plain` shows why passes are needed
+    #[arg(long, value_name = "PASS", value_parser = ["no-contraction", "guarded", "plain"])]
+    pass: Option<String>,
+    /// Only this kernel, instead of both
+    #[arg(long, value_name = "KERNEL", value_parser = ["generic", "specialised"])]
+    kernel: Option<String>,
+    /// Write comparisons, hardware and the digests of short trainings as a row of docs/develop/evidence.md; compares
+    /// the processor's instruction sets, too, and needs no adapter
+    #[arg(long, value_name = "FILE")]
+    report: Option<PathBuf>,
+    /// A remark about the machine, for the report
+    #[arg(long, value_name = "TEXT", requires = "report")]
+    note: Option<String>,
+    #[command(flatten)]
+    printed: Printed,
+}
+
+/// Shown below the help.
+const EXIT_CODES: &str =
+    "Exit codes: 0 all equal, 1 failed, 2 wrong usage, 3 a comparison found other bits than the CPU's";
+
+/// Prints a table of adapters, passes and kernels, and the differences below it.
+pub fn run(args: Args) -> Result<(), Error> {
+    backend::start_threads(None);
+    let config = args.config.as_deref().filter(|path| !config::is_standard_input(path));
+    output::check(&[("--report", args.report.as_deref())], config.as_slice())?;
+    let read = |path: PathBuf| Ok::<_, Error>((config::name(&path), config::read_file(&path)?));
+    let Args { config, set, teams, worlds, seed, adapter, pass, kernel, report, note, printed } = args;
+    let (config, set, evidence) = (config.map(read).transpose()?, set.set, report.is_some());
+    let request = Request { config, set, teams, worlds, seed, adapter, pass, kernel, evidence, note };
+    let found = console::run_without_backend(printed.quiet, |context| ops::verify::run(&request, context))?;
+    if let (Some(path), Some(evidence)) = (&report, &found.evidence) {
+        output::write(path, evidence.to_json().as_bytes())?;
+    }
+    printed.outcome(&found, |found| in_words(&found.comparisons))?;
+    found.difference().map_or(Ok(()), Err)
+}
+
+/// Returns a table, and the differences below it.
+fn in_words(lines: &[Compared]) -> String {
+    let mut text =
+        format!("{:<15} {:<12} {:>7} {:>13} {:<10} adapter\n", "pass", "kernel", "worlds", "agent-steps", "result");
+    let mut failures = String::new();
+    for Compared { adapter, pass, kernel, against, worlds, agent_steps, equal, failure } in lines {
+        let result = if *equal { "equal" } else { "DIFFERENT" };
+        let [pass, kernel] = [pass, kernel].map(|name| name.as_deref().unwrap_or("-"));
+        text += &format!("{pass:<15} {kernel:<12} {worlds:>7} {agent_steps:>13} {result:<10} {adapter}\n");
+        failures.extend(failure.iter().map(|what| match pass {
+            "-" => format!("\n{adapter}, against {against}:\n  {what}\n"),
+            pass => format!("\n{adapter}, {pass} pass, {kernel} kernel:\n  {what}\n"),
+        }));
+    }
+    text + &failures
+}

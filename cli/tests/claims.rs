@@ -1,0 +1,451 @@
+//! Tests the report on the paper's claims: its statistics, baselines and verdicts.
+//!
+//! Statistics are compared with results of scipy (`statistics.json`), and baselines with teams that a backend plays.
+
+use fearless_simd::Level;
+use flotilla::backend::cpu::Cpu;
+use flotilla::backend::{Backend, Group};
+use flotilla::baseline::{self, Baseline, Baselines};
+use flotilla::config::{Fitness, Override, Paradigm, Sharing};
+use flotilla::evaluate::{self, Starts};
+use flotilla::evolve::{self, Key, Purpose};
+use flotilla::statistics::{self, Average, Estimate, Tested};
+use flotilla::world::World;
+use flotilla_studies::paper::claims::{Claim, Verdict, claims};
+use flotilla_studies::paper::{self, Evidence, Experiment, LAYOUTS, SOURCES, Source, tables};
+use serde_json::Value;
+
+/// Returns the paper's experiments with these numbers of trials and generations.
+fn arms(trials: u32, generations: u32) -> Vec<Experiment> {
+    let few = [("learning.trials", trials), ("learning.generations", generations), ("learning.seed", 3)];
+    paper::arms(&few.map(|(key, value)| Override::new(key, value, key))).unwrap()
+}
+
+/// Returns the p-value of Student's test that the mean is 0: the smallest alpha whose interval excludes 0.
+fn p_value(values: &[f64]) -> f64 {
+    let excludes = |Estimate { low, high, .. }| low > 0.0 || high < 0.0;
+    statistics::smallest_alpha(|confidence| statistics::mean_at(confidence, values, 0.0).is_some_and(excludes))
+        .unwrap_or(1.0)
+}
+
+#[test]
+fn intervals_and_tests_equal_those_of_scipy() {
+    let cases: Value = serde_json::from_str(include_str!("statistics.json")).unwrap();
+    let list = |name: &str| cases[name].as_array().unwrap().clone();
+    let numbers = |value: &Value| value.as_array().unwrap().iter().map(|x| x.as_f64().unwrap()).collect::<Vec<_>>();
+    let near = |ours: f64, theirs: &Value| {
+        let theirs = theirs.as_f64().unwrap();
+        assert!((ours - theirs).abs() <= 1e-9 * theirs.abs() + 1e-12, "{ours} is not {theirs}");
+    };
+    let [means, shares, spreads] = ["means", "shares", "spreads"].map(list);
+    assert!(means.len() > 5 && shares.len() > 20 && spreads.len() > 3);
+    for case in means {
+        let values = numbers(&case["values"]);
+        let mean = statistics::mean(&values, 1.0).unwrap();
+        near(mean.value, &case["mean"]);
+        near(mean.low, &case["low"]);
+        near(mean.high, &case["high"]);
+        near(p_value(&values), &case["p"]);
+    }
+    for case in shares {
+        let [count, of] = ["count", "of"].map(|key| case[key].as_u64().unwrap() as usize);
+        let share = statistics::share(count, of).unwrap();
+        near(share.value, &(count as f64 / of as f64).into());
+        near(share.low, &case["low"]);
+        near(share.high, &case["high"]);
+    }
+    for case in spreads {
+        let [one, other] = ["one", "other"].map(|key| statistics::distances(&numbers(&case[key])));
+        let differences: Vec<f64> = one.iter().zip(&other).map(|(one, other)| one - other).collect();
+        near(statistics::mean(&differences, 1.0).unwrap().value, &case["difference"]);
+        near(p_value(&differences), &case["p"]);
+    }
+    let [ranks, signs, intervals, corrected] = ["ranks", "signs", "intervals", "corrected"].map(list);
+    assert!(ranks.len() > 8 && signs.len() > 5 && intervals.len() > 3 && corrected.len() > 2);
+    for case in ranks {
+        let tested = statistics::rank_sum(&numbers(&case["one"]), &numbers(&case["other"])).unwrap();
+        near(tested.a, &case["a"]);
+        near(tested.p, &case["p"]);
+    }
+    for case in signs {
+        let differences = numbers(&case["less"]);
+        let tested = statistics::signed_rank(&differences).unwrap();
+        near(tested.p, &case["p"]);
+        let ahead = |difference: &f64| if *difference > 0.0 { 1.0 } else { f64::from(*difference == 0.0) / 2.0 };
+        near(tested.a, &(differences.iter().map(ahead).sum::<f64>() / differences.len() as f64).into());
+    }
+    for case in intervals {
+        let samples: Vec<_> = case["samples"].as_array().unwrap().iter().map(numbers).collect();
+        let ours = statistics::bootstrap(&samples.iter().map(Vec::as_slice).collect::<Vec<_>>()).unwrap();
+        let [low, high] = ["low", "high"].map(|end| case[end].as_f64().unwrap());
+        // Both resample with random numbers, which differ.
+        let off = 0.03 * (high - low);
+        assert!((ours.low - low).abs() < off && (ours.high - high).abs() < off, "{ours:?} is not {low} to {high}");
+    }
+    for case in corrected {
+        let holm = statistics::holm(&numbers(&case["p"]));
+        holm.iter().zip(case["holm"].as_array().unwrap()).for_each(|(&ours, theirs)| near(ours, theirs));
+    }
+}
+
+#[test]
+fn rank_tests_handle_equal_values_extremes_and_ties() {
+    let equal = [0.75; 8];
+    let no_difference = Some(Tested { a: 0.5, p: 1.0 });
+    assert_eq!(statistics::rank_sum(&equal, &equal[..3]), no_difference);
+    assert_eq!(statistics::rank_sum(&[0.75; 80], &[0.75; 90]), no_difference);
+    assert_eq!(statistics::signed_rank(&[0.0; 4]), no_difference);
+    assert_eq!((statistics::rank_sum(&equal, &[]), statistics::signed_rank(&[])), (None, None));
+    // The smallest possible p: 2 of 32 sign patterns of 5 pairs, and 2 of 252 arrangements of 5 and 5 values.
+    assert_eq!(statistics::signed_rank(&[1.0; 5]), Some(Tested { a: 1.0, p: 2.0 / 32.0 }));
+    let [one, other] = [[1.0; 5], [0.0; 5]];
+    assert_eq!(statistics::rank_sum(&one, &other), Some(Tested { a: 1.0, p: 2.0 / 252.0 }));
+    // These differences are 1/3 or -1/3 except for rounding, so they are ties.
+    let thirds = [1.0 / 3.0, 2.0 / 3.0 - 1.0 / 3.0, 2.0 / 3.0 - 1.0, 1.0 - 2.0 / 3.0];
+    assert_eq!(statistics::signed_rank(&thirds), statistics::signed_rank(&[1.0, 1.0, -1.0, 1.0]));
+}
+
+#[test]
+fn an_average_does_not_depend_on_the_order_of_its_values() {
+    let average_of = |values: &[f64]| {
+        let average: Average = values.iter().collect();
+        (average.count(), average.mean(), average.deviation(), average.error())
+    };
+    assert_eq!(average_of(&[]), (0, 0.0, 0.0, 0.0));
+    // In f64, the sum of seven times 0.1 is not 0.7.
+    assert_eq!(average_of(&[0.1; 7]), (7, 0.1, 0.0, 0.0));
+    for values in [[0.0, 0.5, 1.0, 0.5], [0.5, 1.0, 0.5, 0.0]] {
+        let (count, mean, deviation, error) = average_of(&values);
+        assert_eq!((count, mean), (4, 0.5));
+        assert!((deviation - (0.5f64 / 3.0).sqrt()).abs() < 1e-15, "{deviation}");
+        assert!((error - deviation / 2.0).abs() < 1e-15, "{error}");
+    }
+    assert_eq!([[0.75, 1.0, 0.0, 0.0], [0.0, 0.75, 0.0, 1.0]].map(|values| average_of(&values).1), [0.4375; 2]);
+}
+
+#[test]
+fn bootstrap_intervals_are_reproducible_and_have_no_width_without_spread() {
+    let (one, other) = ([0.25, 0.5, 1.0, 0.75], [0.5, 0.25, 0.0]);
+    let interval = statistics::bootstrap(&[&one, &other]).unwrap();
+    assert_eq!(statistics::bootstrap(&[&one, &other]), Some(interval));
+    assert!(interval.low < interval.value && interval.value == 0.375 && interval.value < interval.high);
+    let constant = statistics::bootstrap(&[&[0.5; 4], &[0.25; 3]]).unwrap();
+    assert_eq!((constant.low, constant.value, constant.high), (0.25, 0.25, 0.25));
+    assert_eq!((statistics::bootstrap(&[&one, &[1.0]]), statistics::bootstrap(&[])), (None, None));
+}
+
+#[test]
+fn the_mean_of_equal_values_has_an_interval_for_unseen_values() {
+    let unseen = statistics::share(0, 30).unwrap().high;
+    let mean = statistics::mean(&[4.0; 30], 1.0).unwrap();
+    assert_eq!((mean.low, mean.value, mean.high), (4.0 - unseen, 4.0, 4.0 + unseen));
+    assert_eq!(mean.within(0.0, 4.0).high, 4.0);
+    assert_eq!((statistics::mean(&[], 1.0), statistics::mean(&[1.0], 1.0)), (None, None));
+    assert_eq!((statistics::share(0, 0), statistics::share(2, 1)), (None, None));
+}
+
+/// Plays baselines to the end.
+fn played(mut baselines: Baselines) -> Baselines {
+    while !baselines.is_done() {
+        baselines.advance(&mut Cpu::default()).unwrap();
+    }
+    baselines
+}
+
+#[test]
+fn random_baselines_equal_the_best_teams_that_a_backend_plays() {
+    let arms = arms(2, 2);
+    let configs = paper::baseline_configs(&arms);
+    let found = played(Baselines::new(configs.clone())).found();
+    assert!(found.iter().all(|found| found.constant[1] == [1.0; 3]), "a constant speed solves every layout");
+    assert!(found.iter().any(|found| found.random[0] != found.random[1]), "both trials drew the same policies");
+    for (config, found) in configs.iter().zip(&found) {
+        let world = World::new(config);
+        let (population, parameters) = (config.learning.population, world.parameters());
+        for purpose in [Purpose::Baseline, Purpose::ConstantActions] {
+            let mut best = 0.0f64;
+            for generation in 0..=2 {
+                let mut weights = Vec::new();
+                for leader in 0..world.leaders() {
+                    for slot in 0..population {
+                        let mut policy = vec![0.0; parameters];
+                        let key = Key::new(3, 1, purpose).at(generation, leader, slot);
+                        match purpose {
+                            Purpose::Baseline => evolve::random_policy(Level::new(), key, &mut policy),
+                            _ => {
+                                let uniform = |of: u32| f64::from(key.draw(of)[0]) / (1u64 << 31) as f64 - 1.0;
+                                baseline::constant_policy(&[uniform(0), uniform(1)], &mut policy);
+                            }
+                        }
+                        weights.extend(policy);
+                    }
+                }
+                let observed = observed(&world, &weights, population);
+                best = best.max(f64::from(observed.into_iter().max().unwrap()) / world.pois.len() as f64);
+                let found = if purpose == Purpose::Baseline { &found.random } else { &found.actions };
+                assert_eq!(found[1][generation], best, "{purpose:?}, generation {generation}");
+            }
+        }
+    }
+}
+
+/// Returns the number of POIs that each team observes. Team j has policy j of every leader.
+fn observed(world: &World, weights: &[f32], policies: usize) -> Vec<u32> {
+    let teams = evolve::aligned_teams(policies, world.leaders());
+    let (weights, starts, sharing) = (weights.into(), &world.starts, Sharing::PerLeader);
+    let group = Group { world, starts, weights, policies, sharing, teams: &teams, fitnesses: &[] };
+    Cpu::default().play(&[group]).unwrap().remove(0).observed
+}
+
+#[test]
+fn constant_speed_baselines_equal_stepped_teams_and_solve_every_layout() {
+    for (place, config) in paper::baseline_configs(&arms(1, 0)).into_iter().enumerate() {
+        let found = played(Baselines::of_trial(config.clone(), 0));
+        let outcome = found.outcomes(&mut Cpu::default(), 1).unwrap().concat().remove(0);
+        let teams = baseline::SPEEDS;
+        let mut stepper = flotilla::stepper(&config, teams, false).unwrap();
+        let speed = |team: usize| (2 * (team + 1)) as f32 / teams as f32 - 1.0;
+        let actions: Vec<f32> =
+            (0..teams).flat_map(|team| (0..config.learners()).flat_map(move |_| [0.0, speed(team)])).collect();
+        (0..config.world.steps).for_each(|_| stepper.step(&actions).unwrap());
+        let pois = config.world.pois.len();
+        let g = |pois: &[bool]| pois.iter().filter(|&&observed| observed).count() as f64 / pois.len() as f64;
+        let stepped: Vec<f64> = stepper.observed().chunks(pois).map(g).collect();
+        let name = format!("{}, {pois} POIs, {} steps", config.learning.paradigm, config.world.steps);
+        assert_eq!(outcome.constants, stepped, "{name}");
+        // Speeds from 60 to 95 % of the largest solve the paper's three layouts, in both paradigms.
+        let solves = outcome.constants[11..19].iter().all(|&g| g == 1.0);
+        assert!(solves || place >= 6, "{name}: {:?}", outcome.constants);
+        assert_eq!(outcome.constants[outcome.best_constant], 1.0, "{name}");
+    }
+}
+
+#[test]
+fn baselines_with_moved_pois_are_measured_from_held_out_starts() {
+    let mut config = paper::baseline_configs(&arms(2, 3))[1].clone();
+    (config.learning.poi_jitter, config.learning.population, config.learning.episodes_per_team) = (5.0, 6, 2);
+    let baselines = played(Baselines::of_trial(config.clone(), 5));
+    let outcome = baselines.outcomes(&mut Cpu::default(), 30).unwrap().concat().remove(0);
+    let world = World::new(&config);
+    let constants = baseline::constants(config.policy.actions);
+    let policies = constants.len();
+    let mut weights = vec![0.0; world.leaders() * policies * world.parameters()];
+    for (place, policy) in weights.chunks_mut(world.parameters()).enumerate() {
+        baseline::constant_policy(&constants[place % policies], policy);
+    }
+    let teams = evolve::aligned_teams(policies, world.leaders());
+    let (weights, starts, sharing) = (weights[..].into(), &world.starts, Sharing::PerLeader);
+    let group = Group { world: &world, starts, weights, policies, sharing, teams: &teams, fitnesses: &[] };
+    let held_out = Starts::Drawn { episodes: 30, seed: 0, jitter: 0.0, poi_jitter: 5.0 };
+    let played = evaluate::evaluate(&mut Cpu::default(), &group, &held_out, &mut |_| ()).unwrap();
+    let g: Vec<f64> = played.observed.iter().map(|tally| tally.mean() / world.pois.len() as f64).collect();
+    for (found, g) in outcome.constants.iter().zip(&g) {
+        assert!((found - g).abs() < 1e-12, "{:?} is not {g:?}", outcome.constants);
+    }
+    assert!(g.iter().any(|&other| other != g[0]) && outcome.network > 0.0 && outcome.action > 0.0, "{outcome:?}");
+    // Another trial has the same constant actions, but other random teams.
+    let other =
+        self::played(Baselines::of_trial(config, 6)).outcomes(&mut Cpu::default(), 30).unwrap().concat().remove(0);
+    assert_eq!(other.constants, outcome.constants);
+    assert_ne!((other.network, other.action), (outcome.network, outcome.action));
+}
+
+/// Returns the claims about experiments whose champions have the G that `g` returns, given trial and generation.
+fn judged(trials: u32, generations: u32, g: impl Fn(&Experiment, usize, usize) -> f64) -> Vec<Claim> {
+    let mut arms = arms(trials, generations);
+    for arm in &mut arms {
+        let course = |trial| (0..=generations as usize).map(|at| g(arm, trial, at)).collect();
+        arm.champion = (0..trials as usize).map(course).collect();
+        arm.best.clone_from(&arm.champion);
+    }
+    let none = vec![vec![0.0; generations as usize + 1]; trials as usize];
+    let baselines = vec![Baseline { constant: none.clone(), actions: none.clone(), random: none }; 8];
+    claims(Evidence { arms: &arms, baselines: &baselines })
+}
+
+/// Returns the verdict on the claim about a layout that contains `words`, for one source.
+fn verdict(claims: &[Claim], layout: usize, words: &str, source: Source) -> Verdict {
+    let is = |claim: &&Claim| claim.layout == LAYOUTS[layout].name && claim.words.contains(words);
+    let claim = claims.iter().find(is).unwrap();
+    claim.findings.iter().find(|found| SOURCES[found.column] == source).unwrap().verdict
+}
+
+const G: Source = Source::Evolved(Fitness::G);
+
+#[test]
+fn verdicts_match_the_wording_of_the_claims() {
+    let leader_follower = |arm: &Experiment| arm.paradigm == Paradigm::LeaderFollower;
+    // Averages of 4, 3.9, 3.7 with few trials, and 3.25 POIs.
+    let consistently = |trials, from: usize, g: f64| {
+        let course = move |arm: &Experiment, trial: usize, _: usize| match leader_follower(arm) {
+            true if trial % 4 >= from => g,
+            true => 1.0,
+            false => 0.0,
+        };
+        verdict(&judged(trials, 100, course), 0, "consistently", G)
+    };
+    assert_eq!(consistently(40, 4, 1.0), Verdict::Yes);
+    assert_eq!(consistently(40, 3, 0.9), Verdict::Yes, "3.9 of 4");
+    assert_eq!(consistently(12, 2, 0.85), Verdict::Undecided, "3.7 of 4, too few trials");
+    assert_eq!(consistently(40, 1, 0.75), Verdict::No, "3.25 of 4");
+
+    let perfect = judged(200, 100, |arm, _, _| f64::from(leader_follower(arm)));
+    for (layout, words, expected) in [
+        (0, "less than a single POI", Verdict::Yes),
+        (0, "at least 3, on average", Verdict::Yes),
+        (1, "almost never", Verdict::Yes),
+        (1, "not as readily apparent", Verdict::Yes),
+        (1, "significantly higher", Verdict::Undecided),
+        (2, "high likelihood of random actions", Verdict::No),
+        (2, "some of the time", Verdict::No),
+        (2, "rather large variance", Verdict::No),
+        (2, "about a similar policy", Verdict::No),
+        (2, "comparable policy", Verdict::Yes),
+        (2, "much faster", Verdict::Yes),
+        (2, "more consistently", Verdict::Undecided),
+        (2, "more reliably", Verdict::Yes),
+        (2, "slight benefit", Verdict::Undecided),
+    ] {
+        assert_eq!(verdict(&perfect, layout, words, G), expected, "{words}");
+    }
+    // A constant speed has the same result in every trial, so the verdict is never undecided.
+    assert_eq!(verdict(&perfect, 0, "at least 3, on average", Source::Constant), Verdict::No);
+
+    // A mean of 3 with a spread is neither clearly below nor above 3.
+    let around = judged(200, 100, |arm, trial, _| if leader_follower(arm) && trial % 2 == 0 { 1.0 } else { 0.5 });
+    assert_eq!(verdict(&around, 0, "at least 3, on average", G), Verdict::Undecided);
+    // All-leaders teams always observe half of the POIs, which is better than the paper says.
+    assert_eq!(verdict(&around, 0, "less than a single POI", G), Verdict::No);
+    assert_eq!(verdict(&around, 1, "almost never", G), Verdict::No);
+    assert_eq!(verdict(&around, 1, "more drastic", G), Verdict::Undecided);
+
+    // Df differs from G by a little, by much, and in its spread.
+    let df = |arm: &Experiment| arm.fitness == Fitness::Df;
+    let slight = judged(200, 100, |arm, trial, _| if df(arm) || trial % 5 > 0 { 1.0 } else { 0.75 });
+    assert_eq!(verdict(&slight, 2, "slight benefit", G), Verdict::Yes);
+    let great = judged(200, 100, |arm, _, _| if df(arm) { 1.0 } else { 0.5 });
+    assert_eq!(verdict(&great, 2, "slight benefit", G), Verdict::No);
+    let wild = judged(200, 100, |arm, trial, _| if df(arm) && trial % 2 > 0 { 0.0 } else { 1.0 });
+    assert_eq!(verdict(&wild, 1, "significantly higher", G), Verdict::Yes);
+    let calm = judged(200, 100, |arm, trial, _| if !df(arm) && trial % 2 > 0 { 0.0 } else { 1.0 });
+    assert_eq!(verdict(&calm, 1, "significantly higher", G), Verdict::No);
+    assert_eq!(verdict(&calm, 2, "some of the time", G), Verdict::Yes);
+
+    // Teams that select between behaviours: equal to all others, then later, then never as good.
+    let to_select = "learning to select between policies";
+    let rival = |from: usize, up_to: f64| {
+        judged(200, 100, move |arm, _, at| {
+            if arm.selects && at < from {
+                0.0
+            } else if arm.selects {
+                up_to
+            } else {
+                1.0
+            }
+        })
+    };
+    for (rivals, faster, better) in [
+        (rival(0, 1.0), Verdict::Undecided, Verdict::Undecided),
+        (rival(50, 1.0), Verdict::Yes, Verdict::Undecided),
+        (rival(0, 0.75), Verdict::Yes, Verdict::Yes),
+    ] {
+        let words = ["“faster” than “those ", "“a more optimal solution” than “those "]
+            .map(|word| word.to_string() + to_select);
+        for layout in 0..3 {
+            for source in [G, Source::Evolved(Fitness::Df)] {
+                assert_eq!(verdict(&rivals, layout, &words[0], source), faster, "{layout}");
+                assert_eq!(verdict(&rivals, layout, &words[1], source), better, "{layout}");
+            }
+        }
+    }
+    // Eight followers: leader-follower teams are as good as all-leaders teams but later, then earlier but worse.
+    let slow = judged(200, 100, |arm, _, at| if leader_follower(arm) && at < 9 { 0.0 } else { 1.0 });
+    let worse =
+        judged(
+            200,
+            100,
+            |arm, _, at| if leader_follower(arm) { if at == 9 { 1.0 } else { 0.5 } } else { 0.0 + f64::from(at > 50) },
+        );
+    for (claims, performant, faster) in [(slow, Verdict::Yes, Verdict::No), (worse, Verdict::No, Verdict::Yes)] {
+        assert_eq!(verdict(&claims, 3, "a similarly performant policy", G), performant);
+        assert_eq!(verdict(&claims, 3, "“faster than when using all learners”", G), faster);
+    }
+    assert_eq!(verdict(&calm, 2, "rather large variance", G), Verdict::Yes);
+}
+
+#[test]
+fn claims_stay_open_if_a_run_is_too_short() {
+    let short = judged(30, 39, |_, _, _| 1.0);
+    assert_eq!(verdict(&short, 0, "at least 3, on average", G), Verdict::Yes);
+    assert_eq!(verdict(&short, 0, "consistently", G), Verdict::Open);
+    assert!(tables::count(&short).contains(" open (too few generations or trials)"), "{}", tables::count(&short));
+    let single = judged(1, 100, |_, _, _| 1.0);
+    assert!(single.iter().flat_map(Claim::on_evolution).all(|found| found.verdict == Verdict::Open));
+}
+
+/// Exploratory claims, which are not the paper's, are counted separately.
+#[test]
+fn a_claim_holds_only_if_it_holds_for_all_its_fitnesses() {
+    let leader_follower = |arm: &Experiment| arm.paradigm == Paradigm::LeaderFollower;
+    let overall_verdict =
+        |claims: &[Claim], words: &str| claims.iter().find(|claim| claim.words.contains(words)).unwrap().verdict();
+    let at_least_3 = "at least 3, on average";
+    assert_eq!(
+        overall_verdict(&judged(30, 100, |arm, _, _| f64::from(leader_follower(arm))), at_least_3),
+        Verdict::Yes
+    );
+    let one_fails = |arm: &Experiment, _: usize, _: usize| match arm.fitness {
+        Fitness::D => 0.5,
+        _ => f64::from(leader_follower(arm)),
+    };
+    assert_eq!(overall_verdict(&judged(30, 100, one_fails), at_least_3), Verdict::No);
+    let one_open = |arm: &Experiment, trial: usize, _: usize| match arm.fitness {
+        Fitness::D if trial.is_multiple_of(2) => 0.5,
+        _ => f64::from(leader_follower(arm)),
+    };
+    assert_eq!(overall_verdict(&judged(30, 100, one_open), at_least_3), Verdict::Undecided);
+    let count = tables::count(&judged(30, 100, one_fails));
+    assert!(count.starts_with("28 claims on the paper's experiments: "), "{count}");
+    assert!(count.contains(". 8 exploratory claims (†): "), "{count}");
+}
+
+/// Times of trials that never observe all POIs are censored, and pairs in which neither does are ties.
+#[test]
+fn times_are_compared_by_restricted_means_and_ties_do_not_count() {
+    let leader_follower = |arm: &Experiment| arm.paradigm == Paradigm::LeaderFollower;
+    let found = |claims: &[Claim], words: &str| {
+        let claim = claims.iter().find(|claim| claim.words.contains(words)).unwrap().clone();
+        claim.findings.into_iter().find(|found| SOURCES[found.column] == G).unwrap()
+    };
+    // Leader-follower teams after 10 generations, all-leaders teams after 60, but neither in every fifth pair.
+    let usual =
+        judged(40, 100, |arm, trial, at| f64::from(trial % 5 > 0 && at >= if leader_follower(arm) { 10 } else { 60 }));
+    let faster = found(&usual, "much faster");
+    assert!(faster.measured.starts_with("+16.0 ["), "60 / 2 - 10 in four of five pairs: {}", faster.measured);
+    assert_eq!(faster.verdict, Verdict::Yes);
+    // All-leaders teams never observe all POIs. Most of their times are censored, so pairs are counted instead.
+    let never = judged(40, 100, |arm, trial, at| f64::from(leader_follower(arm) && trial % 5 > 0 && at >= 10));
+    assert!(found(&never, "much faster").measured.starts_with("32 of 32 ["));
+    // If neither side observes all POIs, no pair differs, and the claim is undecided.
+    let neither = judged(40, 100, |_, _, _| 0.5);
+    let tied = found(&neither, "much faster");
+    assert_eq!((tied.verdict, &*tied.measured), (Verdict::Undecided, "no pair differs"));
+}
+
+/// A claim that holds by its own p-value is undecided if its corrected p-value is large.
+#[test]
+fn verdicts_are_corrected_for_multiple_tests() {
+    let leader_follower = |arm: &Experiment| arm.paradigm == Paradigm::LeaderFollower;
+    // 3.5 POIs with a spread in 20 trials: the 95 % interval begins above 3, which many tests would reach by chance.
+    let claims = judged(20, 100, |arm, trial, _| match leader_follower(arm) {
+        true => [1.0, 1.0, 0.5, 1.0][trial % 4],
+        false => [0.25, 0.5, 0.0, 0.75][trial % 4],
+    });
+    let claim = claims.iter().find(|claim| claim.words.contains("at least 3, on average")).unwrap();
+    let found = claim.findings.iter().find(|found| SOURCES[found.column] == G).unwrap();
+    let (estimate, p) = (found.estimate.unwrap(), found.p.unwrap());
+    assert!(estimate.low > 3.0 && p < 0.05, "{found:?}");
+    assert!(found.p_holm.unwrap() > 0.05 && found.verdict == Verdict::Undecided, "{found:?}");
+    // Student's test of the distance to the threshold: t is 2.5166 with 19 degrees of freedom.
+    assert!((p - 0.020_991_504_670_16).abs() < 1e-12, "{p}");
+}

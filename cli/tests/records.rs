@@ -1,0 +1,430 @@
+//! Tests how a GPU's records are copied to the host.
+//!
+//! Packed records drop the sets of agents that change no score. Scores have to equal those from whole records, and
+//! packed records have to be small.
+
+use crate::support;
+use flotilla::backend::cpu::Cpu;
+use flotilla::backend::gpu::episode::{GpuBackend, Kernel, Records, ResidencyPolicy};
+use flotilla::backend::gpu::{self, device::Request};
+use flotilla::backend::{Backend, Group, GroupScores};
+use flotilla::config::{Config, Coupling, Fitness, Observers, Paradigm, Sharing, ValidConfig};
+use flotilla::credit::Credit;
+use flotilla::evaluate::SCORES_AND_DT;
+use flotilla::sample;
+use flotilla::trainer::Trainer;
+use flotilla::verify::KINDS;
+use flotilla::world::World;
+use flotilla_app::sweep::Sweep;
+
+/// Teams of one world, of five policies with random weights or with all weights 0.
+struct Teams {
+    world: World,
+    weights: Vec<f32>,
+    choice: Vec<u32>,
+}
+
+impl Teams {
+    fn new(config: &Config, teams: usize, random: bool) -> Teams {
+        let world = World::new(config);
+        let mut weights = sample::weights(&world, 5, config.learning.seed);
+        if !random {
+            weights.fill(0.0);
+        }
+        Teams { choice: (0..teams * world.leaders()).map(|place| (place * 7 % 5) as u32).collect(), weights, world }
+    }
+
+    fn group(&self, fitnesses: &'static [Fitness]) -> Group<'_> {
+        let (world, sharing) = (&self.world, Sharing::PerLeader);
+        let (starts, weights, teams) = (&world.starts, self.weights[..].into(), &self.choice[..]);
+        Group { world, starts, weights, policies: 5, sharing, teams, fitnesses }
+    }
+
+    /// Returns the size of the unpacked record in bytes.
+    fn unpacked_bytes(&self) -> u64 {
+        let words = self.world.set_words() + self.world.leaders() * self.world.followers();
+        (self.choice.len() / self.world.leaders() * words * 4) as u64
+    }
+}
+
+/// Returns the fitnesses that a group is scored by. Groups take turns with those that a packed record suffices for,
+/// starting from `first`. [`DT`] selects Dt, which needs the whole record.
+fn fitnesses_of(group: usize, first: usize) -> &'static [Fitness] {
+    let (packed, dt) = KINDS.split_at(5);
+    if first == DT { dt[0] } else { packed[(group + first) % packed.len()] }
+}
+
+const DT: usize = usize::MAX;
+
+/// Plays all teams as one batch. Returns their scores by [`fitnesses_of`] each group.
+fn scores(backend: &mut dyn Backend, batch: &[Teams], first: usize) -> Vec<GroupScores> {
+    let groups: Vec<_> =
+        batch.iter().enumerate().map(|(index, teams)| teams.group(fitnesses_of(index, first))).collect();
+    backend.play(&groups).unwrap()
+}
+
+/// Returns the same scores from whole records, which the CPU traces.
+fn expected(batch: &[Teams], first: usize) -> Vec<GroupScores> {
+    let group_scores = |(index, teams): (usize, &Teams)| {
+        let group = teams.group(SCORES_AND_DT);
+        let (world, leaders, mut credit) = (group.world, group.world.leaders(), Credit::default());
+        let mut scores = GroupScores::default();
+        for (team, teams) in group.teams.chunks(leaders).enumerate() {
+            let trace = Cpu::default().trace(&Group { teams, ..group }).unwrap();
+            for (place, &fitness) in fitnesses_of(index, first).iter().enumerate() {
+                let mut slot_scores = vec![0.0; leaders];
+                let observed = credit.score(&trace.episode(world, 0), world, fitness, &mut slot_scores);
+                scores.scores.extend(slot_scores);
+                match place {
+                    0 => scores.observed.push(observed),
+                    _ => assert_eq!(scores.observed[team], observed),
+                }
+            }
+        }
+        scores
+    };
+    batch.iter().enumerate().map(group_scores).collect()
+}
+
+/// Whether every team observed this many POIs.
+fn all_observed(scores: &[GroupScores], pois: u32) -> bool {
+    scores.iter().flat_map(|scores| &scores.observed).all(|&observed| observed == pois)
+}
+
+fn open(request: &Request, records: Records) -> GpuBackend {
+    GpuBackend::new(gpu::open(request.clone()).unwrap()).unwrap().with_records(records)
+}
+
+/// Returns the bytes of the status words of this many workgroups.
+fn status(workgroups: u64) -> u64 {
+    4 * workgroups
+}
+
+/// Returns the bytes copied from the device since the last call.
+fn downloaded(backend: &mut GpuBackend) -> u64 {
+    backend.take_times().traffic.down
+}
+
+fn config(text: &str) -> Config {
+    Config::parse(text, "records.toml").unwrap()
+}
+
+/// Returns `[[x, y], …]` with equal distances.
+fn line(count: usize, [x, y]: [f64; 2], [dx, dy]: [f64; 2]) -> String {
+    let places = (0..count).map(|i| format!("[{:?}, {:?}]", x + i as f64 * dx, y + i as f64 * dy));
+    format!("[{}]", places.collect::<Vec<_>>().join(", "))
+}
+
+/// Random worlds, and two unusual ones: more than 64 agents, more than 256 leaders, and more POIs than threads.
+fn worlds() -> Vec<Config> {
+    let odd = [
+        format!(
+            "[world]\nleaders = {}\nfollowers = {}\npois = {}\nsteps = 12\ncoupling = [3, 20, 70]\n\
+             [policy]\nhidden = []",
+            line(30, [10.0, 5.0], [0.3, 0.0]),
+            line(41, [10.0, 4.0], [0.2, 0.0]),
+            line(3, [12.0, 8.0], [2.0, 0.0])
+        ),
+        format!(
+            "[world]\nleaders = {}\nfollowers = {}\npois = {}\nsteps = 3\ncoupling = 1\n[policy]\nhidden = []",
+            line(260, [5.0, 5.0], [0.1, 0.0]),
+            line(5, [30.5, 4.0], [0.1, 0.0]),
+            line(70, [5.0, 6.0], [0.5, 0.1])
+        ),
+    ];
+    let random = (0..28).map(|seed| {
+        let mut config = sample::world(seed);
+        // Worlds with windows or an order are not packed.
+        config.world.windows.clear();
+        config.world.after.clear();
+        config
+    });
+    random.chain(odd.iter().map(|text| config(text))).collect()
+}
+
+#[test]
+fn scores_are_the_same_from_whole_and_packed_records() {
+    let batch: Vec<Teams> = worlds().iter().map(|config| Teams::new(config, 37, true)).collect();
+    let expected: Vec<Vec<GroupScores>> = (0..2).map(|first| expected(&batch, first)).collect();
+    let observing = expected[0].iter().flat_map(|scores| &scores.observed).filter(|&&observed| observed > 0).count();
+    assert!(observing > 100, "only {observing} teams observe a POI");
+    for (request, info) in support::adapters("scores_are_the_same_from_whole_and_packed_records") {
+        for (first, expected) in expected.iter().enumerate() {
+            for (records, bytes) in [(Records::Whole, 1 << 28), (Records::Packed, 1 << 28), (Records::Packed, 1 << 15)]
+            {
+                let mut backend = open(&request, records).with_batch_bytes(bytes).with_kernel(Kernel::Generic);
+                let actual = scores(&mut backend, &batch, first);
+                assert!(
+                    actual == *expected,
+                    "{info}: fitnesses from {first} on, {records:?}, batches of {bytes} bytes"
+                );
+            }
+        }
+        let mut checked = open(&Request { checked: true, ..request }, Records::Packed);
+        assert!(scores(&mut checked, &batch, 0) == expected[0], "{info}: checked");
+    }
+}
+
+/// A canary: each edit to the packing shader must change scores. Without it, the other tests might pass by chance.
+#[test]
+fn an_edited_packing_rule_changes_scores() {
+    type Edit = fn(String) -> String;
+    let edits: [Edit; 4] = [
+        |text| text.replace("size >= enough", "size > enough"),
+        |text| text.replace("if less != 0u", "if more == 0u"),
+        |text| text.replace("step < sizes.steps", "step + 1u < sizes.steps"),
+        |text| text.replace("if steps > most", "if steps >= most"),
+    ];
+    let batch: Vec<Teams> = worlds().iter().map(|config| Teams::new(config, 37, true)).collect();
+    let expected = expected(&batch, 0);
+    for (request, info) in support::adapters("an_edited_packing_rule_changes_scores") {
+        for (index, edit) in edits.into_iter().enumerate() {
+            // SAFETY: the edits change comparisons and shorten a loop; every index stays in bounds.
+            #[expect(unsafe_code, reason = "an edited shader is compiled without bounds checks")]
+            let mut backend = unsafe { open(&request, Records::Packed).edited(edit) };
+            assert!(scores(&mut backend, &batch, 0) != expected, "{info}: edit {index} changed no score");
+        }
+    }
+}
+
+/// Agents follow each other past a POI at a steady speed. At every step another agent is near it, so no set can be
+/// dropped, and the packed record does not fit. Then no agent is near a POI, and all sets can be dropped.
+#[test]
+fn dense_and_empty_records_give_the_same_scores() {
+    let single_file = |poi: f64| {
+        let text = format!(
+            "[world]\nspeed = 1.5\nleaders = {}\npois = [[10.0, {poi:?}]]\nsteps = 24\ncoupling = 1\n\
+             observation_radius = 0.14\n[policy]\nhidden = []",
+            line(24, [10.0, 20.0], [0.0, -0.3])
+        );
+        vec![Teams::new(&config(&text), 500, false)]
+    };
+    let (dense, empty) = (single_file(20.3), single_file(45.0));
+    let [for_dense, for_empty] = [&dense, &empty].map(|teams| expected(teams, 0));
+    assert!(all_observed(&for_dense, 1) && all_observed(&for_empty, 0));
+    let (whole, table) = (dense[0].unpacked_bytes(), 501 * 4);
+    for (request, info) in support::adapters("dense_and_empty_records_give_the_same_scores") {
+        let mut backend = open(&request, Records::PackedFrom(0)).with_kernel(Kernel::Generic);
+        let mut play = |batch: &[Teams], expected: &[GroupScores]| {
+            assert!(scores(&mut backend, batch, 0) == *expected, "{info}");
+            downloaded(&mut backend)
+        };
+        let first = play(&empty, &for_empty);
+        assert!(first >= table && first < whole / 4, "{info}: {first} of {whole} bytes");
+        let overflown = play(&dense, &for_dense);
+        assert!(overflown > whole && overflown < whole + whole / 4, "{info}: {overflown} of {whole} bytes");
+        assert_eq!(play(&dense, &for_dense), whole + 8 + status(100), "{info}: a second dense batch is copied whole");
+        // Packing resumes when records become small again.
+        let packed_again = (0..60).map(|_| play(&empty, &for_empty)).find(|&bytes| bytes < whole / 4);
+        assert!(packed_again.is_some(), "{info}: records are never packed again");
+    }
+}
+
+/// A record is copied whole if one dispatch cannot pack it, or if packing saves too little.
+#[test]
+fn very_long_episodes_and_small_batches_are_copied_whole() {
+    let text = |steps: usize| {
+        format!(
+            "[world]\nleaders = [[10.0, 5.0], [20.0, 5.0]]\nfollowers = [[12.0, 2.0], [8.0, 2.0]]\n\
+             pois = [[10.0, 15.0], [30.0, 40.0]]\nsteps = {steps}\ncoupling = 1\n[policy]\nhidden = []"
+        )
+    };
+    let teams_with_steps = |steps: usize| vec![Teams::new(&config(&text(steps)), 20, true)];
+    let (short, long, longest) = (teams_with_steps(100), teams_with_steps(3000), teams_with_steps(10_000));
+    let [for_short, for_long, for_longest] = [&short, &long, &longest].map(|teams| expected(teams, 0));
+    for (request, info) in support::adapters("very_long_episodes_and_small_batches_are_copied_whole") {
+        let mut backend = open(&request, Records::PackedFrom(0)).with_kernel(Kernel::Generic);
+        // This episode takes several dispatches and is still packed.
+        assert!(scores(&mut backend, &long, 0) == for_long, "{info}");
+        assert!(downloaded(&mut backend) < long[0].unpacked_bytes(), "{info}: 3000 steps");
+        assert!(scores(&mut backend, &longest, 0) == for_longest, "{info}");
+        assert_eq!(downloaded(&mut backend), longest[0].unpacked_bytes() + status(2), "{info}: 10 000 steps");
+        let mut small = open(&request, Records::PackedFrom(1 << 20)).with_kernel(Kernel::Generic);
+        assert!(scores(&mut small, &short, 0) == for_short, "{info}");
+        assert_eq!(downloaded(&mut small), short[0].unpacked_bytes() + status(2), "{info}: not worth packing");
+    }
+}
+
+/// Counts bytes over the bus per team, with populations on the device. The config is generally forward with Df. At 2^20
+/// teams, 100 MB are 95 bytes per team. `FLOTILLA_TEAMS` sets the number of teams.
+#[test]
+fn a_generation_moves_less_than_95_bytes_per_team() {
+    let mut config = support::layout("generally_forward");
+    let teams = std::env::var("FLOTILLA_TEAMS").map_or(1 << 11, |teams| teams.parse().unwrap());
+    (config.learning.trials, config.learning.population, config.learning.generations) = (1, teams, 60);
+    config.learning.fitness = Fitness::Df;
+    for (request, info) in support::adapters("a_generation_moves_less_than_95_bytes_per_team") {
+        // The backend must not play the first generation several times to choose the teams per workgroup.
+        let mut backend = open(&request, Records::PackedFrom(0))
+            .with_residency(ResidencyPolicy::Always)
+            .with_teams_per_workgroup(Some(32));
+        let mut trainer = Trainer::new([config.validate().unwrap()]);
+        let mut before = backend.gpu().traffic();
+        for generation in 0..=50 {
+            let rows = trainer.advance(&mut backend).unwrap();
+            let (total, played) = (backend.gpu().traffic(), backend.take_times().traffic);
+            let held = (teams as u64 + 1) * 4 * 112 * 4;
+            let traffic = total - std::mem::replace(&mut before, total);
+            // The populations are uploaded once, in generation 0.
+            let up = traffic.up - if generation == 0 { held } else { 0 };
+            let per_team = |bytes: u64| bytes as f64 / teams as f64;
+            let mean_g = rows.first().map_or(0.0, |row| row.mean_g);
+            println!(
+                "{info}: generation {generation}, mean G of the last {mean_g:.2}: {:.1} bytes per team up ({:.1} of it \
+                 for rollouts), {:.1} down",
+                per_team(up),
+                per_team(played.up),
+                per_team(traffic.down)
+            );
+            if [0, 50].contains(&generation) {
+                assert!(per_team(up + traffic.down) * f64::from(1 << 20) <= 1e8, "{info}: generation {generation}");
+            }
+        }
+    }
+}
+
+/// With windows or an order, the time when an agent was near a POI can decide whether the POI is observed. Packing
+/// drops times, so such records are copied whole. The rule for observers does not depend on times.
+#[test]
+fn records_are_not_packed_if_times_matter() {
+    let teams_with = |change: fn(&mut Config)| {
+        let mut config = config(include_str!("../../configs/generally_forward.toml"));
+        config.world.steps = 60;
+        change(&mut config);
+        vec![Teams::new(&config, 200, true)]
+    };
+    let cases: [(_, _, fn(&mut Config)); 4] = [
+        ("default rules", true, |_| ()),
+        ("followers observe", true, |config| {
+            (config.world.observers, config.world.coupling) = (Observers::Followers, Coupling::Same(2));
+        }),
+        ("windows", false, |config| config.world.windows = vec![[20, 40]; 4]),
+        ("POIs in order", false, |config| config.world.after = vec![vec![], vec![0], vec![0], vec![0]]),
+    ];
+    for (request, info) in support::adapters("records_are_not_packed_if_times_matter") {
+        for (name, packed, change) in cases {
+            let batch = teams_with(change);
+            let expected = expected(&batch, 0);
+            assert!(!all_observed(&expected, 0), "{name}: nothing is observed");
+            let mut backend = open(&request, Records::PackedFrom(0)).with_kernel(Kernel::Generic);
+            assert!(scores(&mut backend, &batch, 0) == expected, "{info}, {name}");
+            let bytes = downloaded(&mut backend);
+            assert_eq!(bytes < batch[0].unpacked_bytes() / 2, packed, "{info}, {name}: {bytes} bytes");
+            // Dt needs the time when each follower was led. Nothing is packed, and sights are copied too.
+            let expected = self::expected(&batch, DT);
+            assert!(scores(&mut backend, &batch, DT) == expected, "{info}, {name}, Dt");
+            let sights = (200 * 4 * batch[0].world.sight_words()) as u64;
+            assert_eq!(downloaded(&mut backend), batch[0].unpacked_bytes() + sights + status(10), "{info}, {name}, Dt");
+        }
+    }
+}
+
+/// Returns the processor time of all threads of this process in seconds. Linux counts in hundredths of a second.
+fn processor_seconds() -> f64 {
+    let stat = std::fs::read_to_string("/proc/self/stat").expect("this is Linux");
+    // The name may contain blanks. After it, the times are the 12th and 13th fields.
+    let fields = stat.rsplit(')').next().unwrap_or_default().split_whitespace().skip(11).take(2);
+    fields.map(|ticks| ticks.parse::<f64>().expect("a count") / 100.0).sum()
+}
+
+/// Prints the processor time of compiling: that of the first two generations minus twice that of the third.
+///
+/// *As on a GPU* forces all kernels that a GPU would compile; *by default* is what a software renderer compiles.
+/// Disable drivers' caches (Mesa: `MESA_SHADER_CACHE_DISABLE=true`).
+#[test]
+#[ignore = "prints a table"]
+fn compiling() {
+    let small = |mut config: Config| {
+        (config.learning.population, config.learning.trials, config.learning.generations) = (2, 1, 9);
+        config
+    };
+    let paper = [
+        ("generally forward", include_str!("../../configs/generally_forward.toml")),
+        ("strictly forward", include_str!("../../configs/strictly_forward.toml")),
+        ("chaotic", include_str!("../../configs/chaotic.toml")),
+    ];
+    let mut cases = Vec::new();
+    for (name, text) in paper {
+        for paradigm in [Paradigm::LeaderFollower, Paradigm::AllLeaders] {
+            let mut config = small(config(text));
+            config.learning.paradigm = paradigm;
+            cases.push((format!("{name}, {paradigm:?}"), vec![config]));
+        }
+    }
+    let sweep = Sweep::read(include_str!("../../configs/sweeps/large.toml"), "large.toml", &[], false).unwrap();
+    cases
+        .push(("large.toml".into(), sweep.points.into_iter().map(|point| small(point.config.into_config())).collect()));
+    for (request, info) in support::adapters("compiling") {
+        for (name, configs) in &cases {
+            let backend = || GpuBackend::new(gpu::open(request.clone()).unwrap()).unwrap();
+            let gpu = backend()
+                .with_kernel(Kernel::Best)
+                .with_residency(ResidencyPolicy::Always)
+                .with_records(Records::PackedFrom(0));
+            for (setup, mut backend) in [("by default", backend()), ("as on a GPU", gpu)] {
+                let mut trainer = Trainer::new(ValidConfig::all(configs).unwrap());
+                let mut seconds = || {
+                    let start = processor_seconds();
+                    trainer.advance(&mut backend).unwrap();
+                    processor_seconds() - start
+                };
+                // The second generation waits until the breeding kernels are compiled.
+                let (first, second, third) = (seconds(), seconds(), seconds());
+                let [generic, specialised] = backend.compiled();
+                println!(
+                    "{name}, {setup}: {:.2} s, {generic} generic and {specialised} specialised kernels, {info}",
+                    first + second - 2.0 * third
+                );
+            }
+        }
+    }
+}
+
+/// Prints the CPU's part of a generation, by phase. The device plays only the first steps of each episode.
+///
+/// `FLOTILLA_TEAMS` sets the number of teams (2^20 by default), and `RAYON_NUM_THREADS` the number of threads.
+#[test]
+#[ignore = "prints a table"]
+fn the_cpus_part_of_a_generation() {
+    fn short(text: String) -> String {
+        text.replace("step < task.end; step++", "step < min(task.end, task.first + 2u); step++")
+    }
+    let mut config = support::layout("generally_forward");
+    let teams = std::env::var("FLOTILLA_TEAMS").map_or(1 << 20, |teams| teams.parse().unwrap());
+    // One small generation is too short to be timed.
+    let generations = (20_000 / teams).clamp(5, 400);
+    (config.learning.trials, config.learning.population, config.learning.generations) = (1, teams, generations + 3);
+    config.learning.fitness = Fitness::Df;
+    // A leader's population has to fit into one buffer, which lavapipe limits to 128 MiB. The CPU moves no weights.
+    config.policy.hidden = vec![];
+    for (request, info) in support::adapters("the_cpus_part_of_a_generation") {
+        let backend = open(&request, Records::PackedFrom(0)).with_residency(ResidencyPolicy::Always);
+        // SAFETY: the edit only shortens a loop.
+        #[expect(unsafe_code, reason = "edited shaders are compiled without bounds checks")]
+        let mut backend = unsafe { backend.edited(short) };
+        let mut trainer = Trainer::new([config.validate().unwrap()]);
+        // The first generations reserve the memory for packed records.
+        for _ in 0..3 {
+            trainer.advance(&mut backend).unwrap();
+        }
+        (_, _) = (trainer.take_times(), backend.take_times());
+        for _ in 0..generations {
+            trainer.advance(&mut backend).unwrap();
+        }
+        let (times, stages) = (trainer.take_times(), backend.take_times());
+        println!("{info}, {teams} teams, {} threads, ms per generation:", rayon::current_num_threads());
+        for (name, time) in [
+            ("prepare", times.prepare),
+            ("play", times.play),
+            ("  gather", stages.gather),
+            ("  upload", stages.upload),
+            ("  wait", stages.wait),
+            ("  read back", stages.read_back),
+            ("  score", stages.score),
+            ("collect", times.collect),
+            ("breed", times.breed),
+        ] {
+            println!("{name:>12} {:9.2}", 1e3 * time.as_secs_f64() / generations as f64);
+        }
+    }
+}

@@ -1,0 +1,1275 @@
+//! Tests that a run stopped at any point resumes to the same bits as an uninterrupted run.
+//!
+//! Runs are stopped between generations, by failing disk operations, lost devices, kills and signals. `FLOTILLA_KILLS`
+//! sets how often the real program is killed (default: 20).
+
+use crate::support;
+use std::fs;
+use std::io::{self, Cursor, Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Output, Stdio};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering::SeqCst};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use crate::support::tiny;
+use flotilla::backend::cpu::Cpu;
+use flotilla::backend::gpu;
+use flotilla::backend::gpu::device::DeviceError;
+use flotilla::backend::gpu::episode::GpuBackend;
+use flotilla::backend::{Backend, BackendError, Group, GroupScores, Trace};
+use flotilla::backend::{Machine, OpenBackend};
+use flotilla::config::Config;
+use flotilla_app::record::checkpoint::{self, Checkpoint, CheckpointWriter, Schedule};
+use flotilla_app::record::disk::{Disk, Operation};
+use flotilla_app::record::folder::{self, CONFIG, Folder, METRICS, Note, POLICIES, RUN, Run, Start, StartFrom, Status};
+use flotilla_app::record::{RecordError, metrics, policies};
+use flotilla_app::run::{Options, Results, RunError, Session, SessionEnd};
+use rand::{RngExt, SeedableRng, rngs::ChaCha8Rng};
+use tempfile::TempDir;
+
+/// A run of 14 generations that takes milliseconds.
+fn text() -> String {
+    tiny(14, "generations = 1\nseconds = 0")
+}
+
+fn small() -> Config {
+    Config::parse(&text(), "small.toml").unwrap()
+}
+
+fn cpu() -> OpenBackend {
+    (Box::new(Cpu::default()), Machine::default())
+}
+
+/// Outcome of one session. `notes` are about the folder. `start` and `reached` are the next generations at its start
+/// and at its end.
+struct Outcome {
+    end: Result<SessionEnd, RunError>,
+    results: Option<Results>,
+    notes: Vec<Note>,
+    start: usize,
+    reached: usize,
+}
+
+fn session(
+    config: &Config,
+    path: &Path,
+    start: Start,
+    disk: Disk,
+    backend: OpenBackend,
+    stop_at: Option<usize>,
+) -> Outcome {
+    let (mut session, notes) = match Session::open(vec![(config.clone(), path.into())], start, &disk) {
+        Ok(opened) => opened,
+        Err(error) => return Outcome { end: Err(error), results: None, notes: vec![], start: 0, reached: 0 },
+    };
+    let notes = notes.into_iter().map(|(_, note)| note).collect();
+    if session.is_done() {
+        let results = session.results(0).cloned();
+        return Outcome { end: Ok(SessionEnd::Finished), results, notes, start: 0, reached: 0 };
+    }
+    let start = session.generations()[0];
+    let end = train(&mut session, backend, &mut |_| None, &mut |next| stop_at.is_some_and(|at| next[0] >= at));
+    Outcome { end, results: session.results(0).cloned(), notes, start, reached: session.generations()[0] }
+}
+
+/// Trains until `stops` returns true or the runs are finished.
+fn train(
+    session: &mut Session,
+    mut backend: OpenBackend,
+    fallback: &mut dyn FnMut(&BackendError) -> Option<OpenBackend>,
+    stops: &mut dyn FnMut(&[usize]) -> bool,
+) -> Result<SessionEnd, RunError> {
+    let (stop, save) = (AtomicBool::new(false), AtomicBool::new(false));
+    let mut options = Options {
+        command: "",
+        stop: &stop,
+        save: &save,
+        fallback,
+        on_recovery: &mut |_| {},
+        watch: &mut |now| stop.store(stops(now.generations), SeqCst),
+    };
+    session.train(&mut backend, &mut options)
+}
+
+/// Resumes a run to its end, on a disk without failures.
+fn resume(config: &Config, path: &Path) -> (Results, Outcome) {
+    let outcome = session(config, path, Start::Resume, Disk::default(), cpu(), None);
+    assert!(matches!(outcome.end, Ok(SessionEnd::Finished)), "{:?}", outcome.end);
+    (outcome.results.clone().unwrap(), outcome)
+}
+
+/// Returns the metrics without the column of seconds, and the policies.
+fn result_files(path: &Path) -> (String, Vec<u8>) {
+    let metrics = fs::read_to_string(path.join(METRICS)).unwrap();
+    let shared = |line: &str| {
+        let fields = line.split(',').enumerate().filter(|&(at, _)| at != 5).map(|(_, field)| field);
+        fields.collect::<Vec<_>>().join(",") + "\n"
+    };
+    (metrics.lines().map(shared).collect(), fs::read(path.join(POLICIES)).unwrap())
+}
+
+/// Trains without interruption. Returns the results and the files.
+fn reference(config: &Config) -> (Results, (String, Vec<u8>)) {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("run");
+    let outcome = session(config, &path, Start::Fresh, Disk::default(), cpu(), None);
+    assert!(matches!(outcome.end, Ok(SessionEnd::Finished)), "{:?}", outcome.end);
+    (outcome.results.unwrap(), result_files(&path))
+}
+
+#[test]
+fn checkpoints_do_not_change_results() {
+    let config = small();
+    let mut never = config.clone();
+    never.checkpoint.generations = 0;
+    assert_eq!(reference(&config), reference(&never));
+}
+
+#[test]
+fn checkpoints_are_due_by_generations_or_by_time() {
+    let writer = CheckpointWriter::new(Disk::default(), "checkpoints".into(), small(), vec![], 4);
+    let due = |generations, seconds| {
+        let schedule = Schedule { generations, seconds };
+        [4, 5, 6, 7].map(|next| writer.is_due(&schedule, next))
+    };
+    assert_eq!(due(0, 0.0), [false; 4]);
+    assert_eq!(due(2, 0.0), [false, false, true, true]);
+    // No checkpoint was written yet, so its cost is 0.
+    assert_eq!(due(0, f64::MIN_POSITIVE), [false, true, true, true]);
+    assert_eq!(due(0, 1e9), [false; 4]);
+    assert_eq!(due(2, 1e9), [false, false, true, true]);
+}
+
+#[test]
+fn no_checkpoint_is_due_by_time_while_the_previous_one_is_written() {
+    let (folder, _, paths) = stopped_run(&small());
+    let checkpoint = Checkpoint::read(fs::File::open(&paths[1]).unwrap(), &small()).unwrap();
+    let gate = Arc::new(Mutex::new(()));
+    let disk = Disk::failing({
+        let gate = gate.clone();
+        move |_, _| {
+            drop(gate.lock());
+            Ok(())
+        }
+    });
+    let metrics = Disk::default().create(&folder.path().join("metrics")).unwrap();
+    let mut writer = CheckpointWriter::new(disk, folder.path().into(), small(), vec![], 4);
+    let schedule = Schedule { generations: 0, seconds: f64::MIN_POSITIVE };
+    // While this is locked, the writer waits.
+    let closed = gate.lock().unwrap();
+    let since = Instant::now();
+    writer.save(checkpoint, metrics, since).unwrap();
+    // The known part of the checkpoint's cost is at most this long.
+    let cost = since.elapsed();
+    while since.elapsed() < cost * 50 {
+        assert!(!writer.is_due(&schedule, 10));
+    }
+    drop(closed);
+    writer.wait().unwrap();
+    assert_eq!(writer.newest(), Some(9));
+}
+
+#[test]
+fn a_run_stopped_before_any_generation_resumes_to_the_same_results() {
+    let config = small();
+    let expected = reference(&config);
+    for stop_at in 1..=config.learning.generations + 2 {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("run");
+        let outcome = session(&config, &path, Start::Fresh, Disk::default(), cpu(), Some(stop_at));
+        // The last step completes the run, which leaves nothing to stop.
+        let done = stop_at == config.learning.generations + 2;
+        assert_eq!(outcome.end.unwrap(), if done { SessionEnd::Finished } else { SessionEnd::Stopped });
+        assert_eq!(outcome.reached, stop_at);
+        let (results, outcome) = resume(&config, &path);
+        assert_eq!(outcome.start, if done { 0 } else { stop_at });
+        assert_eq!((results, result_files(&path)), expected, "stopped before generation {stop_at}");
+    }
+}
+
+#[test]
+fn a_finished_run_is_not_trained_again() {
+    let config = small();
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("run");
+    let expected = reference(&config);
+    session(&config, &path, Start::Fresh, Disk::default(), cpu(), None).end.unwrap();
+    let before = fs::read(path.join(METRICS)).unwrap();
+    let disk = Disk::failing(|operation, path| match operation {
+        Operation::CreateFolder => Ok(()),
+        _ => panic!("{operation:?} {}", path.display()),
+    });
+    let outcome = session(&config, &path, Start::Resume, disk, cpu(), None);
+    assert_eq!((outcome.end.unwrap(), outcome.results), (SessionEnd::Finished, Some(expected.0.clone())));
+    assert_eq!(fs::read(path.join(METRICS)).unwrap(), before);
+    // If a result file is damaged, the run resumes from its last checkpoint and restores the file.
+    for (name, at) in [(POLICIES, 500), (METRICS, 60)] {
+        let mut bytes = fs::read(path.join(name)).unwrap();
+        bytes[at] ^= 1;
+        fs::write(path.join(name), bytes).unwrap();
+        let (results, _) = resume(&config, &path);
+        assert_eq!((results, result_files(&path)), expected, "{name}");
+    }
+}
+
+#[test]
+fn a_finished_run_whose_metrics_cannot_be_read_is_not_changed() {
+    let config = small();
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("run");
+    session(&config, &path, Start::Fresh, Disk::default(), cpu(), None).end.unwrap();
+    let files = || [RUN, POLICIES].map(|name| fs::read(path.join(name)).unwrap());
+    let (metrics, before) = (fs::read(path.join(METRICS)).unwrap(), files());
+    // A directory can be read by nobody, not even by root.
+    fs::remove_file(path.join(METRICS)).unwrap();
+    fs::create_dir(path.join(METRICS)).unwrap();
+    let error = session(&config, &path, Start::Resume, Disk::default(), cpu(), None).end.unwrap_err();
+    // Without this error, the run would be trained again, and fail when it opens the metrics for writing.
+    assert!(matches!(&error, RunError::Record(RecordError::Read { path, .. }) if path.ends_with(METRICS)), "{error}");
+    assert_eq!(files(), before);
+    // If the file can be read again, the run is finished.
+    fs::remove_dir(path.join(METRICS)).unwrap();
+    fs::write(path.join(METRICS), metrics).unwrap();
+    let outcome = session(&config, &path, Start::Resume, Disk::default(), cpu(), None);
+    assert_eq!((outcome.end.unwrap(), outcome.results), (SessionEnd::Finished, Some(reference(&config).0)));
+}
+
+/// Windows has other errors for these paths.
+#[cfg(unix)]
+#[test]
+fn only_a_missing_entry_has_no_kind() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("file");
+    fs::write(&file, "").unwrap();
+    for disk in [Disk::default(), Disk::default().within(folder.path()).unwrap()] {
+        assert!(disk.kind(&file).unwrap().is_some());
+        assert!(disk.kind(&folder.path().join("missing")).unwrap().is_none());
+        assert!(disk.kind(&folder.path().join("missing/file")).unwrap().is_none());
+        // No file system allows a name of this length.
+        assert!(disk.kind(&folder.path().join("x".repeat(10_000))).is_err());
+        assert!(disk.kind(&file.join("x")).is_err());
+    }
+}
+
+/// Returns the config with another number of generations.
+fn with_generations(config: &Config, generations: usize) -> Config {
+    let mut config = config.clone();
+    config.learning.generations = generations;
+    config
+}
+
+#[test]
+fn a_run_extended_from_any_length_has_the_same_results() {
+    let config = small();
+    let expected = reference(&config);
+    // With an interval of 0, the only checkpoint is the one at the end.
+    for interval in [0, 1, 4] {
+        for length in 1..config.learning.generations {
+            let mut short = with_generations(&config, length);
+            short.checkpoint.generations = interval;
+            let folder = tempfile::tempdir().unwrap();
+            let path = folder.path().join("run");
+            session(&short, &path, Start::Fresh, Disk::default(), cpu(), None).end.unwrap();
+            let (results, outcome) = resume(&config, &path);
+            assert_eq!(outcome.start, length + 1, "{:?}", outcome.notes);
+            assert_eq!((results, result_files(&path)), expected, "from {length} generations");
+            assert_eq!(fs::read_to_string(path.join("config.toml")).unwrap(), config.to_toml());
+            // The extended run is finished.
+            assert_eq!(resume(&config, &path).1.reached, 0);
+        }
+    }
+}
+
+#[test]
+fn a_run_with_missing_or_damaged_files_is_extended() {
+    let config = small();
+    let expected = reference(&config);
+    let short = with_generations(&config, 7);
+    let run = || {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("run");
+        session(&short, &path, Start::Fresh, Disk::default(), cpu(), None).end.unwrap();
+        let checkpoints = path.join("checkpoints");
+        assert_eq!(checkpoint::list(&checkpoints).unwrap(), [7, 8]);
+        (folder, path, [7, 8].map(|generation| checkpoint::path(&checkpoints, generation)))
+    };
+    let resumes = |path: &Path, start: usize| {
+        let (results, outcome) = resume(&config, path);
+        assert_eq!(outcome.start, start, "{:?}", outcome.notes);
+        assert_eq!((results, result_files(path)), expected);
+    };
+    // Runs of earlier versions have no checkpoint of their end.
+    let (_folder, path, [_, end]) = run();
+    fs::remove_file(&end).unwrap();
+    resumes(&path, 7);
+    let (_folder, path, ends) = run();
+    ends.iter().for_each(|end| fs::remove_file(end).unwrap());
+    resumes(&path, 0);
+    // The policies are another run's, damaged, or missing.
+    let other = with_generations(&config, 6);
+    let other_folder = tempfile::tempdir().unwrap();
+    session(&other, other_folder.path(), Start::Fresh, Disk::default(), cpu(), None).end.unwrap();
+    let others = fs::read(other_folder.path().join(POLICIES)).unwrap();
+    for (damage, policies) in [Some(others), Some(b"none".to_vec()), None].iter().enumerate() {
+        let (_folder, path, _) = run();
+        match policies {
+            Some(bytes) => fs::write(path.join(POLICIES), bytes).unwrap(),
+            None => fs::remove_file(path.join(POLICIES)).unwrap(),
+        }
+        let (results, outcome) = resume(&config, &path);
+        assert_eq!((outcome.start, outcome.notes.len()), (7, 1), "{damage}: {:?}", outcome.notes);
+        assert_eq!((results, result_files(&path)), expected);
+    }
+    // The policies cannot be read for now: a folder has the file's name.
+    let (_folder, path, _) = run();
+    let (policies, elsewhere) = (path.join(POLICIES), path.join("elsewhere"));
+    fs::rename(&policies, &elsewhere).unwrap();
+    fs::create_dir(&policies).unwrap();
+    let error = session(&config, &path, Start::Resume, Disk::default(), cpu(), None).end.unwrap_err().to_string();
+    assert!(error.contains("policies.safetensors: cannot be read"), "{error}");
+    fs::remove_dir(&policies).unwrap();
+    fs::rename(&elsewhere, &policies).unwrap();
+    resumes(&path, 8);
+    // A run stopped after its last generation, before its end, has the weights in its checkpoint.
+    let stopped = tempfile::tempdir().unwrap();
+    session(&short, stopped.path(), Start::Fresh, Disk::default(), cpu(), Some(8)).end.unwrap();
+    resumes(stopped.path(), 8);
+    // While a run is extended, the digests of the shorter run are not recorded.
+    let (_folder, path, _) = run();
+    let recorded = || Run::read(&path.join(RUN)).unwrap();
+    assert!(recorded().state == Status::Done && recorded().digest.is_some() && recorded().files.is_some());
+    let opened = Folder::open(&path, Start::Resume, &config, StartFrom::Unspecified, Disk::default()).unwrap();
+    assert_eq!((recorded().state, recorded().digest, recorded().files), (Status::Running, None, None));
+    drop(opened);
+    resumes(&path, 8);
+
+    // A run cannot become shorter. The refusal changes no file.
+    let (_folder, path, _) = run();
+    let before = result_files(&path);
+    let outcome = session(&with_generations(&config, 6), &path, Start::Resume, Disk::default(), cpu(), None);
+    let error = outcome.end.unwrap_err().to_string();
+    assert!(error.contains("is a run of 7 generations, which cannot become one of 6"), "{error}");
+    assert_eq!(result_files(&path), before);
+    // An extension cannot change other keys.
+    let mut changed = config.clone();
+    changed.learning.seed = 3;
+    let error = session(&changed, &path, Start::Resume, Disk::default(), cpu(), None).end.unwrap_err().to_string();
+    assert!(error.contains("learning.seed: 0 there, 3 here") && !error.contains("generations:"), "{error}");
+}
+
+/// Lets every disk operation of an extension fail once, alone or with all later ones. Each time, the run must resume to
+/// the same results.
+#[test]
+fn an_extension_survives_every_failing_disk_operation() {
+    let config = with_generations(&small(), 9);
+    let mut short = with_generations(&config, 5);
+    short.checkpoint.generations = 3;
+    let expected = reference(&config);
+    let attempt = |fails: Box<dyn Fn(usize) -> bool + Send + Sync>| {
+        let folder = in_memory();
+        let path = folder.path().join("run");
+        session(&short, &path, Start::Fresh, Disk::default(), cpu(), None).end.unwrap();
+        let count = Arc::new(AtomicUsize::new(0));
+        let disk = Disk::failing({
+            let count = count.clone();
+            move |_, _| match fails(count.fetch_add(1, SeqCst)) {
+                true => Err(io::Error::from(io::ErrorKind::StorageFull)),
+                false => Ok(()),
+            }
+        });
+        let mut without_checkpoints = config.clone();
+        without_checkpoints.checkpoint.generations = 0;
+        let outcome = session(&without_checkpoints, &path, Start::Resume, disk, cpu(), None);
+        (folder, path, outcome, count.load(SeqCst))
+    };
+    let (_, _, outcome, operations) = attempt(Box::new(|_| false));
+    assert_eq!(outcome.results, Some(expected.0.clone()));
+    assert!(operations > 20, "{operations}");
+    for at in 0..operations {
+        for and_later in [false, true] {
+            let (_folder, path, _, _) =
+                attempt(Box::new(move |operation| operation == at || and_later && operation > at));
+            let (results, resumed) = resume(&config, &path);
+            assert_eq!((results, result_files(&path)), expected, "operation {at}");
+            assert!(resumed.notes.len() <= 1, "operation {at}: {:?}", resumed.notes);
+            // The run resumes from the end of the shorter run, or is already finished.
+            assert!(resumed.start >= 6 || resumed.reached == 0, "operation {at}: {:?}", resumed.notes);
+            assert_eq!(leftovers(&path), Vec::<PathBuf>::new(), "operation {at}");
+        }
+    }
+}
+
+/// Trains runs of different lengths, sizes and progress in one session, and compares each with the same run trained
+/// alone.
+#[test]
+fn runs_trained_together_equal_runs_trained_alone() {
+    let mut configs = [small(), with_generations(&small(), 5), with_generations(&small(), 9), small()];
+    configs[2].learning.population = 9;
+    configs[3].learning.seed = 4;
+    configs[3].checkpoint.generations = 0;
+    let expected: Vec<_> = configs.iter().map(reference).collect();
+    let folder = tempfile::tempdir().unwrap();
+    let path = |run: usize| folder.path().join(run.to_string());
+    // The first run is stopped before generation 11, the second is finished, and the others have not started.
+    session(&configs[0], &path(0), Start::Fresh, Disk::default(), cpu(), Some(11)).end.unwrap();
+    session(&configs[1], &path(1), Start::Fresh, Disk::default(), cpu(), None).end.unwrap();
+    let open = || {
+        let runs = configs.iter().enumerate().map(|(run, config)| (config.clone(), path(run))).collect();
+        Session::open(runs, Start::Resume, &Disk::default()).unwrap()
+    };
+    let (mut session, notes) = open();
+    assert_eq!(session.generations(), [11, 7, 0, 0]);
+    assert_eq!(notes.iter().map(|(run, _)| *run).collect::<Vec<_>>(), [0, 2, 3]);
+    let stopped = train(&mut session, cpu(), &mut |_| None, &mut |next| next[2] >= 3);
+    assert_eq!((stopped.unwrap(), session.generations()), (SessionEnd::Stopped, &[14, 7, 3, 3][..]));
+    drop(session);
+    let (mut session, _) = open();
+    let done = train(&mut session, cpu(), &mut |_| None, &mut |_| false);
+    assert_eq!((done.unwrap(), session.generations()), (SessionEnd::Finished, &[16, 7, 11, 16][..]));
+    for (run, expected) in expected.iter().enumerate() {
+        assert_eq!(
+            (session.results(run), result_files(&path(run))),
+            (Some(&expected.0), expected.1.clone()),
+            "run {run}"
+        );
+    }
+    // If one of the folders cannot be used, no folder is changed.
+    drop(session);
+    let runs = [(configs[0].clone(), folder.path().join("new")), (configs[1].clone(), path(1))];
+    assert!(Session::open(runs.to_vec(), Start::Fresh, &Disk::default()).is_err());
+    assert!(!folder.path().join("new").exists());
+}
+
+/// Lets every disk operation of a run fail once, alone or with all later ones. A write that fails leaves its first
+/// half. Each time, the run must resume to the same results.
+#[test]
+fn a_run_survives_every_failing_disk_operation() {
+    let config = small();
+    let expected = reference(&config);
+    let attempt = |fails: Box<dyn Fn(usize) -> bool + Send + Sync>| {
+        let folder = in_memory();
+        let count = Arc::new(AtomicUsize::new(0));
+        let failed = Arc::new(Mutex::new(None));
+        let disk = Disk::failing({
+            let (count, failed) = (count.clone(), failed.clone());
+            move |operation, path| {
+                if fails(count.fetch_add(1, SeqCst)) {
+                    *failed.lock().unwrap() = Some((operation, path.to_path_buf()));
+                    return Err(io::Error::from(io::ErrorKind::StorageFull));
+                }
+                Ok(())
+            }
+        });
+        let path = folder.path().join("run");
+        let outcome = session(&config, &path, Start::Fresh, disk, cpu(), None);
+        let failed = failed.lock().unwrap().clone();
+        (folder, path, outcome, count.load(SeqCst), failed)
+    };
+    let (_, _, outcome, operations, _) = attempt(Box::new(|_| false));
+    assert_eq!((outcome.end.unwrap(), outcome.results), (SessionEnd::Finished, Some(expected.0.clone())));
+    assert!(operations > 14 * 5, "{operations}");
+    let mut reported = Vec::new();
+    for at in 0..operations {
+        for and_later in [false, true] {
+            let (_folder, path, outcome, _, failed) =
+                attempt(Box::new(move |operation| operation == at || and_later && operation > at));
+            let (operation, file) = failed.expect("a failed operation");
+            let context = format!("operation {at}: {operation:?} {}", file.display());
+            if let Err(error) = outcome.end {
+                let error = flotilla_cli::Error::from(error).to_string();
+                assert!(error.contains("free some space, then continue with --resume"), "{context}: {error}");
+                reported.push(operation);
+            }
+            let (results, resumed) = resume(&config, &path);
+            assert_eq!((results, result_files(&path)), expected, "{context}");
+            // No file is reported as damaged. The only possible note is the generation of the resume.
+            assert!(resumed.notes.len() <= 1, "{context}: {:?}", resumed.notes);
+            // With a checkpoint per generation, at most two generations are played again.
+            assert!(
+                resumed.start + 2 >= outcome.reached || outcome.reached > 15,
+                "{context}: {} {}",
+                resumed.start,
+                outcome.reached
+            );
+            assert_eq!(leftovers(&path), Vec::<PathBuf>::new(), "{context}");
+        }
+    }
+    for operation in [
+        Operation::CreateFolder,
+        Operation::Create,
+        Operation::Write,
+        Operation::Flush,
+        Operation::Rename,
+        Operation::Remove,
+    ] {
+        assert!(reported.contains(&operation), "no failure of {operation:?} was reported");
+    }
+}
+
+/// Creates a folder in memory, where flushes are fast, if the system has `/dev/shm`.
+fn in_memory() -> TempDir {
+    tempfile::tempdir_in("/dev/shm").or_else(|_| tempfile::tempdir()).unwrap()
+}
+
+/// Returns the temporary files that an interrupted write has left.
+fn leftovers(path: &Path) -> Vec<PathBuf> {
+    let checkpoints = path.join("checkpoints");
+    let entries = [path, &checkpoints].into_iter().flat_map(|folder| fs::read_dir(folder).into_iter().flatten());
+    entries.map(|entry| entry.unwrap().path()).filter(|path| path.extension().is_some_and(|e| e == "tmp")).collect()
+}
+
+/// Trains a run that stops before generation 9. Returns its folder and its checkpoints, oldest first.
+fn stopped_run(config: &Config) -> (TempDir, PathBuf, Vec<PathBuf>) {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("run");
+    session(config, &path, Start::Fresh, Disk::default(), cpu(), Some(9)).end.unwrap();
+    let checkpoints = path.join("checkpoints");
+    let generations = checkpoint::list(&checkpoints).unwrap();
+    assert_eq!(generations, [8, 9]);
+    let paths = generations.into_iter().map(|generation| checkpoint::path(&checkpoints, generation)).collect();
+    (folder, path, paths)
+}
+
+/// Returns damaged copies of a file: cut to every length, every byte changed in three ways, and one byte longer.
+fn damaged(whole: &[u8]) -> impl Iterator<Item = (String, Vec<u8>)> {
+    let cut = (0..whole.len()).map(|length| (format!("cut to {length}"), whole[..length].to_vec()));
+    let flipped = (0..whole.len()).flat_map(|at| [0x01, 0x20, 0xff].map(|mask| (at, mask))).map(|(at, mask)| {
+        let mut bytes = whole.to_vec();
+        bytes[at] ^= mask;
+        (format!("byte {at} ^ {mask:#x}"), bytes)
+    });
+    let longer = [("one byte more".to_string(), [whole, b" "].concat())];
+    cut.chain(flipped).chain(longer)
+}
+
+#[test]
+fn a_folder_that_cannot_be_read_is_not_a_folder_without_checkpoints() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("file");
+    fs::write(&file, "").unwrap();
+    assert_eq!(checkpoint::list(&file).unwrap(), [0; 0]);
+    assert_eq!(checkpoint::list(&folder.path().join("missing")).unwrap(), [0; 0]);
+    // No file system of Unix allows a name of this length. Windows says that the file is missing.
+    if cfg!(unix) {
+        let error = checkpoint::list(&folder.path().join("x".repeat(10_000))).unwrap_err();
+        assert!(matches!(error, RecordError::Read { .. }), "{error}");
+    }
+}
+
+#[test]
+fn every_damaged_byte_of_a_checkpoint_is_detected() {
+    let config = small();
+    let (_folder, _, paths) = stopped_run(&config);
+    let whole = fs::read(&paths[1]).unwrap();
+    Checkpoint::read(Cursor::new(&whole), &config).unwrap();
+    for (damage, bytes) in damaged(&whole) {
+        let read = Checkpoint::read(Cursor::new(&bytes), &config);
+        assert!(read.is_err(), "{damage}");
+    }
+}
+
+#[test]
+fn every_damaged_byte_of_a_policies_file_is_detected() {
+    let config = small();
+    let (_, (_, whole)) = reference(&config);
+    for trial in [None, Some(0), Some(1)] {
+        policies::from_source(Cursor::new(&whole), &config, trial).unwrap();
+    }
+    for (damage, bytes) in damaged(&whole) {
+        assert!(policies::from_source(Cursor::new(&bytes), &config, None).is_err(), "{damage}");
+    }
+}
+
+#[test]
+fn a_damaged_checkpoint_is_reported_and_the_previous_one_is_used() {
+    let config = small();
+    let expected = reference(&config);
+    let (_folder, path, paths) = stopped_run(&config);
+    let originals: Vec<_> = paths.iter().map(|path| (path, fs::read(path).unwrap())).collect();
+    let metrics = fs::read(path.join(METRICS)).unwrap();
+    for (damage, bytes) in damaged(&originals[1].1).step_by(97) {
+        for (path, bytes) in &originals {
+            fs::write(path, bytes).unwrap();
+        }
+        fs::write(path.join(METRICS), &metrics).unwrap();
+        fs::write(&paths[1], bytes).unwrap();
+        let outcome = session(&config, &path, Start::Resume, Disk::default(), cpu(), Some(10));
+        assert_eq!(outcome.start, 8, "{damage}");
+        let note = outcome.notes[0].to_string();
+        assert!(outcome.notes[0].is_damage() && note.contains("000000009.safetensors: "), "{damage}: {note}");
+        assert_eq!(checkpoint::list(&path.join("checkpoints")).unwrap(), [9, 10]);
+        for generation in [9, 10] {
+            fs::remove_file(checkpoint::path(&path.join("checkpoints"), generation)).unwrap();
+        }
+    }
+    // If both checkpoints are damaged, the run starts over.
+    for (path, bytes) in &originals {
+        fs::write(path, &bytes[..bytes.len() - 1]).unwrap();
+    }
+    fs::write(path.join(METRICS), &metrics).unwrap();
+    let (results, outcome) = resume(&config, &path);
+    assert_eq!((outcome.start, outcome.notes.len()), (0, 3), "{:?}", outcome.notes);
+    assert_eq!((results, result_files(&path)), expected);
+}
+
+#[test]
+fn a_checkpoint_of_another_run_is_set_aside_and_the_previous_one_is_used() {
+    let config = small();
+    let expected = reference(&config);
+    let (_folder, path, paths) = stopped_run(&config);
+    let mut other = config.clone();
+    other.learning.seed = 3;
+    let (_other_folder, _, others) = stopped_run(&other);
+    fs::copy(&others[1], &paths[1]).unwrap();
+    let (results, outcome) = resume(&config, &path);
+    let note = outcome.notes[0].to_string();
+    assert!(note.contains("000000009.safetensors: it is of another run"), "{note}");
+    assert_eq!(outcome.start, 8, "{:?}", outcome.notes);
+    assert_eq!((results, result_files(&path)), expected);
+}
+
+/// A file of which one read fails, after `left` others.
+struct FailingRead<R> {
+    source: R,
+    left: Option<usize>,
+    kind: io::ErrorKind,
+}
+
+impl<R: Read> Read for FailingRead<R> {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        let fails = self.left == Some(0);
+        self.left = self.left.and_then(|left| left.checked_sub(1));
+        if fails { Err(self.kind.into()) } else { self.source.read(buffer) }
+    }
+}
+
+impl<R: Seek> Seek for FailingRead<R> {
+    fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
+        self.source.seek(to)
+    }
+}
+
+#[test]
+fn an_interrupted_read_is_repeated_and_a_failed_one_is_reported() {
+    let config = small();
+    let (_folder, _, paths) = stopped_run(&config);
+    let whole = fs::read(&paths[1]).unwrap();
+    let expected = Checkpoint::read(Cursor::new(&whole), &config).unwrap();
+    for reads in 0.. {
+        let read = |kind| {
+            let mut file = FailingRead { source: Cursor::new(&whole), left: Some(reads), kind };
+            (Checkpoint::read(&mut file, &config), file.left.is_none())
+        };
+        assert_eq!(read(io::ErrorKind::Interrupted).0.unwrap(), expected, "after {reads} reads");
+        let (found, failed) = read(io::ErrorKind::TimedOut);
+        if !failed {
+            assert!(reads >= 5, "a checkpoint took only {reads} reads");
+            return;
+        }
+        let error = found.expect_err("a read failed");
+        assert!(error.contains("cannot be read"), "after {reads} reads: {error}");
+    }
+}
+
+#[test]
+fn a_run_with_cut_metrics_resumes_before_the_cut() {
+    let config = small();
+    let expected = reference(&config);
+    for (cut, start) in [(0, 9), (1, 8), (100, 0)] {
+        let (_folder, path, _) = stopped_run(&config);
+        let metrics = fs::read(path.join(METRICS)).unwrap();
+        fs::write(path.join(METRICS), &metrics[..metrics.len() - cut]).unwrap();
+        let (results, outcome) = resume(&config, &path);
+        assert_eq!(outcome.start, start, "{:?}", outcome.notes);
+        assert_eq!((results, result_files(&path)), expected);
+    }
+}
+
+#[test]
+fn a_changed_config_is_refused_with_the_names_of_its_keys() {
+    let config = small();
+    let (_folder, path, _) = stopped_run(&config);
+    let mut changed = config.clone();
+    changed.learning.seed = 5;
+    changed.world.steps = 9;
+    changed.checkpoint.seconds = 1.0;
+    let error = session(&changed, &path, Start::Resume, Disk::default(), cpu(), None).end.unwrap_err().to_string();
+    assert!(
+        error.contains("learning.seed: 0 there, 5 here") && error.contains("world.steps: 8 there, 9 here"),
+        "{error}"
+    );
+    assert!(!error.contains("checkpoint.") && !error.contains('…'), "{error}");
+    // The values of a key with a long text are cut.
+    let mut long = config.clone();
+    long.world.pois = vec![[10.0, 10.0]; 20];
+    let differences = folder::differences(&config, &long);
+    assert!(differences.len() == 1 && differences[0].ends_with("… here"), "{differences:?}");
+    // Without the config file, the checkpoint still identifies its config.
+    fs::remove_file(path.join("config.toml")).unwrap();
+    let error = session(&changed, &path, Start::Resume, Disk::default(), cpu(), None).end.unwrap_err();
+    assert!(matches!(error, RunError::Record(RecordError::ConfigDiffers { .. })), "{error}");
+    // The interval of checkpoints may change.
+    let mut rarer = config;
+    rarer.checkpoint.generations = 0;
+    assert_eq!(resume(&rarer, &path).1.start, 9);
+}
+
+#[test]
+fn a_folder_has_one_process_at_a_time_and_one_run() {
+    let config = small();
+    let (_folder, path, _) = stopped_run(&config);
+    let refused = |start| match Folder::open(&path, start, &config, StartFrom::Unspecified, Disk::default()) {
+        Err(error) => error,
+        Ok(_) => panic!("opened"),
+    };
+    assert!(matches!(refused(Start::Fresh), RecordError::Exists { .. }));
+    let lock = Folder::open(&path, Start::Resume, &config, StartFrom::Unspecified, Disk::default()).unwrap();
+    assert!(matches!(refused(Start::Resume), RecordError::Locked { .. }));
+    assert!(matches!(refused(Start::Force), RecordError::Locked { .. }));
+    drop(lock);
+    fs::write(path.join("notes.txt"), "mine").unwrap();
+    let outcome = session(&config, &path, Start::Force, Disk::default(), cpu(), Some(3));
+    assert_eq!(outcome.start, 0);
+    assert_eq!(checkpoint::list(&path.join("checkpoints")).unwrap(), [2, 3]);
+    assert_eq!(fs::read(path.join("notes.txt")).unwrap(), b"mine");
+}
+
+/// A backend that fails after this many successful calls of `play`.
+struct Failing {
+    cpu: Cpu,
+    left: usize,
+}
+
+impl Backend for Failing {
+    fn play(&mut self, groups: &[Group<'_>]) -> Result<Vec<GroupScores>, BackendError> {
+        // A device may fail after half of its work.
+        self.cpu.play(&groups[..groups.len().div_ceil(2)])?;
+        self.left = self
+            .left
+            .checked_sub(1)
+            .ok_or(BackendError::from(DeviceError::Lost { adapter: "test".into(), reason: "pulled out".into() }))?;
+        self.cpu.play(groups)
+    }
+
+    fn trace(&mut self, group: &Group<'_>) -> Result<Trace, BackendError> {
+        self.cpu.trace(group)
+    }
+
+    fn describe(&self) -> String {
+        "a device about to be lost".into()
+    }
+}
+
+#[test]
+fn a_lost_device_does_not_change_results() {
+    let config = Config::parse(&tiny(14, "seconds = 0"), "small.toml").unwrap();
+    let expected = reference(&config);
+    for left in 0..=config.learning.generations + 1 {
+        let failing = || -> OpenBackend { (Box::new(Failing { cpu: Cpu::default(), left }), Machine::default()) };
+        let folder = tempfile::tempdir().unwrap();
+        // Without another device, the run is saved and can be resumed.
+        let path = folder.path().join("stop");
+        let outcome = session(&config, &path, Start::Fresh, Disk::default(), failing(), None);
+        let error = flotilla_cli::Error::from(outcome.end.unwrap_err()).to_string();
+        assert!(error.contains("the device was lost") && error.contains("--resume"), "{error}");
+        // A command that trains no run suggests to run it again.
+        let error = BackendError::from(DeviceError::Lost { adapter: "test".into(), reason: "pulled out".into() });
+        let error = flotilla_cli::Error::from(error).to_string();
+        assert!(error.ends_with("; run again, or use --backend cpu"), "{error}");
+        let error = BackendError::from(DeviceError::UnknownAdapter { name: "test".into(), found: vec![] });
+        let error = flotilla_cli::Error::from(error).to_string();
+        assert!(error.ends_with("; use --backend cpu"), "{error}");
+        assert_eq!(Run::read(&path.join("run.json")).unwrap().state, Status::Stopped);
+        let (results, outcome) = resume(&config, &path);
+        assert_eq!((outcome.start, results), (left, expected.0.clone()));
+        assert_eq!(result_files(&path), expected.1);
+
+        // With the CPU as replacement, the run continues.
+        let path = folder.path().join("cpu");
+        let runs = vec![(config.clone(), path.clone())];
+        let (mut session, _) = Session::open(runs, Start::Fresh, &Disk::default()).unwrap();
+        let mut requests = 0;
+        let mut fallback = |_: &_| {
+            requests += 1;
+            Some(cpu())
+        };
+        assert_eq!(train(&mut session, failing(), &mut fallback, &mut |_| false).unwrap(), SessionEnd::Finished);
+        assert_eq!(session.results(0), Some(&expected.0));
+        assert_eq!((requests, result_files(&path)), (1, expected.1.clone()));
+    }
+}
+
+#[test]
+fn a_run_can_alternate_between_cpu_and_gpu() {
+    let config = small();
+    let expected = reference(&config);
+    for (request, info) in support::adapters("a_run_can_alternate_between_cpu_and_gpu") {
+        let gpu = || -> OpenBackend {
+            let backend = GpuBackend::new(gpu::open(request.clone()).unwrap()).unwrap();
+            (Box::new(backend), Machine { backend: "gpu".into(), ..Machine::default() })
+        };
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("run");
+        for (stop_at, backend) in [(4, cpu()), (9, gpu()), (12, cpu())] {
+            let outcome = session(&config, &path, Start::Resume, Disk::default(), backend, Some(stop_at));
+            assert_eq!((outcome.end.unwrap(), outcome.reached), (SessionEnd::Stopped, stop_at));
+        }
+        let outcome = session(&config, &path, Start::Resume, Disk::default(), gpu(), None);
+        assert_eq!((outcome.end.unwrap(), outcome.results), (SessionEnd::Finished, Some(expected.0.clone())), "{info}");
+        assert_eq!(result_files(&path), expected.1, "{info}");
+    }
+}
+
+/// Returns a command of the real program, with captured output.
+fn flotilla() -> Command {
+    let mut command = support::flotilla();
+    command.stdout(Stdio::piped()).stderr(Stdio::piped());
+    command
+}
+
+/// Returns a command that trains in a folder.
+fn flotilla_train(config: &Path, out: &Path, flags: &[&str]) -> Command {
+    let mut command = flotilla();
+    // `--backend cpu` saves the search for GPUs.
+    command.arg("train").arg(config).arg("--out").arg(out).args(["--backend", "cpu"]).args(flags);
+    command
+}
+
+fn config_file(folder: &Path, text: &str) -> PathBuf {
+    let path = folder.join("config.toml");
+    fs::write(&path, text).unwrap();
+    path
+}
+
+fn stderr(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+/// Removes warnings. These short episodes cause one, because no agent reaches a POI.
+fn without_warnings(text: &str) -> String {
+    text.split_inclusive('\n').filter(|line| !line.starts_with("warning: ")).collect()
+}
+
+/// Returns the number of generations with complete rows in the metrics.
+fn generations_recorded(path: &Path) -> usize {
+    let metrics = fs::read_to_string(path.join(METRICS)).unwrap_or_default();
+    let whole = metrics.rfind('\n').map_or("", |end| &metrics[..end]);
+    whole.lines().skip(1).filter(|line| line.starts_with("1,")).count()
+}
+
+/// A run of one or two seconds, most of which are spent on checkpoints.
+const HEAVY: &str = "
+[world]
+leaders = [[10, 5], [20, 5], [30, 5], [40, 5]]
+followers = [[12, 2], [22, 2], [32, 2], [42, 2]]
+pois = [[10, 9], [20, 9], [30, 9], [40, 9]]
+coupling = 2
+steps = 4
+[policy]
+hidden = [24, 24]
+[learning]
+population = 60
+generations = 60
+trials = 2
+[checkpoint]
+generations = 1
+seconds = 0
+";
+
+#[test]
+fn a_killed_run_resumes_to_the_same_results() {
+    let kills: usize = std::env::var("FLOTILLA_KILLS").map_or(20, |text| text.parse().expect("a number of kills"));
+    let config = Config::parse(HEAVY, "heavy.toml").unwrap();
+    let expected = reference(&config);
+    let folder = tempfile::tempdir().unwrap();
+    let file = config_file(folder.path(), HEAVY);
+    let mut random = ChaCha8Rng::seed_from_u64(1);
+    let (mut killed, mut while_writing, mut runs) = (0, 0, 0);
+    while killed < kills {
+        let out = folder.path().join(format!("run-{runs}"));
+        runs += 1;
+        // Every second run first finishes with 25 generations, and is then extended.
+        let mut lengths = if runs % 2 == 0 { vec!["60"] } else { vec!["60", "25"] };
+        loop {
+            let recorded = generations_recorded(&out);
+            // The number of threads differs between starts.
+            let threads = (1 + random.random_range(0..3)).to_string();
+            let length = lengths.last().expect("a length that remains");
+            let flags = ["--resume", "--threads", &threads, "--generations", length];
+            let mut child = flotilla_train(&file, &out, &flags).spawn().unwrap();
+            let moment = Instant::now() + Duration::from_micros(random.random_range(0..150_000));
+            let ended = loop {
+                match child.try_wait().unwrap() {
+                    Some(status) => break Some(status),
+                    None if killed < kills && Instant::now() >= moment => {
+                        child.kill().unwrap();
+                        child.wait().unwrap();
+                        break None;
+                    }
+                    None => std::thread::sleep(Duration::from_micros(200)),
+                }
+            };
+            let stderr = without_warnings(&read_all(child.stderr.take()));
+            // A generation's row is written after the checkpoint before that generation. No recorded generation is
+            // played again.
+            if let Some((_, start)) = stderr.split_once("resuming at generation ") {
+                let start: usize = start.split_whitespace().next().unwrap().parse().unwrap();
+                // The last row is written before the policies. Without these, the run resumes at its last generation.
+                let last: usize = length.parse().unwrap();
+                assert!(start >= recorded.min(last), "{recorded} generations were recorded: {stderr}");
+            } else {
+                assert!(recorded == 0 || !stderr.contains("generation"), "{recorded} recorded: {stderr}");
+            }
+            assert!(!stderr.contains("set aside") && !stderr.contains("rewritten"), "{stderr}");
+            match ended {
+                None => {
+                    killed += 1;
+                    while_writing += usize::from(!leftovers(&out).is_empty());
+                }
+                Some(status) => {
+                    assert_eq!(status.code(), Some(0), "{stderr}");
+                    lengths.pop();
+                    if lengths.is_empty() {
+                        break;
+                    }
+                }
+            }
+        }
+        assert_eq!(result_files(&out), expected.1);
+        assert_eq!(Run::read(&out.join("run.json")).unwrap().digest, Some(expected.0.digest.clone()));
+        fs::remove_dir_all(out).unwrap();
+    }
+    println!("killed {killed} times, {while_writing} of them while a file was written, in {runs} runs");
+}
+
+/// Kills and resumes a run up to `kills` times, then lets it finish. Returns the number of kills.
+fn finish_under_kills(file: &Path, out: &Path, flags: &[&str], kills: usize) -> usize {
+    let mut random = ChaCha8Rng::seed_from_u64(2);
+    let mut killed = 0;
+    loop {
+        let mut child = flotilla_train(file, out, &[&["--resume"], flags].concat()).spawn().unwrap();
+        let before = generations_recorded(out);
+        let start = Instant::now();
+        // Every kill waits for some progress, or 20 seconds, so that the run finishes eventually.
+        let ended = loop {
+            let progressed = generations_recorded(out) > before + random.random_range(0..9);
+            match child.try_wait().unwrap() {
+                Some(status) => break Some(status),
+                None if killed < kills && (progressed || start.elapsed() > Duration::from_secs(20)) => {
+                    child.kill().unwrap();
+                    child.wait().unwrap();
+                    break None;
+                }
+                None => std::thread::sleep(Duration::from_micros(200)),
+            }
+        };
+        let stderr = read_all(child.stderr.take());
+        assert!(!stderr.contains("set aside") && !stderr.contains("rewritten"), "{stderr}");
+        match ended {
+            None => killed += 1,
+            Some(status) => {
+                assert_eq!(status.code(), Some(0), "{stderr}");
+                return killed;
+            }
+        }
+    }
+}
+
+#[test]
+fn a_run_killed_around_changes_of_stage_resumes_to_the_same_results() {
+    let staged = (1..20).map(|stage| {
+        let (from, coupling) = (3 * stage, 1 + stage % 3);
+        format!("[[stages]]\nfrom = {from}\nset = {{ world.coupling = {coupling}, learning.start_jitter = 0.5 }}\n")
+    });
+    let text = [HEAVY.to_string()].into_iter().chain(staged).collect::<String>();
+    let expected = reference(&Config::parse(&text, "staged.toml").unwrap());
+    let folder = tempfile::tempdir().unwrap();
+    let (file, out) = (config_file(folder.path(), &text), folder.path().join("run"));
+    let killed = finish_under_kills(&file, &out, &[], 8);
+    assert!(killed >= 4, "killed {killed} times");
+    assert_eq!(result_files(&out), expected.1);
+    assert_eq!(Run::read(&out.join("run.json")).unwrap().digest, Some(expected.0.digest));
+}
+
+#[test]
+fn a_killed_run_with_init_resumes_to_the_same_results() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = config_file(folder.path(), HEAVY);
+    let [source, uninterrupted, out] = ["source", "whole", "run"].map(|name| folder.path().join(name));
+    let run = |out: &Path, flags: &[&str]| {
+        let done = flotilla_train(&file, out, flags).output().unwrap();
+        assert_eq!(done.status.code(), Some(0), "{}", stderr(&done));
+    };
+    run(&source, &["--generations", "3"]);
+    let policies = source.join("policies.safetensors");
+    let init = ["--init", policies.to_str().unwrap()];
+    run(&uninterrupted, &init);
+    let killed = finish_under_kills(&file, &out, &init, 5);
+    assert!(killed >= 3, "killed {killed} times");
+    assert_eq!(result_files(&out), result_files(&uninterrupted));
+    let digest = |path: &Path| Run::read(&path.join("run.json")).unwrap().digest;
+    assert_eq!(digest(&out), digest(&uninterrupted));
+    assert_ne!(digest(&out), Some(reference(&Config::parse(HEAVY, "heavy.toml").unwrap()).0.digest));
+}
+
+fn read_all(pipe: Option<impl Read>) -> String {
+    let mut text = String::new();
+    pipe.unwrap().read_to_string(&mut text).unwrap();
+    text
+}
+
+/// Waits until a condition is true, for at most 60 seconds.
+fn wait_until(what: &str, mut condition: impl FnMut() -> bool) {
+    let start = Instant::now();
+    while !condition() {
+        assert!(start.elapsed() < Duration::from_secs(60), "waited for 60 s: {what}");
+        std::thread::sleep(Duration::from_millis(2));
+    }
+}
+
+#[test]
+fn a_second_process_is_refused_until_the_first_ends() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = config_file(folder.path(), &HEAVY.replace("generations = 60", "generations = 100000"));
+    let out = folder.path().join("run");
+    let mut first = flotilla_train(&file, &out, &[]).spawn().unwrap();
+    wait_until("the run starts", || generations_recorded(&out) > 0);
+    for flags in [&["--resume"][..], &["--force"]] {
+        let second = flotilla_train(&file, &out, flags).output().unwrap();
+        assert_eq!(second.status.code(), Some(1));
+        assert!(stderr(&second).contains("error: another process is training in"), "{}", stderr(&second));
+    }
+    let third = flotilla_train(&file, &out, &[]).output().unwrap();
+    assert_eq!(third.status.code(), Some(1));
+    assert!(stderr(&third).contains("holds a run already; pass --resume to continue it"), "{}", stderr(&third));
+    first.kill().unwrap();
+    first.wait().unwrap();
+    let changed = flotilla_train(&file, &out, &["--resume", "--seed", "3"]).output().unwrap();
+    assert_eq!(changed.status.code(), Some(1));
+    assert!(stderr(&changed).contains("learning.seed: 0 there, 3 here"), "{}", stderr(&changed));
+    let mut resumed = flotilla_train(&file, &out, &["--resume"]).spawn().unwrap();
+    let recorded = generations_recorded(&out);
+    wait_until("the run continues", || generations_recorded(&out) > recorded + 2);
+    resumed.kill().unwrap();
+    resumed.wait().unwrap();
+}
+
+#[test]
+fn no_folder_is_changed_if_one_of_several_runs_cannot_start() {
+    let place = tempfile::tempdir().unwrap();
+    let [free, taken] = ["free", "taken"].map(|name| place.path().join(name));
+    let open = |start: Start| {
+        let runs = [&free, &taken].map(|path| (small(), path.clone()));
+        Session::open(runs.into(), start, &Disk::default()).err().expect("an error about the taken folder").to_string()
+    };
+    let lock = Folder::open(&taken, Start::Fresh, &small(), StartFrom::Unspecified, Disk::default()).unwrap();
+    assert!(open(Start::Fresh).contains("holds a run already") && !free.exists());
+    fs::create_dir(&free).unwrap();
+    fs::write(free.join(METRICS), metrics::HEADER).unwrap();
+    assert!(open(Start::Force).starts_with("another process is training in"));
+    assert_eq!(fs::read_to_string(free.join(METRICS)).unwrap(), metrics::HEADER);
+    drop(lock);
+}
+
+/// Tests that no flag overwrites files that flotilla has not written.
+#[test]
+fn files_of_others_are_not_overwritten() {
+    let place = tempfile::tempdir().unwrap();
+    let text = format!("# Mine.\n{}", small().to_toml());
+    let out = place.path().join("mine");
+    fs::create_dir(&out).unwrap();
+    let file = config_file(&out, &text);
+    // A run may start in a folder that has only its config file. That file is not rewritten.
+    let done = flotilla_train(&file, &out, &["--resume", "--quiet"]).output().unwrap();
+    assert_eq!(done.status.code(), Some(0), "{}", stderr(&done));
+    assert_eq!(fs::read_to_string(&file).unwrap(), text);
+    for name in [CONFIG, METRICS, POLICIES] {
+        let out = place.path().join(format!("theirs {name}"));
+        fs::create_dir(&out).unwrap();
+        fs::write(out.join(name), "of another program").unwrap();
+        for flag in ["--resume", "--force"] {
+            let refused = flotilla_train(&file, &out, &[flag]).output().unwrap();
+            let message = stderr(&refused);
+            assert!(
+                refused.status.code() == Some(1)
+                    && message.contains("was not made by flotilla and would be overwritten"),
+                "{message}"
+            );
+            assert!(message.contains(name) && message.contains("move it away"), "{message}");
+            assert_eq!(fs::read_to_string(out.join(name)).unwrap(), "of another program");
+            assert!(!out.join(RUN).exists());
+        }
+    }
+    // The policies of --init are not overwritten either.
+    let policies = out.join(POLICIES);
+    let before = fs::read(&policies).unwrap();
+    for flag in ["--resume", "--force"] {
+        let refused = flotilla_train(&file, &out, &[flag, "--init", policies.to_str().unwrap()]).output().unwrap();
+        assert_eq!(refused.status.code(), Some(2), "{}", stderr(&refused));
+        assert!(stderr(&refused).contains("would be written over it"), "{}", stderr(&refused));
+        assert!(fs::read(&policies).unwrap() == before && out.join(RUN).exists());
+    }
+    // A run without its config file still refuses another config.
+    fs::remove_file(&file).unwrap();
+    let other = config_file(place.path(), &text);
+    let refused = flotilla_train(&other, &out, &["--resume", "--seed", "3"]).output().unwrap();
+    assert_eq!(refused.status.code(), Some(1), "{}", stderr(&refused));
+    let done = flotilla_train(&other, &out, &["--resume"]).output().unwrap();
+    assert_eq!(done.status.code(), Some(0), "{}", stderr(&done));
+    assert!(fs::read(&policies).unwrap() == before);
+}
+
+/// Tests that a refused --force or --resume leaves all files of a paper unchanged.
+#[test]
+fn a_refused_paper_is_unchanged() {
+    let place = tempfile::tempdir().unwrap();
+    let out = place.path().join("paper");
+    let paper = |flags: &[&str]| {
+        let mut command = flotilla();
+        command.args(["paper", "--trials", "1", "--backend", "cpu", "--quiet", "--out"]).arg(&out).args(flags);
+        command.output().unwrap()
+    };
+    let done = paper(&["--generations", "1"]);
+    assert_eq!(done.status.code(), Some(0), "{}", stderr(&done));
+    let files = || {
+        let names = fs::read_dir(&out).unwrap().map(|entry| entry.unwrap().path()).filter(|path| path.is_file());
+        let mut files: Vec<_> = names.map(|path| (fs::read(&path).unwrap(), path)).collect();
+        files.sort();
+        files
+    };
+    let files_before = files();
+    let mut arms: Vec<_> = fs::read_dir(out.join("arms")).unwrap().map(|entry| entry.unwrap().path()).collect();
+    arms.sort();
+    for arm in [&arms[0], &arms[arms.len() - 1]] {
+        let config = Config::load(&arm.join(CONFIG)).unwrap();
+        let lock = Folder::open(arm, Start::Resume, &config, StartFrom::Unspecified, Disk::default()).unwrap();
+        let results = || arms.iter().map(|arm| result_files(arm)).collect::<Vec<_>>();
+        let results_before = results();
+        for flags in
+            [&["--generations", "1", "--force", "--seed", "1"], &["--generations", "2", "--resume", "--seed", "0"]]
+        {
+            let refused = paper(flags);
+            assert!(stderr(&refused).contains("another process is training in"), "{}", stderr(&refused));
+            assert!(files() == files_before && results() == results_before, "{flags:?}");
+        }
+        drop(lock);
+    }
+}
+
+#[cfg(unix)]
+mod unix {
+    use super::*;
+
+    fn signal(child: &Child, name: &str) {
+        let status = Command::new("kill").args([format!("-{name}"), child.id().to_string()]).status().unwrap();
+        assert!(status.success());
+    }
+
+    /// Waits for the end of a process. Returns its status and what it printed to standard error.
+    fn wait_for_end(child: Child) -> (ExitStatus, String) {
+        let output = child.wait_with_output().unwrap();
+        (output.status, stderr(&output))
+    }
+
+    #[test]
+    fn a_signal_stops_a_run_after_its_generation_and_prints_how_to_resume() {
+        let config = Config::parse(HEAVY, "heavy.toml").unwrap();
+        let expected = reference(&config);
+        let folder = tempfile::tempdir().unwrap();
+        let file = config_file(folder.path(), HEAVY);
+        // Only signals cause checkpoints here.
+        let flags = ["--checkpoint-generations", "0", "--checkpoint-seconds", "0", "--quiet"];
+        for name in ["TERM", "INT"] {
+            let out = folder.path().join(name);
+            let child = flotilla_train(&file, &out, &flags).spawn().unwrap();
+            wait_until("the run starts", || out.join("run.json").exists());
+            signal(&child, name);
+            let (status, message) = wait_for_end(child);
+            assert_eq!(status.code(), Some(75), "{message}");
+            let (_, command) = message.split_once("continue with\n  flotilla ").expect(&message);
+            assert!(
+                without_warnings(&message).starts_with("stopped: before generation")
+                    && command.contains("--backend cpu"),
+                "{message}"
+            );
+            let resumed = flotilla().args(command.split_whitespace()).output().unwrap();
+            assert_eq!(resumed.status.code(), Some(0), "{}", stderr(&resumed));
+            assert!(stderr(&resumed).contains("resuming at generation"), "{}", stderr(&resumed));
+            assert!(String::from_utf8_lossy(&resumed.stdout).contains(&expected.0.digest));
+            assert_eq!(result_files(&out), expected.1);
+        }
+    }
+
+    #[test]
+    fn an_interrupt_after_another_signal_stops_a_run_at_once() {
+        let folder = tempfile::tempdir().unwrap();
+        let text = HEAVY.replace("population = 60", "population = 2000").replace("steps = 4", "steps = 10000");
+        let file = config_file(folder.path(), &text);
+        let out = folder.path().join("run");
+        let child = flotilla_train(&file, &out, &["--threads", "1"]).spawn().unwrap();
+        wait_until("the run starts", || out.join("run.json").exists());
+        let start = Instant::now();
+        signal(&child, "TERM");
+        std::thread::sleep(Duration::from_millis(100));
+        signal(&child, "INT");
+        assert_eq!(wait_for_end(child).0.code(), Some(130));
+        assert!(start.elapsed() < Duration::from_secs(5));
+    }
+
+    #[test]
+    fn sigusr1_writes_a_checkpoint_and_the_run_continues() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = config_file(folder.path(), &HEAVY.replace("generations = 60", "generations = 100000"));
+        let out = folder.path().join("run");
+        let flags = ["--checkpoint-generations", "0", "--checkpoint-seconds", "0"];
+        let child = flotilla_train(&file, &out, &flags).spawn().unwrap();
+        wait_until("the run starts", || out.join("run.json").exists());
+        let checkpoints = out.join("checkpoints");
+        assert!(checkpoint::list(&checkpoints).unwrap().is_empty());
+        for count in [1, 2] {
+            signal(&child, "USR1");
+            wait_until("a checkpoint", || checkpoint::list(&checkpoints).unwrap().len() == count);
+        }
+        signal(&child, "TERM");
+        assert_eq!(wait_for_end(child).0.code(), Some(75));
+    }
+
+    /// Limits the size of files with `ulimit -f`, so that the system itself refuses a write.
+    #[test]
+    fn a_write_that_the_system_refuses_is_reported_and_the_run_resumes() {
+        let config = Config::parse(HEAVY, "heavy.toml").unwrap();
+        let expected = reference(&config);
+        let folder = tempfile::tempdir().unwrap();
+        let file = config_file(folder.path(), HEAVY);
+        let out = folder.path().join("run");
+        let program = assert_cmd::cargo::cargo_bin!("flotilla");
+        let limited = |blocks: &str| {
+            let script = format!("trap '' XFSZ; ulimit -f {blocks}; exec \"$@\"");
+            let mut command = Command::new("sh");
+            command.args(["-c", &script, "sh"]).arg(program).arg("train").arg(&file).arg("--out").arg(&out);
+            command.args(["--resume", "--backend", "cpu"]).output().unwrap()
+        };
+        // Not even a checkpoint fits.
+        let refused = limited("100");
+        assert_eq!(refused.status.code(), Some(1), "{}", stderr(&refused));
+        assert!(stderr(&refused).contains(".safetensors: cannot be written"), "{}", stderr(&refused));
+        let resumed = flotilla_train(&file, &out, &["--resume"]).output().unwrap();
+        assert_eq!(resumed.status.code(), Some(0), "{}", stderr(&resumed));
+        assert_eq!(result_files(&out), expected.1);
+    }
+
+    #[test]
+    fn an_output_folder_that_cannot_be_created_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = config_file(folder.path(), &text());
+        let output = flotilla_train(&file, &file, &[]).output().unwrap();
+        assert_eq!(output.status.code(), Some(1));
+        let message = stderr(&output);
+        assert!(message.starts_with("error: ") && message.contains("is a file; choose a folder"), "{message}");
+        // The parent is a file.
+        let output = flotilla_train(&file, &file.join("run"), &[]).output().unwrap();
+        assert_eq!(output.status.code(), Some(1));
+        assert!(stderr(&output).contains("cannot be written"), "{}", stderr(&output));
+    }
+}

@@ -1,0 +1,187 @@
+//! Tests the tasks in `configs/tasks/`, with scripted teams that solve them.
+//!
+//! Baselines and small populations play one task. With `FLOTILLA_LONG=1`, they play all. `FLOTILLA_TASKS=DIR` tests the
+//! tasks in another directory.
+
+use crate::support;
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use crate::support::{Place, TINY};
+use assert_cmd::cargo::cargo_bin_cmd;
+use flotilla::Config;
+use flotilla_app::script::Script;
+use flotilla_studies::questions::parts;
+use serde_json::Value;
+use tempfile::TempDir;
+
+fn task_files(ending: &str) -> Vec<PathBuf> {
+    let folder = std::env::var_os("FLOTILLA_TASKS").map(PathBuf::from);
+    let folder = folder.unwrap_or_else(|| Path::new(crate::ROOT).join("configs/tasks"));
+    let paths = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
+    let mut paths: Vec<PathBuf> = paths.filter(|path| path.extension().is_some_and(|other| other == ending)).collect();
+    paths.sort();
+    paths
+}
+
+fn play(config: &Config, path: &Path) -> Vec<Option<u32>> {
+    let script = Script::parse(&fs::read_to_string(path).unwrap()).unwrap();
+    // A team that does not move observes nothing, so the script matters.
+    assert!(Script::default().play(config).unwrap().iter().all(Option::is_none), "{}", path.display());
+    script.play(config).unwrap()
+}
+
+#[test]
+fn scripted_teams_observe_every_poi() {
+    let scripts = task_files("csv");
+    for path in &scripts {
+        let observed = play(&Config::load(&path.with_extension("toml")).unwrap(), path);
+        println!("{}: {observed:?}", path.display());
+        assert!(observed.iter().all(Option::is_some), "{}: {observed:?}", path.display());
+    }
+    assert!(scripts.len() >= 8, "{scripts:?}");
+}
+
+/// Windows of 10 steps for the last POIs, as in one point of the study.
+#[test]
+fn a_scripted_team_solves_the_relay_with_an_enforced_hand_over() {
+    let relay = parts(&['c']).into_iter().find(|part| part.name == "relay_forced").unwrap();
+    let path = Path::new(crate::ROOT).join("studies/configs/questions/relay_forced.csv");
+    let sweep = relay.sweep(&[]).unwrap();
+    let config = &sweep.points[4].config;
+    assert_eq!(config.world.windows[2], [37, 46]);
+    let observed = play(config, &path);
+    assert!(observed.iter().all(Option::is_some), "{observed:?}");
+}
+
+#[test]
+fn invalid_scripts_are_refused_before_training() {
+    let folder = TempDir::new().unwrap();
+    let config = Path::new(crate::ROOT).join("configs/tasks/slalom.toml");
+    fs::copy(config, folder.path().join("task.toml")).unwrap();
+    let head = "leader,until,x,y,speed\n";
+    for (rows, message) in [
+        ("", "there are no rows"),
+        ("7,5,1,1,1\n", "row 1: leader 7 of 1"),
+        ("0,5,NaN,1,1\n", "row 1: x, y and speed have to be finite"),
+        ("0,5,1,1,-1\n", "speed at least 0"),
+        ("0,5,1,1,1\n0,5,2,2,1\n", "row 2: `until` has to be larger"),
+        ("0,5,1,1,fast\n", "task.csv"),
+    ] {
+        fs::write(folder.path().join("task.csv"), format!("{head}{rows}")).unwrap();
+        let (code, _, error) = run(folder.path(), "task.toml --trials 2");
+        assert!(code == Some(2) && error.contains(message), "{rows}: {error}");
+        assert!(!folder.path().join("tasks").exists());
+    }
+    fs::write(folder.path().join("task.csv"), format!("{head}0,5,1,1,1\n")).unwrap();
+    let (code, _, error) = run(folder.path(), "task.toml --trials 2");
+    assert!(code == Some(1) && error.contains("the scripted team has G 0.00"), "{error}");
+    // Without a scripted team, a champion has to solve the task.
+    fs::remove_file(folder.path().join("task.csv")).unwrap();
+    let (code, _, error) = run(folder.path(), "task.toml --trials 2 --resume");
+    assert!(code == Some(1) && error.contains("no champion solves it, and there is no scripted team"), "{error}");
+}
+
+/// Between these marks, the page has what the test below prints.
+const MARKS: [&str; 2] = ["<!-- what comes out: cargo test tasks:: -->\n", "<!-- so far -->\n"];
+
+/// Runs `flotilla tasks` without large populations. Returns its exit code, standard output and standard error.
+fn run(folder: &Path, line: &str) -> (Option<i32>, String, String) {
+    let line = format!("tasks {line} --population 0 --backend cpu --quiet");
+    let output = cargo_bin_cmd!("flotilla").args(line.split_whitespace()).current_dir(folder).output().unwrap();
+    let text = |bytes| String::from_utf8(bytes).unwrap();
+    (output.status.code(), text(output.stdout), text(output.stderr))
+}
+
+/// Returns the cells of a table by the task, which is in the first column.
+fn cells(table: &str) -> BTreeMap<String, Vec<String>> {
+    let row = |line: &str| line.trim_matches('|').split('|').map(|cell| cell.trim().to_string()).collect();
+    let rows = table.lines().filter(|line| line.starts_with("| ") && !line.starts_with("| -")).map(row);
+    rows.map(|row: Vec<String>| (row[0].clone(), row)).collect()
+}
+
+/// If results change on purpose, `FLOTILLA_LONG=1 FLOTILLA_WRITE_TASKS=1 cargo test --release tasks::` writes the
+/// page's table again.
+#[test]
+fn baselines_and_small_populations_do_not_solve_tasks() {
+    let path = Path::new(crate::ROOT).join("docs/results/tasks.md");
+    let page = fs::read_to_string(&path).unwrap();
+    let tasks = task_files("toml");
+    assert!(tasks.len() >= 8, "{tasks:?}");
+    for task in &tasks {
+        let name = task.file_stem().unwrap().to_str().unwrap();
+        assert!(page.contains(&format!("(tasks/{name}.svg)")), "{name} has no picture on the page");
+        assert!(path.with_file_name("tasks").join(name).with_extension("svg").is_file(), "{name}");
+    }
+    // This task takes a twentieth of the time of all.
+    let is_played = |task: &&PathBuf| support::is_long() || task.ends_with("slalom.toml");
+    let list: Vec<String> = tasks.iter().filter(is_played).map(|task| task.display().to_string()).collect();
+    let folder = TempDir::new().unwrap();
+    let (code, table, error) = run(folder.path(), &format!("{} --trials 10", list.join(" ")));
+    println!("{table}");
+    assert_eq!(code, Some(0), "{error}");
+    let (before, rest) = page.split_once(MARKS[0]).unwrap();
+    let (expected, after) = rest.split_once(MARKS[1]).unwrap();
+    let (actual, rows) = (format!("\n{table}"), cells(expected));
+    assert!(rows.len() == tasks.len() + 1, "{rows:?}");
+    for (task, row) in cells(&table) {
+        assert_eq!(rows[&task], row, "docs/results/tasks.md");
+    }
+    if !support::is_long() {
+        return;
+    }
+    match std::env::var_os("FLOTILLA_WRITE_TASKS") {
+        Some(_) => fs::write(&path, [before, MARKS[0], &actual, MARKS[1], after].concat()).unwrap(),
+        None => assert_eq!(expected, actual, "docs/results/tasks.md"),
+    }
+}
+
+#[test]
+fn tasks_resume_and_those_that_a_constant_speed_solves_fail() {
+    let folder = TempDir::new().unwrap();
+    let run = |line: &str| run(folder.path(), &format!("{line} --trials 2"));
+    let configs = Path::new(crate::ROOT).join("configs");
+    let file = |name: &str| configs.join(name).display().to_string();
+    let (task, solved) = (file("tasks/slalom.toml"), file("strictly_forward.toml"));
+    let (code, table, error) = run(&format!("{task} --out a"));
+    assert_eq!(code, Some(0), "{error}");
+    // Without `--resume`, the same command does not overwrite the runs.
+    assert_eq!(run(&format!("{task} --out a --resume")).1, table);
+    assert_eq!(run(&format!("{task} --out a")).0, Some(1));
+    let (code, _, error) = run(&format!("{solved} --out b"));
+    assert!(code == Some(1) && error.contains("G of the best constant action is 1.00"), "{error}");
+    let (code, _, error) = run(&format!("{task} {task} --out c"));
+    assert!(code == Some(2) && error.contains("two configs"), "{error}");
+}
+
+/// Both would train in the same directories.
+#[test]
+fn the_large_population_differs_from_the_small_ones() {
+    let place = Place::new(&[]).on_cpu();
+    place.write("tiny.toml", TINY);
+    let error = place.refused(2, "tasks tiny.toml --trials 2 --population 50 --out refused");
+    assert!(error.contains("--population 50") && !place.path("refused").exists(), "{error}");
+}
+
+#[test]
+fn champions_play_held_out_episodes_if_starts_or_pois_move() {
+    let place = Place::new(&[]).on_cpu();
+    for key in ["start_jitter", "poi_jitter"] {
+        place.write(format!("{key}.toml"), format!("{TINY}{key} = 2.0\n"));
+        let output = place.run(&format!("tasks {key}.toml --trials 2 --population 0 --quiet --json"));
+        let found: Value = serde_json::Deserializer::from_slice(&output.stdout).into_iter().next().unwrap().unwrap();
+        let task = &found["tasks"][0];
+        assert!(task["scripted_g"].is_null() && task["scripted"] == false, "{task}");
+        for trained in task["trained"].as_array().unwrap() {
+            let run = format!("tasks/{key}/50-{}", trained["fitness"].as_str().unwrap());
+            for trial in 0..2 {
+                let line = format!("rollout {run} --trial {trial} --episodes 200 --seed 0 --json");
+                let played: Value = serde_json::from_str(&place.good(&line).0).unwrap();
+                // The champions are policy 0 of every leader.
+                let expected = played["team_0"]["mean"].as_f64().unwrap() / played["pois"].as_f64().unwrap();
+                assert_eq!(trained["champion_g"][trial].as_f64(), Some(expected), "{run}, trial {trial}");
+            }
+        }
+    }
+}

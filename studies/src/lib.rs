@@ -1,0 +1,15 @@
+//! The studies that come with flotilla: programs on the public interface of the engine and of [`flotilla_app`].
+//!
+//! Each module imports only modules above it.
+//!
+//! | module | contents |
+//! |---|---|
+//! | [`paper`] | the paper's experiments, figures and claims |
+//! | [`questions`] | the open questions of the paper, as sweeps |
+//! | [`tasks`] | a suite of tasks, and which of them no baseline solves |
+
+#![deny(missing_docs)]
+
+pub mod paper;
+pub mod questions;
+pub mod tasks;

@@ -1,0 +1,262 @@
+//! Trains the paper's experiments, draws its figures and checks its claims.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+
+use crate::paper::claims::Claim;
+use crate::paper::{self, Evidence, Experiment, Summary, Trajectory, claims, tables};
+use flotilla::backend::OpenBackend;
+use flotilla::baseline::{Baseline, Baselines};
+use flotilla::config::{Actions, Config, Fitness, Override, Paradigm, ValidConfig};
+use flotilla::escape::PathExt;
+use flotilla::memory;
+use flotilla::parallel::current_num_threads;
+use flotilla_app::choice::Work;
+use flotilla_app::ops::{BackendSource, Context, Error, Event, Processor};
+use flotilla_app::record::disk::Disk;
+use flotilla_app::record::folder::{self, Start};
+use flotilla_app::record::{RecordError, ownership};
+use flotilla_app::report::curves::PRINT;
+use flotilla_app::report::scene::Format;
+use flotilla_app::run::RunError;
+
+mod experiments;
+mod identity;
+
+use experiments::Experiments;
+use identity::Identity;
+
+/// The results in a paper's folder, for people and for programs.
+const CLAIMS: &str = "claims.md";
+const SUMMARY: &str = "summary.json";
+
+/// The default folder of a paper.
+pub const OUT: &str = "paper";
+
+/// Request to train the paper's experiments.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Request {
+    /// The folder for figures, claims and runs.
+    pub out: PathBuf,
+    /// Treatment of a paper that is in the folder.
+    pub start: Start,
+    /// Config keys to set in all experiments.
+    #[serde(default)]
+    pub set: Vec<Override>,
+    /// Letters of the open questions. Only [`super::questions`] uses them.
+    #[serde(default)]
+    pub questions: Vec<char>,
+}
+
+impl Request {
+    /// Reports whether the user chose the folder.
+    pub fn is_out_named(&self) -> bool {
+        self.out != Path::new(OUT)
+    }
+}
+
+/// A trained experiment.
+#[derive(Clone, Debug, Serialize)]
+pub struct ExperimentOutcome {
+    /// The name, which is that of its folder.
+    pub name: String,
+    /// The run's folder.
+    pub folder: String,
+    /// The layout.
+    pub layout: &'static str,
+    /// Who learns.
+    pub paradigm: Paradigm,
+    /// The kind of actions that policies choose.
+    pub actions: Actions,
+    /// The score that policies are selected by.
+    pub fitness: Fitness,
+    /// The number of POIs.
+    pub pois: usize,
+    /// The run's digest.
+    pub digest: Option<String>,
+    /// The mean over trials of the last generation's best team, as G.
+    pub best_g: f64,
+}
+
+impl ExperimentOutcome {
+    fn of(experiment: &Experiment, folder: &Path, digest: Option<String>) -> ExperimentOutcome {
+        ExperimentOutcome {
+            name: folder_name(experiment),
+            folder: folder.escaped().to_string(),
+            layout: experiment.layout.name,
+            paradigm: experiment.paradigm,
+            actions: experiment.config.policy.actions,
+            fitness: experiment.fitness,
+            pois: experiment.pois(),
+            digest,
+            best_g: experiment.best.iter().filter_map(|trial| trial.last()).sum::<f64>() / experiment.best.len() as f64,
+        }
+    }
+}
+
+/// The files that were written.
+#[derive(Clone, Debug, Serialize)]
+pub struct Files {
+    /// The claims with every figure.
+    pub claims: String,
+    /// The curves and claims for programs.
+    pub summary: String,
+    /// The pictures.
+    pub figures: Vec<String>,
+}
+
+/// Results of the paper's experiments.
+#[derive(Clone, Debug, Serialize)]
+pub struct Outcome {
+    /// The folder.
+    pub folder: String,
+    /// The random seed of all experiments.
+    pub seed: u64,
+    /// The number of trials of each.
+    pub trials: usize,
+    /// The last generation.
+    pub generations: usize,
+    /// The processor of the last session.
+    #[serde(flatten)]
+    pub processor: Processor,
+    /// Training time in seconds, including earlier sessions.
+    pub seconds: f64,
+    /// The experiments.
+    pub arms: Vec<ExperimentOutcome>,
+    /// The paper's claims with their verdicts.
+    pub claims: Vec<Claim>,
+    /// The files.
+    pub files: Files,
+    /// The tables for people.
+    #[serde(skip)]
+    pub text: String,
+}
+
+/// Trains the experiments side by side, each as a run, and writes figures, claims and summary.
+///
+/// # Errors
+/// The folder or a config cannot be used, training fails or is stopped, or files cannot be written.
+pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
+    let Request { ref out, start, .. } = *request;
+    let mut experiments = Experiments::new(paper::arms(&request.set)?, out);
+    let learning = experiments.all[0].config.learning.clone();
+    let identity = Identity::of(&learning);
+    identity.check(out, start)?;
+    let (backend, on) = backends.open(Work::of(&experiments.configs))?;
+    let plan = memory::Peaks::of(&ValidConfig::all(&experiments.configs)?, current_num_threads());
+    plan.check(backend.1.backend == "gpu").map_err(RunError::from)?;
+    let disk = ownership::create_output_folder(&Disk::default(), out, request.is_out_named())?;
+    let _lock = folder::lock(&disk, out)?;
+    // Checked again, because another process could write here until the folder was locked.
+    identity.check(out, start)?;
+    experiments.check_folders(&disk, start)?;
+    ownership::check(&disk, products().map(|name| out.join(name)))?;
+    identity.write(out, start, &disk)?;
+    let mut session = experiments.open(start, &disk, context)?;
+    if !session.is_done() {
+        experiments.train(&mut session, backend, &on, out, context)?;
+    }
+    experiments.record_copies(&disk)?;
+    experiments.read_metrics()?;
+    let baselines = play_baselines(paper::baseline_configs(&experiments.all), learning.generations, backend, context)?;
+
+    let found = Evidence { arms: &experiments.all, baselines: &baselines };
+    let publish =
+        |name: &str, content: &[u8]| ownership::publish(&disk, &out.join(name), |file| file.write_all(content));
+    for (index, layout) in paper::LAYOUTS.iter().enumerate() {
+        let Some(number) = layout.figure else { continue };
+        let scene = paper::figure(found, index).scene();
+        for kind in Format::ALL {
+            let name = format!("figure{number}.{}", kind.extension());
+            let picture = scene.file(kind, PRINT).map_err(RecordError::write(&out.join(&name)))?;
+            publish(&name, &picture)?;
+        }
+    }
+    let claims = claims::claims(found);
+    let baseline = tables::without_learning(found);
+    let heading = tables::heading(&learning, &claims);
+    let full = tables::full(&claims);
+    publish(CLAIMS, tables::page(&baseline, &heading, &full).as_bytes())?;
+    let seconds = (0..experiments.configs.len()).map(|run| session.run(run).seconds).fold(0.0, f64::max);
+    let summary = Summary {
+        version: flotilla::version::VERSION,
+        backend: session.run(0).backend.clone(),
+        description: session.run(0).description.clone(),
+        seconds,
+        seed: learning.seed,
+        trials: learning.trials,
+        generations: learning.generations,
+        curves: Trajectory::all(found),
+        claims: &claims,
+    };
+    let summary = serde_json::to_string(&summary).expect("plain fields are JSON") + "\n";
+    publish(SUMMARY, summary.as_bytes())?;
+    let digest = |index: usize| session.results(experiments.config_of[index]).map(|results| results.digest.clone());
+    let outcome =
+        |index: usize| ExperimentOutcome::of(&experiments.all[index], &experiments.folders[index], digest(index));
+    let path = |name: &str| out.join(name).escaped().to_string();
+    Ok(Outcome {
+        folder: out.escaped().to_string(),
+        seed: learning.seed,
+        trials: learning.trials,
+        generations: learning.generations,
+        processor: Processor::of_run(session.run(0)),
+        seconds,
+        arms: (0..experiments.all.len()).map(outcome).collect(),
+        files: Files { claims: path(CLAIMS), summary: path(SUMMARY), figures: FIGURES.map(path).to_vec() },
+        text: format!("{baseline}\n{}\n{heading}\n\n", tables::verdicts(&claims)),
+        claims,
+    })
+}
+
+/// Plays the baselines without learning of some configs, which have the same number of generations.
+///
+/// # Errors
+/// The backend fails, or the user stops.
+fn play_baselines(
+    configs: Vec<Config>,
+    last: usize,
+    backend: &mut OpenBackend,
+    context: Context<'_>,
+) -> Result<Vec<Baseline>, Error> {
+    let mut baselines = Baselines::new(configs);
+    while !baselines.is_done() {
+        if context.is_stopped() {
+            return Err(Error::Stopped("before the baselines were played; all runs are finished".into()));
+        }
+        if let Err(error) = baselines.advance(&mut *backend.0) {
+            *backend = context.fallback(&error).ok_or(error)?;
+            continue;
+        }
+        let generation = baselines.generation();
+        let part = generation as f64 / (last + 1) as f64;
+        (context.report)(Event::Fraction(part, format!("playing random teams: generation {generation} of {last}")));
+    }
+    (context.report)(Event::Pause);
+    Ok(baselines.found())
+}
+
+/// File names of the figures.
+const FIGURES: [&str; 9] = [
+    "figure4.svg",
+    "figure4.png",
+    "figure4.pdf",
+    "figure5.svg",
+    "figure5.png",
+    "figure5.pdf",
+    "figure6.svg",
+    "figure6.png",
+    "figure6.pdf",
+];
+
+/// Returns the names of all files that are made from the runs.
+fn products() -> impl Iterator<Item = &'static str> {
+    [CLAIMS, SUMMARY].into_iter().chain(FIGURES)
+}
+
+/// Returns the name of an experiment's folder, such as `chaotic-all-leaders-Df`.
+fn folder_name(experiment: &Experiment) -> String {
+    experiment.name().replace(", ", "-").replace(' ', "-")
+}

@@ -1,0 +1,244 @@
+//! Trains experiments for the questions that the paper leaves open.
+
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+
+use crate::paper::run::Request;
+use crate::questions::{self, Answer, OpenQuestion, QUESTIONS, Study, Warm};
+use flotilla::backend::OpenBackend;
+use flotilla::config::Config;
+use flotilla::escape::PathExt;
+use flotilla_app::choice::Work;
+use flotilla_app::ops::sweep::{claim, free_memory, same_sweep, train_points};
+use flotilla_app::ops::{BackendSource, Context, Error, Event, check_memory, with_remedy};
+use flotilla_app::record::disk::Disk;
+use flotilla_app::record::folder::{self, SWEEP};
+use flotilla_app::record::{RecordError, ownership, policies};
+use flotilla_app::report::comparison::{self, Comparison};
+use flotilla_app::report::curves::PRINT;
+use flotilla_app::report::scene::Format;
+use flotilla_app::run::{Session, SessionEnd};
+use flotilla_app::sweep::results::point_folder;
+use flotilla_app::sweep::run::SweepProgress;
+use flotilla_app::sweep::{Sweep, shard};
+
+/// The page with the results.
+const PAGE: &str = "questions.md";
+
+/// Results of one question.
+#[derive(Clone, Debug, Serialize)]
+pub struct QuestionOutcome {
+    /// The question's letter.
+    pub letter: char,
+    /// The question.
+    pub title: &'static str,
+    /// The comparisons of all its parts.
+    pub comparisons: Vec<Comparison>,
+}
+
+/// Results of all questions.
+#[derive(Clone, Debug, Serialize)]
+pub struct Outcome {
+    /// The folder.
+    pub folder: String,
+    /// The random seed of all experiments.
+    pub seed: u64,
+    /// The number of trials of each.
+    pub trials: usize,
+    /// The questions.
+    pub questions: Vec<QuestionOutcome>,
+    /// The path of the page with the results.
+    pub page: String,
+    /// The page.
+    #[serde(skip)]
+    pub text: String,
+}
+
+/// Returns all parts of all questions.
+fn all_parts() -> impl Iterator<Item = &'static Study> {
+    QUESTIONS.iter().flat_map(|question| question.parts)
+}
+
+/// Returns the names of the files that are made for each part.
+fn files() -> impl Iterator<Item = String> {
+    let endings = || Format::ALL.map(Format::extension).into_iter().chain(["csv"]);
+    all_parts().flat_map(move |part| endings().map(|ending| format!("{}.{ending}", part.name)))
+}
+
+/// Trains every part of the questions, each as a sweep in a folder of its own, and writes the results.
+///
+/// # Errors
+/// The folder or a config cannot be used, training fails or is stopped, or files cannot be written.
+pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
+    let (out, start) = (&request.out, request.start);
+    let parts: Vec<(&Study, Sweep)> = questions::parts(&request.questions)
+        .into_iter()
+        .map(|part| Ok((part, part.sweep(&request.set)?)))
+        .collect::<Result<_, Error>>()?;
+    if let Some((_, sweep)) = parts.iter().find(|(_, sweep)| sweep.points[0].config.learning.trials < 2) {
+        let trials = sweep.points[0].config.learning.trials;
+        return Err(Error::Usage(format!("--trials {trials}: intervals and tests take two trials or more").into()));
+    }
+    check_folder(&parts, out)?;
+    let configs = || parts.iter().flat_map(|(_, sweep)| &sweep.points).map(|point| &point.config);
+    let (backend, on) = backends.open(Work::of(configs().map(|config| &**config)))?;
+    check_memory(configs(), backend)?;
+    let disk = ownership::create_output_folder(&Disk::default(), out, request.is_out_named())?;
+    let _lock = folder::lock(&disk, out)?;
+    ownership::check(&disk, files().chain([PAGE.into()]).map(|name| out.join(name)))?;
+    let points: usize = parts.iter().map(|(_, sweep)| sweep.points.len()).sum();
+    context.message(format_args!("training {points} experiments on {on}, into {}", out.escaped()));
+
+    let warm: Vec<_> = parts.iter().map(|(part, sweep)| part.warm(sweep, out)).collect();
+    // All folders are checked before training, so that no part is trained only to fail at another part's folder.
+    let points = parts.iter().flat_map(|(part, sweep)| {
+        sweep.points.iter().map(|point| (point_folder(&out.join(part.name), point), &*point.config))
+    });
+    let warm_runs = warm.iter().flatten().map(|run| (run.folder.clone(), &run.config));
+    let folders: Vec<(PathBuf, &Config)> = points.chain(warm_runs).collect();
+    folder::check(&disk, folders.iter().map(|(path, config)| (&**path, *config)), start)?;
+
+    train(&parts, &warm, request, &disk, backend, context)?;
+    let answers = compare(&parts, request, &disk, backend, context)?;
+    let first = &parts[0].1.points[0].config.learning;
+    let heading = format!(
+        "Means over {} trials of seed {} with 95 % bootstrap intervals. In parentheses beside a champion's G is that of the\n\
+         best of {} teams. p is from Mann and Whitney's test, two-sided, with Holm's correction for all pairs of arms at\n\
+         one place.\n",
+        first.trials,
+        first.seed,
+        first.teams()
+    );
+    let page = questions::page(&answers, &heading);
+    write(&disk, &out.join(PAGE), Ok(page.clone().into_bytes()))?;
+    let of = |(question, answers): &(OpenQuestion, Vec<Answer>)| QuestionOutcome {
+        letter: question.letter,
+        title: question.title,
+        comparisons: answers.iter().flat_map(Answer::comparisons).cloned().collect(),
+    };
+    Ok(Outcome {
+        folder: out.escaped().to_string(),
+        seed: first.seed,
+        trials: first.trials,
+        questions: answers.iter().map(of).collect(),
+        page: out.join(PAGE).escaped().to_string(),
+        text: page,
+    })
+}
+
+/// Refuses a folder with other content, or with other sweeps.
+fn check_folder(parts: &[(&Study, Sweep)], out: &Path) -> Result<(), Error> {
+    let refused = |what: &str| {
+        let reason = format!("{} holds {what}", out.escaped());
+        Err(Error::Refused(with_remedy(reason, "choose another --out")))
+    };
+    if let Some(what) = folder::collection(out) {
+        return refused(what);
+    }
+    if folder::holds_run(out)? {
+        return refused("a run");
+    }
+    parts.iter().try_for_each(|(part, sweep)| same_sweep(sweep, &out.join(part.name)))?;
+    let has_sweeps = all_parts().any(|part| out.join(part.name).join(SWEEP).exists());
+    match files().chain([PAGE.into()]).find(|name| out.join(name).exists()) {
+        Some(theirs) if !has_sweeps => refused(&format!("{theirs}, but none of the questions' sweeps")),
+        _ => Ok(()),
+    }
+}
+
+/// Returns the error for a command that the user stopped.
+fn stopped() -> Error {
+    Error::Stopped("with everything saved".into())
+}
+
+/// Trains the sweep of each part, and then its runs from policies of that sweep.
+fn train(
+    parts: &[(&Study, Sweep)],
+    warm: &[Vec<Warm>],
+    request: &Request,
+    disk: &Disk,
+    backend: &mut OpenBackend,
+    context: Context<'_>,
+) -> Result<(), Error> {
+    let (out, start) = (&request.out, request.start);
+    let cost = |sweep: &Sweep| sweep.points.iter().map(shard::cost).sum::<u128>() as f64;
+    // Each warm start costs as much as an average point of its sweep.
+    let times = |at: usize| 1.0 + warm[at].len() as f64 / parts[at].1.points.len() as f64;
+    let whole: f64 = parts.iter().enumerate().map(|(at, (_, sweep))| cost(sweep) * times(at)).sum();
+    let mut before = 0.0;
+    for (at, (part, sweep)) in parts.iter().enumerate() {
+        let folder = out.join(part.name);
+        claim(disk, sweep, &folder)?;
+        let points: Vec<_> = sweep.points.iter().collect();
+        let share = |now: &SweepProgress| {
+            let share = now.played as f64 / now.total.max(1) as f64;
+            let text = format!("{}: {}/{} experiments done", part.name, now.done, now.points);
+            (context.report)(Event::Fraction((before + share * cost(sweep)) / whole, text));
+        };
+        let ended = train_points(context, sweep, &points, &folder, start, disk, free_memory(), backend, &share)?;
+        if ended == SessionEnd::Stopped {
+            return Err(stopped());
+        }
+        before += cost(sweep);
+        if warm[at].is_empty() {
+            continue;
+        }
+        let runs = warm[at].iter().map(|run| {
+            Ok((run.config.clone(), run.folder.clone(), Some(policies::read_init(&run.policies, &run.config)?)))
+        });
+        let (mut session, _) = Session::open_from(runs.collect::<Result<_, RecordError>>()?, start, disk)?;
+        let mut watch = |_: &flotilla_app::run::Progress<'_>| {
+            (context.report)(Event::Fraction(before / whole, format!("{}: warm starts", part.name)));
+        };
+        if !session.is_done()
+            && context.train(&mut watch, |options| session.train(backend, options))? == SessionEnd::Stopped
+        {
+            return Err(stopped());
+        }
+        before += cost(sweep) * (times(at) - 1.0);
+    }
+    Ok(())
+}
+
+/// Compares the results of each question's parts, and writes their pictures and tables.
+fn compare(
+    parts: &[(&Study, Sweep)],
+    request: &Request,
+    disk: &Disk,
+    backend: &mut OpenBackend,
+    context: Context<'_>,
+) -> Result<Vec<(OpenQuestion, Vec<Answer>)>, Error> {
+    let out = &request.out;
+    let mut answers: Vec<(OpenQuestion, Vec<Answer>)> = Vec::new();
+    for question in QUESTIONS.iter().filter(|question| request.questions.contains(&question.letter)) {
+        let mut of_parts = Vec::new();
+        for part in question.parts {
+            if context.is_stopped() {
+                return Err(stopped());
+            }
+            let sweep = parts.iter().find(|(other, _)| other.name == part.name).map(|(_, sweep)| sweep);
+            let Some(sweep) = sweep else { continue };
+            (context.report)(Event::Fraction(1.0, format!("comparing {}", part.name)));
+            let answer = part.answer(sweep, out, &mut *backend.0)?;
+            for kind in Format::ALL {
+                let path = out.join(format!("{}.{}", part.name, kind.extension()));
+                let bytes = answer.scene().file(kind, PRINT);
+                write(disk, &path, bytes)?;
+            }
+            let mut csv = Vec::new();
+            let all: Vec<_> = answer.comparisons().cloned().collect();
+            let path = out.join(format!("{}.csv", part.name));
+            write(disk, &path, comparison::csv(&all, &mut csv).map(|()| csv))?;
+            of_parts.push(answer);
+        }
+        answers.push((*question, of_parts));
+    }
+    (context.report)(Event::Pause);
+    Ok(answers)
+}
+
+fn write(disk: &Disk, path: &Path, bytes: std::io::Result<Vec<u8>>) -> Result<(), Error> {
+    let bytes = bytes.map_err(RecordError::write(path))?;
+    Ok(ownership::publish(disk, path, |output| output.write_all(&bytes))?)
+}

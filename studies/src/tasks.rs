@@ -1,0 +1,283 @@
+//! Trains the tasks of a suite, and checks that no baseline and no small population solves them.
+//!
+//! A task is admitted if no baseline reaches [`EASY`], if populations of [`SMALL`] policies solve it under no fitness,
+//! and if something solves it: a champion here, or a scripted team from a file next to the config.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+
+use crate::questions::champions;
+use flotilla::backend::{Backend, OpenBackend};
+use flotilla::baseline::Outcome as Played;
+use flotilla::config::{Config, Fitness, Override};
+use flotilla::evaluate::Starts;
+use flotilla_app::choice::Work;
+use flotilla_app::ops::{BackendSource, ConfigText, Context, Error, Event, baseline, check_memory, with_remedy};
+use flotilla_app::record::RecordError;
+use flotilla_app::record::digests::Verification;
+use flotilla_app::record::disk::Disk;
+use flotilla_app::record::folder::{POLICIES, Start};
+use flotilla_app::record::ownership;
+use flotilla_app::report::runs;
+use flotilla_app::run::{Progress, Session, SessionEnd};
+use flotilla_app::script::Script;
+
+/// Default folder.
+pub const OUT: &str = "tasks";
+/// G that no baseline of a task may reach.
+pub const EASY: f64 = 0.7;
+/// Number of policies in the small populations, and their number of generations.
+pub const SMALL: (i64, i64) = (50, 100);
+/// Number of repetitions of the baselines.
+const SEEDS: usize = 10;
+/// Number of held-out episodes per champion, if starts or POIs move.
+const EPISODES: u32 = 200;
+/// G above which a champion solves a task. If starts or POIs move, no team observes all POIs in all episodes.
+const SOLVED: f64 = 0.9;
+/// The fitnesses of both kinds of populations.
+pub const FITNESSES: [Fitness; 4] = [Fitness::G, Fitness::D, Fitness::Df, Fitness::Dpp];
+
+/// Request to check tasks.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Request {
+    /// The tasks.
+    pub tasks: Vec<Task>,
+    /// The folder for the runs.
+    pub out: PathBuf,
+    /// Whether the user chose the folder.
+    pub named: bool,
+    /// Treatment of runs that are in the folder.
+    pub start: Start,
+    /// Independent repetitions of every training.
+    pub trials: u32,
+    /// Policies per population of the large populations, of which 10 % are elites. 0 trains none.
+    pub population: u32,
+    /// Random seed.
+    pub seed: u32,
+}
+
+/// A task.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Task {
+    /// The name.
+    pub name: String,
+    /// The config.
+    pub config: ConfigText,
+    /// A scripted team.
+    pub script: Option<Script>,
+}
+
+/// Results of a suite.
+#[derive(Clone, Debug, Serialize)]
+pub struct Outcome {
+    /// Policies per large population.
+    pub population: u32,
+    /// The tasks.
+    pub tasks: Vec<Found>,
+}
+
+impl Outcome {
+    /// Returns an error that names the tasks that are not admitted, if there are any.
+    pub fn refused(&self) -> Option<Error> {
+        let reason = |task: &Found| Some(format!("{}: {}", task.name, task.refused.as_ref()?));
+        let reasons: Vec<String> = self.tasks.iter().filter_map(reason).collect();
+        (!reasons.is_empty()).then(|| Error::Refused(format!("not admitted:\n  {}", reasons.join("\n  ")).into()))
+    }
+}
+
+/// Results of a task.
+#[derive(Clone, Debug, Serialize)]
+pub struct Found {
+    /// The name.
+    pub name: String,
+    /// Number of POIs.
+    pub pois: usize,
+    /// G of the best constant action, of the best random constant actions and of the best random networks, per seed.
+    pub baselines: [Vec<f64>; 3],
+    /// The trainings.
+    pub trained: Vec<Trained>,
+    /// G of the scripted team from the config's start, if there is one.
+    pub scripted_g: Option<f64>,
+    /// Whether the scripted team observes every POI.
+    pub scripted: bool,
+    /// Why the task is not admitted.
+    pub refused: Option<String>,
+}
+
+/// Results of one training.
+#[derive(Clone, Debug, Serialize)]
+pub struct Trained {
+    /// Policies per population.
+    pub population: usize,
+    /// The fitness.
+    pub fitness: Fitness,
+    /// G of each trial's champion.
+    pub champion_g: Vec<f64>,
+    /// G of each trial's best team.
+    pub best_g: Vec<f64>,
+}
+
+impl Trained {
+    /// Returns the number of trials whose champion solves the task.
+    pub fn solved(&self) -> usize {
+        self.champion_g.iter().filter(|&&g| g >= SOLVED).count()
+    }
+}
+
+/// Trains and checks all tasks, one after the other.
+///
+/// # Errors
+/// A config is invalid, the folder cannot be used, or training fails or is stopped. A task that is not admitted is an
+/// outcome.
+pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
+    if i64::from(request.population) == SMALL.0 {
+        let message = format!("--population {}: the small populations have this size", SMALL.0);
+        return Err(Error::Usage(with_remedy(message, "choose another, or 0 for none")));
+    }
+    // Each task with G of its scripted team and its configs, that of the small populations first.
+    let mut tasks: Vec<(&Task, Option<f64>, Vec<Config>)> = Vec::new();
+    for task in &request.tasks {
+        let name = &task.name;
+        if tasks.iter().any(|(other, ..)| other.name == *name) {
+            return Err(Error::Usage(format!("two configs have the name {name}; rename one").into()));
+        }
+        let set =
+            |key: &str, value: toml::Value| Override::new(format!("learning.{key}"), value, format!("learning.{key}"));
+        let common = [("trials", request.trials.into()), ("seed", request.seed.into()), ("generations", SMALL.1)];
+        let common = common.map(|(key, value): (&str, i64)| set(key, value.into()));
+        let read = |more: &[Override]| {
+            let set = [&task.config.set[..], &common, more].concat();
+            ConfigText { set, ..task.config.clone() }.read()
+        };
+        let mut configs = vec![read(&[set("population", SMALL.0.into())])?];
+        if request.population > 0 {
+            configs.push(read(&[set("population", request.population.into()), set("elites", "10%".into())])?);
+        }
+        let scripted_g = task.script.as_ref().map(|script| play_script(script, name, &configs[0])).transpose()?;
+        tasks.push((task, scripted_g, configs));
+    }
+    let mut work = Work::default();
+    for config in tasks.iter().flat_map(|(.., configs)| configs) {
+        // One training after the other.
+        FITNESSES.iter().for_each(|_| work += Work::of([config]));
+    }
+    let (backend, on) = backends.open(work)?;
+    let disk = ownership::create_output_folder(&Disk::default(), &request.out, request.named)?;
+    let mut found = Vec::new();
+    for (task, scripted_g, configs) in tasks {
+        let name = &task.name;
+        context.message(format_args!("{name}: playing baselines and training on {on}"));
+        let small = &configs[0];
+        let played = baseline::play(small, SEEDS, EPISODES, &mut *backend.0, context.quiet())?;
+        let g = |of: fn(&Played) -> f64| played.iter().map(of).collect();
+        let baselines = [g(|played| played.constants[played.best_constant]), g(|p| p.action), g(|p| p.network)];
+        let mut trained = Vec::new();
+        // One training at a time, because large populations take much memory.
+        for config in &configs {
+            for fitness in FITNESSES {
+                let mut config = config.clone();
+                config.learning.fitness = fitness;
+                let parent = request.out.join(name);
+                disk.create_folder(&parent).map_err(RecordError::write(&parent))?;
+                let folder = parent.join(format!("{}-{fitness}", config.learning.population));
+                train(&config, name, &folder, request.start, &disk, backend, context)?;
+                trained.push(measure(&config, &folder, &mut *backend.0)?);
+            }
+        }
+        let pois = small.world.pois.len();
+        let refused = reason(&baselines, &trained, scripted_g);
+        let scripted = scripted_g == Some(1.0);
+        found.push(Found { name: name.clone(), pois, baselines, trained, scripted_g, scripted, refused });
+    }
+    Ok(Outcome { population: request.population, tasks: found })
+}
+
+/// Returns G of a task's scripted team.
+fn play_script(script: &Script, name: &str, config: &Config) -> Result<f64, Error> {
+    let invalid = |error: String| Error::Usage(format!("{name}: scripted team: {error}").into());
+    script.check(config).map_err(invalid)?;
+    let observed = script.play(config).map_err(|error| invalid(error.to_string()))?;
+    Ok(observed.iter().flatten().count() as f64 / config.world.pois.len() as f64)
+}
+
+/// Trains one run of a task, unless it is finished.
+fn train(
+    config: &Config,
+    task: &str,
+    folder: &Path,
+    start: Start,
+    disk: &Disk,
+    backend: &mut OpenBackend,
+    context: Context<'_>,
+) -> Result<(), Error> {
+    check_memory([&config.validate()?], backend)?;
+    let (mut session, _) = Session::open(vec![(config.clone(), folder.into())], start, disk)?;
+    if session.is_done() {
+        return Ok(());
+    }
+    let learning = &config.learning;
+    let title = format!("{task}, {} policies, {}", learning.population, learning.fitness);
+    let names = vec![(title, Some(config.world.pois.len()))];
+    (context.report)(Event::Begin(names, session.generations()[0], learning.generations));
+    let mut watch = |now: &Progress<'_>| context.rows(now.generations[0], now.rows);
+    let ended = context.train(&mut watch, |options| session.train(backend, options));
+    context.pause();
+    match ended? {
+        SessionEnd::Finished => Ok(()),
+        SessionEnd::Stopped => Err(Error::Stopped("with everything saved".into())),
+    }
+}
+
+/// Reads a finished run. If starts or POIs move, its champions play held-out episodes.
+fn measure(config: &Config, folder: &Path, backend: &mut dyn Backend) -> Result<Trained, Error> {
+    let learning = &config.learning;
+    let (population, fitness, none) = (learning.population, learning.fitness, vec![0.0; learning.trials]);
+    let mut trained = Trained { population, fitness, champion_g: none.clone(), best_g: none };
+    runs::metrics(folder, config, Verification::Required, |row| {
+        if row.generation == learning.generations {
+            (trained.champion_g[row.trial], trained.best_g[row.trial]) = (row.champion_g, row.best_g);
+        }
+    })?;
+    if learning.start_jitter > 0.0 || learning.poi_jitter > 0.0 {
+        let weights = champions(&folder.join(POLICIES), config)?;
+        let starts = Starts::Drawn {
+            episodes: EPISODES,
+            seed: 0,
+            jitter: learning.start_jitter,
+            poi_jitter: learning.poi_jitter,
+        };
+        let played = flotilla::front::play(config, backend, learning.trials, &weights, &starts)
+            .map_err(|error| Error::Refused(error.to_string().into()))?;
+        trained.champion_g = played.observed.iter().map(|observed| observed / config.world.pois.len() as f64).collect();
+    }
+    Ok(trained)
+}
+
+/// Returns why a task is not admitted.
+fn reason(baselines: &[Vec<f64>; 3], trained: &[Trained], scripted_g: Option<f64>) -> Option<String> {
+    let names = ["the best constant action", "random constant actions", "random networks"];
+    for (name, g) in names.iter().zip(baselines) {
+        let g = mean(g);
+        if g >= EASY {
+            return Some(format!("G of {name} is {g:.2}; allowed below {EASY}"));
+        }
+    }
+    let small = |found: &&Trained| found.population == SMALL.0 as usize;
+    if let Some(found) = trained.iter().filter(small).find(|found| 2 * found.solved() > found.champion_g.len()) {
+        return Some(format!("{} policies solve it with fitness {}", SMALL.0, found.fitness));
+    }
+    match scripted_g {
+        Some(1.0) => None,
+        Some(g) => Some(format!("the scripted team has G {g:.2}; it has to observe every POI")),
+        None if trained.iter().any(|found| found.solved() > 0) => None,
+        None => Some("no champion solves it, and there is no scripted team beside the config".into()),
+    }
+}
+
+/// Returns the mean of some values.
+pub fn mean(values: &[f64]) -> f64 {
+    values.iter().sum::<f64>() / values.len() as f64
+}

@@ -1,0 +1,271 @@
+//! The configs of the golden digests, which `golden.txt` describes.
+
+use std::sync::LazyLock;
+
+use flotilla::config::{Config, Override};
+
+const GENERALLY_FORWARD: &str = include_str!("../../configs/generally_forward.toml");
+const STRICTLY_FORWARD: &str = include_str!("../../configs/strictly_forward.toml");
+const CHAOTIC: &str = include_str!("../../configs/chaotic.toml");
+/// Ten groups of one leader and three followers. A set of 40 agents needs two words.
+const FORTY_AGENTS: &str = "
+[world]
+leaders = [[5, 5], [15, 5], [25, 5], [35, 5], [45, 5], [5, 40], [15, 40], [25, 40], [35, 40], [45, 40]]
+followers = [
+    [7, 2], [3, 2], [5, 8], [17, 2], [13, 2], [15, 8], [27, 2], [23, 2], [25, 8], [37, 2], [33, 2], [35, 8],
+    [47, 2], [43, 2], [45, 8], [7, 37], [3, 37], [5, 43], [17, 37], [13, 37], [15, 43], [27, 37], [23, 37], [25, 43],
+    [37, 37], [33, 37], [35, 43], [47, 37], [43, 37], [45, 43],
+]
+pois = [[5, 12], [20, 12], [45, 12], [10, 47], [30, 47], [48, 30]]
+coupling = 4
+";
+
+/// Name, description, config, and the keys that are changed.
+pub type Case = (&'static str, &'static str, &'static str, &'static [(&'static str, &'static str)]);
+
+/// Together these cases cover every choice in a config, and sizes on both sides of every special case.
+pub const CASES: [Case; 33] = [
+    ("generally-forward", "first layout, leader-follower, Df", GENERALLY_FORWARD, &[]),
+    ("strictly-forward", "second layout, D++", STRICTLY_FORWARD, &[("learning.fitness", "'D++'")]),
+    ("chaotic", "third layout, G", CHAOTIC, &[("learning.fitness", "'G'")]),
+    (
+        "all-leaders",
+        "all-leaders, D, coupling 2",
+        GENERALLY_FORWARD,
+        &[("learning.paradigm", "'all-leaders'"), ("learning.fitness", "'D'"), ("world.coupling", "2")],
+    ),
+    (
+        "all-leaders-chaotic",
+        "20 leaders, D++",
+        CHAOTIC,
+        &[("learning.paradigm", "'all-leaders'"), ("learning.fitness", "'D++'")],
+    ),
+    (
+        "jittered",
+        "three episodes per team from jittered starts, D",
+        GENERALLY_FORWARD,
+        &[
+            ("learning.start_jitter", "0.75"),
+            ("learning.episodes_per_team", "3"),
+            ("learning.population", "13"),
+            ("learning.fitness", "'D'"),
+        ],
+    ),
+    (
+        "additive",
+        "additive mutation of every weight, no elites",
+        STRICTLY_FORWARD,
+        &[
+            ("learning.mutation", "'additive'"),
+            ("learning.mutation_probability", "1.0"),
+            ("learning.mutation_sigma", "0.3"),
+            ("learning.elites", "0"),
+        ],
+    ),
+    (
+        "inverse",
+        "inverse density, POIs sensed up to a distance of 12",
+        GENERALLY_FORWARD,
+        &[("sense.density", "'inverse'"), ("sense.poi_range", "12.0")],
+    ),
+    ("unlimited", "agents sensed at any distance", CHAOTIC, &[("sense.agent_range", "inf")]),
+    (
+        "two-hidden",
+        "two hidden layers, three elites",
+        GENERALLY_FORWARD,
+        &[("policy.hidden", "[16, 7]"), ("learning.elites", "3")],
+    ),
+    ("no-hidden", "no hidden layer", GENERALLY_FORWARD, &[("policy.hidden", "[]")]),
+    (
+        "each-coupling",
+        "one coupling per POI, a seed above 32 bits",
+        CHAOTIC,
+        &[("world.coupling", "[1, 2, 5, 7]"), ("learning.seed", "81985529216486895")],
+    ),
+    ("forty-agents", "40 agents, two words per set, six POIs", FORTY_AGENTS, &[]),
+    (
+        "followers-observe",
+        "only followers observe, Df",
+        GENERALLY_FORWARD,
+        &[("world.observers", "'followers'"), ("world.coupling", "2")],
+    ),
+    (
+        "leaders-observe",
+        "only leaders observe, D++",
+        GENERALLY_FORWARD,
+        &[("world.observers", "'leaders'"), ("world.coupling", "1"), ("learning.fitness", "'D++'")],
+    ),
+    (
+        "windows",
+        "POIs that can be observed only in windows of steps, D",
+        CHAOTIC,
+        &[("world.windows", "[[1, 20], [16, 24], [30, 50], [21, 21]]"), ("learning.fitness", "'D'")],
+    ),
+    (
+        "after",
+        "POIs that have to be observed in order, Df, two words per set",
+        FORTY_AGENTS,
+        &[("world.after", "[[], [0], [1], [0], [3], [3]]"), ("world.coupling", "3")],
+    ),
+    (
+        "behaviours",
+        "policies choose behaviours, G",
+        GENERALLY_FORWARD,
+        &[("policy.actions", "'behaviours'"), ("learning.fitness", "'G'")],
+    ),
+    (
+        "behaviours-of-all",
+        "20 leaders choose behaviours, no hidden layer",
+        CHAOTIC,
+        &[("policy.actions", "'behaviours'"), ("policy.hidden", "[]"), ("learning.paradigm", "'all-leaders'")],
+    ),
+    (
+        "shared",
+        "all leaders share a policy, D of two episodes",
+        GENERALLY_FORWARD,
+        &[
+            ("learning.sharing", "'all'"),
+            ("learning.fitness", "'D'"),
+            ("learning.start_jitter", "0.5"),
+            ("learning.episodes_per_team", "2"),
+        ],
+    ),
+    (
+        "shared-by-all",
+        "twelve leaders share a policy that chooses behaviours",
+        GENERALLY_FORWARD,
+        &[("learning.sharing", "'all'"), ("learning.paradigm", "'all-leaders'"), ("policy.actions", "'behaviours'")],
+    ),
+    (
+        "moved-pois",
+        "two episodes per team with moved POIs",
+        GENERALLY_FORWARD,
+        &[("learning.poi_jitter", "3.0"), ("learning.episodes_per_team", "2"), ("learning.population", "13")],
+    ),
+    (
+        "stages",
+        "coupling 1, from generation 3 on coupling 3 and jittered starts, from generation 6 on a larger speed",
+        GENERALLY_FORWARD,
+        &[(
+            "stages",
+            "[{from = 0, set = {'world.coupling' = 1}}, {from = 3, set = {'learning.start_jitter' = 0.5}}, \
+             {from = 6, set = {'motion.max_speed' = 10.0}}]",
+        )],
+    ),
+    (
+        "led-step-by-step",
+        "Dt, followers led by the leader that they saw most so far",
+        CHAOTIC,
+        &[("learning.fitness", "'Dt'")],
+    ),
+    (
+        "relay",
+        "Dt, followers led by all leaders seen in the last 3 steps, only followers observe, order and windows",
+        CHAOTIC,
+        &[
+            ("learning.fitness", "'Dt'"),
+            ("learning.led_within", "3"),
+            ("learning.led_by", "'any-seen'"),
+            ("world.observers", "'followers'"),
+            ("world.coupling", "2"),
+            ("world.after", "[[], [0], [1], []]"),
+            ("world.windows", "[[1, 50], [20, 50], [25, 50], [10, 30]]"),
+        ],
+    ),
+    (
+        "truncation",
+        "a fifth of each population are elites, and only they become parents",
+        GENERALLY_FORWARD,
+        &[("learning.elites", "'20%'"), ("learning.parents", "'elites'"), ("world.coupling", "2")],
+    ),
+    (
+        "partners",
+        "the mean of three teams per policy, D",
+        GENERALLY_FORWARD,
+        &[("learning.partners", "3"), ("learning.fitness", "'D'"), ("world.coupling", "2")],
+    ),
+    (
+        "lenient",
+        "the best of two teams per policy, all-leaders, two episodes from jittered starts",
+        CHAOTIC,
+        &[
+            ("learning.partners", "2"),
+            ("learning.leniency", "'max'"),
+            ("learning.paradigm", "'all-leaders'"),
+            ("learning.start_jitter", "0.5"),
+            ("learning.episodes_per_team", "2"),
+            ("world.coupling", "3"),
+        ],
+    ),
+    (
+        "hall-of-fame",
+        "two teams per policy and one with champions of one of the last three generations, all-leaders, Df",
+        CHAOTIC,
+        &[
+            ("learning.hall_of_fame", "3"),
+            ("learning.partners", "2"),
+            ("learning.paradigm", "'all-leaders'"),
+            ("world.coupling", "3"),
+        ],
+    ),
+    (
+        "sense-gain",
+        "inverse density with a gain of 8, coupling 3, all-leaders, D++",
+        CHAOTIC,
+        &[
+            ("sense.density", "'inverse'"),
+            ("sense.gain", "8.0"),
+            ("world.coupling", "3"),
+            ("learning.paradigm", "'all-leaders'"),
+            ("learning.fitness", "'D++'"),
+        ],
+    ),
+    (
+        "openai-es",
+        "OpenAI's evolution strategy, an odd population",
+        GENERALLY_FORWARD,
+        &[
+            ("learning.method", "'openai-es'"),
+            ("learning.search_step", "0.3"),
+            ("learning.population", "21"),
+            ("world.coupling", "2"),
+        ],
+    ),
+    (
+        "snes",
+        "separable natural evolution strategies, D++, two partners",
+        CHAOTIC,
+        &[
+            ("learning.method", "'snes'"),
+            ("learning.search_sigma", "0.5"),
+            ("learning.partners", "2"),
+            ("learning.fitness", "'D++'"),
+            ("world.coupling", "3"),
+        ],
+    ),
+    (
+        "shared-openai-es",
+        "OpenAI's evolution strategy, all leaders share a policy, larger steps from generation 4 on",
+        GENERALLY_FORWARD,
+        &[
+            ("learning.method", "'openai-es'"),
+            ("learning.search_step", "0.3"),
+            ("learning.sharing", "'all'"),
+            ("learning.fitness", "'G'"),
+            ("world.coupling", "2"),
+            ("stages", "[{from = 4, set = {'learning.search_step' = 1.5}}]"),
+        ],
+    ),
+];
+
+pub static CONFIGS: LazyLock<Vec<Config>> = LazyLock::new(|| {
+    let small = [("learning.trials", "2"), ("learning.generations", "8"), ("learning.population", "20")];
+    let config = |(name, _, text, changes): Case| {
+        let change = |&(key, text): &(&str, &str)| Override { key: key.into(), text: text.into(), name: key.into() };
+        let small: Vec<Override> = small.iter().map(change).collect();
+        let changes: Vec<Override> = changes.iter().map(change).collect();
+        let config = Config::parse(text, name).and_then(|config| config.with(&small)?.with(&changes));
+        config.unwrap_or_else(|error| panic!("{name}: {error}"))
+    };
+    CASES.map(config).into()
+});

@@ -1,0 +1,26 @@
+//! Tests of the engine, as one program, because a link takes longer than most tests.
+
+#[cfg(feature = "gpu")]
+#[path = "support/adapters.rs"]
+mod adapters;
+mod config;
+mod credit;
+mod evolve;
+mod fit;
+mod golden;
+#[path = "support/mod.rs"]
+mod helpers;
+mod math;
+mod parity;
+mod stepping;
+mod strategy;
+mod support {
+    #[cfg(feature = "gpu")]
+    pub use crate::adapters::*;
+    pub use crate::helpers::*;
+}
+mod structure;
+mod watchdog;
+
+/// The root of the checkout.
+const ROOT: &str = env!("CARGO_MANIFEST_DIR");
