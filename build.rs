@@ -1,5 +1,4 @@
-//! Sets `FLOTILLA_TARGET`, `FLOTILLA_RUSTC` and `FLOTILLA_COMMIT` for the compiler. `FLOTILLA_COMMIT` is empty if the
-//! commit is unknown.
+//! Sets `FLOTILLA_TARGET` and `FLOTILLA_COMMIT` for the compiler. `FLOTILLA_COMMIT` is empty if the commit is unknown.
 //!
 //! Only release builds contain the commit, because a crate that contains it is recompiled at every commit.
 
@@ -11,9 +10,6 @@ fn main() {
     let variable = |name| std::env::var(name).unwrap_or_default();
     println!("cargo::rerun-if-changed=build.rs");
     println!("cargo::rustc-env=FLOTILLA_TARGET={}", variable("TARGET"));
-    let compiler = Command::new(variable("RUSTC")).arg("--version").output();
-    let compiler = compiler.map_or(String::new(), |output| String::from_utf8_lossy(&output.stdout).trim().into());
-    println!("cargo::rustc-env=FLOTILLA_RUSTC={compiler}");
     let (commit, files) = match variable("PROFILE").as_str() {
         "release" => state(Path::new(&variable("CARGO_MANIFEST_DIR"))),
         _ => Default::default(),

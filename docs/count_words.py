@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-GENERATED = {"docs/reference/config.md", "docs/reference/python.md", "docs/develop/evidence.md",
+GENERATED = {"docs/reference/config.md", "docs/reference/python.md",
              "docs/results/claims-measured.md", "docs/results/questions-tables.md", "benches/static-figures.md"}
 LOGS = ["benches/README.md", "benches/peers/README.md", "benches/static-figures.md"]
 

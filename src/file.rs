@@ -32,6 +32,9 @@ pub enum TextError {
     /// The text is larger than this many bytes.
     #[error("it is larger than {0} bytes, the maximum for such a file")]
     TooLarge(u64),
+    /// The file is a zip file.
+    #[error("it is a zip file; unpack it, for example with `unzip`")]
+    Zip,
     /// The line with this number, from 1, is not UTF-8.
     #[error("line {0} is not UTF-8 text")]
     NotText(usize),
@@ -44,6 +47,9 @@ pub enum TextError {
 pub fn text(file: impl Read, max_bytes: u64) -> Result<String, TextError> {
     let mut bytes = Vec::new();
     file.take(max_bytes + 1).read_to_end(&mut bytes)?;
+    if bytes.starts_with(b"PK\x03\x04") {
+        return Err(TextError::Zip);
+    }
     if bytes.len() as u64 > max_bytes {
         return Err(TextError::TooLarge(max_bytes));
     }
@@ -58,6 +64,11 @@ pub fn text(file: impl Read, max_bytes: u64) -> Result<String, TextError> {
 pub fn stem(path: &Path, default: &str) -> String {
     let stem = path.file_stem().unwrap_or_default().to_string_lossy();
     if stem.trim_matches('.').is_empty() { default.into() } else { stem.into_owned() }
+}
+
+/// Returns whether a path is named like a zip file, such as the runs that the browser page saves.
+pub fn is_zip(path: &Path) -> bool {
+    path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("zip"))
 }
 
 /// Returns whether a path exists.

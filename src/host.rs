@@ -124,6 +124,8 @@ mod embedded {
 pub use embedded::*;
 
 #[cfg(all(feature = "parallel", not(target_family = "wasm")))]
+pub use threads::MAX_THREADS;
+#[cfg(all(feature = "parallel", not(target_family = "wasm")))]
 pub use threads::{Threads, start};
 
 /// Starts the threads that rayon shares work between, as many as the system allows.
@@ -167,13 +169,16 @@ mod threads {
     /// those that could be started.
     pub fn start(threads: Option<usize>) -> Threads {
         static STARTED: OnceLock<Threads> = OnceLock::new();
-        *STARTED.get_or_init(|| start_now(threads.unwrap_or_else(usual)))
+        *STARTED.get_or_init(|| start_now(threads.unwrap_or_else(|| usual(std::env::var("RAYON_NUM_THREADS").ok()))))
     }
 
-    /// Returns how many threads rayon would start.
-    fn usual() -> usize {
-        let set = std::env::var("RAYON_NUM_THREADS").ok().and_then(|text| text.parse().ok());
-        set.filter(|&threads| threads > 0).unwrap_or_else(|| thread::available_parallelism().map_or(1, usize::from))
+    /// Maximum number of threads. More would spend their time waiting for each other.
+    pub const MAX_THREADS: usize = 1024;
+
+    /// Returns how many threads rayon would start, given the value of `RAYON_NUM_THREADS`, but at most [`MAX_THREADS`].
+    fn usual(set: Option<String>) -> usize {
+        let set = set.and_then(|text| text.parse().ok()).filter(|&threads| threads > 0);
+        set.unwrap_or_else(|| thread::available_parallelism().map_or(1, usize::from)).min(MAX_THREADS)
     }
 
     type Worker = mpsc::Sender<rayon::ThreadBuilder>;
@@ -217,6 +222,13 @@ mod threads {
     #[cfg(test)]
     mod tests {
         use super::*;
+
+        #[test]
+        fn the_environment_cannot_ask_for_more_threads_than_the_flag() {
+            let asked = |text: &str| usual(Some(text.into()));
+            assert_eq!((asked("7"), asked("1024"), asked("3000")), (7, MAX_THREADS, MAX_THREADS));
+            assert_eq!(asked("0"), usual(None));
+        }
 
         #[test]
         fn as_many_threads_are_started_as_the_system_allows() {

@@ -120,7 +120,6 @@
 //! | feature | adds | total crates, approximately |
 //! |---|---|---|
 //! | (none) | training, evaluation and verification on one CPU thread; also on WebAssembly | 35 |
-//! | `scalar` | also episodes without vector instructions, for `verify --report` | 35 |
 //! | `parallel` (default) | all threads, using rayon; results keep the same bits | 40 |
 //! | `gpu` (default) | any GPU, using wgpu | 85 |
 

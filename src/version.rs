@@ -11,5 +11,3 @@ pub const VERSION: &str = env!("CARGO_PKG_VERSION");
 
 /// The target that this build was made for.
 pub const TARGET: &str = env!("FLOTILLA_TARGET");
-/// The compiler of this build.
-pub const COMPILER: &str = env!("FLOTILLA_RUSTC");

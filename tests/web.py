@@ -1011,8 +1011,6 @@ def main():
         archive = downloads / "strictly_forward-leader-follower.zip"
         downloaded(archive)
         run = folder / "home"
-        for command, out in [("plot", "curves.svg"), ("replay", "replay.html")]:
-            call(command, archive, "--out", folder / f"zipped-{out}")
         with zipfile.ZipFile(archive) as files:
             names = files.namelist()
             assert {name.split("/")[0] for name in names} == {"strictly_forward-leader-follower"}, names

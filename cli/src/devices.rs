@@ -39,6 +39,7 @@ pub fn run(args: Args) -> Result<(), Error> {
                     "driver": info.driver,
                     "api": info.backend,
                     "kind": info.kind.to_string(),
+                    "pci": info.pci,
                     "compiler": device::compiler(&info.backend),
                     "open_s": seconds,
                     "pass": opened.as_ref().ok().map(|gpu| gpu.pass.to_string()),

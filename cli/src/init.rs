@@ -34,6 +34,9 @@ pub struct Args {
     /// Number of POIs in a ring, row or grid [default: one per group]
     #[arg(long, value_name = "N", value_parser = whole)]
     pois: Option<usize>,
+    /// Agents that a POI needs in a ring, row or grid [default: as many as a group has]
+    #[arg(long, value_name = "N", value_parser = whole)]
+    coupling: Option<usize>,
     /// New file to write [default: standard output]
     #[arg(long, short, value_name = "FILE")]
     out: Option<PathBuf>,
@@ -63,7 +66,12 @@ pub fn run(args: Args) -> Result<(), Error> {
 /// Returns the text of the config to start from: one of the paper's, or a layout with the requested groups and POIs.
 fn template(args: &Args) -> Result<String, Error> {
     let Some((_, shape)) = SHAPES.into_iter().find(|(name, _)| *name == args.layout) else {
-        let given = [("--groups", args.groups), ("--followers", args.followers), ("--pois", args.pois)];
+        let given = [
+            ("--groups", args.groups),
+            ("--followers", args.followers),
+            ("--pois", args.pois),
+            ("--coupling", args.coupling),
+        ];
         if let Some((flag, _)) = given.into_iter().find(|(_, number)| number.is_some()) {
             let layout = &args.layout;
             return Err(Error::Usage(with_remedy(
@@ -74,9 +82,9 @@ fn template(args: &Args) -> Result<String, Error> {
         let paper = LAYOUTS.into_iter().find(|(names, _)| names.contains(&&*args.layout));
         return Ok(paper.expect("no other is taken").1.into());
     };
-    let groups = args.groups.unwrap_or(4);
-    let layout =
-        StartLayout { shape, groups, followers: args.followers.unwrap_or(3), pois: args.pois.unwrap_or(groups) };
+    let (groups, followers) = (args.groups.unwrap_or(4), args.followers.unwrap_or(3));
+    let coupling = args.coupling.unwrap_or(followers.saturating_add(1));
+    let layout = StartLayout { shape, groups, followers, pois: args.pois.unwrap_or(groups), coupling };
     match layout.problem() {
         Some(problem) => Err(Error::Usage(problem.into())),
         None => Ok(layout.text()?),

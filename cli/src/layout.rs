@@ -39,6 +39,7 @@ pub(super) struct StartLayout {
     pub groups: usize,
     pub followers: usize,
     pub pois: usize,
+    pub coupling: usize,
 }
 
 /// The position and heading of a group's leader at the start.
@@ -60,6 +61,9 @@ impl StartLayout {
                 "--groups {} --followers {}: these are {agents} agents, allowed 1 to {MAX_AGENTS}",
                 self.groups, self.followers
             )),
+            _ if self.coupling == 0 || self.coupling > agents => {
+                Some(format!("--coupling {}: allowed 1 to {agents}, the number of agents", self.coupling))
+            }
             _ => None,
         }
     }
@@ -157,7 +161,7 @@ impl StartLayout {
         };
         let headings: Vec<_> =
             groups.iter().map(|group| format!("{:?}", (group.heading * 1e6).round() / 1e6)).collect();
-        let needed = self.followers + 1;
+        let needed = self.coupling;
         let mut text = self.header(needed);
         let _ = write!(
             text,

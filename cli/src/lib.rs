@@ -21,6 +21,7 @@ use serde::Serialize;
 use flotilla::config::{self, Choice, Fitness, Override, Paradigm};
 use flotilla::escape;
 use flotilla::file;
+use flotilla::host::MAX_THREADS;
 use flotilla_app::ops::ConfigText;
 pub use flotilla_app::ops::{Error, Processor, with_remedy};
 use flotilla_app::record::folder::Start;
@@ -156,25 +157,29 @@ pub fn main(words: Option<Vec<OsString>>) -> u8 {
     }
     let failed = match process::set_up().and_then(|()| run()) {
         Ok(Ok(())) => return 0,
-        // Help and the version are no errors to clap's caller.
-        Ok(Err(rejected)) => {
+        Ok(Err(rejected)) if rejected.use_stderr() => {
             let _ = rejected.print();
-            if !rejected.use_stderr() {
-                return 0;
-            }
             of_clap(&rejected)
         }
-        Err(error) => {
-            let word = if matches!(error, Error::Stopped(_)) { "stopped" } else { "error" };
-            say(format_args!("{word}: {error}"));
-            error
-        }
+        // Help and the version are no errors to clap's caller.
+        Ok(Err(text)) => match printed(text.print().and_then(|()| io::stdout().flush())) {
+            Ok(()) => return 0,
+            Err(error) => reported(error),
+        },
+        Err(error) => reported(error),
     };
     if wants_json(&self::words()) && !PRINTED.load(Relaxed) {
         // The exit code already reports a failure.
         let _ = print_json(&failed);
     }
     failed.exit_code()
+}
+
+/// Prints an error to standard error, and returns it.
+fn reported(error: Error) -> Error {
+    let word = if matches!(error, Error::Stopped(_)) { "stopped" } else { "error" };
+    say(format_args!("{word}: {error}"));
+    error
 }
 
 /// Runs the command, or returns clap's error if it rejects the command line.
@@ -210,13 +215,24 @@ fn of_clap(error: &clap::Error) -> Error {
     })
 }
 
-/// Removes clap's advice to pass an unknown flag as a value, which does not apply to any command. Suggests `--team` in
-/// place of `--champion` and `--best`, and `--set` in place of flags named like config keys.
+/// Flags that were removed, and what replaces each.
+const REMOVED: [(&str, &str); 3] = [
+    ("--note", "`verify` writes no reports; --json prints the comparisons"),
+    ("--report", "`verify` writes no reports; --json prints the comparisons"),
+    ("--tensorboard", "`train` writes no event files; in Python, pass `callback=flotilla.loggers.tensorboard(FOLDER)`"),
+];
+
+/// Removes clap's advice to pass an unknown flag as a value, which does not apply to any command. Says what replaces a
+/// removed flag. Suggests `--team` in place of `--champion` and `--best`, and `--set` in place of flags named like
+/// config keys.
 fn hinted(mut error: clap::Error) -> clap::Error {
     if error.kind() == ErrorKind::UnknownArgument {
         error.remove(ContextKind::Suggested);
         let unknown = error.get(ContextKind::InvalidArg).map(ToString::to_string);
-        if let Some(flag @ ("--champion" | "--best")) = unknown.as_deref() {
+        if let Some((_, advice)) = REMOVED.iter().find(|(flag, _)| unknown.as_deref() == Some(*flag)) {
+            error.remove(ContextKind::SuggestedArg);
+            error.insert(ContextKind::Suggested, ContextValue::StyledStrs(vec![(*advice).into()]));
+        } else if let Some(flag @ ("--champion" | "--best")) = unknown.as_deref() {
             let meant = format!("--team {}", flag.trim_start_matches('-'));
             error.insert(ContextKind::SuggestedArg, ContextValue::String(meant));
         } else if let Some(key) = unknown.and_then(|flag| key_of(&flag)).filter(|_| takes_set()) {
@@ -337,7 +353,12 @@ pub fn print(text: &str) -> Result<(), Error> {
 
 fn write_out(text: &str) -> Result<(), Error> {
     let mut stdout = io::stdout().lock();
-    match stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()) {
+    printed(stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()))
+}
+
+/// Converts the result of writing to standard output.
+fn printed(result: io::Result<()>) -> Result<(), Error> {
+    match result {
         Err(error) if error.kind() != io::ErrorKind::BrokenPipe => Err(Error::Output(error)),
         _ => Ok(()),
     }
@@ -554,7 +575,7 @@ pub struct RunOptions {
     #[arg(long, help_heading = WHERE, value_enum, default_value_t = Breed::Auto)]
     pub breed: Breed,
     /// CPU threads [default: all]
-    #[arg(long, help_heading = WHERE, value_name = "N", value_parser = between(1..=1024u16))]
+    #[arg(long, help_heading = WHERE, value_name = "N", value_parser = between(1..=MAX_THREADS as u16))]
     pub threads: Option<u16>,
 }
 

@@ -11,7 +11,7 @@ use flotilla_app::report::runs::TeamKind;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Run directories, made by `flotilla train`, or zip files of runs
+    /// Run directories, made by `flotilla train`
     #[arg(required = true, value_name = "RUN")]
     runs: Vec<PathBuf>,
     /// Picture to write, .svg, .pdf or .png [default: curves.svg in the folder of one run, comparison.svg here of

@@ -114,9 +114,10 @@ pub struct Signals {
 }
 
 impl Signals {
-    /// Installs the signal handlers. SIGINT and SIGTERM set `stop`, and SIGUSR1 sets `save`.
+    /// Installs the signal handlers. SIGINT, SIGTERM and, unless it is ignored as under `nohup`, SIGHUP set `stop`.
+    /// SIGUSR1 sets `save`.
     ///
-    /// A SIGINT after any of the first two ends the process at once, because a person who presses Ctrl-C again does not
+    /// A SIGINT after any of the first three ends the process at once, because a person who presses Ctrl-C again does not
     /// want to wait. Another SIGTERM changes nothing: batch systems send it to a script and to its processes, and to
     /// these twice at a time limit.
     ///
@@ -132,10 +133,26 @@ impl Signals {
                 flag::register(signal, signals.stop.clone())?;
             }
             #[cfg(unix)]
-            flag::register(signal_hook::consts::SIGUSR1, signals.save.clone())?;
+            {
+                use signal_hook::consts::{SIGHUP, SIGUSR1};
+                if hangup_ends() {
+                    flag::register(SIGHUP, signals.stop.clone())?;
+                }
+                flag::register(SIGUSR1, signals.save.clone())?;
+            }
             Ok(())
         };
         listen().map_err(Error::Signals)?;
         Ok(signals)
     }
+}
+
+/// Reports whether SIGHUP, which a closed terminal sends, would end this process. Elsewhere than on Linux this is not
+/// known, so that the signal keeps its usual effect.
+#[cfg(unix)]
+fn hangup_ends() -> bool {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let ignored = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
+    // Signal 1 is the lowest bit.
+    ignored.and_then(|bits| u64::from_str_radix(bits.trim(), 16).ok()).is_some_and(|bits| bits & 1 == 0)
 }

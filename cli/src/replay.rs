@@ -13,7 +13,7 @@ use flotilla_app::shell;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Run directory, made by `flotilla train`, or a zip file of a run
+    /// Run directory, made by `flotilla train`
     #[arg(value_name = "RUN")]
     folder: PathBuf,
     /// Trial to look at: a number from 0, or the one with the largest (best) or smallest (worst) G

@@ -16,7 +16,7 @@ const HELD_OUT: &str = "Held-out starts";
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Run directory, or a zip file of a run; with --policies also a config file (TOML), or - for standard input
+    /// Run directory; with --policies also a config file (TOML), or - for standard input
     #[arg(value_name = "RUN|CONFIG")]
     path: PathBuf,
     #[command(flatten)]

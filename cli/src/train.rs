@@ -31,9 +31,6 @@ pub struct Args {
     init: Option<PathBuf>,
     #[command(flatten)]
     printed: Printed,
-    /// Also write event files for TensorBoard to OUT/tensorboard; with --resume, earlier generations too
-    #[arg(long)]
-    tensorboard: bool,
     #[command(flatten)]
     checkpoints: Checkpoints,
     #[command(flatten)]
@@ -41,11 +38,9 @@ pub struct Args {
 }
 
 pub fn run(args: Args) -> Result<(), Error> {
-    let Args { config, run, out, existing, init, tensorboard, printed, checkpoints, loss } = args;
-    // Before the config is read: the message names it where it will be.
-    [Some(&config.file.path), out.as_ref()].into_iter().flatten().try_for_each(|path| train::refuse_zip(path))?;
+    let Args { config, run, out, existing, init, printed, checkpoints, loss } = args;
     let (name, start) = (config.name(), existing.start());
-    let request = Request { config: config.text(checkpoints.list())?, name, out, start, init, tensorboard };
+    let request = Request { config: config.text(checkpoints.list())?, name, out, start, init };
     let mut console = Console::new(&run, loss, printed.quiet);
     let found = console.run(|backends, context| train::run(&request, backends, context))?;
     printed.summary(&found, report)

@@ -4,9 +4,7 @@ use std::path::PathBuf;
 
 use super::{Error, Printed, SetKeys, backend, between, console};
 use flotilla::config;
-use flotilla_app::ops::verify::{Request, TEAMS};
-use flotilla_app::ops::{self, output};
-use flotilla_app::record::evidence::Compared;
+use flotilla_app::ops::verify::{self, Compared, Request, TEAMS};
 
 #[derive(clap::Args)]
 #[command(after_help = EXIT_CODES)]
@@ -18,14 +16,13 @@ pub struct Args {
     /// Random teams per world
     #[arg(long, value_name = "N", default_value_t = TEAMS, value_parser = between(1..=65_536u32))]
     teams: u32,
-    /// Random worlds per adapter, pass and kernel [default: as many of 200 as take about a minute; all 200 with
-    /// --report]
+    /// Random worlds per adapter, pass and kernel [default: as many of 200 as take about a minute]
     #[arg(long, value_name = "N", value_parser = between(1..=100_000u32))]
     worlds: Option<u32>,
     /// Random seed
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = between(0..=u32::MAX))]
     seed: u32,
-    /// Only this adapter: its number or part of its name
+    /// Only this adapter: its number or part of its name; `cpu` compares the processor's instruction sets instead
     #[arg(long, value_name = "NAME")]
     adapter: Option<String>,
     /// Only this pass, instead of all exact ones; `plain` shows why passes are needed
@@ -34,13 +31,6 @@ pub struct Args {
     /// Only this kernel, instead of both
     #[arg(long, value_name = "KERNEL", value_parser = ["generic", "specialised"])]
     kernel: Option<String>,
-    /// Write comparisons, hardware and the digests of short trainings as a row of docs/develop/evidence.md; compares
-    /// the processor's instruction sets, too, and needs no adapter
-    #[arg(long, value_name = "FILE")]
-    report: Option<PathBuf>,
-    /// A remark about the machine, for the report
-    #[arg(long, value_name = "TEXT", requires = "report")]
-    note: Option<String>,
     #[command(flatten)]
     printed: Printed,
 }
@@ -52,16 +42,11 @@ const EXIT_CODES: &str =
 /// Prints a table of adapters, passes and kernels, and the differences below it.
 pub fn run(args: Args) -> Result<(), Error> {
     backend::start_threads(None);
-    let config = args.config.as_deref().filter(|path| !config::is_standard_input(path));
-    output::check(&[("--report", args.report.as_deref())], config.as_slice())?;
     let read = |path: PathBuf| Ok::<_, Error>((config::name(&path), config::read_file(&path)?));
-    let Args { config, set, teams, worlds, seed, adapter, pass, kernel, report, note, printed } = args;
-    let (config, set, evidence) = (config.map(read).transpose()?, set.set, report.is_some());
-    let request = Request { config, set, teams, worlds, seed, adapter, pass, kernel, evidence, note };
-    let found = console::run_without_backend(printed.quiet, |context| ops::verify::run(&request, context))?;
-    if let (Some(path), Some(evidence)) = (&report, &found.evidence) {
-        output::write(path, evidence.to_json().as_bytes())?;
-    }
+    let Args { config, set, teams, worlds, seed, adapter, pass, kernel, printed } = args;
+    let request =
+        Request { config: config.map(read).transpose()?, set: set.set, teams, worlds, seed, adapter, pass, kernel };
+    let found = console::run_without_backend(printed.quiet, |context| verify::run(&request, context))?;
     printed.outcome(&found, |found| in_words(&found.comparisons))?;
     found.difference().map_or(Ok(()), Err)
 }

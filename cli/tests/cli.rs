@@ -132,6 +132,21 @@ fn the_papers_configs_are_valid() {
     }
 }
 
+#[test]
+fn another_language_is_one_problem() {
+    for (text, line, language) in [
+        ("# a config\nworld:\n  leaders: [[1, 2]]\n  steps: 5\n", 2, "YAML"),
+        ("---\nsteps: 5\n", 1, "YAML"),
+        ("{\n  \"world\": {\"steps\": 5},\n  \"learning\": {}\n}\n", 1, "JSON"),
+    ] {
+        let output = check(text, &[]);
+        let stderr = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(1), "{stderr}");
+        let found = format!(":{line}: found {language}, allowed TOML");
+        assert!(stderr.contains(&found) && stderr.matches(": found").count() == 1, "{stderr}");
+    }
+}
+
 /// Each message has the line, the key, the value found and the allowed values.
 #[test]
 fn wrong_values_are_reported_with_line_and_range() {
@@ -162,7 +177,22 @@ fn wrong_values_are_reported_with_line_and_range() {
         (3, "leaders = [[1, 'a']]", "world.leaders[0][1]: found 'a', allowed a number, 0 to 40 (the map)"),
         (19, "density = 3", "sense.density: found 3, allowed \"linear\" or \"inverse\""),
         (19, "density = 'flat'", "sense.density: found 'flat', allowed \"linear\" or \"inverse\""),
-        (23, "fitness = 'd'", "learning.fitness: found 'd', allowed \"G\" or \"D\" or \"Df\" or \"D++\" or \"Dt\""),
+        (23, "fitness = 'x'", "learning.fitness: found 'x', allowed \"G\" or \"D\" or \"Df\" or \"D++\" or \"Dt\""),
+        (
+            23,
+            "fitness = 'df'",
+            "learning.fitness: found 'df', allowed \"G\" or \"D\" or \"Df\" or \"D++\" or \"Dt\"; did you mean \"Df\"?",
+        ),
+        (
+            23,
+            "paradigm = 'all-leader'",
+            "learning.paradigm: found 'all-leader', allowed \"leader-follower\" or \"all-leaders\"; did you mean \"all-leaders\"?",
+        ),
+        (
+            23,
+            "elites = 0.1",
+            "learning.elites: found 0.1, allowed a whole number, 0 to 50 (learning.population), or a percentage such as \"10%\"",
+        ),
         (23, "mutation = ''", "learning.mutation: found '', allowed \"scaled\" or \"additive\""),
         (23, "paradigm = 'x'", "learning.paradigm: found 'x', allowed \"leader-follower\" or \"all-leaders\""),
         // NaN and infinity

@@ -540,6 +540,8 @@ fn two_adapters() -> Vec<AdapterInfo> {
         driver: "Mesa 22.3.6".into(),
         backend: "vulkan".into(),
         kind,
+        index: 0,
+        pci: String::new(),
     };
     vec![adapter("GeForce RTX 4090", Kind::Discrete), adapter("llvmpipe (LLVM 15.0.6, 256 bits)", Kind::Software)]
 }

@@ -41,7 +41,7 @@ struct Scenario {
     long: usize,
 }
 
-const SCENARIOS: [Scenario; 10] = [
+const SCENARIOS: [Scenario; 9] = [
     Scenario {
         name: "train",
         before: &[],
@@ -84,14 +84,6 @@ const SCENARIOS: [Scenario; 10] = [
         command: "train stages.toml --out out",
         resume: ["train stages.toml --out out --resume", ""],
         short: 24,
-        long: 1000,
-    },
-    Scenario {
-        name: "tensorboard",
-        before: &[],
-        command: "train small.toml --out out --tensorboard",
-        resume: ["train small.toml --out out --resume --tensorboard", ""],
-        short: 30,
         long: 1000,
     },
     Scenario {
@@ -257,7 +249,7 @@ fn copy(from: &Path, to: &Path) {
 
 /// Reads the results: every file except those that record time and place.
 ///
-/// `metrics.csv` is read without its seconds. Event files contain times, so only their sizes count.
+/// `metrics.csv` is read without its seconds.
 fn outcome(folder: &Path) -> BTreeMap<String, Vec<u8>> {
     let mut results = BTreeMap::new();
     let mut folders = vec![folder.to_path_buf()];
@@ -283,9 +275,6 @@ fn outcome(folder: &Path) -> BTreeMap<String, Vec<u8>> {
                     fields.collect::<Vec<_>>().join(",") + "\n"
                 };
                 results.insert(name, text.lines().map(kept).collect::<String>().into_bytes());
-            } else if file.contains("tfevents") {
-                let name = name.split("events.out").next().unwrap().to_string();
-                results.insert(name, bytes.len().to_string().into_bytes());
             } else {
                 results.insert(name, bytes);
             }

@@ -321,6 +321,13 @@ fn init_layouts_have_the_requested_size_and_reachable_pois() {
     let stderr = place.refused(2, "init ring --groups 600 --followers 1 --pois 5");
     assert!(stderr.contains("these are 1200 agents, allowed 1 to 1024"), "{stderr}");
     assert!(place.refused(2, "init row --pois 0").contains("--pois 0: allowed 1 to 256"));
+    place.good("init row --coupling 8 --out eight.toml");
+    let text = place.read("eight.toml");
+    assert!(text.contains("\ncoupling = 8\n") && text.contains("when 8 agents are within"), "{text}");
+    for (flags, wrong) in [("--coupling 0", "0: allowed 1 to 16"), ("--groups 2 --coupling 9", "9: allowed 1 to 8")] {
+        let stderr = place.refused(2, &*format!("init row {flags}"));
+        assert!(stderr.contains(&format!("--coupling {wrong}, the number of agents")), "{stderr}");
+    }
 }
 
 /// In the ring, the last teams must observe clearly more POIs than random ones.

@@ -105,6 +105,21 @@ fn outputs_do_not_replace_inputs_or_files_of_a_run() {
 }
 
 #[test]
+fn help_that_cannot_be_printed_is_an_error() {
+    let place = place();
+    let full = device(&place, "full", "7");
+    if fs::metadata(&full).is_err() {
+        return support::skip("help_that_cannot_be_printed_is_an_error", "this system has no full device");
+    }
+    for command in ["--help", "--version", "train --help", "help train", "completions bash", "man", "init"] {
+        let output = place.shell(&format!("flotilla {command} > {full}"));
+        let stderr = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(1), "{command}: {stderr}");
+        assert!(stderr.contains("standard output cannot be written"), "{command}: {stderr}");
+    }
+}
+
+#[test]
 fn outputs_are_complete_or_absent_and_devices_are_not_replaced() {
     let place = with_run();
     let rollout = ["rollout", "small.toml", "--policies", "run/policies.safetensors"];
@@ -135,6 +150,46 @@ fn outputs_are_complete_or_absent_and_devices_are_not_replaced() {
     place.good(&[&rollout[..], &["--trace", "link"]].concat());
     assert!(place.read("trace.csv").starts_with("team,step"));
     assert!(fs::symlink_metadata(place.path("link")).unwrap().is_symlink());
+}
+
+/// Runs on x86-64, because the flag has another value elsewhere.
+#[cfg(all(target_os = "linux", target_arch = "x86_64"))]
+#[test]
+fn an_interrupted_trace_leaves_no_file() {
+    use std::os::unix::fs::OpenOptionsExt;
+    const O_TMPFILE: i32 = 0o20_200_000;
+    let place = with_run();
+    if fs::File::options().write(true).custom_flags(O_TMPFILE).open(place.root()).is_err() {
+        let why = "the file system of the temporary directory has no unnamed files";
+        return support::skip("an_interrupted_trace_leaves_no_file", why);
+    }
+    // A file anywhere, and one in the folder of a run.
+    for trace in ["trace.csv", "run/mine.csv"] {
+        let folder = place.path(trace).parent().unwrap().canonicalize().unwrap();
+        let names = || {
+            let mut names: Vec<_> = fs::read_dir(&folder).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+            names.sort();
+            names
+        };
+        let before = names();
+        let mut command = support::flotilla();
+        command.current_dir(place.root()).args(["rollout", "run", "--backend", "cpu", "--quiet", "--trace", trace]);
+        command.args(["--start-jitter", "1", "--episodes", "1000", "--set", "world.steps=1000"]);
+        let mut child = command.stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+        let written = |file: fs::DirEntry| {
+            let large = fs::metadata(file.path()).is_ok_and(|file| file.len() > 1 << 20 && file.is_file());
+            large && fs::read_link(file.path()).is_ok_and(|path| path.starts_with(&folder))
+        };
+        let begun = std::time::Instant::now();
+        while !fs::read_dir(format!("/proc/{}/fd", child.id())).unwrap().flatten().any(written) {
+            assert_eq!(child.try_wait().unwrap(), None);
+            assert!(begun.elapsed().as_secs() < 60, "nothing was written");
+            std::thread::sleep(std::time::Duration::from_millis(10));
+        }
+        child.kill().unwrap();
+        child.wait().unwrap();
+        assert_eq!(names(), before);
+    }
 }
 
 #[test]
@@ -545,24 +600,24 @@ fn names_that_are_not_utf8_work_except_in_scripts() {
 #[test]
 fn a_training_works_with_fewer_threads_than_requested() {
     let place = Place::new(&[("small.toml", TINY)]);
-    let writable = std::os::unix::fs::PermissionsExt::from_mode(0o777);
-    std::fs::set_permissions(place.root(), writable).unwrap();
+    let skip = |why| support::skip_without("a_training_works_with_fewer_threads_than_requested", why);
     if place.shell("prlimit --version && setpriv --version").status.code() != Some(0) {
-        return support::skip_without(
-            "a_training_works_with_fewer_threads_than_requested",
-            "prlimit or setpriv is missing",
-        );
+        return skip("prlimit or setpriv is missing");
     }
+    // Another user may be unable to enter the checkout, or to read new files.
+    assert!(place.shell("cp $(command -v flotilla) . && chmod -R a+rwX .").status.success());
     let root = place.shell("test $(id -u) = 0").status.success();
     let user = if root { "setpriv --reuid=65534 --clear-groups" } else { "" };
+    if !place.shell(&format!("{user} ./flotilla --version")).status.success() {
+        return skip("another user cannot enter the temporary directory");
+    }
     let digests: Vec<String> = [(1, "0 of"), (3, "2 of")]
         .into_iter()
         .map(|(limit, started)| {
             // The limit counts all processes of a user. Only `nobody` (65534) is assumed to have no others.
             let started = if root { started } else { "of" };
             let run = |command: &str| {
-                let output =
-                    place.shell(&format!("exec {user} prlimit --nproc={limit} $(command -v flotilla) {command}"));
+                let output = place.shell(&format!("exec {user} prlimit --nproc={limit} ./flotilla {command}"));
                 let stderr = String::from_utf8(output.stderr).unwrap();
                 assert_eq!(output.status.code(), Some(0), "{limit}, {command}: {stderr}");
                 stderr

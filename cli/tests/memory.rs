@@ -88,6 +88,27 @@ fn runs_use_the_predicted_memory() {
 }
 
 #[test]
+fn memory_grows_with_the_generations_as_predicted() {
+    let folder = tempfile::tempdir().unwrap();
+    let measured = |generations: usize| {
+        let config = folder.path().join(format!("{generations}.toml"));
+        let text = support::TINY.replace("steps = 8", "steps = 1").replace("population = 6", "population = 2");
+        let text = text.replace("trials = 2", "trials = 1").replace("= 4\n", &format!("= {generations}\n"));
+        fs::write(&config, format!("{text}[checkpoint]\ngenerations = 0\nseconds = 0.0\n")).unwrap();
+        let mut train = support::flotilla();
+        train.arg("train").arg(&config).args(["--backend", "cpu", "--quiet", "--threads", "1", "--out"]);
+        let used = peak(train.arg(config.with_extension("")))?;
+        Some([used, predicted(&config)].map(|bytes| bytes as f64))
+    };
+    let (Some([short, expected_short]), Some([long, expected_long])) = (measured(1), measured(32_000)) else {
+        let test = "memory_grows_with_the_generations_as_predicted";
+        return support::skip(test, "this system does not report the memory of a process");
+    };
+    let share = (long - short) / (expected_long - expected_short);
+    assert!((0.6..=1.4).contains(&share), "grew by {}, {share:.3} of the prediction", long - short);
+}
+
+#[test]
 fn a_run_without_enough_memory_does_not_start() {
     let folder = tempfile::tempdir().unwrap();
     let (path, out) = (folder.path().join("config.toml"), folder.path().join("run"));

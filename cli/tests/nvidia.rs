@@ -6,7 +6,7 @@
 //! Without `nvcc` the tests are skipped with a message, or fail if `FLOTILLA_REQUIRE_NVCC=1`. `FLOTILLA_CUDA_INCLUDE`
 //! names the directory of CUDA's headers if the compiler does not find it. `.ci/ports nvidia` installs both.
 //!
-//! With `FLOTILLA_EVIDENCE=DIRECTORY` the findings are written there, as a row of `docs/develop/evidence.md`.
+//! With `--nocapture`, the findings are printed, for `docs/develop/evidence.md`.
 //!
 //! `cargo test nvidia::table -- --ignored --nocapture` prints the table of `benches/static-figures.md`.
 
@@ -272,7 +272,7 @@ fn guards_prevent_fusing_and_registers_rarely_spill() {
     if !has_nvcc("guards_prevent_fusing_and_registers_rarely_spill") {
         return;
     }
-    let mut findings = Vec::new();
+    println!("{}, of naga's Metal text made CUDA", version());
     for pass in [Pass::NoContraction, Pass::Guarded] {
         for chip in CHIPS {
             let (mut max_registers, mut shaders) = (0, 0);
@@ -285,14 +285,11 @@ fn guards_prevent_fusing_and_registers_rarely_spill() {
                 assert!(kernel.stack <= STACK, "{case}: {} bytes of local memory", kernel.stack);
                 (max_registers, shaders) = (max_registers.max(kernel.registers), shaders + 1);
             }
-            println!("{chip}: {shaders} shaders, {pass} pass, at most {max_registers} registers");
             // Under the no-contraction pass nvcc must not fuse, so its result says nothing about the pass.
             let fused_note = if pass == Pass::Guarded { "none fused though nvcc may, " } else { "" };
-            findings
-                .push(format!("{chip}, {pass} pass: {shaders} shaders, {fused_note}at most {max_registers} registers"));
+            println!("{chip}, {pass} pass: {shaders} shaders, {fused_note}at most {max_registers} registers");
         }
     }
-    note(findings);
 }
 
 /// A canary: without a pass, the compiler fuses, and the test above can detect it.
@@ -325,13 +322,4 @@ fn table() {
         });
         println!("| {name} | {} |", cells.collect::<Vec<_>>().join(" | "));
     }
-}
-
-/// Writes the findings if `FLOTILLA_EVIDENCE` is set.
-fn note(findings: Vec<String>) {
-    use flotilla_app::record::evidence::{MachineReport, Tier};
-    let Some(folder) = std::env::var_os("FLOTILLA_EVIDENCE") else { return };
-    let note = format!("NVIDIA's {}, of naga's Metal text made CUDA, for chips that are not installed", version());
-    let report = MachineReport { note: Some(note), findings, ..MachineReport::new(Tier::MachineCodeRead) };
-    std::fs::write(Path::new(&folder).join("nvidia.json"), report.to_json()).expect("the directory is writable");
 }

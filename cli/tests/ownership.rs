@@ -115,25 +115,6 @@ fn force_removes_only_files_of_the_run() {
     assert!(!place.path("v/replay.html").exists(), "the replay showed the replaced run");
 }
 
-#[test]
-fn event_files_of_others_are_kept() {
-    let place = with_run();
-    let trial = place.path("run/tensorboard/trial-0");
-    fs::create_dir_all(&trial).unwrap();
-    let theirs = ["notes.flotilla", "events.out.tfevents.1.flotilla", "events.out.tfevents.x.flotilla"];
-    theirs.iter().for_each(|name| fs::write(trial.join(name), "precious, and longer than a first record is").unwrap());
-    let assert_kept = |count: usize| {
-        theirs.iter().for_each(|name| assert!(fs::read(trial.join(name)).unwrap().starts_with(b"precious"), "{name}"));
-        assert_eq!(fs::read_dir(&trial).unwrap().count(), count);
-    };
-    place.good("train small.toml --out run --quiet --force --tensorboard");
-    assert_kept(4);
-    place.good("train small.toml --out run --quiet --resume --generations 8 --tensorboard");
-    assert_kept(4);
-    place.good("train small.toml --out run --quiet --force");
-    assert_kept(3);
-}
-
 /// No message may suggest a flag with which the next attempt is refused, too.
 #[test]
 fn folders_with_files_of_others_are_refused_with_every_flag() {
@@ -357,19 +338,6 @@ mod links {
             &victim,
             &["train small.toml --out v --quiet", "train small.toml --out v --quiet --resume"],
         );
-    }
-
-    #[test]
-    fn event_files_are_not_written_through_links() {
-        let place = with_run();
-        let victim = victim(&place);
-        symlink(&victim, place.path("run/tensorboard")).unwrap();
-        assert_unchanged(&place, &victim, &["train small.toml --out run --quiet --force --tensorboard"]);
-        fs::remove_file(place.path("run/tensorboard")).unwrap();
-        fs::create_dir(place.path("run/tensorboard")).unwrap();
-        symlink(&victim, place.path("run/tensorboard/trial-0")).unwrap();
-        assert_unchanged(&place, &victim, &["train small.toml --out run --quiet --force --tensorboard"]);
-        assert!(place.path("run/run.json").exists(), "the run is kept");
     }
 
     #[test]

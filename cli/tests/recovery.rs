@@ -1172,6 +1172,29 @@ mod unix {
         (output.status, stderr(&output))
     }
 
+    /// Reports whether a process ignores SIGHUP. On Linux only.
+    fn ignores_hangup(process: &str) -> bool {
+        let status = fs::read_to_string(format!("/proc/{process}/status")).unwrap();
+        let ignored = status.lines().find_map(|line| line.strip_prefix("SigIgn:")).unwrap();
+        u64::from_str_radix(ignored.trim(), 16).unwrap() & 1 == 1
+    }
+
+    #[cfg(target_os = "linux")]
+    #[test]
+    fn a_run_under_nohup_survives_a_hangup() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = config_file(folder.path(), HEAVY);
+        let out = folder.path().join("run");
+        let train = flotilla_train(&file, &out, &["--quiet"]);
+        let mut child = Command::new("nohup");
+        child.arg(train.get_program()).args(train.get_args()).stdout(Stdio::piped()).stderr(Stdio::piped());
+        let child = child.spawn().unwrap();
+        wait_until("the run starts", || out.join("run.json").exists());
+        signal(&child, "HUP");
+        let (status, message) = wait_for_end(child);
+        assert_eq!(status.code(), Some(0), "{message}");
+    }
+
     #[test]
     fn a_signal_stops_a_run_after_its_generation_and_prints_how_to_resume() {
         let config = Config::parse(HEAVY, "heavy.toml").unwrap();
@@ -1180,7 +1203,10 @@ mod unix {
         let file = config_file(folder.path(), HEAVY);
         // Only signals cause checkpoints here.
         let flags = ["--checkpoint-generations", "0", "--checkpoint-seconds", "0", "--quiet"];
-        for name in ["TERM", "INT"] {
+        for name in ["TERM", "INT", "HUP"] {
+            if name == "HUP" && (!cfg!(target_os = "linux") || ignores_hangup("self")) {
+                continue;
+            }
             let out = folder.path().join(name);
             let child = flotilla_train(&file, &out, &flags).spawn().unwrap();
             wait_until("the run starts", || out.join("run.json").exists());

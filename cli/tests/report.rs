@@ -1,12 +1,10 @@
-//! Tests `plot`, `replay`, `check --out`, `paper` and `train --tensorboard`, mostly on small runs that each test
-//! trains.
+//! Tests `plot`, `replay`, `check --out` and `paper`, mostly on small runs that each test trains.
 //!
-//! The tests check pictures, replay pages and event files, and the messages about damaged runs.
+//! The tests check pictures and replay pages, and the messages about damaged runs.
 
 use crate::support;
 use std::collections::BTreeMap;
 use std::fs;
-use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::Output;
 
@@ -180,44 +178,6 @@ fn train_writes_the_curves() {
     assert!(fs::read_to_string(run.file("curves.svg")).unwrap().contains("champion"));
 }
 
-/// Reads the only event file in a folder, checks its checksums, and returns the step of every record.
-fn event_steps(folder: &Path) -> Vec<u8> {
-    let files: Vec<_> = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect();
-    assert_eq!(files.len(), 1, "{files:?}");
-    let bytes = fs::read(&files[0]).unwrap();
-    let number = |bytes: &[u8]| u32::from_le_bytes(bytes.try_into().unwrap());
-    let (mut rest, mut steps) = (&bytes[..], Vec::new());
-    while !rest.is_empty() {
-        // A record is: length, checksum, content, checksum.
-        let (length, more) = rest.split_at(8);
-        let content = &more[4..][..u64::from_le_bytes(length.try_into().unwrap()) as usize];
-        let end = 12 + content.len();
-        assert_eq!(number(&rest[8..12]), checksum(length));
-        assert_eq!(number(&rest[end..end + 4]), checksum(content));
-        // The time takes 9 bytes. The step follows.
-        assert_eq!(content[9], 2 << 3);
-        steps.push(content[10]);
-        rest = &rest[end + 4..];
-    }
-    steps
-}
-
-/// Computes the masked CRC-32C of TFRecord bit by bit.
-fn checksum(bytes: &[u8]) -> u32 {
-    let bit = |crc: u32, _| crc >> 1 ^ if crc & 1 == 1 { 0x82f6_3b78 } else { 0 };
-    let crc = !bytes.iter().fold(u32::MAX, |crc, &byte| (0..8).fold(crc ^ u32::from(byte), bit));
-    crc.rotate_right(15).wrapping_add(0xa282_ead8)
-}
-
-#[test]
-fn event_files_have_every_generation_of_every_trial_once() {
-    let run = Run::new(CONFIG, &["--tensorboard"]);
-    for trial in 0..3 {
-        let steps = event_steps(&run.file("tensorboard").join(format!("trial-{trial}")));
-        assert_eq!(steps, [0, 0, 1, 2, 3, 4, 5, 6], "expected the version record and generations 0 to 6");
-    }
-}
-
 #[test]
 fn several_runs_are_labelled_by_the_keys_that_differ() {
     let (first, second) = (Run::new(CONFIG, &["--fitness", "G"]), Run::new(CONFIG, &["--fitness", "D++"]));
@@ -331,139 +291,16 @@ fn removing_a_leader_lowers_g_by_its_credit() {
     assert!(positive > 10, "only {positive} credits are above 0");
 }
 
-/// Packs the files of a folder into a zip file, with names that begin with `top`.
-fn zip(folder: &Path, top: &str, to: &Path) {
-    let mut zip = zip::ZipWriter::new(fs::File::create(to).unwrap());
-    let mut folders = vec![folder.to_path_buf()];
-    while let Some(next) = folders.pop() {
-        for entry in fs::read_dir(next).unwrap() {
-            let path = entry.unwrap().path();
-            if path.is_dir() {
-                folders.push(path);
-                continue;
-            }
-            let name = path.strip_prefix(folder).unwrap().to_str().unwrap().replace('\\', "/");
-            zip.start_file(format!("{top}{name}"), zip::write::SimpleFileOptions::default()).unwrap();
-            zip.write_all(&fs::read(&path).unwrap()).unwrap();
-        }
-    }
-    zip.finish().unwrap();
-}
-
-/// Names in an archive cannot lead out of the folder into which it is unpacked.
 #[test]
-fn only_the_files_of_a_run_are_unpacked() {
-    let run = Run::new(CONFIG, &[]);
-    let names = ["checkpoints/../../../evil.safetensors", "../../evil.safetensors", "evil.safetensors"];
-    let [archive, temporary] = ["run.zip", "temporary"].map(|name| run.folder.path().join(name));
-    zip(&run.path(), "", &archive);
-    let file = fs::File::options().read(true).write(true).open(&archive).unwrap();
-    let mut zip = zip::ZipWriter::new_append(file).unwrap();
-    for name in names {
-        zip.start_file(name, zip::write::SimpleFileOptions::default()).unwrap();
-        zip.write_all(b"evil").unwrap();
+fn a_zipped_run_is_refused_with_the_command_that_unpacks_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("my run.zip");
+    fs::write(&file, b"PK\x03\x04 and the rest of a zip file").unwrap();
+    let (file, run) = (file.to_str().unwrap(), Run::new(CONFIG, &[]));
+    for arguments in [&["plot", file][..], &["replay", file], &["rollout", file], &["compare", file, &run.text()]] {
+        fail(arguments, &["my run.zip is a file", "unpack it with `unzip '", "my run.zip'`"]);
     }
-    zip.finish().unwrap();
-    fs::create_dir(&temporary).unwrap();
-    let mut plot = support::flotilla();
-    plot.env("TMPDIR", &temporary).current_dir(run.folder.path()).arg("plot").arg(&archive);
-    let output = plot.output().unwrap();
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    assert!(!run.folder.path().join("evil.safetensors").exists());
-    assert_eq!(fs::read_dir(&temporary).unwrap().count(), 0);
-}
-
-#[test]
-fn a_zipped_run_is_read_like_its_folder() {
-    let run = Run::new(CONFIG, &["--checkpoint-generations", "2"]);
-    let at = |name: &str| run.folder.path().join(name).to_str().unwrap().to_string();
-    for (index, top) in ["", "run/", "deep/er/run/"].into_iter().enumerate() {
-        let archive = at(&format!("run{index}.zip"));
-        zip(&run.path(), top, archive.as_ref());
-        for (command, extension) in [("plot", "svg"), ("replay", "svg")] {
-            let (from_folder, from_zip) = (at(&format!("one.{extension}")), at(&format!("other.{extension}")));
-            succeed(&[command, &run.text(), "--out", &from_folder]);
-            succeed(&[command, &archive, "--out", &from_zip]);
-            assert_eq!(fs::read(&from_folder).unwrap(), fs::read(&from_zip).unwrap(), "{command}");
-        }
-        let rollout = |path: &str| {
-            let scores = at("scores.csv");
-            succeed(&["rollout", path, "--scores", &scores, "--quiet", "--backend", "cpu"]);
-            fs::read(scores).unwrap()
-        };
-        assert_eq!(rollout(&run.text()), rollout(&archive));
-        succeed(&["compare", &run.text(), &archive]);
-    }
-    // Without --out, pictures go to the current directory, because the unpacked files are deleted.
-    let here = run.folder.path().join("here");
-    fs::create_dir(&here).unwrap();
-    for (command, name) in [("plot", "curves.svg"), ("replay", "replay.html")] {
-        let output = support::flotilla().current_dir(&here).args([command, &at("run1.zip")]).output().unwrap();
-        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-        assert!(here.join(name).exists(), "{name}");
-    }
-}
-
-#[test]
-fn the_message_about_resuming_a_zipped_run_has_working_commands() {
-    let run = Run::new(CONFIG, &[]);
-    let here = run.folder.path().join("here");
-    for (index, top) in ["", "saved/", "deep/er/"].into_iter().enumerate() {
-        let unpacked = if top.is_empty() { format!("run{index}") } else { top.trim_end_matches('/').into() };
-        let _ = fs::remove_dir_all(&here);
-        fs::create_dir(&here).unwrap();
-        let (name, config) = (format!("run{index}.zip"), format!("{unpacked}/config.toml"));
-        zip(&run.path(), top, &here.join(&name));
-        let flotilla = |arguments: &[&str]| support::flotilla().current_dir(&here).args(arguments).output().unwrap();
-        for arguments in [vec!["train", &name, "--resume"], vec!["train", &config, "--resume", "--out", &name]] {
-            let output = flotilla(&arguments);
-            let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
-            assert_eq!(output.status.code(), Some(2), "{stderr}");
-            let target = if top.is_empty() { format!(" -d {unpacked}") } else { String::new() };
-            // Windows separates names by a backslash, which shells need in quotes.
-            let path = Path::new(&unpacked).join("config.toml").display().to_string();
-            let path = if cfg!(windows) { format!("'{path}'") } else { path };
-            for expected in [
-                format!("{name} is a run in a zip file"),
-                format!("unzip {name}{target}\n"),
-                format!("flotilla train {path} --out {unpacked} --resume"),
-            ] {
-                assert!(stderr.contains(&expected), "{expected}: {stderr}");
-            }
-        }
-        // Does what both commands of the message do. The zip crate replaces `unzip`.
-        let mut archive = zip::ZipArchive::new(fs::File::open(here.join(&name)).unwrap()).unwrap();
-        archive.extract(if top.is_empty() { here.join(&unpacked) } else { here.clone() }).unwrap();
-        let output = flotilla(&["train", &config, "--out", &unpacked, "--resume", "--generations", "9"]);
-        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    }
-}
-
-#[test]
-fn a_zip_file_without_exactly_one_run_is_refused() {
-    let run = Run::new(CONFIG, &[]);
-    let at = |name: &str| run.folder.path().join(name).to_str().unwrap().to_string();
-    let (none, two, cut) = (at("none.zip"), at("two.zip"), at("cut.zip"));
-    let contents = run.folder.path().join("other");
-    fs::create_dir_all(contents.join("a")).unwrap();
-    fs::write(contents.join("a/notes.txt"), "nothing").unwrap();
-    zip(&contents, "", none.as_ref());
-    fail(&["plot", &none], &["none.zip", "no config.toml"]);
-    for name in ["a", "b"] {
-        fs::create_dir_all(contents.join(name)).unwrap();
-        fs::write(contents.join(name).join("config.toml"), "").unwrap();
-    }
-    zip(&contents, "", two.as_ref());
-    fail(&["replay", &two], &["two.zip", "2 runs"]);
-    // Entries with `..` in their names are not written outside the folder.
-    let evil = at("evil.zip");
-    zip(&run.path(), "../../evil/", evil.as_ref());
-    succeed(&["plot", &evil, "--out", &at("evil.svg")]);
-    assert!(!run.folder.path().join("evil").exists() && !std::env::temp_dir().join("evil").exists());
-    zip(&run.path(), "", cut.as_ref());
-    let bytes = fs::read(&cut).unwrap();
-    fs::write(&cut, &bytes[..bytes.len() / 2]).unwrap();
-    fail(&["plot", &cut], &["cut.zip"]);
+    fail(&["train", file, "--resume"], &["my run.zip", "it is a zip file; unpack it"]);
 }
 
 #[test]
@@ -1275,26 +1112,6 @@ fn a_paper_stopped_by_a_signal_resumes_to_the_same_files() {
     let uninterrupted = folder.path().join("whole");
     succeed(&[&["paper", "--out", uninterrupted.to_str().unwrap()], &flags[..]].concat());
     assert!(outcome(&out) == outcome(&uninterrupted));
-}
-
-#[test]
-fn resume_writes_event_files_of_a_finished_run() {
-    let run = Run::new(CONFIG, &[]);
-    let config = run.folder.path().join("small.toml");
-    let (config, text) = (config.to_str().unwrap().to_string(), run.text());
-    let train = ["train", &config, "--out", &text, "--backend", "cpu", "--quiet"];
-    let records = |trial: usize| event_steps(&run.file("tensorboard").join(format!("trial-{trial}")));
-    fail(&[&train[..], &["--tensorboard"]].concat(), &["holds a run already", "--resume --tensorboard"]);
-    succeed(&[&train[..], &["--resume", "--tensorboard"]].concat());
-    for trial in 0..3 {
-        assert_eq!(records(trial), [0, 0, 1, 2, 3, 4, 5, 6], "expected the version record and generations 0 to 6");
-    }
-    // An extended run has every generation once, including those trained without event files.
-    succeed(&[&train[..], &["--resume", "--generations", "8"]].concat());
-    succeed(&[&train[..], &["--resume", "--generations", "10", "--tensorboard"]].concat());
-    for trial in 0..3 {
-        assert_eq!(records(trial), [0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10]);
-    }
 }
 
 /// Tests that pictures in docs/ have a title and a description, like the program's own pictures.

@@ -220,7 +220,7 @@ pub fn train_into(
         _ => Start::Fresh,
     };
     let config = ConfigText { text: config.0.to_toml(), name: "config".into(), set: vec![] };
-    let request = Request { config, name: "run".into(), out: Some(out), start, init, tensorboard: false };
+    let request = Request { config, name: "run".into(), out: Some(out), start, init };
     let watcher = Watcher { callback: callback.as_ref(), populations: 0 };
     let watch = |rows: &[Row], last, _: Option<&[f32]>| watcher.tell(rows, last, None);
     perform(py, backend, command, &watch, |backends, context| ops::train::run(&request, backends, context)).map(drop)

@@ -97,6 +97,10 @@ pub struct Machine {
     pub adapter: Option<String>,
     /// The GPU's driver and its version.
     pub driver: Option<String>,
+    /// The GPU's index in `flotilla devices`.
+    pub adapter_index: Option<usize>,
+    /// The GPU's PCI address, if the driver reports it. Equal GPUs differ in this.
+    pub adapter_pci: Option<String>,
     /// CPU threads.
     pub threads: usize,
 }
@@ -115,6 +119,8 @@ impl Machine {
             backend: "gpu".into(),
             adapter: Some(adapter.name.clone()),
             driver: Some(adapter.driver.clone()),
+            adapter_index: Some(adapter.index),
+            adapter_pci: Some(adapter.pci.clone()).filter(|pci| !pci.is_empty()),
             threads: current_num_threads(),
         }
     }

@@ -20,6 +20,10 @@ pub const PROGRAM: u64 = 8 << 20;
 /// Maximum bytes of populations that are copied for a checkpoint, so that it can be written while training continues.
 const COPIED: u64 = 64 << 20;
 
+/// Bytes per generation for a run's learning curves, drawn at its end: for each of three curves the average over trials
+/// and a point. The arrays double as they grow.
+const DRAWN: u64 = 3 * (32 + 32);
+
 /// Peaks of memory use, in bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Peaks {
@@ -54,7 +58,7 @@ impl Peaks {
     /// Returns the peaks for training these configs together on `threads` threads.
     pub fn of<'a>(configs: impl IntoIterator<Item = &'a ValidConfig>, threads: usize) -> Peaks {
         let lanes = cpu::lanes();
-        let [mut training, mut next, mut checkpoint, mut queue] = [0_u64; 4];
+        let [mut training, mut next, mut checkpoint, mut queue, mut drawing] = [0_u64; 5];
         let [mut weights, mut record, mut states] = [0_u64; 3];
         let [mut block, mut order, mut populations, mut held] = [0_u64; 4];
         for config in configs {
@@ -69,6 +73,7 @@ impl Peaks {
             training += trainer::bytes(config);
             next += trainer::next_schedule_bytes(config);
             checkpoint += checkpoint_bytes(config);
+            drawing = drawing.max(DRAWN * (config.learning.generations as u64 + 1).next_power_of_two());
             queue += most(&|config, _| teams(config).div_ceil(lanes) * 16);
             block = block.max(most(&|config, world| cpu::block_bytes(world, config.learning.fitness)));
             // An evolution strategy also needs the utilities.
@@ -88,9 +93,9 @@ impl Peaks {
                 teams(config).saturating_mul(backend::state_bytes(world, config.learning.fitness))
             }));
         }
-        // Episodes and the final sorting of each population do not happen at the same time.
+        // Episodes, the final sorting of each population and the picture do not happen at the same time.
         let playing = threads as u64 * block + queue;
-        let sorting = populations.min(threads as u64) * order;
+        let ending = (populations.min(threads as u64) * order).max(drawing);
         let always = PROGRAM + training + checkpoint;
         // A batch ends when the largest of its three large buffers is full. Two batches are in progress at a time.
         let share = |bytes: u64, batches: u64| {
@@ -101,10 +106,10 @@ impl Peaks {
         // The packed form of a record takes at most as much again. If it does not fit, the whole record is read back.
         let records = share(record, 2) * if record < PACKED_FROM { 1 } else { 2 };
         Peaks {
-            host: always + playing.max(sorting),
+            host: always + playing.max(ending),
             checkpoint,
             // One batch is assembled on the host, and two are being transferred to or from the adapter.
-            gpu_host: always + next + (share(weights, 1) + share(weights, 2) + records).max(sorting),
+            gpu_host: always + next + (share(weights, 1) + share(weights, 2) + records).max(ending),
             adapter: share(weights, 2) + records + share(states, 2) + held,
         }
     }

@@ -168,7 +168,14 @@ pub(crate) fn read<T>(
 ) -> Result<(T, Vec<String>), Problems> {
     let Document { text, table, errors, lines } = document;
     let mut reader = Reader::default();
-    for error in first_errors(errors, lines) {
+    let other = if errors.is_empty() { None } else { other_language(text) };
+    if let Some((start, language)) = other {
+        let message = format!(
+            "found {language}, allowed TOML: `key = value` below a [section]; `flotilla init` writes an example"
+        );
+        reader.report(Place::Offset(start), "", message);
+    }
+    for error in first_errors(errors, lines).filter(|_| other.is_none()) {
         let span = error.span().unwrap_or(0..0);
         let at = text.get(span.clone()).filter(|at| !at.trim().is_empty());
         // A missing comma is the usual mistake in a list of positions. The parser takes it for a word without quotes.
@@ -202,6 +209,24 @@ pub fn keys<T>(ask: impl FnOnce(&mut Reader<'_>) -> T) -> (T, Vec<Definition>) {
     let mut reader = Reader { table: Some(vec![]), ..Reader::default() };
     let read = ask(&mut reader);
     (read, reader.table.unwrap_or_default())
+}
+
+/// Returns the language of a text that is not TOML, with the offset of the first line that is not a comment.
+fn other_language(text: &str) -> Option<(usize, &'static str)> {
+    let mut start = 0;
+    let lines = text.split_inclusive('\n').map(|line| {
+        let at = start;
+        start += line.len();
+        (at, line.trim())
+    });
+    let (start, first) = lines.into_iter().find(|(_, line)| !line.is_empty() && !line.starts_with('#'))?;
+    let is_name = |name: &str| name.bytes().all(|byte| byte.is_ascii_alphanumeric() || b"_-.".contains(&byte));
+    let yaml = first == "---" || first.split_once(':').is_some_and(|(name, _)| !name.is_empty() && is_name(name));
+    match first {
+        _ if first.starts_with('{') => Some((start, "JSON")),
+        _ if yaml => Some((start, "YAML")),
+        _ => None,
+    }
 }
 
 /// Returns the syntax errors that are not consequences of an earlier one: an error can invalidate the rest of its line,

@@ -41,6 +41,16 @@ impl<'a> KeyRequest<'_, 'a> {
         let entry = self.take(|| (kind(), range(), Some(written(&default))));
         let Some((entry, word)) = entry.as_ref().and_then(|entry| Some((entry, entry.value.get_ref().as_str()?)))
         else {
+            if let Some(entry) = entry.as_ref().filter(|entry| T::read(entry.value.get_ref()).is_none()) {
+                // A share is the usual mistake.
+                let share = f64::read(entry.value.get_ref()).flatten().filter(|share| (1e-6..=1.0).contains(share));
+                let percentage = (share.unwrap_or(0.1) * 1e6).round() / 1e4;
+                let (found, kind) = (entry.found(), T::KIND);
+                let message =
+                    format!("found {found}, allowed {kind}, {allowed}, or a percentage such as \"{percentage}%\"");
+                self.reader.report(entry.place(), &entry.name, message);
+                return NumberOrPercentage::Number(allowed.nearest(default));
+            }
             return NumberOrPercentage::Number(self.reader.number(self.name, entry, allowed, default));
         };
         let percentage = word.strip_suffix('%').and_then(|number| number.parse().ok());
@@ -61,7 +71,11 @@ impl<'a> KeyRequest<'_, 'a> {
         let word = entry.value.get_ref().as_str();
         T::ALL.iter().find(|choice| Some(choice.0) == word).map_or_else(
             || {
-                let message = format!("found {}, allowed {}", entry.found(), words());
+                let typed = word.unwrap_or_default().to_lowercase();
+                let distance = |name: &&str| strsim::damerau_levenshtein(&name.to_lowercase(), &typed);
+                let nearest = T::names().min_by_key(distance).filter(|name| distance(name) <= typed.len() / 3);
+                let hint = nearest.map_or(String::new(), |name| format!("; did you mean {name:?}?"));
+                let message = format!("found {}, allowed {}{hint}", entry.found(), words());
                 self.reader.report(entry.place(), &entry.name, message);
                 default
             },

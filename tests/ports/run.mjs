@@ -1,13 +1,11 @@
-// Runs the WebAssembly of tests/ports in Node, and writes a row of evidence if REPORT is given.
+// Runs the WebAssembly of tests/ports in Node.
 //
-//     node run.mjs FILE.wasm TOOLCHAIN VERSION [REPORT]
+//     node run.mjs FILE.wasm
 
-import { readFileSync, writeFileSync } from "node:fs";
-import { cpus } from "node:os";
+import { readFileSync } from "node:fs";
 
-const [file, toolchain, version, report] = process.argv.slice(2);
 const lines = [];
-const { instance } = await WebAssembly.instantiate(readFileSync(file), {
+const { instance } = await WebAssembly.instantiate(readFileSync(process.argv[2]), {
   host: {
     say(at, length) {
       const text = new TextDecoder().decode(new Uint8Array(instance.exports.memory.buffer, at, length));
@@ -17,24 +15,4 @@ const { instance } = await WebAssembly.instantiate(readFileSync(file), {
   },
 });
 instance.exports.run();
-
-const [backend, ...trained] = lines;
-if (trained.length !== 6) throw new Error(`expected six short trainings: ${lines}`);
-if (report) {
-  const evidence = {
-    schema: 1,
-    tier: "executed",
-    date: new Date().toISOString().slice(0, 10),
-    version,
-    commit: null,
-    target: "wasm32-unknown-unknown",
-    toolchain,
-    processor: cpus()[0]?.model ?? null,
-    instructions: backend.replace(/^cpu \(([^,]*),.*/, "$1"),
-    note: `Node ${process.version}, V8 ${process.versions.v8}`,
-    findings: ["every golden digest of tests/golden.txt, by the core alone, on one thread"],
-    comparisons: [],
-    trained: trained.map((line) => ({ config: line.split("\t")[0], digest: line.split("\t")[1] })),
-  };
-  writeFileSync(report, `${JSON.stringify(evidence, null, 2)}\n`);
-}
+if (lines.length !== 1) throw new Error(`expected one line: ${lines}`);

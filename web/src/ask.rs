@@ -170,7 +170,7 @@ fn resolve(text: &str, name: &str, changes: Vec<(String, String)>) -> Result<Val
 }
 
 fn machine((backend, machine): &OpenBackend) -> Value {
-    let Machine { backend: kind, adapter, driver, threads } = machine;
+    let Machine { backend: kind, adapter, driver, threads, .. } = machine;
     json!({ "description": backend.describe(), "backend": kind, "adapter": adapter, "driver": driver, "threads": threads })
 }
 

@@ -7,9 +7,8 @@ use serde::{Deserialize, Serialize};
 
 use super::{Context, Error, with_remedy};
 use crate::record;
-use crate::record::archive::RunFolder;
 use crate::record::digests::{self, Verification};
-use crate::record::folder::{self, RUN, Run, SWEEP};
+use crate::record::folder::{self, CONFIG, RUN, Run, SWEEP};
 use crate::report::comparison::{self, At, Cohort, Comparison, ComparisonError, Question};
 use crate::report::runs::{self, MAX_RUNS, ReadError};
 use crate::shell;
@@ -23,7 +22,7 @@ use flotilla::statistics;
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Request {
-    /// Folders or zip files of runs, two at least, or the folder of one sweep.
+    /// Folders of runs, two at least, or the folder of one sweep.
     pub folders: Vec<PathBuf>,
     /// The axis of a sweep whose values are compared. The default is the only axis.
     #[serde(default)]
@@ -88,11 +87,7 @@ type Contest = (String, Vec<Cohort>);
 ///
 /// # Errors
 /// A run cannot be read, or there is nothing to compare.
-pub fn run(request: &Request, context: Context<'_>) -> Result<Outcome, Error> {
-    // Runs in zip files stay unpacked until the comparison is done.
-    let opened = request.folders.iter().map(|folder| RunFolder::open(folder)).collect::<Result<Vec<_>, _>>()?;
-    let folders = opened.iter().map(|run| run.path().into()).collect();
-    let args = &Request { folders, ..request.clone() };
+pub fn run(args: &Request, context: Context<'_>) -> Result<Outcome, Error> {
     let at = args.at.iter().map(|text| at(text).map_err(|error| Error::Usage(format!("--at {text}: {error}").into())));
     let question = Question { at: at.collect::<Result<_, _>>()?, reach: args.reach, paired: args.paired };
     if args.folders.is_empty() {
@@ -161,7 +156,15 @@ fn of_runs(folders: &[PathBuf], args: &Request, notes: &mut Vec<String>) -> Resu
         let folder = folders[0].escaped();
         // Problems of the folder are reported first.
         runs::config(&folders[0], verification)?;
-        return Err(Error::Usage(with_remedy(format!("{folder} is one run"), "name another to compare it with")));
+        let config = shell::argument(&folders[0].join(CONFIG));
+        let words = ["flotilla".into(), "train".into(), config, "--set".into()];
+        return Err(Error::Usage(with_remedy(
+            format!("{folder} is one run"),
+            format!(
+                "name another to compare it with; `{} KEY=VALUE --out OTHER` trains one that differs in a key",
+                shell::command(words)
+            ),
+        )));
     }
     too_many(folders.len(), "runs")?;
     let mut seen = BTreeSet::new();

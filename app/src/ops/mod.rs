@@ -305,7 +305,7 @@ pub struct Processor {
 impl Processor {
     /// Describes the processor of an open backend.
     pub fn of(machine: &Machine, description: &str) -> Processor {
-        let Machine { backend, adapter, driver, threads } = machine.clone();
+        let Machine { backend, adapter, driver, threads, .. } = machine.clone();
         Processor { backend, description: description.into(), adapter, driver, threads }
     }
 

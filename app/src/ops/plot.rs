@@ -7,7 +7,6 @@ use serde::{Deserialize, Serialize};
 use super::output::Destination;
 use super::{Context, Error, escaped, with_remedy};
 use crate::record::RecordError;
-use crate::record::archive::RunFolder;
 use crate::record::digests::{self, Verification};
 use crate::record::ownership::CURVES;
 use crate::report::curves::{Band, PRINT};
@@ -19,7 +18,7 @@ use flotilla::escape::PathExt;
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Request {
-    /// Folders or zip files of runs.
+    /// Folders of runs.
     pub runs: Vec<PathBuf>,
     /// The picture. By default `curves.svg` in the folder of one run, or `comparison.svg` here of several.
     #[serde(default)]
@@ -57,26 +56,24 @@ pub fn run(request: &Request, context: Context<'_>) -> Result<Outcome, Error> {
         let text = format!("{} runs are too many to tell apart", request.runs.len());
         return Err(Error::Usage(with_remedy(text, format!("name {MAX_RUNS} at most"))));
     }
-    let opened = request.runs.iter().map(|run| RunFolder::open(run)).collect::<Result<Vec<_>, _>>()?;
-    let runs: Vec<PathBuf> = opened.iter().map(|run| run.path().into()).collect();
-    let place = match (&request.out, &*opened) {
+    let runs = &request.runs;
+    let place = match (&request.out, &**runs) {
         (Some(out), _) => Destination::Named(out.clone()),
-        (None, [run]) if run.is_unpacked() => Destination::Here(CURVES.into()),
-        (None, [run]) => Destination::OfRun(run.path().join(CURVES)),
+        (None, [run]) => Destination::OfRun(run.join(CURVES)),
         (None, _) => Destination::Here("comparison.svg".into()),
     };
     let out = place.path();
     let kind = kind_of(out)?;
-    let scene = runs::figure(&runs, request.measure, request.band, verification)?.scene();
+    let scene = runs::figure(runs, request.measure, request.band, verification)?.scene();
     digests::without(runs.iter().map(|run| &**run)).into_iter().for_each(|note| context.note(note));
     place.check()?;
     place.write(&content(&scene, kind, out)?)?;
-    if runs::paired(&runs, verification)? {
+    if runs::paired(runs, verification)? {
         context.note(
             "note: these runs have one seed, so their trials are pairs: compare trial with trial, not only the means",
         );
     }
-    let named = request.runs.iter().map(|run| run.escaped().to_string()).collect();
+    let named = runs.iter().map(|run| run.escaped().to_string()).collect();
     Ok(Outcome { out: out.into(), runs: named, unverified: request.unverified })
 }
 

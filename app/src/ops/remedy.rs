@@ -27,7 +27,7 @@ const TOO_MANY_FILES: i32 = 24;
 const INPUT_OUTPUT: i32 = 5;
 
 /// Advice on a comparison without a GPU.
-pub const NONE_TO_VERIFY: &str = "; --report FILE without --adapter compares only the processor's instruction sets";
+pub const NONE_TO_VERIFY: &str = "; --adapter cpu compares the processor's instruction sets";
 
 /// Returns advice on a device that could not be opened, or that failed.
 pub fn device(error: &DeviceError) -> &'static str {
@@ -164,6 +164,9 @@ pub fn read(error: &runs::ReadError) -> String {
             let words = ["flotilla", "train", "CONFIG", "--out"].map(OsString::from);
             let command = shell::command(words.into_iter().chain([shell::argument(folder)]));
             format!("; `{command}` makes a run there")
+        }
+        runs::ReadError::NoFolder(path) if file::is_zip(path) => {
+            format!("; unpack it with `{}`", shell::command(["unzip".into(), shell::argument(path)]))
         }
         runs::ReadError::NoFolder(_) => ", which `flotilla train` makes".into(),
         runs::ReadError::Foreign { .. } => "; `flotilla train CONFIG --out DIR` makes one".into(),

@@ -9,7 +9,6 @@ use super::output::{self, Destination};
 use super::{BackendSource, Context, Error, escaped, points, with_remedy};
 use crate::choice::Work;
 use crate::record::RecordError;
-use crate::record::archive::RunFolder;
 use crate::record::digests::{self, Verification};
 use crate::record::disk::Disk;
 use crate::record::ownership::{self, REPLAY};
@@ -24,7 +23,7 @@ use flotilla::file;
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Request {
-    /// A run's folder or zip file.
+    /// A run's folder.
     pub folder: PathBuf,
     /// The trial. The first by default.
     #[serde(default)]
@@ -182,11 +181,9 @@ impl WhichTrial {
 pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
     let Request { generation, team, compare, step, width, fps, unverified, .. } = *request;
     let verification = Verification::unless(unverified);
-    let opened = RunFolder::open_with_checkpoints(&request.folder)?;
-    let folder = opened.path();
+    let folder = &*request.folder;
     let place = match &request.out {
         Some(out) => Destination::Named(out.clone()),
-        None if opened.is_unpacked() => Destination::Here(REPLAY.into()),
         None => Destination::OfRun(folder.join(REPLAY)),
     };
     let out = place.path();
@@ -288,7 +285,7 @@ fn stage<'a>(config: &'a ValidConfig, generations: &[usize]) -> Result<&'a Confi
 }
 
 /// Checks the output, and creates the folder of a film. Called before the trial is trained again, which may take hours.
-/// `run` is the run's folder or zip file.
+/// `run` is the run's folder.
 ///
 /// # Errors
 /// The file cannot be written, or would overwrite a file of the run.

@@ -8,11 +8,11 @@ use serde::{Deserialize, Serialize};
 
 use super::{BackendSource, ConfigText, Context, Error, Processor, output, points, with_remedy};
 use crate::choice::Work;
-use crate::record::archive::RunFolder;
 use crate::record::digests::{self, Digests, Verification};
 use crate::record::{folder, policies, tensors};
 use crate::report::map;
 use crate::report::replay::numbered;
+use crate::report::runs::ReadError;
 use flotilla::backend::{Backend, Group, Moment};
 use flotilla::config::{self, Config, Override};
 use flotilla::escape::PathExt;
@@ -29,7 +29,7 @@ const SENSED: &str = "pois_back_right,pois_front_right,pois_front_left,pois_back
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Request {
-    /// A run's folder or zip file, or a config file.
+    /// A run's folder, or a config file.
     pub path: PathBuf,
     /// Config keys to set.
     #[serde(default)]
@@ -119,13 +119,14 @@ impl Request {
 /// # Errors
 /// The config or the policies cannot be used, the backend fails, or a file cannot be written.
 pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
-    let opened = RunFolder::open(&request.path)?;
-    let (config_path, trained) = match opened.path() {
-        path if path.is_dir() => {
+    let path = &request.path;
+    let (config_path, trained) = match path.is_dir() {
+        true => {
             points::config(path, Verification::unless(request.unverified))?;
             (path.join(folder::CONFIG), Some(path.join(folder::POLICIES)))
         }
-        path => (path.to_path_buf(), None),
+        false if file::is_zip(path) => return Err(ReadError::NoFolder(path.clone()).into()),
+        false => (path.clone(), None),
     };
     let Some(policies) = request.policies.clone().or(trained) else {
         return Err(Error::Usage(with_remedy(

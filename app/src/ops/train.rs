@@ -12,7 +12,6 @@ use super::remedy::RUNS;
 use super::{BackendSource, ConfigText, Context, Error, Event, Processor, check_memory, escaped, with_remedy};
 use crate::choice::Work;
 use crate::record::RecordError;
-use crate::record::archive;
 use crate::record::digests::Verification;
 use crate::record::disk::Disk;
 use crate::record::finished::{Finished, Storage};
@@ -20,10 +19,8 @@ use crate::record::folder::{self, CONFIG, FirstAndLastRows, METRICS, POLICIES, R
 use crate::record::ownership::{self, CURVES};
 use crate::record::policies::{self, Init};
 use crate::report::curves::Band;
-use crate::report::replay::History;
 use crate::report::runs;
 use crate::report::scene::Scene;
-use crate::report::tensorboard::Events;
 use crate::run::{Progress, RunError, Session, SessionEnd};
 use crate::shell;
 use flotilla::backend::OpenBackend;
@@ -33,9 +30,6 @@ use flotilla::file;
 use flotilla::front::{self, Generation, Trained};
 use flotilla::host::Instant;
 use flotilla::trainer::Row;
-
-/// The folder of event files for TensorBoard, in a run's folder.
-const TENSORBOARD: &str = "tensorboard";
 
 /// The files of a run by their content.
 const FILES: [(&str, &str); 5] =
@@ -57,9 +51,6 @@ pub struct Request {
     /// A file with the policies to start from.
     #[serde(default)]
     pub init: Option<PathBuf>,
-    /// Whether event files for TensorBoard are written.
-    #[serde(default)]
-    pub tensorboard: bool,
 }
 
 /// Results of a run.
@@ -160,8 +151,7 @@ impl Request {
     fn command_to_resume(&self, folder: &Path, context: Context<'_>) -> String {
         let words: [OsString; 3] = ["flotilla".into(), "train".into(), shell::argument(&folder.join(CONFIG))];
         let out = ["--out".into(), shell::argument(folder), "--resume".into()];
-        let events = self.tensorboard.then(|| "--tensorboard".into());
-        shell::command(words.into_iter().chain(out).chain(events).chain(context.flags.iter().cloned()))
+        shell::command(words.into_iter().chain(out).chain(context.flags.iter().cloned()))
     }
 
     /// Returns the run's folder.
@@ -176,29 +166,11 @@ impl Request {
     }
 }
 
-/// Refuses a run in a zip file, because its folder would be removed at the end. The message shows the commands
-/// that unpack and resume it.
-pub fn refuse_zip(path: &Path) -> Result<(), Error> {
-    let Some(top) = archive::run_prefix(path) else { return Ok(()) };
-    let inner = if top.is_empty() { file::stem(path, "run") } else { top.clone() };
-    let mut unpack = vec!["unzip".into(), shell::argument(path)];
-    if top.is_empty() {
-        unpack.extend(["-d".into(), inner.clone().into()]);
-    }
-    let [config, folder] = [Path::new(&inner).join(CONFIG), inner.into()].map(|path| shell::argument(&path));
-    let resume = ["flotilla".into(), "train".into(), config, "--out".into(), folder, "--resume".into()];
-    Err(Error::Usage(with_remedy(
-        format!("{} is a run in a zip file, and a run resumes in a folder", path.escaped()),
-        format!("unpack it, and resume it there:\n  {}\n  {}", shell::command(unpack), shell::command(resume)),
-    )))
-}
-
 /// Starts or resumes a run, trains it to its end, and draws its curves.
 ///
 /// # Errors
 /// The config is invalid, the folder cannot be used, or training fails or is stopped.
 pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
-    request.out.iter().try_for_each(|path| refuse_zip(path))?;
     let (config, notes) = request.config.read_noted(context)?;
     let (backend, on) = backends.open(Work::of([&*config]))?;
     check_memory([&config], backend)?;
@@ -207,13 +179,12 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let init = request.init.as_deref().map(|path| policies::read_init(path, &config)).transpose()?;
     let folder = request.folder()?;
     let mut session = open_session(request, &config, init, &folder, context)?;
-    let mut events = EventFiles::open(request, &folder, config.learning.trials, session.disk(0), context);
     let (since, from, was_done) = (Instant::now(), session.generations()[0], session.is_done());
     if !was_done {
         context.message(format_args!("training on {on}, into {}", folder.escaped()));
         (context.report)(Event::Begin(vec![(String::new(), config.pois())], from, config.learning.generations));
     }
-    let last = train(&mut session, &mut events, request, &folder, backend, context)?;
+    let last = train(&mut session, request, &folder, backend, context)?;
     let (config, results) = (session.config(0), session.results(0).expect("the run is done"));
     // A session that ended after the run but before its picture left an older picture, or none.
     let is_drawn = || fs::read_to_string(folder.join(CURVES)).is_ok_and(|svg| Scene::shows(&svg, &results.digest));
@@ -272,14 +243,10 @@ fn open_session(
     }
     let opened = Session::open_from(vec![(config.clone(), folder.to_path_buf(), policies)], start, &disk);
     let (session, found) = opened.map_err(|error| match error {
-        RunError::Record(RecordError::Exists { .. }) if request.tensorboard => Error::Refused(with_remedy(
-            format!("{error}\nfor event files of the run that is there:"),
-            format!("  {}", request.command_to_resume(folder, context)),
-        )),
         // This avoids the advice to use `--resume`. Until the run's origin is recorded, a resumed run would start from
         // random policies.
-        RunError::Record(error) if init.is_some() => error.into(),
-        error => error.into(),
+        RunError::Record(error) if init.is_some() => Error::Record(error),
+        error => Error::Run(error),
     })?;
     for (_, note) in found {
         if note.is_damage() { context.warn(note) } else { context.note(note) }
@@ -290,7 +257,6 @@ fn open_session(
 /// Trains a run to its end, or until the user ends it. Returns the last generation, which is earlier in that case.
 fn train(
     session: &mut Session,
-    events: &mut EventFiles<'_>,
     request: &Request,
     folder: &Path,
     backend: &mut OpenBackend,
@@ -298,13 +264,9 @@ fn train(
 ) -> Result<usize, Error> {
     let mut last = session.config(0).learning.generations;
     while !session.is_done() {
-        let mut watch = |progress: &Progress<'_>| {
-            context.rows(progress.generations[0], progress.rows);
-            events.add(progress.rows);
-        };
+        let mut watch = |progress: &Progress<'_>| context.rows(progress.generations[0], progress.rows);
         let ended = context.train(&mut watch, |options| session.train(backend, options));
         context.pause();
-        events.flush();
         if ended? == SessionEnd::Finished {
             break;
         }
@@ -322,8 +284,11 @@ fn train(
 
 /// Warns if no team observed a POI in any generation.
 fn warn_if_nothing_was_observed(folder: &Path, config: &Config, context: Context<'_>) {
-    let ever = |all: Vec<History>| all.iter().any(|history| history.most() > 0.0);
-    if History::all(folder, config, Verification::Required).is_ok_and(|all| !ever(all)) {
+    let mut ever = false;
+    let read = runs::metrics(folder, config, Verification::Required, |row| {
+        ever |= row.best_g > 0.0 || row.champion_g > 0.0;
+    });
+    if read.is_ok() && !ever {
         context.warn(format_args!(
             "warning: no team observed any POI in any generation, so there was nothing to learn from; try more \
              world.steps, a smaller world.coupling, POIs nearer to the starts, or a larger learning.population; \
@@ -399,43 +364,4 @@ fn draw(disk: &Disk, folder: &Path) -> Result<(), Error> {
     let runs = [folder.to_path_buf()];
     let svg = runs::figure(&runs, None, Band::Interval, Verification::Required)?.scene().svg();
     Ok(ownership::publish(disk, &folder.join(CURVES), |output| output.write_all(svg.as_bytes()))?)
-}
-
-/// The event files of a run, if they are wanted and can be written. A failure is only reported.
-struct EventFiles<'a> {
-    open: Option<Events>,
-    path: PathBuf,
-    context: Context<'a>,
-}
-
-impl<'a> EventFiles<'a> {
-    fn open(request: &Request, folder: &Path, trials: usize, disk: &Disk, context: Context<'a>) -> EventFiles<'a> {
-        let mut files = EventFiles { open: None, path: folder.join(TENSORBOARD), context };
-        if request.tensorboard {
-            let opened = Events::create(disk, &files.path, trials, &folder.join(METRICS));
-            files.open = opened.map_err(|error| files.failed(&error)).ok();
-        } else if request.start == Start::Force {
-            // The event files belong to the run that was overwritten.
-            Events::clear(disk, &files.path).unwrap_or_else(|error| files.failed(&error));
-        }
-        files
-    }
-
-    fn add(&mut self, rows: &[Row]) {
-        if let Some(Err(error)) = self.open.as_mut().map(|events| events.add(rows)) {
-            self.failed(&error);
-            self.open = None;
-        }
-    }
-
-    fn flush(&mut self) {
-        if let Some(Err(error)) = self.open.as_mut().map(Events::flush) {
-            self.failed(&error);
-        }
-    }
-
-    fn failed(&self, error: &std::io::Error) {
-        self.context
-            .warn(format_args!("{}: cannot be written: {error}; there are no event files", self.path.escaped()));
-    }
 }

@@ -1,14 +1,10 @@
 //! Compares every adapter with the CPU, bit for bit.
 
-use std::ops::ControlFlow::Continue;
-use std::process::Command;
 use std::time::Duration;
 
-use fearless_simd::Level;
 use serde::{Deserialize, Serialize};
 
 use super::{Context, Error, Event, with_remedy};
-use crate::record::evidence::{Compared, MachineReport, ShortTraining, Tier};
 use flotilla::backend::Backend;
 use flotilla::backend::cpu::{Cpu, level_name};
 use flotilla::backend::gpu;
@@ -16,10 +12,9 @@ use flotilla::backend::gpu::device::{self, AdapterChoice, AdapterInfo, DeviceErr
 use flotilla::backend::gpu::episode::{GpuBackend, Kernel, Records, ResidencyPolicy};
 use flotilla::backend::gpu::exact::Pass;
 use flotilla::config::{Config, Override};
-use flotilla::escape;
-use flotilla::front;
 use flotilla::host::Instant;
-use flotilla::verify::{Agreement, Plan, compare, short_trainings};
+use flotilla::verify::{Agreement, Plan, compare};
+use flotilla::version::{COMMIT, VERSION};
 
 /// Request of a verification.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -35,20 +30,18 @@ pub struct Request {
     pub worlds: Option<u32>,
     /// Random seed.
     pub seed: u32,
-    /// The only adapter to compare, by its number or a part of its name.
+    /// The only adapter to compare, by its number or a part of its name. [`CPU`] compares instruction sets instead.
     pub adapter: Option<String>,
     /// The only pass to compare.
     pub pass: Option<String>,
     /// The only kernel to compare.
     pub kernel: Option<String>,
-    /// Whether to collect evidence: also compare the processor's instruction sets, and train.
-    pub evidence: bool,
-    /// A remark about the machine, for the evidence.
-    pub note: Option<String>,
 }
 
 /// Default number of random teams of each world.
 pub const TEAMS: u32 = 48;
+/// The name of the processor, in place of an adapter's.
+pub const CPU: &str = "cpu";
 
 impl Default for Request {
     fn default() -> Request {
@@ -61,8 +54,6 @@ impl Default for Request {
             adapter: None,
             pass: None,
             kernel: None,
-            evidence: false,
-            note: None,
         }
     }
 }
@@ -74,12 +65,46 @@ pub struct Outcome {
     pub equal: bool,
     /// The comparisons.
     pub comparisons: Vec<Compared>,
-    /// The evidence, if it was requested.
-    #[serde(skip)]
-    pub evidence: Option<MachineReport>,
+    /// Version of the program.
+    pub version: &'static str,
+    /// Commit that the program was built from, if known.
+    pub commit: Option<&'static str>,
+    /// Target that the program was built for, such as "x86_64-unknown-linux-gnu".
+    pub target: &'static str,
+}
+
+/// Comparison of episodes and trainings on two backends.
+#[derive(Clone, Debug, Serialize)]
+pub struct Compared {
+    /// The compared processor: an adapter with its driver, or "cpu (AVX2)".
+    pub adapter: String,
+    /// Compile pass of the shaders, for a GPU.
+    pub pass: Option<String>,
+    /// How the shaders were compiled: `generic`, or `specialised` for each world.
+    pub kernel: Option<String>,
+    /// The reference processor, such as "cpu (SSE2)".
+    pub against: String,
+    /// Number of worlds with equal results.
+    pub worlds: usize,
+    /// Number of agent steps in these worlds.
+    pub agent_steps: u64,
+    /// Whether all bits were equal.
+    pub equal: bool,
+    /// Description of a difference or an error.
+    pub failure: Option<String>,
 }
 
 impl Outcome {
+    fn new(comparisons: Vec<Compared>) -> Outcome {
+        Outcome {
+            equal: comparisons.iter().all(|line| line.equal),
+            comparisons,
+            version: VERSION,
+            commit: COMMIT,
+            target: flotilla::version::TARGET,
+        }
+    }
+
     /// Returns an error if a comparison differs.
     pub fn difference(&self) -> Option<Error> {
         let failed = self.comparisons.iter().filter(|line| !line.equal).count();
@@ -98,15 +123,11 @@ impl Outcome {
 /// There is nothing to compare, or the request is invalid. A difference is an outcome.
 pub fn run(args: &Request, context: Context<'_>) -> Result<Outcome, Error> {
     let (plan, budget) = plan(args)?;
-    let mut lines = Vec::new();
-    if args.evidence {
-        lines.extend(instruction_sets(&plan, context));
+    if args.adapter.as_deref() == Some(CPU) {
+        return instruction_sets(&plan, budget, args, context).map(Outcome::new);
     }
-    let adapters = match adapters(args.adapter.as_deref()) {
-        // The report still contains the comparison of the processor's instruction sets.
-        Err(Error::NoneToVerify(DeviceError::NoAdapter)) if args.evidence => vec![],
-        adapters => adapters?,
-    };
+    let adapters = adapters(args.adapter.as_deref())?;
+    let mut lines = Vec::new();
     let mut combinations = Vec::new();
     for (choice, info) in &adapters {
         for pass in passes(args.pass.as_deref(), info) {
@@ -115,9 +136,7 @@ pub fn run(args: &Request, context: Context<'_>) -> Result<Outcome, Error> {
             }
         }
     }
-    if !combinations.is_empty() {
-        context.message(expected(&plan, budget, combinations.len()));
-    }
+    context.message(expected(&plan, budget, combinations.len()));
     for (place, combination) in combinations.iter().enumerate() {
         if context.is_stopped() {
             return Err(Error::Stopped("before everything was compared".into()));
@@ -136,15 +155,14 @@ pub fn run(args: &Request, context: Context<'_>) -> Result<Outcome, Error> {
         });
     }
     (context.report)(Event::Pause);
-    let evidence = args.evidence.then(|| evidence(&lines, args.note.clone(), context)).transpose()?;
-    Ok(Outcome { equal: lines.iter().all(|line| line.equal), comparisons: lines, evidence })
+    Ok(Outcome::new(lines))
 }
 
 /// Default number of random worlds. A time budget may leave out the last ones.
 const WORLDS: u32 = 200;
 /// Number of worlds that are compared between two checks of the clock: one of each layout.
 const PART: usize = 10;
-/// Time for all comparisons, if no config, number of worlds or report is requested.
+/// Time for all comparisons, if no config or number of worlds is requested.
 const BUDGET: Duration = Duration::from_secs(60);
 
 /// A combination that is compared with the CPU.
@@ -209,62 +227,42 @@ fn line(adapter: String, reference: &Cpu, result: Result<Agreement, Error>) -> C
 }
 
 /// Compares every instruction set of the processor with the narrowest.
-fn instruction_sets(plan: &Plan, context: Context<'_>) -> Vec<Compared> {
+fn instruction_sets(
+    plan: &Plan,
+    budget: Option<Duration>,
+    args: &Request,
+    context: Context<'_>,
+) -> Result<Vec<Compared>, Error> {
     let levels = Cpu::levels();
-    let wider = levels[1..].iter().map(|&level| {
-        let (mut reference, mut wider) = (Cpu::at_level(levels[0]), Cpu::at_level(level));
-        let compared = compare(plan, &mut reference, &mut wider, |outcome| {
-            let (done, all) = (outcome.worlds, plan.worlds.len());
-            let text = format!("{}: {done} of {all} worlds", level_name(level));
-            (context.report)(Event::Fraction(done as f64 / all as f64, text));
-        });
-        (context.report)(Event::Pause);
-        line(wider.describe(), &reference, compared.map_err(Error::from))
-    });
-    wider.collect()
-}
-
-/// Returns the comparisons, the hardware and the digests of short trainings, for a report.
-fn evidence(lines: &[Compared], note: Option<String>, context: Context<'_>) -> Result<MachineReport, Error> {
-    let mut trained = Vec::new();
-    let trainings = short_trainings();
-    for (index, (name, config)) in trainings.iter().enumerate() {
-        (context.report)(Event::Fraction(index as f64 / trainings.len() as f64, format!("training {name}")));
-        let run = front::train(config, &mut Cpu::default(), |_| Continue(())).map_err(Error::of_training)?;
-        trained.push(ShortTraining { config: name.clone(), digest: run.digest() });
+    let (narrowest, wider) = levels.split_first().expect("every processor has an instruction set");
+    if args.pass.is_some() || args.kernel.is_some() {
+        let text = "--adapter cpu compares instruction sets, which have no passes and kernels";
+        return Err(Error::Usage(with_remedy(text, "leave out --pass and --kernel")));
     }
-    (context.report)(Event::Pause);
-    Ok(MachineReport {
-        processor: processor(),
-        instructions: Some(level_name(Level::new()).into()),
-        note,
-        comparisons: lines.to_vec(),
-        trained,
-        ..MachineReport::new(Tier::Executed)
-    })
-}
-
-/// Returns the processor's name, if the system reports it.
-fn processor() -> Option<String> {
-    let processor = match std::env::consts::OS {
-        "linux" => std::fs::read_to_string("/proc/cpuinfo").ok().and_then(|text| {
-            let names = text.lines().filter_map(|line| line.split_once(':'));
-            names.into_iter().find(|(key, _)| key.trim() == "model name").map(|(_, name)| name.to_string())
-        }),
-        "macos" => Command::new("/usr/sbin/sysctl")
-            .args(["-n", "machdep.cpu.brand_string"])
-            .output()
-            .ok()
-            .map(|output| String::from_utf8_lossy(&output.stdout).into_owned()),
-        _ => std::env::var("PROCESSOR_IDENTIFIER").ok(),
+    if wider.is_empty() {
+        let text = format!("this processor has one instruction set, {}: nothing to compare", level_name(*narrowest));
+        return Err(Error::Refused(text.into()));
+    }
+    let compare_one = |(place, &level): (usize, _)| {
+        let (mut reference, mut backend) = (Cpu::at_level(*narrowest), Cpu::at_level(level));
+        let found = compare_within(plan, budget.map(|all| all / wider.len() as u32), |part, before| {
+            compare(part, &mut reference, &mut backend, |now| {
+                let worlds = before.worlds + now.worlds;
+                let part = (place as f64 + worlds as f64 / plan.worlds.len() as f64) / wider.len() as f64;
+                (context.report)(Event::Fraction(part, format!("{}: {worlds} worlds", level_name(level))));
+            })
+        });
+        line(backend.describe(), &reference, found.map_err(Error::from))
     };
-    processor.map(|name| escape::line(name.trim()).into_owned()).filter(|name| !name.is_empty())
+    let lines = wider.iter().enumerate().map(compare_one).collect();
+    (context.report)(Event::Pause);
+    Ok(lines)
 }
 
 /// Returns what to compare, and the time budget if no amount is requested.
 fn plan(args: &Request) -> Result<(Plan, Option<Duration>), Error> {
     let (seed, teams) = (u64::from(args.seed), args.teams as usize);
-    let is_open = args.config.is_none() && args.worlds.is_none() && !args.evidence;
+    let is_open = args.config.is_none() && args.worlds.is_none();
     let plan = match &args.config {
         None if !args.set.is_empty() => {
             return Err(Error::Usage(with_remedy(
@@ -377,7 +375,6 @@ mod tests {
         let budget = |request: Request| plan(&request).unwrap().1;
         assert_eq!(budget(Request::default()), Some(BUDGET));
         assert_eq!(budget(Request { worlds: Some(3), ..Request::default() }), None);
-        assert_eq!(budget(Request { evidence: true, ..Request::default() }), None);
         assert_eq!(budget(Request { config: Some(config), ..Request::default() }), None);
     }
 
@@ -387,7 +384,7 @@ mod tests {
             let agreement =
                 |failure: &Option<&str>| Agreement { mismatch: failure.map(String::from), ..Agreement::default() };
             let lines = failures.iter().map(|failure| line("a GPU".into(), &Cpu::default(), Ok(agreement(failure))));
-            Outcome { equal: false, comparisons: lines.collect(), evidence: None }
+            Outcome::new(lines.collect())
         };
         assert!(compared(&[None, None]).difference().is_none());
         let error = compared(&[Some("stage credit"), None, None]).difference().unwrap();

@@ -1,7 +1,7 @@
 //! Access to the disk for everything that is written. Files are replaced whole or not at all, and tests can make any
 //! single operation fail.
 
-use std::fs::{self, File, OpenOptions};
+use std::fs::{self, File, OpenOptions, Permissions};
 use std::io::{self, BufWriter, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -172,6 +172,8 @@ impl Disk {
     /// Replaces a file like [`Disk::replace`], but several processes may do so at the same time. `before` is called
     /// after the new content is on the disk and before the file gets its name.
     ///
+    /// On Linux the new content has no name until it is complete, so that nothing is left of an interrupted process.
+    ///
     /// # Errors
     /// Returns the error of the system or of `before`.
     pub(crate) fn replace_shared(
@@ -180,22 +182,49 @@ impl Disk {
         content: impl FnOnce(&mut dyn Write) -> io::Result<()>,
         before: impl FnOnce() -> io::Result<()>,
     ) -> io::Result<()> {
+        self.replace_with(path, None, content, before)
+    }
+
+    /// Replaces a file like [`Disk::replace_shared`]. `permissions` replaces those that new files have.
+    fn replace_with(
+        &self,
+        path: &Path,
+        permissions: Option<Permissions>,
+        content: impl FnOnce(&mut dyn Write) -> io::Result<()>,
+        before: impl FnOnce() -> io::Result<()>,
+    ) -> io::Result<()> {
         static NEXT: AtomicUsize = AtomicUsize::new(0);
-        let name = path.file_name().unwrap_or_default().to_string_lossy();
-        let mut taken = None;
         for _ in 0..1000 {
             let number = NEXT.fetch_add(1, Relaxed);
-            let temporary = path.with_file_name(format!("{PREFIX}{}-{number}-{name}.tmp", std::process::id()));
-            match self.create_new(&temporary) {
-                // A process on another machine may have the same id.
-                Err(error) if error.kind() == io::ErrorKind::AlreadyExists => continue,
-                Err(error) => return Err(error),
-                Ok(output) => taken = Some((temporary, output)),
+            let temporary = path.with_file_name(format!("{PREFIX}{}-{number}.tmp", std::process::id()));
+            // A process on another machine may have the same id.
+            if self.kind(&temporary)?.is_some() {
+                continue;
             }
-            break;
+            let entry = self.entry(&temporary)?;
+            let unnamed = entry.create_unnamed();
+            let is_unnamed = unnamed.is_some();
+            let output = match unnamed {
+                Some(file) => {
+                    self.check(Operation::Create, &temporary)?;
+                    Output { disk: self.clone(), path: temporary.clone(), file }
+                }
+                None => match self.create_new(&temporary) {
+                    Err(error) if error.kind() == io::ErrorKind::AlreadyExists => continue,
+                    created => created?,
+                },
+            };
+            if let Some(permissions) = permissions {
+                output.file.set_permissions(permissions)?;
+            }
+            let file = output.share()?.file;
+            let name = || {
+                before()?;
+                if is_unnamed { entry.link(&file) } else { Ok(()) }
+            };
+            return self.replace_by(path, temporary, |_| Ok(output), content, name);
         }
-        let (temporary, output) = taken.ok_or(io::ErrorKind::AlreadyExists)?;
-        self.replace_by(path, temporary, |_| Ok(output), content, before)
+        Err(io::ErrorKind::AlreadyExists.into())
     }
 
     fn replace_by(
@@ -247,22 +276,8 @@ impl Disk {
         if !file::folder(path).is_dir() {
             return Err(file::no_folder(path));
         }
-        self.check(Operation::Create, path)?;
-        // A random name, because the folder may contain any files of the user.
-        let mut builder = tempfile::Builder::new();
-        #[cfg(unix)]
-        builder.permissions(match &existing {
-            Ok(existing) => existing.permissions(),
-            Err(_) => std::os::unix::fs::PermissionsExt::from_mode(0o666),
-        });
-        let temporary = builder.prefix(".flotilla-").suffix(".tmp").tempfile_in(file::folder(path));
-        let temporary = temporary.map_err(without_path)?;
-        let mut output = BufWriter::with_capacity(1 << 20, temporary.as_file());
-        content(&mut output)?;
-        output.into_inner().map_err(|error| error.into_error())?.sync_all()?;
-        self.check(Operation::Rename, path)?;
-        temporary.persist(path).map_err(|error| error.error)?;
-        self.sync_folder(file::folder(path))
+        let permissions = existing.ok().filter(|_| cfg!(unix)).map(|existing| existing.permissions());
+        self.replace_with(path, permissions, content, || Ok(()))
     }
 
     /// Renames a file and flushes the new name to the disk.
@@ -303,12 +318,6 @@ impl Disk {
     /// The entry is not a plain file, or the system returns an error.
     pub(crate) fn open_lock(&self, path: &Path) -> io::Result<File> {
         self.entry(path)?.extend()
-    }
-
-    /// Flushes the names in a folder to the disk, if the system can.
-    fn sync_folder(&self, path: &Path) -> io::Result<()> {
-        self.check(Operation::Flush, path)?;
-        RootedFolder::open(path)?.entry(&path.join("x"))?.sync_folder()
     }
 }
 

@@ -12,9 +12,7 @@
 //! | [`folder`] | the folder of a run, its lock and `run.json` |
 //! | [`digests`] | comparison of files with the digests in `run.json` |
 //! | [`runs`] | configs and metrics of runs |
-//! | [`archive`] | runs in zip files |
 //! | [`finished`] | a finished run that was trained in memory |
-//! | [`evidence`] | results of checks on a machine, for `docs/develop/evidence.md` |
 //!
 //! Every file that is read is untrusted. Its size is checked before memory is allocated, and its values are checked
 //! before they are used. Nothing in it can name another file.
@@ -31,11 +29,9 @@ use flotilla::file::{self, TextError};
 
 pub use flotilla::trainer::digest::hex;
 
-pub mod archive;
 pub mod checkpoint;
 pub mod digests;
 pub mod disk;
-pub mod evidence;
 pub mod finished;
 pub mod folder;
 pub mod metrics;

@@ -128,6 +128,17 @@ impl FolderEntry {
         system::create_new(&self.parent, &self.name, &self.path)
     }
 
+    /// Creates a file without a name in the entry's folder. It disappears with its process, unless [`FolderEntry::link`]
+    /// names it. Returns `None` if the system cannot do this.
+    pub(crate) fn create_unnamed(&self) -> Option<File> {
+        system::create_unnamed(&self.parent)
+    }
+
+    /// Gives a file of [`FolderEntry::create_unnamed`] this name. Fails if the name is taken.
+    pub(crate) fn link(&self, file: &File) -> io::Result<()> {
+        system::link(&self.parent, &self.name, file)
+    }
+
     /// Opens a plain file for reading.
     ///
     /// # Errors
@@ -204,6 +215,22 @@ fn not_a_folder(kind: Option<FileKind>, path: &Path, error: io::Error) -> io::Er
 /// An open folder. Empty on systems without such handles.
 struct Handle(#[cfg(unix)] std::os::fd::OwnedFd);
 
+#[cfg(not(target_os = "linux"))]
+mod without_unnamed_files {
+    use super::Handle;
+    use std::ffi::OsStr;
+    use std::fs::File;
+    use std::io::{ErrorKind, Result};
+
+    pub(crate) fn create_unnamed(_: &Handle) -> Option<File> {
+        None
+    }
+
+    pub(crate) fn link(_: &Handle, _: &OsStr, _: &File) -> Result<()> {
+        Err(ErrorKind::Unsupported.into())
+    }
+}
+
 #[cfg(unix)]
 mod system {
     use std::ffi::OsStr;
@@ -260,6 +287,27 @@ mod system {
         let flags = FILE | OFlags::WRONLY | OFlags::CREATE | OFlags::EXCL;
         Ok(fs::openat(&parent.0, name, flags, FILE_MODE)?.into())
     }
+
+    #[cfg(target_os = "linux")]
+    pub(crate) fn create_unnamed(parent: &Handle) -> Option<File> {
+        let flags = OFlags::TMPFILE | OFlags::WRONLY | OFlags::CLOEXEC;
+        let file = File::from(fs::openat(&parent.0, c".", flags, FILE_MODE).ok()?);
+        // Naming it needs /proc.
+        Path::new(&path_of(&file)).exists().then_some(file)
+    }
+
+    #[cfg(target_os = "linux")]
+    pub(crate) fn link(parent: &Handle, name: &OsStr, file: &File) -> io::Result<()> {
+        Ok(fs::linkat(fs::CWD, path_of(file), &parent.0, name, AtFlags::SYMLINK_FOLLOW)?)
+    }
+
+    #[cfg(target_os = "linux")]
+    fn path_of(file: &File) -> String {
+        format!("/proc/self/fd/{}", std::os::fd::AsRawFd::as_raw_fd(file))
+    }
+
+    #[cfg(not(target_os = "linux"))]
+    pub(crate) use super::without_unnamed_files::{create_unnamed, link};
 
     pub fn read(parent: &Handle, name: &OsStr, _: &Path) -> io::Result<File> {
         Ok(fs::openat(&parent.0, name, FILE | OFlags::RDONLY, Mode::empty())?.into())
@@ -336,6 +384,8 @@ mod system {
     pub(crate) fn create_new(_: &Handle, _: &OsStr, path: &Path) -> io::Result<File> {
         OpenOptions::new().write(true).create_new(true).open(path)
     }
+
+    pub(crate) use super::without_unnamed_files::{create_unnamed, link};
 
     pub fn read(_: &Handle, _: &OsStr, path: &Path) -> io::Result<File> {
         File::open(path)

@@ -9,7 +9,6 @@
 //! | [`comparison`] | comparison of arms, with intervals and tests |
 //! | [`grid`] | heat maps and curves over the axes of a sweep |
 //! | [`replay`] | episodes of any trial and generation, as a page or a picture |
-//! | [`tensorboard`] | event files for TensorBoard |
 //! | [`table`] | text tables, for people and for LaTeX |
 
 pub mod comparison;
@@ -22,4 +21,3 @@ pub mod replay;
 pub mod runs;
 pub mod scene;
 pub mod table;
-pub mod tensorboard;

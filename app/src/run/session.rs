@@ -244,11 +244,12 @@ impl Session {
 
     /// Records the backend of all unfinished runs.
     fn record_machine(&mut self, (backend, machine): &OpenBackend) {
+        let description = backend.describe();
         for run in self.members.iter_mut().filter(|member| member.unfinished.is_some()).map(|member| &mut member.run) {
-            let Machine { backend: kind, adapter, driver, threads } = machine.clone();
+            let Machine { backend, adapter, driver, adapter_index, adapter_pci, threads } = machine.clone();
             let (version, commit) = (flotilla::version::VERSION.into(), flotilla::version::COMMIT.map(String::from));
-            let description = backend.describe();
-            *run = Run { version, commit, description, backend: kind, adapter, driver, threads, ..run.clone() };
+            let session = Run { version, commit, description: description.clone(), backend, ..run.clone() };
+            *run = Run { adapter, driver, adapter_index, adapter_pci, threads, ..session };
         }
     }
 

@@ -9,7 +9,7 @@
 //! installed, tests print that they are skipped. With `FLOTILLA_REQUIRE_RADV=1`, they fail instead. With
 //! `FLOTILLA_REQUIRE_RADV=0`, they are always skipped.
 //!
-//! With `FLOTILLA_EVIDENCE=FOLDER`, the results are written there as a row of `docs/develop/evidence.md`.
+//! With `--nocapture`, the findings are printed, for `docs/develop/evidence.md`.
 //!
 //! `cargo test --test radv -- table --ignored --nocapture` prints the tables of `benches/static-figures.md`.
 
@@ -272,12 +272,11 @@ fn fused_instructions_are_recognised() {
 fn compiled_shaders_are_exact_small_and_fast() {
     let test = "compiled_shaders_are_exact_small_and_fast";
     let Some(manifest) = radv(test) else { return };
-    let (cases, mut findings) = (Case::all(), Vec::new());
+    let cases = Case::all();
     for (pass, max_instructions) in PASSES.into_iter().zip(MAX_INSTRUCTIONS) {
         let jobs = jobs(pass, &cases);
         for chip in CHIPS {
             let (version, results) = compile_for(&manifest, chip, &jobs);
-            println!("{chip}: {version}, {} shaders, {pass} pass", results.len());
             let is_known = is_known(test, &version);
             for (name, Compiled { statistics, assembly }) in &results {
                 let context = format!("{chip} under the {pass} pass, {name} ({version})");
@@ -309,10 +308,9 @@ fn compiled_shaders_are_exact_small_and_fast() {
                 let kernels = cases.len();
                 finding += &format!("; {kernels} run in an emulator for {steps} agent-steps, with the CPU's bits");
             }
-            findings.push((version, finding));
+            println!("{finding} ({version})");
         }
     }
-    write_evidence(findings);
 }
 
 /// Emulates the compiled kernel of a case, and checks its results and its speed. Returns the number of agent-steps.
@@ -324,16 +322,6 @@ fn run(case: &Case, chip: Chip, pass: Pass, compiled: &Compiled) -> u64 {
     let min = case.min_share(&chip, pass);
     assert!(share >= min, "{context}: {:.1} % of the f32 rate, not {:.0}", 100.0 * share, 100.0 * min);
     case.agent_steps
-}
-
-/// Writes the findings to the directory that `FLOTILLA_EVIDENCE` names. Each has the version of the driver.
-fn write_evidence(findings: Vec<(String, String)>) {
-    use flotilla_app::record::evidence::{MachineReport, Tier};
-    let Some(folder) = std::env::var_os("FLOTILLA_EVIDENCE") else { return };
-    let note = findings.first().map(|(version, _)| format!("Mesa's RADV, {version}, for chips that are not installed"));
-    let findings = findings.into_iter().map(|(_, finding)| finding).collect();
-    let report = MachineReport { note, findings, ..MachineReport::new(Tier::MachineCodeRead) };
-    fs::write(Path::new(&folder).join("radv.json"), report.to_json()).expect("the file is writable");
 }
 
 /// A canary: without a pass, the compiler fuses. Both the search for instructions and the emulator must detect this.

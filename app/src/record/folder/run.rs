@@ -27,6 +27,12 @@ pub struct Run {
     pub adapter: Option<String>,
     /// Driver of the GPU.
     pub driver: Option<String>,
+    /// Index of the GPU in `flotilla devices`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub adapter_index: Option<usize>,
+    /// PCI address of the GPU, if its driver reports it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub adapter_pci: Option<String>,
     /// Number of CPU threads that work.
     pub threads: usize,
     /// Start of the first session, in UTC.
@@ -125,6 +131,8 @@ impl Run {
             description: String::new(),
             adapter: None,
             driver: None,
+            adapter_index: None,
+            adapter_pci: None,
             threads: 0,
             started: now(),
             updated: String::new(),

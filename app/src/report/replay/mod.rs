@@ -212,11 +212,6 @@ impl History {
         self.rows.len().checked_sub(1)
     }
 
-    /// Returns the largest G of a best team or champion in any generation; 0 without rows.
-    pub fn most(&self) -> f64 {
-        self.rows.iter().flatten().copied().fold(0.0, f64::max)
-    }
-
     /// Returns a generation's G of the champion if `which` requests it, otherwise of the best team. None without a row.
     pub fn get(&self, generation: usize, which: Which) -> Option<f64> {
         let &[best, champion] = self.rows.get(generation)?;

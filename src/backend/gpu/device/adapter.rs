@@ -22,6 +22,10 @@ pub struct AdapterInfo {
     pub backend: String,
     /// The kind of device.
     pub kind: Kind,
+    /// The index in [`adapters`].
+    pub index: usize,
+    /// The PCI address, such as "0000:65:00.0". Empty if the driver does not report it.
+    pub pci: String,
 }
 
 /// The kind of device, the preferred kinds first.
@@ -86,6 +90,8 @@ impl From<&wgpu::AdapterInfo> for AdapterInfo {
                 .into(),
             backend: info.backend.to_str().to_string(),
             kind,
+            index: 0,
+            pci: escape::line(&info.device_pci_bus_id).into(),
         }
     }
 }
@@ -129,7 +135,8 @@ fn found() -> Vec<(wgpu::Adapter, AdapterInfo)> {
     let infos: Vec<_> = adapters.iter().map(|(info, _)| info.clone()).collect();
     let first = |index: usize| !infos[..index].iter().any(|earlier| same(earlier, &infos[index]));
     let kept = adapters.into_iter().enumerate().filter(|(index, _)| first(*index));
-    kept.map(|(_, (info, adapter))| (adapter, AdapterInfo::from(&info))).collect()
+    let numbered = kept.map(|(_, kept)| kept).enumerate();
+    numbered.map(|(index, (info, adapter))| (adapter, AdapterInfo { index, ..AdapterInfo::from(&info) })).collect()
 }
 
 /// Describes the compiler that a backend ("vulkan", "metal", "dx12") passes shaders to.
