@@ -27,7 +27,7 @@ pub fn open_for(options: &RunOptions, work: Work) -> Result<(OpenBackend, String
 ///
 /// # Errors
 /// Fails if the GPU is not available, or if the flags contradict each other.
-pub fn open_gpu(options: &RunOptions, work: Option<Work>) -> Result<(Option<GpuBackend>, Option<String>), Error> {
+pub fn open_gpu(options: &RunOptions, work: Option<Work>) -> Result<(Option<GpuBackend>, Option<&'static str>), Error> {
     start_threads(options.threads);
     let holding = match options.breed {
         Breed::Auto => None,
@@ -51,12 +51,9 @@ pub fn open_gpu(options: &RunOptions, work: Option<Work>) -> Result<(Option<GpuB
         (BackendChoice::Auto | BackendChoice::Gpu, Some(named)) => Processor::Adapter(named),
     };
     device::report_stalls(|text| say(format_args!("note: {text}")));
-    let Chosen { gpu, reason, passed_over, forgotten } = choice::find(&processor, holding, work)?;
+    let Chosen { gpu, reason, passed_over } = choice::find(&processor, holding, work)?;
     if let Some(error) = passed_over {
         say(format_args!("note: no GPU is used: {error}{}", advice_on_device(&error)));
-    }
-    if let Some(text) = forgotten {
-        say(format_args!("note: {text}"));
     }
     Ok((gpu, reason))
 }

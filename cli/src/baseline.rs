@@ -1,7 +1,6 @@
 //! `flotilla baseline`: plays teams that do not learn.
 
 use super::console::Console;
-use super::recovery::Loss;
 use super::{ConfigFile, Error, Overrides, Printed, RunOptions, SetKeys, between, number};
 use clap::builder::PossibleValuesParser as Words;
 use flotilla::baseline::SPEEDS;
@@ -42,7 +41,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     let overrides = Overrides { generations, population, paradigm, set, ..Overrides::default() };
     let config = config.text(overrides.list())?;
     let request = Request { config, seeds, episodes };
-    let mut console = Console::new(&run, Loss::default(), printed.quiet);
+    let mut console = Console::new(&run, printed.quiet);
     let found = console.play(|backends, context| baseline::run(&request, backends, context))?;
     printed.outcome(&found, in_words)
 }

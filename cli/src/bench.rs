@@ -52,9 +52,6 @@ pub struct Args {
     /// Instruction set of the CPU backend [default: the widest that this processor has]
     #[arg(long, value_name = "NAME")]
     instructions: Option<String>,
-    /// Teams per workgroup of a GPU's specialised kernels: 32, 16 or 8 [default: the faster one of 32 and 16, measured]
-    #[arg(long, value_name = "N", value_parser = ["32", "16", "8"])]
-    teams_per_workgroup: Option<String>,
     /// Print JSON objects, one per line
     #[arg(long)]
     json: bool,
@@ -158,16 +155,8 @@ fn open(args: &Args) -> Result<(Subject, Machine), Error> {
     };
     Ok(match backend::open_gpu(&args.run, None)?.0 {
         Some(gpu) => {
-            let gpu = match args.teams_per_workgroup.as_deref().and_then(|teams| teams.parse().ok()) {
-                Some(teams) => gpu.with_teams_per_workgroup(Some(teams)),
-                None => gpu,
-            };
             let machine = Machine::of_gpu(&gpu);
             (Subject::Gpu(Box::new(gpu)), machine)
-        }
-        None if args.teams_per_workgroup.is_some() => {
-            let message = "--teams-per-workgroup is for specialised kernels of a GPU, and none is used";
-            return Err(Error::Usage(with_remedy(message, "leave it out, or name a GPU with --adapter")));
         }
         None => (Subject::Cpu(Cpu::at_level(level), level), front::cpu().1),
     })

@@ -3,7 +3,7 @@
 use std::cell::RefCell;
 use std::ffi::OsString;
 
-use super::recovery::{self, Loss, Signals};
+use super::recovery::{self, Signals};
 use super::{Error, RunOptions, backend, say};
 use crate::progress::{Meter, ProgressBars};
 use flotilla::backend::OpenBackend;
@@ -13,7 +13,6 @@ use flotilla_app::ops::{BackendSource, Context, Event};
 /// The flags of a command that concern every use case.
 pub struct Console<'a> {
     machine: Machine<'a>,
-    loss: Loss,
     quiet: bool,
 }
 
@@ -35,8 +34,8 @@ impl BackendSource for Machine<'_> {
 
 impl<'a> Console<'a> {
     /// Returns a console with a command's flags.
-    pub fn new(options: &'a RunOptions, loss: Loss, quiet: bool) -> Console<'a> {
-        Console { machine: Machine { options, open: None }, loss, quiet }
+    pub fn new(options: &'a RunOptions, quiet: bool) -> Console<'a> {
+        Console { machine: Machine { options, open: None }, quiet }
     }
 
     /// Runs a use case that signals stop.
@@ -66,8 +65,8 @@ impl<'a> Console<'a> {
         signals: &Signals,
         work: impl FnOnce(&mut dyn BackendSource, Context<'_>) -> Result<R, Error>,
     ) -> Result<R, Error> {
-        let flags = recovery::words_of_machine(self.machine.options, self.loss);
-        run_reported(self.quiet, signals, &flags, self.loss.falls_back(), |context| work(&mut self.machine, context))
+        let flags = recovery::words_of_machine(self.machine.options);
+        run_reported(self.quiet, signals, &flags, |context| work(&mut self.machine, context))
     }
 }
 
@@ -76,19 +75,18 @@ impl<'a> Console<'a> {
 /// # Errors
 /// The use case fails.
 pub fn run_without_backend<R>(quiet: bool, work: impl FnOnce(Context<'_>) -> Result<R, Error>) -> Result<R, Error> {
-    run_reported(quiet, &Signals::default(), &[], false, work)
+    run_reported(quiet, &Signals::default(), &[], work)
 }
 
 fn run_reported<R>(
     quiet: bool,
     signals: &Signals,
     flags: &[OsString],
-    falls_back: bool,
     work: impl FnOnce(Context<'_>) -> Result<R, Error>,
 ) -> Result<R, Error> {
     let (show, command) = (Display::new(quiet), recovery::command_line());
     let (Signals { stop, save }, report) = (signals, |event: Event<'_>| show.event(event));
-    let done = work(Context { stop, save, command: &command, flags, falls_back, ..Context::new(&report) });
+    let done = work(Context { stop, save, command: &command, flags, ..Context::new(&report) });
     show.event(Event::Pause);
     done
 }

@@ -216,8 +216,9 @@ fn of_clap(error: &clap::Error) -> Error {
 }
 
 /// Flags that were removed, and what replaces each.
-const REMOVED: [(&str, &str); 3] = [
+const REMOVED: [(&str, &str); 4] = [
     ("--note", "`verify` writes no reports; --json prints the comparisons"),
+    ("--on-device-loss", "training always continues on the CPU if a GPU fails; leave it out"),
     ("--report", "`verify` writes no reports; --json prints the comparisons"),
     ("--tensorboard", "`train` writes no event files; in Python, pass `callback=flotilla.loggers.tensorboard(FOLDER)`"),
 ];

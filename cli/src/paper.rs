@@ -4,7 +4,7 @@ use std::ffi::OsString;
 use std::path::PathBuf;
 
 use super::console::Console;
-use super::recovery::{self, Checkpoints, Loss};
+use super::recovery::{self, Checkpoints};
 use super::{Error, ExistingResults, Overrides, Printed, RunOptions, SetKeys, number};
 use flotilla::config::Override;
 use flotilla::escape::PathExt;
@@ -40,8 +40,6 @@ pub struct Args {
     #[command(flatten)]
     checkpoints: Checkpoints,
     #[command(flatten)]
-    loss: Loss,
-    #[command(flatten)]
     run: RunOptions,
 }
 
@@ -60,13 +58,13 @@ impl Args {
         let questions = (!letters.is_empty()).then(|| format!("--questions={}", letters.join(",")).into());
         let words = ["flotilla", "paper"].map(OsString::from).into_iter().chain(questions);
         let words = words.chain(["--out".into(), out]);
-        let machine = recovery::words_of_machine(&self.run, self.loss);
+        let machine = recovery::words_of_machine(&self.run);
         shell::command(words.chain(recovery::words_of(&overrides)).chain(["--resume".into()]).chain(machine))
     }
 }
 
 pub fn run(args: Args) -> Result<(), Error> {
-    let mut console = Console::new(&args.run, args.loss, args.printed.quiet);
+    let mut console = Console::new(&args.run, args.printed.quiet);
     let (set, start) = (args.overrides(), args.existing.start());
     let request = Request { out: args.out.clone(), start, set, questions: args.questions.clone() };
     let resume = |error: Error| error.or_advise(|| format!("continue with\n  {}", args.command_to_resume()));

@@ -12,30 +12,6 @@ use super::{Error, RunOptions, number};
 use flotilla::config::Override;
 use flotilla_app::shell;
 
-/// The reaction to a failing device.
-#[derive(clap::Args, Clone, Copy, Default)]
-pub struct Loss {
-    /// Reaction to a device that fails during a run
-    #[arg(long, value_enum, value_name = "WHAT", default_value_t = OnLoss::Stop)]
-    on_device_loss: OnLoss,
-}
-
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
-pub enum OnLoss {
-    /// Save, and stop with an error
-    #[default]
-    Stop,
-    /// Continue on the CPU, with the same results
-    Cpu,
-}
-
-impl Loss {
-    /// Reports whether the CPU continues after another backend failed.
-    pub fn falls_back(self) -> bool {
-        self.on_device_loss == OnLoss::Cpu
-    }
-}
-
 /// How often runs are saved. Overrides the config.
 #[derive(clap::Args)]
 pub struct Checkpoints {
@@ -67,7 +43,7 @@ pub fn words_of(overrides: &[Override]) -> impl Iterator<Item = OsString> {
 }
 
 /// Returns the flags that choose what to run on, as typed, without those at their defaults.
-pub fn words_of_machine(run: &RunOptions, loss: Loss) -> Vec<OsString> {
+pub fn words_of_machine(run: &RunOptions) -> Vec<OsString> {
     fn word<T: ValueEnum + PartialEq>(value: T, default: T) -> Option<String> {
         (value != default).then(|| value.to_possible_value()).flatten().map(|value| value.get_name().to_string())
     }
@@ -77,7 +53,6 @@ pub fn words_of_machine(run: &RunOptions, loss: Loss) -> Vec<OsString> {
         ("--adapter", adapter),
         ("--breed", word(breed, super::Breed::Auto)),
         ("--threads", threads.map(|threads| threads.to_string())),
-        ("--on-device-loss", word(loss.on_device_loss, OnLoss::Stop)),
     ];
     let words = |(flag, value): (&str, Option<String>)| match value? {
         // As a separate word it would be read as a flag.

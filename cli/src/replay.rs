@@ -3,7 +3,6 @@
 use std::path::{Path, PathBuf};
 
 use super::console::Console;
-use super::recovery::Loss;
 use super::{Error, Printed, RunOptions, between, whole, words};
 use flotilla::escape::PathExt;
 use flotilla_app::ops::replay::{self, Outcome, Request, WhichTrial, Written};
@@ -57,7 +56,7 @@ pub fn run(args: Args) -> Result<(), Error> {
         refuse_video(out, fps)?;
     }
     let request = Request { folder, trial, generation, team, compare, step, out, width, fps, unverified };
-    let mut console = Console::new(&run, Loss::default(), printed.quiet);
+    let mut console = Console::new(&run, printed.quiet);
     let found = console.run(|backends, context| replay::run(&request, backends, context))?;
     printed.summary(&found, in_words)
 }

@@ -5,7 +5,6 @@ use std::path::PathBuf;
 use clap::builder::PossibleValuesParser as Words;
 
 use super::console::Console;
-use super::recovery::Loss;
 use super::{Error, Printed, RunOptions, SetKeys, between, canonical, real, whole};
 use flotilla::config::{Choice, Override, Paradigm};
 use flotilla::evaluate::{MAX_EPISODES, Spread};
@@ -77,7 +76,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     ];
     let set = keys.into_iter().flatten().chain(set.set).collect();
     let request = Request { path, set, policies, trial, stage, trace, scores, unverified, episodes, seed };
-    let mut console = Console::new(&args.run, Loss::default(), args.printed.quiet);
+    let mut console = Console::new(&args.run, args.printed.quiet);
     let found = console.play(|backends, context| rollout::run(&request, backends, context))?;
     args.printed.outcome(&found, in_words)
 }

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use serde_json::json;
 
 use super::console::{self, Console};
-use super::recovery::{self, Loss};
+use super::recovery;
 use super::{Error, ExistingResults, Overrides, RunOptions, between, print, print_json, say, whole};
 use flotilla::config;
 use flotilla::escape::PathExt;
@@ -54,8 +54,6 @@ pub struct Args {
     /// Print the results as one JSON object (docs/reference/json.md)
     #[arg(long, conflicts_with_all = ["list", "slurm"])]
     json: bool,
-    #[command(flatten)]
-    loss: Loss,
 
     /// Train shard I of N [default: the task of a Slurm array or Kubernetes indexed job, otherwise everything]
     #[arg(long, value_name = "I/N", allow_hyphen_values = true, help_heading = SCALE_OUT)]
@@ -146,7 +144,7 @@ impl Args {
     fn words(&self, sweep: &Path, out: &Path) -> Vec<OsString> {
         let mut words = vec!["sweep".into(), shell::argument(sweep), "--out".into(), shell::argument(out)];
         words.extend(recovery::words_of(&self.overrides.list()));
-        words.extend(recovery::words_of_machine(&self.run, self.loss));
+        words.extend(recovery::words_of_machine(&self.run));
         words.extend(self.memory.into_iter().flat_map(|gib| ["--memory".into(), gib.to_string().into()]));
         if self.skip_impossible {
             words.push("--skip-impossible".into());
@@ -219,7 +217,7 @@ pub fn run(mut args: Args) -> Result<(), Error> {
     }
     let shard = if args.collect { None } else { args.shard()?.filter(|shard| shard.count > 1) };
     let request = args.request(&sweep, &out, shard);
-    let mut console = Console::new(&args.run, args.loss, args.quiet);
+    let mut console = Console::new(&args.run, args.quiet);
     if !args.collect {
         let trained = console.run(|backends, context| ops::sweep::train(&request, &sweep, backends, context));
         trained

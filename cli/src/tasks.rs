@@ -3,7 +3,6 @@
 use std::path::{Path, PathBuf};
 
 use super::console::Console;
-use super::recovery::Loss;
 use super::{ConfigFile, Error, ExistingResults, Printed, RunOptions, SetKeys, between};
 use flotilla::config;
 use flotilla::escape::PathExt;
@@ -37,13 +36,11 @@ pub struct Args {
     #[command(flatten)]
     printed: Printed,
     #[command(flatten)]
-    loss: Loss,
-    #[command(flatten)]
     run: RunOptions,
 }
 
 pub fn run(args: Args) -> Result<(), Error> {
-    let Args { configs, out, trials, population, seed, set, existing, printed, loss, run } = args;
+    let Args { configs, out, trials, population, seed, set, existing, printed, run } = args;
     let task = |path: PathBuf| {
         let (name, table) = (file::stem(&path, "task"), path.with_extension("csv"));
         let script = if table.is_file() { Some(read_script(&table)?) } else { None };
@@ -52,7 +49,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     let tasks = configs.into_iter().map(task).collect::<Result<_, _>>()?;
     let (named, start) = (out != Path::new(OUT), existing.start());
     let request = Request { tasks, out, named, start, trials, population, seed };
-    let mut console = Console::new(&run, loss, printed.quiet);
+    let mut console = Console::new(&run, printed.quiet);
     let found = console
         .run(|backends, context| tasks::run(&request, backends, context))
         .map_err(|error| error.or_advise(|| "run the same command with --resume to continue".into()))?;

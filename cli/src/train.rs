@@ -4,7 +4,7 @@ use std::fmt::Write;
 use std::path::PathBuf;
 
 use super::console::Console;
-use super::recovery::{Checkpoints, Loss, quoted};
+use super::recovery::{Checkpoints, quoted};
 use super::{ConfigArgs, Error, ExistingResults, Printed, RunOptions};
 use flotilla::escape::PathExt;
 use flotilla::trainer::Row;
@@ -33,15 +33,13 @@ pub struct Args {
     printed: Printed,
     #[command(flatten)]
     checkpoints: Checkpoints,
-    #[command(flatten)]
-    loss: Loss,
 }
 
 pub fn run(args: Args) -> Result<(), Error> {
-    let Args { config, run, out, existing, init, printed, checkpoints, loss } = args;
+    let Args { config, run, out, existing, init, printed, checkpoints } = args;
     let (name, start) = (config.name(), existing.start());
     let request = Request { config: config.text(checkpoints.list())?, name, out, start, init };
-    let mut console = Console::new(&run, loss, printed.quiet);
+    let mut console = Console::new(&run, printed.quiet);
     let found = console.run(|backends, context| train::run(&request, backends, context))?;
     printed.summary(&found, report)
 }

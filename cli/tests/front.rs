@@ -55,14 +55,7 @@ fn run_digest_from(config: &Config, folder: &Path, init: Option<Init>) -> String
     let unset = std::sync::atomic::AtomicBool::default();
     let ended = session.train(
         &mut front::cpu(),
-        &mut Options {
-            command: "",
-            stop: &unset,
-            save: &unset,
-            fallback: &mut |_| None,
-            on_recovery: &mut |_| (),
-            watch: &mut |_| (),
-        },
+        &mut Options { command: "", stop: &unset, save: &unset, fallback: &mut |_| None, watch: &mut |_| () },
     );
     assert_eq!(ended.expect("training succeeds"), SessionEnd::Finished);
     session.results(0).expect("the run is finished").digest.clone()

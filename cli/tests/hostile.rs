@@ -60,14 +60,8 @@ fn files() -> Files {
     config.checkpoint.generations = 1;
     let (mut session, _) = Session::open(vec![(config, path.clone())], Start::Fresh, &Disk::default()).unwrap();
     let (stop, save) = Default::default();
-    let mut options = Options {
-        command: "flotilla train",
-        stop: &stop,
-        save: &save,
-        fallback: &mut |_| None,
-        on_recovery: &mut |_| {},
-        watch: &mut |_| {},
-    };
+    let mut options =
+        Options { command: "flotilla train", stop: &stop, save: &save, fallback: &mut |_| None, watch: &mut |_| {} };
     session.train(&mut (Box::new(Cpu::default()), Machine::default()), &mut options).unwrap();
     let read = |name: &str| fs::read(path.join(name)).unwrap();
     let checkpoints = path.join("checkpoints");

@@ -487,14 +487,7 @@ fn train(config: &Config, path: &Path, start: Start, disk: Disk) -> Result<(), S
         return Ok(());
     }
     let (stop, save) = (AtomicBool::new(false), AtomicBool::new(false));
-    let mut options = Options {
-        command: "",
-        stop: &stop,
-        save: &save,
-        fallback: &mut |_| None,
-        on_recovery: &mut |_| {},
-        watch: &mut |_| {},
-    };
+    let mut options = Options { command: "", stop: &stop, save: &save, fallback: &mut |_| None, watch: &mut |_| {} };
     let mut backend: OpenBackend = (Box::new(Cpu::default()), Machine::default());
     let ended = session.train(&mut backend, &mut options).map_err(|error| error.to_string())?;
     assert_eq!(ended, SessionEnd::Finished);

@@ -1,6 +1,6 @@
 //! Compares populations in GPU memory with populations in host memory, bit for bit: breeding, training and snapshots.
 //!
-//! A fake device fails at a chosen call, which tests that training survives the loss of the device.
+//! A fake device fails at a chosen call, which tests that a run survives the loss of the device.
 
 use crate::support;
 use std::any::Any;
@@ -224,18 +224,11 @@ fn training_is_the_same_wherever_populations_are_stored() {
             rows.extend(trainer.advance(&mut device).unwrap());
         }
         assert_eq!((&rows, policies(&trainer)), (&expected.rows, expected.policies.clone()), "{info}");
-        // When a trainer changes its backend, its populations move along.
-        let (mut trainer, mut rows) = (Trainer::new(ValidConfig::all(&experiments()).unwrap()), Vec::new());
-        let mut backends: [Box<dyn Backend>; 3] = [
-            Box::new(open(ResidencyPolicy::Always)),
-            Box::new(open(ResidencyPolicy::Always)),
-            Box::new(Cpu::default()),
-        ];
-        while !trainer.is_done() {
-            let backend = &mut backends[trainer.generation(2) % 3];
-            rows.extend(trainer.advance(&mut **backend).unwrap());
-        }
-        assert_eq!((&rows, policies(&trainer)), (&expected.rows, expected.policies.clone()), "{info}");
+        // Another backend refuses populations that it does not hold. A snapshot moves them.
+        let mut trainer = Trainer::new(ValidConfig::all(&experiments()).unwrap());
+        trainer.advance(&mut device).unwrap();
+        assert!(matches!(trainer.advance(&mut other_device), Err(BackendError::HeldElsewhere)), "{info}");
+        assert_eq!(&snapshots_of(&mut trainer).unwrap(), &snapshots[1], "{info}");
     }
 }
 
@@ -246,24 +239,15 @@ fn experiments_at_different_generations_train_together() {
     for first in 0..snapshots.len() {
         let from = [first, (first + 3) % snapshots.len(), snapshots.len() - 1 - first];
         let mixed: Vec<Snapshot> = (0..3).map(|experiment| snapshots[from[experiment]][experiment].clone()).collect();
-        // Also with a device that holds the populations and is lost during the training.
-        for nth in [None, Some(2), Some(5), Some(8)] {
-            let mut trainer = restored(&mixed);
-            let mut device =
-                nth.map_or_else(|| FakeDevice::failing_at(0, false), |nth| FakeDevice::failing_at(nth, true));
-            let mut rows = Vec::new();
-            while !trainer.is_done() {
-                let advanced = trainer.advance(&mut device);
-                rows.extend(advanced.unwrap_or_else(|_| trainer.advance(&mut Cpu::default()).unwrap()));
-            }
-            assert_eq!(policies(&trainer), expected.policies, "from {from:?}, lost at {nth:?}");
-            for (experiment, &from) in from.iter().enumerate() {
-                let own_rows =
-                    |rows: &[Row]| rows.iter().filter(|row| row.experiment == experiment).copied().collect::<Vec<_>>();
-                let expected_rows =
-                    own_rows(&expected.rows).into_iter().filter(|row| row.generation + 1 >= from).collect::<Vec<_>>();
-                assert_eq!(own_rows(&rows), expected_rows, "experiment {experiment} from {from}, lost at {nth:?}");
-            }
+        let mut trainer = restored(&mixed);
+        let rows = trainer.finish(&mut FakeDevice::failing_at(0, false)).unwrap();
+        assert_eq!(policies(&trainer), expected.policies, "from {from:?}");
+        for (experiment, &from) in from.iter().enumerate() {
+            let own_rows =
+                |rows: &[Row]| rows.iter().filter(|row| row.experiment == experiment).copied().collect::<Vec<_>>();
+            let expected_rows =
+                own_rows(&expected.rows).into_iter().filter(|row| row.generation + 1 >= from).collect::<Vec<_>>();
+            assert_eq!(own_rows(&rows), expected_rows, "experiment {experiment} from {from}");
         }
     }
 }
@@ -331,26 +315,6 @@ fn starts_drawn_in_advance_are_discarded_after_a_restore() {
         "champions observe nothing, so their starts are not tested"
     );
     assert_eq!(outcome(&mut FakeDevice::failing_at(0, false)), expected);
-}
-
-/// `take_recovered_error` returns an error from which the trainer recovered, once.
-#[test]
-fn a_recovered_error_is_reported_once() {
-    for nth in 1.. {
-        let (mut trainer, mut device, mut reported) =
-            (Trainer::new(ValidConfig::all(&experiments()).unwrap()), FakeDevice::failing_at(nth, false), 0);
-        while !trainer.is_done() {
-            trainer.advance(&mut device).unwrap();
-            reported += usize::from(
-                trainer.take_recovered_error().is_some_and(|error| error.to_string().contains("pulled out")),
-            );
-        }
-        assert_eq!(reported, usize::from(device.failed()), "call {nth}");
-        if !device.failed() {
-            assert!(nth > 20, "a run makes more calls than {nth}");
-            break;
-        }
-    }
 }
 
 /// A population has to fit in a buffer. If it does not, `ResidencyPolicy::Always` is an error.
@@ -445,7 +409,6 @@ impl DevicePopulation for FakePopulation {
 impl Backend for FakeDevice {
     fn play(&mut self, groups: &[Group<'_>]) -> Result<Vec<GroupScores>, BackendError> {
         self.state.call()?;
-        // After an error, the trainer plays with weights that it fetched to the host.
         let weights = |group: &Group<'_>| match group.weights {
             Weights::OnHost(weights) => weights.to_vec(),
             Weights::OnDevice(held) => (held as &dyn Any)
@@ -476,11 +439,11 @@ impl Backend for FakeDevice {
     }
 }
 
-/// The device fails at each call in turn. If it fails permanently, the CPU continues. If it fails once, the trainer
-/// recovers by itself. Rows and policies are the same, and no row is repeated. With `FLOTILLA_LONG=1`, every call fails.
-/// Otherwise one of four does, and each case starts at another.
+/// The device fails at each call in turn, permanently or once. After an error, the last snapshots continue on the CPU.
+/// Rows and policies are the same. With `FLOTILLA_LONG=1`, every call fails. Otherwise one of four does, and each case
+/// starts at another.
 #[test]
-fn populations_of_a_lost_device_are_recomputed() {
+fn training_continues_from_snapshots_after_the_loss_of_a_device() {
     let (expected, _) = reference();
     let step = if support::is_long() { 1 } else { 4 };
     let cases = [(true, 1), (true, 3), (true, 100), (false, 3), (false, 100)];
@@ -488,22 +451,23 @@ fn populations_of_a_lost_device_are_recomputed() {
         for nth in (1 + at % step..).step_by(step) {
             let case = format!("fails at call {nth}, permanently: {permanent}, saved every {saves_every} generations");
             let (mut trainer, mut rows) = (Trainer::new(ValidConfig::all(&experiments()).unwrap()), Vec::new());
-            let mut device = FakeDevice::failing_at(nth, permanent);
+            let (mut device, mut saved) = (FakeDevice::failing_at(nth, permanent), (Vec::new(), 0));
             while !trainer.is_done() {
                 if trainer.generation(2) % saves_every == 0 {
                     match snapshots_of(&mut trainer) {
                         Err(SnapshotError::Backend(_)) => assert!(device.failed(), "{case}"),
-                        taken => assert_eq!(taken.unwrap()[2].generation, trainer.generation(2), "{case}"),
+                        taken => saved = (taken.unwrap(), rows.len()),
                     }
                 }
-                let advanced = match trainer.advance(&mut device) {
-                    Ok(advanced) => advanced,
+                match trainer.advance(&mut device) {
+                    Ok(advanced) => rows.extend(advanced),
                     Err(error) => {
-                        assert!(device.failed() && permanent, "{case}: {error}");
-                        trainer.advance(&mut Cpu::default()).unwrap()
+                        assert!(device.failed() && error.is_device_failure(), "{case}: {error}");
+                        trainer = restored(&saved.0);
+                        rows.truncate(saved.1);
+                        rows.extend(trainer.finish(&mut Cpu::default()).unwrap());
                     }
-                };
-                rows.extend(advanced);
+                }
             }
             assert_eq!(rows, expected.rows, "{case}");
             assert_eq!(policies(&trainer), expected.policies, "{case}");
@@ -515,8 +479,8 @@ fn populations_of_a_lost_device_are_recomputed() {
     }
 }
 
-/// If the device is lost, the run continues on the CPU, provided that `instead` returns it. Otherwise it stops with an
-/// error, and can be resumed from the last checkpoint.
+/// If the device is lost, the run continues on the CPU from its last checkpoint, provided that `fallback` returns it.
+/// Otherwise it stops with an error, and can be resumed.
 #[test]
 fn a_run_survives_the_loss_of_its_device() {
     let mut config = experiments().remove(0);
@@ -532,7 +496,6 @@ fn a_run_survives_the_loss_of_its_device() {
             stop: &stop,
             save: &save,
             fallback: &mut |_| fall_back.then(cpu),
-            on_recovery: &mut |_| {},
             watch: &mut |_| {},
         };
         let mut backend = device.map_or_else(cpu, |device| (Box::new(device), Machine::default()));

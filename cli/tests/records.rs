@@ -254,10 +254,7 @@ fn a_generation_moves_less_than_95_bytes_per_team() {
     (config.learning.trials, config.learning.population, config.learning.generations) = (1, teams, 60);
     config.learning.fitness = Fitness::Df;
     for (request, info) in support::adapters("a_generation_moves_less_than_95_bytes_per_team") {
-        // The backend must not play the first generation several times to choose the teams per workgroup.
-        let mut backend = open(&request, Records::PackedFrom(0))
-            .with_residency(ResidencyPolicy::Always)
-            .with_teams_per_workgroup(Some(32));
+        let mut backend = open(&request, Records::PackedFrom(0)).with_residency(ResidencyPolicy::Always);
         let mut trainer = Trainer::new([config.validate().unwrap()]);
         let mut before = backend.gpu().traffic();
         for generation in 0..=50 {

@@ -86,7 +86,6 @@ fn train(
         stop: &stop,
         save: &save,
         fallback,
-        on_recovery: &mut |_| {},
         watch: &mut |now| stop.store(stops(now.generations), SeqCst),
     };
     session.train(&mut backend, &mut options)

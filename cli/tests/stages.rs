@@ -141,7 +141,6 @@ fn train_until(session: &mut Session, stops: impl Fn(usize) -> bool) -> Result<S
         stop: &stop,
         save: &save,
         fallback: &mut |_| None,
-        on_recovery: &mut |_| {},
         watch: &mut |progress| stop.store(stops(progress.generations[0]), Relaxed),
     };
     session.train(&mut (Box::new(Cpu::default()), Machine::default()), &mut options)

@@ -966,9 +966,9 @@ fn the_batch_script_runs_in_bash() {
         assert!(script.lines().any(|other| other == line), "{line}: {script}");
     }
     assert!(!script.contains("--gpus"), "a GPU is requested for a sweep on the CPU: {script}");
-    let host = ["--slurm", "--seed", "7", "--breed", "host", "--on-device-loss", "cpu"];
+    let host = ["--slurm", "--seed", "7", "--breed", "host"];
     let host_script = succeed(flotilla(&sweep, &out, &host));
-    assert!(host_script.contains("--backend cpu --breed host --on-device-loss cpu --shard"), "{host_script}");
+    assert!(host_script.contains("--backend cpu --breed host --shard"), "{host_script}");
     assert!(
         script.contains("--seed 7 --backend cpu --threads 4 --shard \"$SLURM_ARRAY_TASK_ID/3\" --resume"),
         "{script}"

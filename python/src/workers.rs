@@ -163,10 +163,10 @@ fn find(backend: &str, work: Option<Work>) -> PyResult<(Option<OpenBackend>, Opt
         "gpu" => Processor::Gpu,
         name => Processor::Adapter(name.into()),
     };
-    let Chosen { gpu, reason, passed_over, forgotten } = choice::find(&processor, None, work).raise()?;
-    for text in passed_over.map(|error| format!("no GPU is used: {error}")).into_iter().chain(forgotten) {
+    let Chosen { gpu, reason, passed_over } = choice::find(&processor, None, work).raise()?;
+    if let Some(text) = passed_over.map(|error| format!("no GPU is used: {error}")) {
         let text = std::ffi::CString::new(text.replace('\0', " ")).unwrap_or_default();
         Python::attach(|py| PyErr::warn(py, &py.get_type::<PyRuntimeWarning>(), &text, 2))?;
     }
-    Ok((gpu.map(front::on_gpu), reason))
+    Ok((gpu.map(front::on_gpu), reason.map(String::from)))
 }

@@ -26,6 +26,18 @@ pub enum BackendError {
     Gone,
 }
 
+impl BackendError {
+    /// Reports whether a device was lost or ran out of memory, so that another backend may play the same.
+    pub fn is_device_failure(&self) -> bool {
+        match self {
+            #[cfg(feature = "gpu")]
+            BackendError::Gpu(error) => matches!(error, DeviceError::Lost { .. } | DeviceError::OutOfMemory { .. }),
+            BackendError::Gone => true,
+            _ => false,
+        }
+    }
+}
+
 impl From<ConfigError> for BackendError {
     fn from(error: ConfigError) -> BackendError {
         BackendError::InvalidInput(error.to_string())

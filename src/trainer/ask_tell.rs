@@ -106,7 +106,6 @@ impl Trainer {
                 experiment.breed_on_host(level);
                 rows
             };
-            experiment.generation += 1;
             rows.sort_by_key(|row| (row.experiment, row.trial, row.generation));
             rows
         })

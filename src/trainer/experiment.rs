@@ -21,9 +21,7 @@ pub(super) struct Experiment {
     pub schedules: Vec<TeamSchedule>,
     /// The schedules of the next generation, drawn while a backend that holds the populations plays. Otherwise empty.
     pub next_schedules: Vec<TeamSchedule>,
-    /// The generation that plays next, two past the last when all is done. The populations are of an earlier generation
-    /// after a device lost them.
-    pub generation: usize,
+    /// Where the populations are, and the generation that they play next: two past the last when all is done.
     pub residency: Residency,
 }
 
@@ -58,7 +56,7 @@ impl Experiment {
         let schedules = std::iter::repeat_with(schedule).take(trials.len()).collect();
         let trials = trials.into_par_iter().map(|index| TrialState::new(&stages, index, level)).collect();
         let residency = Residency::on_host(0);
-        Experiment { stages, trials, schedules, next_schedules: vec![], generation: 0, residency }
+        Experiment { stages, trials, schedules, next_schedules: vec![], residency }
     }
 
     /// The stage that the populations are about to play in.
@@ -73,12 +71,7 @@ impl Experiment {
 
     /// Reports whether the champions of the last generation have played.
     pub fn is_done(&self) -> bool {
-        self.generation > self.last() + 1
-    }
-
-    /// Reports whether the populations are of a generation that was played already, so that it has to be replayed.
-    pub fn needs_replay(&self) -> bool {
-        self.residency.generation() < self.generation && !self.is_done()
+        self.residency.generation() > self.last() + 1
     }
 
     /// Reports whether the populations are past the last generation, and only champions play.
@@ -125,7 +118,7 @@ impl Experiment {
     /// Returns the experiment's state as far as the host has it.
     pub fn snapshot(&self) -> Snapshot<&[f32]> {
         Snapshot {
-            generation: self.generation,
+            generation: self.residency.generation(),
             last: self.last(),
             weights: self.trials.iter().map(|trial| &trial.weights[..]).collect(),
             fitness: self.trials.iter().map(|trial| &trial.fitness[..]).collect(),
@@ -150,12 +143,10 @@ impl Experiment {
             (trial.weights, trial.fitness) = (weights, fitness);
             trial.pending = pending.map(|row| Row { experiment: index, ..row });
         }
-        self.generation = generation.min(self.last() + 2);
-        self.residency = Residency::on_host(self.generation);
+        self.residency = Residency::on_host(generation.min(self.last() + 2));
         if generation > last && last < self.last() {
             // The shorter run kept its last policies. This run breeds a next generation from them. The shorter run's
             // last champions may have played already; they play again, in the next generation.
-            self.generation = last + 1;
             self.residency = Residency::on_host(last);
             self.breed_beyond_the_last(level);
         }

@@ -45,7 +45,6 @@ pub struct Trainer {
     experiments: Vec<Experiment>,
     level: Level,
     times: GenerationTimes,
-    recovered_error: Option<BackendError>,
 }
 
 /// The results of one generation of one trial. Every G is in 0..1.
@@ -148,34 +147,28 @@ impl Trainer {
         let level = Level::new();
         let experiment = |config: ValidConfig| Experiment::new(&config, 0..config.learning.trials, level);
         let experiments = configs.into_iter().map(experiment).collect();
-        Trainer { experiments, level, times: GenerationTimes::default(), recovered_error: None }
+        Trainer { experiments, level, times: GenerationTimes::default() }
     }
 
     /// Creates random populations for one trial of a config. Its rows are the same as among the other trials.
     pub fn of_trial(config: &ValidConfig, trial: usize) -> Trainer {
         let level = Level::new();
         let experiments = vec![Experiment::new(config, trial..trial + 1, level)];
-        Trainer { experiments, level, times: GenerationTimes::default(), recovered_error: None }
+        Trainer { experiments, level, times: GenerationTimes::default() }
     }
 
     /// Returns the generation that an experiment plays next: two past its last when it is done.
     pub fn generation(&self, experiment: usize) -> usize {
-        self.experiments[experiment].generation
+        self.experiments[experiment].residency.generation()
     }
 
     /// Makes the generation that an experiment plays next its last, unless an earlier one is. Returns the last.
     ///
     /// The results are those of a config with that number of generations.
     pub fn end(&mut self, experiment: usize) -> usize {
-        let Experiment { stages, generation, .. } = &mut self.experiments[experiment];
-        stages.last_generation = stages.last_generation.min(*generation);
+        let Experiment { stages, residency, .. } = &mut self.experiments[experiment];
+        stages.last_generation = stages.last_generation.min(residency.generation());
         stages.last_generation
-    }
-
-    /// Takes the error of a backend that held populations and failed, if the trainer recovered from it. The host holds
-    /// the populations from then on.
-    pub fn take_recovered_error(&mut self) -> Option<BackendError> {
-        self.recovered_error.take()
     }
 
     /// Returns and resets the times of generations.
@@ -193,21 +186,12 @@ impl Trainer {
     /// Returns the rows that became complete, by experiment, trial and generation. A generation's champion plays with
     /// the next generation. The last champion plays alone.
     ///
-    /// A backend may hold the populations. If it loses them, the trainer replays generations from its last copy.
-    ///
     /// # Errors
-    /// The backend failed. The trainer is then still before this generation.
+    /// The backend failed. The trainer is then still before this generation, and another backend can play it, unless
+    /// the one that failed holds the populations. Then a new trainer continues from a [`Trainer::snapshot`].
     pub fn advance(&mut self, backend: &mut dyn Backend) -> Result<Vec<Row>, BackendError> {
         // Enters the thread pool once, because waking a thread takes longer than a small generation.
-        scope(|_| match self.replay_and_play(backend) {
-            // A device may have room for the populations or for the episodes, but not for both.
-            Err(error) if self.release_all() => {
-                let rows = self.replay_and_play(backend)?;
-                self.recovered_error = Some(error);
-                Ok(rows)
-            }
-            played => played,
-        })
+        scope(|_| self.play_generation(backend))
     }
 
     /// Plays every generation that is left, and returns all rows.
@@ -222,33 +206,9 @@ impl Trainer {
         Ok(rows)
     }
 
-    /// Replays the generations that were lost, then plays the next one. Returns only the rows of that, because the rows
-    /// of replayed generations were returned before.
-    fn replay_and_play(&mut self, backend: &mut dyn Backend) -> Result<Vec<Row>, BackendError> {
-        while self.experiments.iter().any(Experiment::needs_replay) {
-            self.play_generation(Experiment::needs_replay, backend)?;
-        }
-        let rows = self.play_generation(|experiment| !experiment.is_done(), backend)?;
-        let unfinished = self.experiments.iter_mut().filter(|experiment| !experiment.is_done());
-        unfinished.for_each(|experiment| experiment.generation += 1);
-        Ok(rows)
-    }
-
-    /// Takes all populations back from the backend that failed. Returns false if there were none, or if they are lost.
-    fn release_all(&mut self) -> bool {
-        let on_device = self.experiments.iter_mut().filter(|experiment| experiment.residency.is_on_device());
-        let released: Vec<bool> = on_device.map(|experiment| experiment.release().is_ok()).collect();
-        !released.is_empty() && released.iter().all(|&released| released)
-    }
-
-    /// Plays the generation that the populations of some experiments are at.
-    fn play_generation(
-        &mut self,
-        plays: impl Fn(&Experiment) -> bool,
-        backend: &mut dyn Backend,
-    ) -> Result<Vec<Row>, BackendError> {
+    fn play_generation(&mut self, backend: &mut dyn Backend) -> Result<Vec<Row>, BackendError> {
         let level = self.level;
-        let playing = self.experiments.iter_mut().enumerate().filter(|(_, experiment)| plays(experiment));
+        let playing = self.experiments.iter_mut().enumerate().filter(|(_, experiment)| !experiment.is_done());
         let mut playing: Vec<(usize, &mut Experiment)> = playing.collect();
 
         let start = Instant::now();
@@ -266,9 +226,7 @@ impl Trainer {
         let mut rows = playing.par_iter_mut().flat_map_iter(collect).collect::<Vec<_>>();
         let collected = Instant::now();
         playing.retain(|(_, experiment)| !experiment.only_champions_left());
-        let errors: Vec<_> =
-            playing.par_iter_mut().filter_map(|(_, experiment)| experiment.breed(level).err()).collect();
-        self.recovered_error = errors.into_iter().next().or(self.recovered_error.take());
+        playing.par_iter_mut().for_each(|(_, experiment)| experiment.breed(level));
         rows.sort_by_key(|row| (row.experiment, row.trial, row.generation));
         self.times.prepare += prepared - start;
         self.times.play += played - prepared;
@@ -322,14 +280,14 @@ impl Trainer {
     /// The backend that holds them failed to return them.
     pub fn weights(&mut self, experiment: usize, trial: usize) -> Result<&[f32], BackendError> {
         let experiment = &mut self.experiments[experiment];
-        experiment.bring_up_to_date()?;
+        experiment.fetch()?;
         Ok(&experiment.trials[trial].weights)
     }
 
     /// Returns the world that an experiment's next generation plays in.
     pub fn world(&self, experiment: usize) -> &World {
         let experiment = &self.experiments[experiment];
-        &experiment.stages.of(experiment.generation).world
+        &experiment.stages.of(experiment.residency.generation()).world
     }
 
     /// Returns what [`Trainer::restore`] needs of an experiment, without copying it.
@@ -338,7 +296,7 @@ impl Trainer {
     /// The backend that holds the populations failed to return them.
     pub fn view(&mut self, experiment: usize) -> Result<Snapshot<&[f32]>, BackendError> {
         let experiment = &mut self.experiments[experiment];
-        experiment.bring_up_to_date()?;
+        experiment.fetch()?;
         Ok(experiment.snapshot())
     }
 
@@ -360,7 +318,7 @@ impl Trainer {
         let stage = experiment.stage();
         let (populations, parameters) = (stage.config.populations(), stage.world.parameters());
         let (population, slots) = (stage.config.learning.population, stage.config.learning.slots());
-        let fresh = experiment.generation == 0 && experiment.residency.is_undecided();
+        let fresh = experiment.residency.generation() == 0 && experiment.residency.is_undecided();
         let Some(trial) = experiment.trials.get_mut(trial) else { return false };
         if !fresh || policies == 0 || weights.len() != populations * policies * parameters {
             return false;

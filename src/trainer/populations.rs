@@ -17,7 +17,11 @@ const SLOTS_PER_TASK: usize = 64;
 
 impl Experiment {
     /// Asks a backend once to hold the populations. It takes those of all trials or none.
+    ///
+    /// # Errors
+    /// The backend failed, or a backend has lost the populations.
     pub fn offer(&mut self, backend: &mut dyn Backend) -> Result<(), BackendError> {
+        self.residency.check()?;
         if !self.residency.is_undecided() {
             return Ok(());
         }
@@ -38,6 +42,7 @@ impl Experiment {
 
     /// Copies the populations of all trials to the host, unless the host's are current. An error copies none.
     pub fn fetch(&mut self) -> Result<(), BackendError> {
+        self.residency.check()?;
         if self.residency.host_is_current() {
             return Ok(());
         }
@@ -51,43 +56,20 @@ impl Experiment {
         Ok(())
     }
 
-    /// Takes the populations back from the backend. After an error, only the host's last copy is left.
-    pub fn release(&mut self) -> Result<(), BackendError> {
-        let fetched = self.fetch();
-        self.residency.lose();
-        fetched
-    }
-
-    /// Makes the host's weights those of the generation that plays next, for a snapshot.
-    pub fn bring_up_to_date(&mut self) -> Result<(), BackendError> {
-        if self.needs_replay() {
-            return Err(BackendError::Gone);
-        }
-        let fetched = self.fetch();
-        if fetched.is_err() {
-            self.residency.lose();
-        }
-        fetched
-    }
-
     /// Breeds the next generation, on the host or on the device that holds the populations. After the last generation,
     /// no policy changes. Tournaments then copy the champion to its slot, and evolution strategies move the mean, which is
     /// in that slot.
     ///
-    /// # Errors
-    /// The backend that holds the populations failed. The results of this generation are already known. The next call
-    /// replays the lost generations, or fails.
-    pub fn breed(&mut self, level: Level) -> Result<(), BackendError> {
+    /// The results of this generation are already known. So if the backend that holds the populations fails, the next
+    /// use of the populations returns its error.
+    pub fn breed(&mut self, level: Level) {
         if !self.residency.is_on_device() {
-            self.breed_on_host(level);
-            return Ok(());
+            return self.breed_on_host(level);
         }
-        let bred = self.breed_on_device(level);
-        match bred {
+        match self.breed_on_device(level) {
             Ok(()) => self.residency.bred(),
-            Err(_) => self.residency.lose(),
+            Err(error) => self.residency.lose(error),
         }
-        bred
     }
 
     /// Plans the next generation, and lets the device breed it.

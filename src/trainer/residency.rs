@@ -1,18 +1,15 @@
 //! Where an experiment's populations are, and of which generation each copy is.
 
-use crate::backend::DevicePopulation;
+use crate::backend::{BackendError, DevicePopulation};
 
 /// Where the populations of all trials of an experiment are.
-///
-/// After [`Residency::lose`] the host's copy may be older than the generation that plays next. The experiment then
-/// replays the generations in between, with the same results.
 #[derive(Debug)]
 pub(super) enum Residency {
     /// The host alone has them.
     Host {
         /// The generation of the weights.
         generation: usize,
-        /// Whether a backend was asked to hold them and did not, or lost them.
+        /// Whether a backend was asked to hold them and did not.
         declined: bool,
     },
     /// A backend holds them. The host keeps an older copy.
@@ -23,6 +20,13 @@ pub(super) enum Residency {
         host_generation: usize,
         /// One per trial.
         populations: Vec<Box<dyn DevicePopulation>>,
+    },
+    /// A backend failed to breed them, so nobody has them.
+    Lost {
+        /// The generation that they should have become.
+        generation: usize,
+        /// The backend's error, until it is reported.
+        error: Option<BackendError>,
     },
 }
 
@@ -35,21 +39,31 @@ impl Residency {
     /// Returns the generation that the populations are about to play.
     pub fn generation(&self) -> usize {
         match *self {
-            Residency::Host { generation, .. } | Residency::Device { generation, .. } => generation,
+            Residency::Host { generation, .. }
+            | Residency::Device { generation, .. }
+            | Residency::Lost { generation, .. } => generation,
         }
     }
 
-    /// Returns the populations that a backend holds, one per trial; empty if the host has them.
+    /// Returns the populations that a backend holds, one per trial; empty if none does.
     pub fn on_device(&self) -> &[Box<dyn DevicePopulation>] {
         match self {
-            Residency::Host { .. } => &[],
+            Residency::Host { .. } | Residency::Lost { .. } => &[],
             Residency::Device { populations, .. } => populations,
         }
     }
 
-    /// Reports whether a backend holds the populations.
+    /// Reports whether a backend holds the populations, or has lost them.
     pub fn is_on_device(&self) -> bool {
-        matches!(self, Residency::Device { .. })
+        !matches!(self, Residency::Host { .. })
+    }
+
+    /// Fails if the populations are lost.
+    pub fn check(&mut self) -> Result<(), BackendError> {
+        match self {
+            Residency::Lost { error, .. } => Err(error.take().unwrap_or(BackendError::Gone)),
+            Residency::Host { .. } | Residency::Device { .. } => Ok(()),
+        }
     }
 
     /// Reports whether a backend has yet to be asked to hold the populations.
@@ -62,6 +76,7 @@ impl Residency {
         match *self {
             Residency::Host { .. } => true,
             Residency::Device { generation, host_generation, .. } => generation == host_generation,
+            Residency::Lost { .. } => false,
         }
     }
 
@@ -83,11 +98,9 @@ impl Residency {
         }
     }
 
-    /// Drops the device's copy. Only the host's copy is left, which may be older.
-    pub fn lose(&mut self) {
-        if let Residency::Device { host_generation, .. } = *self {
-            *self = Residency::Host { generation: host_generation, declined: true };
-        }
+    /// Records that the backend failed to breed the populations.
+    pub fn lose(&mut self, error: BackendError) {
+        *self = Residency::Lost { generation: self.generation() + 1, error: Some(error) };
     }
 
     /// Records that the last generation is over. The host's weights are current, and the device's copy is dropped.
@@ -98,7 +111,9 @@ impl Residency {
     /// Records that the populations, wherever they are, became the next generation.
     pub fn bred(&mut self) {
         match self {
-            Residency::Host { generation, .. } | Residency::Device { generation, .. } => *generation += 1,
+            Residency::Host { generation, .. }
+            | Residency::Device { generation, .. }
+            | Residency::Lost { generation, .. } => *generation += 1,
         }
     }
 }
@@ -108,7 +123,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_loss_goes_back_to_the_last_copy_on_the_host() {
+    fn copies_on_the_host_and_losses_are_tracked() {
         let mut residency = Residency::on_host(3);
         assert!(residency.is_undecided() && residency.host_is_current());
         residency.accept(vec![]);
@@ -119,9 +134,11 @@ mod tests {
         residency.fetched();
         assert!(residency.host_is_current());
         residency.bred();
-        residency.lose();
-        assert_eq!((residency.generation(), residency.is_on_device(), residency.is_undecided()), (5, false, false));
-        residency.bred();
-        assert_eq!(residency.generation(), 6);
+        assert!(residency.check().is_ok());
+        residency.lose(BackendError::HeldElsewhere);
+        assert_eq!((residency.generation(), residency.host_is_current(), residency.is_undecided()), (7, false, false));
+        // The backend's own error is reported once.
+        assert!(matches!(residency.check(), Err(BackendError::HeldElsewhere)));
+        assert!(matches!(residency.check(), Err(BackendError::Gone)));
     }
 }

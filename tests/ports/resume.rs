@@ -53,7 +53,6 @@ fn train(folder: &Path) {
         stop: &stop,
         save: &save,
         fallback: &mut |_| None,
-        on_recovery: &mut |_| {},
         // Slow down, so that there is time for a kill.
         watch: &mut |_| std::thread::sleep(Duration::from_millis(10)),
     };

@@ -119,15 +119,13 @@ pub struct Context<'a> {
     pub command: &'a str,
     /// Flags that choose the processor, for commands in advice.
     pub flags: &'a [OsString],
-    /// Whether the CPU continues if a device fails during a run.
-    pub falls_back: bool,
 }
 
 impl<'a> Context<'a> {
     /// Returns a context that reports to `report`, and never stops.
     pub fn new(report: &'a dyn Fn(Event<'_>)) -> Context<'a> {
         static NEVER: AtomicBool = AtomicBool::new(false);
-        Context { report, stop: &NEVER, save: &NEVER, end: &NEVER, command: "", flags: &[], falls_back: false }
+        Context { report, stop: &NEVER, save: &NEVER, end: &NEVER, command: "", flags: &[] }
     }
 }
 
@@ -194,18 +192,16 @@ impl Context<'_> {
         ends
     }
 
-    /// Returns the CPU backend to continue with after another backend failed, if that is allowed.
+    /// Returns the CPU, to continue with after a device failed. Returns `None` after any other error.
     pub fn fallback(&self, error: &BackendError) -> Option<OpenBackend> {
-        self.falls_back.then(|| {
+        error.is_device_failure().then(|| {
             let (backend, machine) = front::cpu();
-            self.warn(format_args!("{error}\ncontinuing on {}, with the same results", backend.describe()));
+            let cpu = backend.describe();
+            self.warn(format_args!(
+                "note: {error}\ncontinuing on {cpu} from the last checkpoint, with the same results"
+            ));
             (backend, machine)
         })
-    }
-
-    /// Reports that populations moved to the host.
-    pub fn on_recovery(&self, error: &BackendError) {
-        self.warn(format_args!("{error}\nthe populations are kept by the host from here on, to the same results"));
     }
 
     /// Calls `work` with the options of a training that calls `watch` after every generation.
@@ -215,7 +211,6 @@ impl Context<'_> {
             stop: self.stop,
             save: self.save,
             fallback: &mut |error| self.fallback(error),
-            on_recovery: &mut |error| self.on_recovery(error),
             watch,
         })
     }

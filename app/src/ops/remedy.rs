@@ -142,11 +142,10 @@ pub fn run(error: &RunError) -> String {
             " (flotilla check shows what a config needs; `ulimit -v` and limits of a job or container count)".into()
         }
         RunError::Backend { saved: Ok(()), .. } => {
-            ": continue with --resume, with --on-device-loss cpu to change to the CPU".into()
+            ": continue with --resume, with --backend cpu to change to the CPU".into()
         }
         RunError::Backend { saved: Err(error), .. } => run(error),
-        RunError::Fetch(BackendError::Gone) => "; --resume continues from the last checkpoint or the start".into(),
-        RunError::Fetch(error) => backend(error).into(),
+        RunError::Fetch(_) => "; --resume continues from the last checkpoint or the start".into(),
         RunError::Memory { .. } | RunError::Config(_) => String::new(),
     }
 }

@@ -364,7 +364,6 @@ pub fn train_points(
             stop: context.stop,
             save: context.save,
             fallback: &mut |error| context.fallback(error),
-            on_recovery: &mut |error| context.on_recovery(error),
             watch: &mut |_| {},
         },
         watch: &mut |progress| share(progress),

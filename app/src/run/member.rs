@@ -63,31 +63,47 @@ impl Member {
                 found.notes,
             ));
         }
-        let (metrics, before, from) = match found.checkpoint {
-            Some((Checkpoint { snapshot, seconds, .. }, metrics)) => {
-                (metrics, seconds, InitialState::Checkpoint(snapshot))
-            }
+        let before = found.checkpoint.as_ref().map_or(0.0, |(checkpoint, _)| checkpoint.seconds);
+        let mut member = Member { before, ..member };
+        let from = member.begin(found.checkpoint, found.kept, init)?;
+        Ok((member, from, found.notes))
+    }
+
+    /// Makes the writers of an unfinished run. Returns its initial state: that of a checkpoint, if there is one.
+    fn begin(
+        &mut self,
+        checkpoint: Option<(Checkpoint, metrics::Writer)>,
+        kept: Vec<usize>,
+        init: Option<Init>,
+    ) -> Result<InitialState, RunError> {
+        let (metrics, from) = match checkpoint {
+            Some((Checkpoint { snapshot, .. }, metrics)) => (metrics, InitialState::Checkpoint(snapshot)),
             None => {
-                let metrics =
-                    metrics::Writer::create(&member.folder.disk, &member.folder.file(METRICS), &member.config);
-                (
-                    metrics.map_err(member.metrics_failed())?,
-                    0.0,
-                    init.map_or(InitialState::Random, InitialState::Policies),
-                )
+                let metrics = metrics::Writer::create(&self.folder.disk, &self.folder.file(METRICS), &self.config);
+                (metrics.map_err(self.metrics_failed())?, init.map_or(InitialState::Random, InitialState::Policies))
             }
         };
         let generation = if let InitialState::Checkpoint(snapshot) = &from { snapshot.generation } else { 0 };
-        let checkpoints = member.folder.file(folder::CHECKPOINTS);
-        let checkpoints = CheckpointWriter::new(
-            member.folder.disk.clone(),
-            checkpoints,
-            member.config.clone(),
-            found.kept,
-            generation,
-        );
-        let unfinished = Some(Unfinished { experiment: 0, metrics, checkpoints, ending: None });
-        Ok((Member { unfinished, before, ..member }, from, found.notes))
+        let (disk, checkpoints) = (self.folder.disk.clone(), self.folder.file(folder::CHECKPOINTS));
+        let checkpoints = CheckpointWriter::new(disk, checkpoints, self.config.clone(), kept, generation);
+        self.unfinished = Some(Unfinished { experiment: 0, metrics, checkpoints, ending: None });
+        Ok(from)
+    }
+
+    /// Goes back to the last checkpoint of an unfinished run, or to its start.
+    pub(super) fn reload(&mut self) -> Result<InitialState, RunError> {
+        self.wait()?;
+        if self.unfinished.take().is_none() {
+            return Ok(InitialState::Random);
+        }
+        let (checkpoint, kept) = self.folder.last_checkpoint(&self.config)?;
+        match (&checkpoint, &self.run.init) {
+            (None, Some(existing)) => {
+                let (path, existing) = (self.folder.path.clone(), existing.clone());
+                Err(RecordError::InitNeeded { path, existing }.into())
+            }
+            _ => self.begin(checkpoint, kept, None),
+        }
     }
 
     pub(super) fn flush(&mut self) -> Result<(), RunError> {

@@ -89,11 +89,8 @@ pub struct Options<'a> {
     pub stop: &'a AtomicBool,
     /// Set by the caller to request a checkpoint of every run.
     pub save: &'a AtomicBool,
-    /// Called after a backend fails. Returns another backend to use, if there is one.
+    /// Called after a backend fails. Returns another backend that continues from the last checkpoints, if there is one.
     pub fallback: &'a mut dyn FnMut(&BackendError) -> Option<OpenBackend>,
-    /// Called at most once, with the error of a backend that held the populations, if training recovered from it. The
-    /// host holds the populations from then on.
-    pub on_recovery: &'a mut dyn FnMut(&BackendError),
     /// Called after every generation.
     pub watch: &'a mut dyn FnMut(&Progress<'_>),
 }

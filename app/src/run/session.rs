@@ -73,27 +73,35 @@ impl Session {
         let configs = runs.iter().map(|(config, ..)| config.validate()).collect::<Result<Vec<ValidConfig>, _>>()?;
         folder::check(disk, runs.iter().map(|(config, path, _)| (&**path, config)), start)?;
         let opened = on_threads(runs, |(config, path, init)| Member::open(config, path, init, otherwise, start, disk))?;
-        let (mut members, mut snapshots, mut notes) = (Vec::new(), Vec::new(), Vec::new());
-        for (member, snapshot, own_notes) in opened {
+        let (mut members, mut states, mut notes) = (Vec::new(), Vec::new(), Vec::new());
+        for (member, state, own_notes) in opened {
             // One warning about missing locks is enough for all runs.
             let is_new = |note: &Note| *note != Note::NotLocked || !notes.iter().any(|(_, other)| other == note);
             let own_notes: Vec<Note> = own_notes.into_iter().filter(is_new).collect();
             notes.extend(own_notes.into_iter().map(|note| (members.len(), note)));
             members.push(member);
-            snapshots.push(snapshot);
+            states.push(state);
         }
-        let unfinished = members.iter().zip(configs).filter(|(member, _)| member.unfinished.is_some());
+        let (generations, runs_of_experiments, since) = (vec![], vec![], Instant::now());
+        let mut session = Session { members, generations, trainer: Trainer::new([]), runs_of_experiments, since };
+        session.restore(configs, states);
+        Ok((session, notes))
+    }
+
+    /// Makes a new trainer for the unfinished runs, each in its state.
+    fn restore(&mut self, configs: Vec<ValidConfig>, states: Vec<InitialState>) {
+        let unfinished = self.members.iter().zip(configs).filter(|(member, _)| member.unfinished.is_some());
         let mut trainer = Trainer::new(unfinished.map(|(_, config)| config));
-        let mut generations = Vec::with_capacity(members.len());
-        let mut runs_of_experiments = Vec::new();
-        for (run, (member, snapshot)) in members.iter_mut().zip(snapshots).enumerate() {
+        self.generations.clear();
+        self.runs_of_experiments.clear();
+        for (run, (member, state)) in self.members.iter_mut().zip(states).enumerate() {
             let Some(unfinished) = &mut member.unfinished else {
-                generations.push(member.config.learning.generations + 2);
+                self.generations.push(member.config.learning.generations + 2);
                 continue;
             };
-            unfinished.experiment = runs_of_experiments.len();
-            runs_of_experiments.push(run);
-            let fits = match snapshot {
+            unfinished.experiment = self.runs_of_experiments.len();
+            self.runs_of_experiments.push(run);
+            let fits = match state {
                 InitialState::Checkpoint(snapshot) => trainer.restore(unfinished.experiment, snapshot),
                 InitialState::Policies(Init { trials, .. }) => {
                     (trials.into_iter().enumerate()).all(|(trial, Policies { policies, weights, .. })| {
@@ -105,9 +113,22 @@ impl Session {
             if !fits {
                 unreachable!("checkpoints and policies are read in the sizes of their config");
             }
-            generations.push(trainer.generation(unfinished.experiment));
+            self.generations.push(trainer.generation(unfinished.experiment));
         }
-        Ok((Session { members, generations, trainer, runs_of_experiments, since: Instant::now() }, notes))
+        self.trainer = trainer;
+    }
+
+    /// Goes back to the last checkpoints after the backend failed. The populations that it still returns are saved
+    /// first.
+    fn reopen(&mut self) -> Result<(), RunError> {
+        match self.save() {
+            Err(RunError::Fetch(_)) => {}
+            saved => saved?,
+        }
+        let configs = self.members.iter().map(|member| member.config.validate()).collect::<Result<_, _>>()?;
+        let states = self.members.iter_mut().map(Member::reload).collect::<Result<_, _>>()?;
+        self.restore(configs, states);
+        Ok(())
     }
 
     /// Reports whether all runs are finished.
@@ -154,32 +175,15 @@ impl Session {
         self.record_machine(backend);
         self.write_runs(Status::Running)?;
         self.save_starts()?;
-        let (mut flushed, mut recovered_error, mut reported) = (Instant::now(), None, false);
-        // An error is reported once, and only after a generation has recovered from it. A lost device ends the session
-        // with an error instead.
-        let mut report = |error: Option<BackendError>| {
-            if let Some(error) = error.filter(|_| !reported) {
-                reported = true;
-                (options.on_recovery)(&error);
-            }
-        };
+        let mut flushed = Instant::now();
         while !self.trainer.is_done() {
             let rows = match self.trainer.advance(&mut *backend.0) {
                 Ok(rows) => rows,
-                Err(error) => match (options.fallback)(&error) {
-                    Some(other) => {
-                        recovered_error = None;
-                        *backend = other;
-                        self.record_machine(backend);
-                        continue;
-                    }
-                    None => {
-                        let generation = self.unfinished().map(|run| self.generations[run]).min().unwrap_or(0);
-                        return Err(RunError::Backend { error, generation, saved: self.stop().map_err(Box::new) });
-                    }
-                },
+                Err(error) => {
+                    self.replace_backend(error, backend, options)?;
+                    continue;
+                }
             };
-            report(std::mem::replace(&mut recovered_error, self.trainer.take_recovered_error()));
             let rows = self.add(rows)?;
             if flushed.elapsed() >= FLUSH {
                 self.members.iter_mut().try_for_each(Member::flush)?;
@@ -198,11 +202,8 @@ impl Session {
                 () => continue,
             };
             match saved {
-                // The device failed. The next generation either recovers from this or ends with the error.
-                Err(RunError::Fetch(error)) => {
-                    options.save.store(!stop, Relaxed);
-                    recovered_error = Some(error);
-                }
+                // A request to stop is met after the next generation.
+                Err(RunError::Fetch(error)) => self.replace_backend(error, backend, options)?,
                 saved => {
                     saved?;
                     if stop {
@@ -211,8 +212,27 @@ impl Session {
                 }
             }
         }
-        report(recovered_error);
         Ok(SessionEnd::Finished)
+    }
+
+    /// Continues on another backend after one failed.
+    ///
+    /// # Errors
+    /// There is no other backend, or a file cannot be read or written. What can be saved is saved.
+    fn replace_backend(
+        &mut self,
+        error: BackendError,
+        backend: &mut OpenBackend,
+        options: &mut Options<'_>,
+    ) -> Result<(), RunError> {
+        let Some(other) = (options.fallback)(&error) else {
+            let generation = self.unfinished().map(|run| self.generations[run]).min().unwrap_or(0);
+            return Err(RunError::Backend { error, generation, saved: self.stop().map_err(Box::new) });
+        };
+        self.reopen()?;
+        *backend = other;
+        self.record_machine(backend);
+        Ok(())
     }
 
     /// Makes the generation that each run plays next its last, unless an earlier one is. Returns the largest of these

@@ -127,8 +127,8 @@ pub fn run(
         };
         tell(session.generations());
         let mut watch = |now: &run::Progress<'_>| tell(now.generations);
-        let run::Options { command, stop, save, ref mut fallback, ref mut on_recovery, .. } = options.runs;
-        let mut runs = run::Options { command, stop, save, fallback, on_recovery, watch: &mut watch };
+        let run::Options { command, stop, save, ref mut fallback, .. } = options.runs;
+        let mut runs = run::Options { command, stop, save, fallback, watch: &mut watch };
         if !session.is_done() && session.train(backend, &mut runs)? == SessionEnd::Stopped {
             return Ok(SessionEnd::Stopped);
         }

@@ -31,11 +31,6 @@ pub trait Faults: Send + Sync {
         None
     }
 
-    /// Returns how long a rollout with so many teams per workgroup seems to take, if not as long as it does.
-    fn rollout_takes(&self, _teams: usize) -> Option<Duration> {
-        None
-    }
-
     /// Returns the text of a shader to compile instead of its own.
     fn edits(&self, text: String) -> String {
         text

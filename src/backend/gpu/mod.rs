@@ -5,14 +5,12 @@
 //! | module | holds |
 //! |---|---|
 //! | [`exact`] | what makes the shaders' arithmetic bit-identical to the CPU's |
-//! | `absent` | why no GPU is found |
 //! | [`mod@faults`] | faults that tests inject |
 //! | [`device`] | adapters, and what is asked of an opened one |
 //! | [`population`] | policies that stay on the device |
 //! | [`episode`] | whole episodes |
 //! | [`mod@self_test`] | opening a device, and the tests that it must pass |
 
-mod absent;
 pub mod device;
 pub mod episode;
 pub mod exact;

@@ -62,6 +62,16 @@ impl Folder {
         Ok(())
     }
 
+    /// Returns the newest usable checkpoint of a run that trains in this folder, and the generations of all.
+    pub(crate) fn last_checkpoint(
+        &self,
+        config: &Config,
+    ) -> Result<(Option<(Checkpoint, metrics::Writer)>, Vec<usize>), RecordError> {
+        let mut kept = checkpoint::list(&self.file(CHECKPOINTS))?;
+        let newest = self.find_checkpoint(config, Some(config), false, None, &mut kept, &mut Vec::new())?;
+        Ok((newest, kept))
+    }
+
     /// Returns an error if the run's origin does not allow the given config. `has_config` says that `config.toml` could
     /// be read. It then agrees with the given config, so that a mismatch means that it was edited.
     fn origin_error(&self, config: &Config, run: Option<&Run>, has_config: bool) -> Option<RecordError> {

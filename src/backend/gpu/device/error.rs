@@ -1,17 +1,19 @@
 //! Why a GPU could not be opened, or failed.
 
 use super::adapter::{AdapterInfo, is_index};
-use crate::backend::gpu::absent;
 use crate::backend::gpu::exact::{Pass, ShaderError};
+
+/// Where a person finds out why.
+const REASONS: &str = "the page on GPUs (docs/help/gpus.md) has usual reasons";
 
 /// Why a GPU could not be opened, or failed.
 #[derive(Debug, thiserror::Error)]
 pub enum DeviceError {
     /// There is no adapter.
-    #[error("no GPU adapter found: {}", absent::reasons())]
+    #[error("no GPU adapter found: no Vulkan, Metal or DirectX 12 driver answers; {REASONS}")]
     NoAdapter,
     /// There are only adapters that are not certainly GPUs. They are opened only by name or number.
-    #[error("no GPU among the adapters, only {}{}", list(.found), absent::hints())]
+    #[error("no GPU among the adapters, only {}; {REASONS}", list(.found))]
     NoRealAdapter {
         /// The adapters.
         found: Vec<AdapterInfo>,

@@ -186,11 +186,6 @@ impl Gpu {
         self.faults.as_ref().and_then(|faults| faults.takes(iterations)).unwrap_or(elapsed)
     }
 
-    /// Returns how long a rollout took, or seems to take under injected faults.
-    pub(super) fn rollout_taken(&self, teams: usize, elapsed: Duration) -> Duration {
-        self.faults.as_ref().and_then(|faults| faults.rollout_takes(teams)).unwrap_or(elapsed)
-    }
-
     /// Returns an error if the device was lost, or if anything failed outside of [`Gpu::scoped`]. Call it after every
     /// wait.
     ///

@@ -154,9 +154,8 @@ fn lay_out(batch: &BatchPlan, rounds: usize, nonce: u32) -> (Vec<Task>, Vec<Run>
 /// The dispatches of a batch on their way to the device, in submissions that no watchdog ends.
 #[derive(Default)]
 struct Queue {
-    /// Dispatches of the next submission, their estimated time in seconds and their estimated work.
+    /// Dispatches of the next submission, and their estimated work.
     dispatches: Vec<Dispatch>,
-    load: f64,
     iterations: u64,
     /// Dispatches that pack records, after all others.
     packing: Vec<Dispatch>,
@@ -329,7 +328,7 @@ impl GpuBackend {
         Ok((readback, copies))
     }
 
-    /// Adds a run's dispatches to the queue. Submits the queue whenever its estimated time reaches the target.
+    /// Adds a run's dispatches to the queue. Submits the queue whenever it has as much work as a submission may have.
     fn enqueue(
         &mut self,
         flight: usize,
@@ -339,8 +338,7 @@ impl GpuBackend {
     ) -> Result<(), DeviceError> {
         let most = self.gpu.limits.max_compute_workgroups_per_dimension as usize / TASK_ALIGNMENT * TASK_ALIGNMENT;
         while !tasks.is_empty() {
-            let pace = self.paces.entry(shape).or_default();
-            let allowed = pace.tasks(iterations, queue.load) / TASK_ALIGNMENT * TASK_ALIGNMENT;
+            let allowed = self.pace.tasks(iterations, queue.iterations) / TASK_ALIGNMENT * TASK_ALIGNMENT;
             if allowed == 0 && queue.iterations > 0 {
                 self.flush(flight, queue, &[])?;
                 continue;
@@ -350,17 +348,16 @@ impl GpuBackend {
             let part_iterations = part.len() as u64 * iterations;
             queue.all_iterations += part_iterations;
             queue.iterations += part_iterations;
-            queue.load += pace.seconds(part_iterations);
-            let is_trial = !tasks.is_empty() && !pace.is_known();
+            let is_trial = !tasks.is_empty() && !self.pace.is_measured();
             self.dispatch(shape, part, buffers, queue, round == 0)?;
             if is_trial {
                 // The rest is cut by how long this part takes.
                 self.gpu.wait()?;
-                let start = Instant::now();
+                let (start, trial_iterations) = (Instant::now(), queue.iterations);
                 let submitted = self.flush(flight, queue, &[])?;
                 self.gpu.wait_for(Some(submitted))?;
-                let elapsed = self.gpu.taken(part_iterations, start.elapsed());
-                self.paces.entry(shape).or_default().record_trial(part_iterations, elapsed);
+                let elapsed = self.gpu.taken(trial_iterations, start.elapsed());
+                self.pace.record_trial(trial_iterations, elapsed);
                 self.times.longest = self.times.longest.max(elapsed);
                 queue.started = None;
             }
@@ -394,7 +391,7 @@ impl GpuBackend {
         }
         let inputs = [worlds, tasks, places, weights, record, moments, states];
         let group = self.gpu.bind("episode", &self.layout, &inputs)?;
-        queue.dispatches.push((self.pipelines[&shape].pipeline.clone(), group, grid));
+        queue.dispatches.push((self.pipelines[&shape].clone(), group, grid));
         Ok(())
     }
 
@@ -426,7 +423,7 @@ impl GpuBackend {
             gpu.submit_commands("episodes", queue.iterations, encoder)
         })?;
         queue.dispatches.clear();
-        (queue.submissions, queue.load, queue.iterations) = (queue.submissions + 1, 0.0, 0);
+        (queue.submissions, queue.iterations) = (queue.submissions + 1, 0);
         Ok(submitted)
     }
 

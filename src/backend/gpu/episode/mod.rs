@@ -5,7 +5,6 @@
 //! | `shape` | kernels: what they are compiled for, and how teams fill their workgroups |
 //! | `planner` | teams cut into tasks, and tasks into batches |
 //! | `source` | the text of the shaders |
-//! | `workgroups` | how many teams per workgroup are faster on a device |
 //! | `pipelines` | compiled kernels |
 //! | `pace` | how long submissions take, so that none is too long |
 //! | `flight` | buffers, and submitting a batch |
@@ -42,7 +41,6 @@ mod planner;
 mod readback;
 mod shape;
 mod source;
-mod workgroups;
 
 pub(crate) use planner::state_bytes;
 pub use planner::{State, Task};
@@ -51,10 +49,10 @@ pub use source::{WorkgroupBuffers, shader_of, shaders, workgroup_of};
 
 use flight::{Flight, KEPT_SHARE};
 use pace::Pace;
-use pipelines::{Compiled, IDLE_PLAYS, KEPT_KERNELS};
+use pipelines::KEPT_KERNELS;
 use planner::{NOWHERE, owner_words, plan};
 use readback::{Done, Readback};
-use shape::{Shape, TEAMS};
+use shape::Shape;
 
 /// Selects the populations that a device holds between generations. Results do not depend on it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -95,17 +93,12 @@ pub struct GpuBackend {
     gpu: Gpu,
     layout: Bindings,
     kernel: Kernel,
-    /// Maximum teams per workgroup of a specialised kernel. `None` until it is measured.
-    teams_per_workgroup: Option<usize>,
-    pipelines: HashMap<Shape, Compiled>,
-    /// How fast the device plays each shape.
-    paces: HashMap<Shape, Pace>,
+    pipelines: HashMap<Shape, wgpu::ComputePipeline>,
+    pace: Pace,
     /// When the last batch finished.
     done_at: Option<Instant>,
     /// Whether rollouts are timed by the device's clock.
     clock: bool,
-    /// The number of rollouts so far.
-    plays: u64,
     residency: ResidencyPolicy,
     records: Records,
     /// Compiled when first needed.
@@ -121,7 +114,6 @@ pub struct GpuBackend {
     /// Target bytes of one buffer of a batch.
     batch_bytes: u64,
     kept_kernels: usize,
-    idle_plays: u64,
     times: PhaseTimes,
 }
 
@@ -159,13 +151,10 @@ impl GpuBackend {
             gpu,
             layout,
             kernel: if software { Kernel::Generic } else { Kernel::Best },
-            // Software renderers have no warps to fill.
-            teams_per_workgroup: software.then_some(TEAMS[0]),
             pipelines: HashMap::new(),
-            paces: HashMap::new(),
+            pace: Pace::default(),
             done_at: None,
             clock: false,
-            plays: 0,
             residency: if software { ResidencyPolicy::Never } else { ResidencyPolicy::From(HELD_FROM) },
             records: if software { Records::Whole } else { Records::PackedFrom(PACKED_FROM) },
             pack: None,
@@ -175,7 +164,6 @@ impl GpuBackend {
             staging: Vec::new(),
             batch_bytes: BATCH_BYTES,
             kept_kernels: KEPT_KERNELS,
-            idle_plays: IDLE_PLAYS,
             times: PhaseTimes::default(),
         })
     }
@@ -191,22 +179,9 @@ impl GpuBackend {
         GpuBackend { kernel, ..self }
     }
 
-    /// Sets the maximum teams per workgroup of specialised kernels: 32, 16 or 8. With `None`, the faster one of 32 and
-    /// 16 is measured on the first large rollout. This is the default, except on software renderers. Results do not
-    /// depend on it.
-    pub fn with_teams_per_workgroup(self, teams: Option<usize>) -> GpuBackend {
-        GpuBackend { teams_per_workgroup: teams, ..self }
-    }
-
-    /// Returns the maximum teams per workgroup of specialised kernels, or `None` if it is yet to be measured.
-    pub fn teams_per_workgroup(&self) -> Option<usize> {
-        self.teams_per_workgroup
-    }
-
-    /// Sets the maximum number of kernels per batch and kept between batches, at least one, and the number of rollouts
-    /// after which an unused kernel is evicted. Results do not depend on it.
-    pub fn with_kernel_cache(self, kernels: usize, plays: u64) -> GpuBackend {
-        GpuBackend { kept_kernels: kernels.max(1), idle_plays: plays, ..self }
+    /// Sets the maximum number of kernels per batch and kept between batches, at least one. Results do not depend on it.
+    pub fn with_kernel_cache(self, kernels: usize) -> GpuBackend {
+        GpuBackend { kept_kernels: kernels.max(1), ..self }
     }
 
     /// Returns how many generic and how many specialised kernels are compiled.
@@ -261,9 +236,6 @@ impl GpuBackend {
     /// Plays all tasks, and calls `done` for each with the record and the moments of its batch.
     fn play_tasks(&mut self, groups: &[Group<'_>], trace: bool, done: &Done<'_>) -> Result<(), BackendError> {
         let (start, before) = (Instant::now(), self.gpu.traffic());
-        self.plays += 1;
-        let (plays, most) = (self.plays, self.idle_plays);
-        self.pipelines.retain(|_, compiled| plays - compiled.played <= most);
         let batches = plan(groups, trace, self.records, self.capacity(), &self.specialised(groups, trace))?;
         self.times.gather += start.elapsed();
         let mut previous = None;
@@ -325,7 +297,6 @@ impl GpuBackend {
 impl Backend for GpuBackend {
     fn play(&mut self, groups: &[Group<'_>]) -> Result<Vec<GroupScores>, BackendError> {
         groups.iter().try_for_each(Group::check)?;
-        self.measure_workgroups(groups)?;
         let scores = ScoreTable::new(groups);
         self.visit(groups, &|group, team, episode| scores.score(group, team, episode))?;
         Ok(scores.finish())

@@ -1,35 +1,25 @@
-//! Compiled kernels: which worlds get one of their own, and how long each is kept.
+//! Compiled kernels: which worlds get one of their own, and how many are kept.
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet, HashSet};
 
 use super::GpuBackend;
-use super::shape::{Capacity, Kernel, MAX_OFFSET, Recorded, Shape, TEAMS, Workgroup};
+use super::shape::{Capacity, Kernel, MAX_OFFSET, Recorded, Shape, Workgroup};
 use super::source::{packing, source};
 use crate::backend::Group;
 use crate::backend::gpu::device::{Binding, DeviceError};
 use crate::parallel::*;
 
-/// Maximum number of specialised kernels under [`Kernel::Best`]: each takes a fraction of a second to compile.
+/// Maximum number of specialised kernels per rollout under [`Kernel::Best`]: each takes a fraction of a second to compile.
 const MAX_SPECIALISED: usize = 16;
 /// Default maximum of kernels per batch, and of kernels kept from one batch to the next: a driver needs megabytes for
 /// each.
 pub(super) const KEPT_KERNELS: usize = 64;
-/// Default number of rollouts after which an unused pipeline is evicted. A process that trains one layout after another
-/// needs new kernels for each; a process that plays ever new worlds should rarely compile.
-pub(super) const IDLE_PLAYS: u64 = 1000;
-
-/// A compiled kernel, and the last call of `play` that used it.
-pub(super) struct Compiled {
-    pub(super) pipeline: wgpu::ComputePipeline,
-    pub(super) played: u64,
-}
-
 /// Returns the shapes that get a specialised kernel: those that have one, and of the others those with most
 /// agent-steps, up to [`MAX_SPECIALISED`] in all.
 fn worth_compiling(work: BTreeMap<Shape, u64>, compiled: &HashSet<Shape>) -> HashSet<Shape> {
-    let free = MAX_SPECIALISED.saturating_sub(compiled.iter().filter(|shape| shape.is_specialised()).count());
     let (mut shapes, mut new): (Vec<_>, Vec<_>) = work.into_iter().partition(|(shape, _)| compiled.contains(shape));
+    let free = MAX_SPECIALISED.saturating_sub(shapes.len());
     new.sort_by_key(|(_, agent_steps)| Reverse(*agent_steps));
     shapes.extend(new.into_iter().take(free));
     shapes.into_iter().map(|(shape, _)| shape).collect()
@@ -42,7 +32,6 @@ impl GpuBackend {
         Capacity {
             batch: self.batch_bytes,
             kernels: self.kept_kernels,
-            teams: self.teams_per_workgroup.unwrap_or(TEAMS[0]),
             buffer: limits.max_buffer_size.min(limits.max_storage_buffer_binding_size).min(MAX_OFFSET),
             workgroup: limits.max_compute_invocations_per_workgroup.min(limits.max_compute_workgroup_size_x) as usize,
             workgroup_bytes: limits.max_compute_workgroup_storage_size as usize,
@@ -85,17 +74,10 @@ impl GpuBackend {
         if self.pipelines.len() + new.len() > self.kept_kernels {
             self.pipelines.retain(|shape, _| shapes.contains(shape));
         }
-        let (gpu, layout, played) = (&self.gpu, &self.layout, self.plays);
-        let compile = |shape: Shape| {
-            let pipeline = gpu.own_pipeline("episode", &source(shape), "episode", layout)?;
-            Ok((shape, Compiled { pipeline, played }))
-        };
+        let (gpu, layout) = (&self.gpu, &self.layout);
+        let compile = |shape: Shape| Ok((shape, gpu.own_pipeline("episode", &source(shape), "episode", layout)?));
         let compiled: Vec<_> = new.into_par_iter().map(compile).collect::<Result<_, DeviceError>>()?;
         self.pipelines.extend(compiled);
-        self.paces.retain(|shape, _| self.pipelines.contains_key(shape));
-        for shape in shapes {
-            self.pipelines.get_mut(shape).expect("compiled just now").played = played;
-        }
         Ok(())
     }
 }

@@ -36,7 +36,7 @@ impl GpuBackend {
         let start = Instant::now();
         self.gpu.wait_for(Some(batch.last.clone()))?;
         let done_waiting = Instant::now();
-        self.note_pace(&batch, plan, done_waiting, done_waiting - start);
+        self.note_pace(&batch, done_waiting, done_waiting - start);
         self.check_populations(&batch)?;
         let score = match self.score_packed(plan, &batch, done)? {
             Some(score) => score,
@@ -136,7 +136,7 @@ impl GpuBackend {
     }
 
     /// Notes how long a batch took that is `done`, after the host has waited for it.
-    fn note_pace(&mut self, batch: &SubmittedBatch, plan: &BatchPlan, done: Instant, waited: Duration) {
+    fn note_pace(&mut self, batch: &SubmittedBatch, done: Instant, waited: Duration) {
         // The device plays one batch after the other.
         let before = self.done_at.replace(done);
         let Some(started) = batch.started.map(|started| before.map_or(started, |before| started.max(before))) else {
@@ -146,8 +146,6 @@ impl GpuBackend {
         if !self.clock {
             self.times.longest = self.times.longest.max(elapsed / batch.submissions.max(1) as u32);
         }
-        if let (1, Some(pace)) = (plan.shapes.len(), plan.shapes.first().and_then(|shape| self.paces.get_mut(shape))) {
-            pace.observe(batch.iterations, elapsed, waited > WAITED);
-        }
+        self.pace.observe(batch.iterations, elapsed, waited > WAITED);
     }
 }

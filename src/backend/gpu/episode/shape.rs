@@ -137,9 +137,7 @@ impl Workgroup {
         let threads = |teams: usize| threads_needed(world, teams).next_multiple_of(ROLE);
         let bytes = |teams: usize| 2 * teams * world.agents() * size_of::<Vec2>();
         let fits = |&teams: &usize| {
-            teams <= capacity.teams
-                && threads(teams) <= capacity.workgroup.min(MAX_THREADS)
-                && bytes(teams) <= capacity.workgroup_bytes
+            threads(teams) <= capacity.workgroup.min(MAX_THREADS) && bytes(teams) <= capacity.workgroup_bytes
         };
         let teams = TEAMS.into_iter().find(fits).filter(|_| world.parameters() <= MAX_STRAIGHT_WEIGHTS)?;
         Some(Workgroup { threads: threads(teams), slots: 1, teams })
@@ -169,8 +167,6 @@ pub(super) struct Capacity {
     pub(super) buffer: u64,
     /// Maximum kernels per batch.
     pub(super) kernels: usize,
-    /// Maximum teams per workgroup of a specialised kernel.
-    pub(super) teams: usize,
     /// Maximum threads per workgroup, and bytes of workgroup memory.
     pub(super) workgroup: usize,
     pub(super) workgroup_bytes: usize,
@@ -185,7 +181,6 @@ impl Capacity {
     /// Returns the limits of a device with this maximum of threads per workgroup, and no limit on batches.
     pub(super) fn of_workgroups(threads: usize) -> Capacity {
         let bytes = MAX_OFFSET;
-        let (kernels, teams, workgroup_bytes) = (1, TEAMS[0], 16 << 10);
-        Capacity { batch: bytes, buffer: bytes, kernels, teams, workgroup: threads, workgroup_bytes }
+        Capacity { batch: bytes, buffer: bytes, kernels: 1, workgroup: threads, workgroup_bytes: 16 << 10 }
     }
 }
