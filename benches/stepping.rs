@@ -37,7 +37,7 @@ fn main() -> Result<(), Box<dyn Error>> {
 fn measure(config: &Config, level: Level, teams: usize, rounds: usize) -> Result<(), Box<dyn Error>> {
     let mut small = config.clone();
     small.policy.hidden.clear();
-    let (world, small) = (World::new(config), World::new(&small));
+    let (world, small) = (World::new(&config.validate()?), World::new(&small.validate()?));
     let leaders = world.leaders();
     let weights = [&world, &small].map(|world| constant(world, teams, config.learning.seed));
     let order: Vec<u32> = (0..teams as u32).flat_map(|team| vec![team; leaders]).collect();

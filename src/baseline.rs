@@ -11,7 +11,7 @@ use fearless_simd::Level;
 use glam::Vec2;
 
 use crate::backend::{Backend, BackendError, Group};
-use crate::config::{Actions, Config, Learning, Sharing};
+use crate::config::{Actions, Config, Learning, Sharing, ValidConfig};
 use crate::evaluate::Starts;
 use crate::evolve::{self, Key, MIN_WEIGHT, Purpose};
 use crate::model::policy::BEHAVIOURS;
@@ -129,17 +129,23 @@ struct Trial {
 }
 
 impl Baselines {
-    /// Prepares the baselines of all trials of valid configs. Fitness, selection and mutation play no part.
-    pub fn new(configs: Vec<Config>) -> Baselines {
-        let all = |config: Config| {
-            let trials = 0..config.learning.trials;
-            Setting::new(config, trials)
-        };
-        Baselines { settings: configs.into_iter().map(all).collect(), generation: 0 }
+    /// Prepares the baselines of all trials of some configs, in the config's own keys. Fitness, selection and mutation
+    /// play no part.
+    pub fn new(configs: &[ValidConfig]) -> Baselines {
+        let all = |config: &ValidConfig| Setting::new(config, 0..config.learning.trials);
+        Baselines { settings: configs.iter().map(all).collect(), generation: 0 }
     }
 
-    /// Prepares the baselines of one trial of a valid config. The trial may be beyond the config's number of trials.
-    pub fn of_trial(config: Config, trial: usize) -> Baselines {
+    /// Prepares the baselines of all trials of a config as [`Baselines::new`] does, but with as few random teams as
+    /// possible, because only the constant actions matter.
+    pub fn of_constants(config: &ValidConfig) -> Baselines {
+        let mut baselines = Baselines::new(std::slice::from_ref(config));
+        baselines.settings[0].config.learning.population = 2;
+        baselines
+    }
+
+    /// Prepares the baselines of one trial. The trial may be beyond the config's number of trials.
+    pub fn of_trial(config: &ValidConfig, trial: usize) -> Baselines {
         Baselines { settings: vec![Setting::new(config, trial..trial + 1)], generation: 0 }
     }
 
@@ -250,8 +256,8 @@ fn play(backend: &mut dyn Backend, rounds: &[Round<'_>]) -> Result<Vec<Vec<u32>>
 }
 
 impl Setting {
-    fn new(config: Config, trials: std::ops::Range<usize>) -> Setting {
-        let world = World::new(&config);
+    fn new(config: &ValidConfig, trials: std::ops::Range<usize>) -> Setting {
+        let (world, config) = (World::new(config), Config::clone(config));
         let constants = constants(config.policy.actions);
         let Learning { episodes_per_team, generations, .. } = config.learning;
         let none = || vec![Vec::with_capacity(generations + 1); trials.len()];

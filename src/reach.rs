@@ -5,7 +5,7 @@
 
 use std::fmt::{self, Display};
 
-use crate::config::{Config, MAX_STEPS, Observers};
+use crate::config::{MAX_STEPS, Observers, StageConfig};
 use crate::model::rule::NEVER;
 use crate::world::{GRID, World};
 
@@ -104,7 +104,7 @@ pub fn travel(world: &World, steps: usize) -> Vec<f64> {
 }
 
 /// Returns the POIs that no team can observe in any episode. Uses the config's own keys and ignores its stages.
-pub fn unreachable(config: &Config) -> Vec<Unreachable> {
+pub fn unreachable(config: &StageConfig) -> Vec<Unreachable> {
     let world = World::new(config);
     let steps = world.steps();
     let travel = travel(&world, steps);
@@ -150,7 +150,7 @@ pub fn unreachable(config: &Config) -> Vec<Unreachable> {
 }
 
 /// Returns the smallest number of steps in which every POI could be reached. None if longer episodes would not help.
-pub fn fewest_steps(config: &Config, unreachable: &[Unreachable]) -> Option<usize> {
+pub fn fewest_steps(config: &StageConfig, unreachable: &[Unreachable]) -> Option<usize> {
     let far = unreachable.iter().filter_map(|unreachable| match unreachable.why {
         Why::Far { distance, radius, .. } => Some(distance - radius),
         Why::After { .. } => None,
@@ -163,16 +163,17 @@ pub fn fewest_steps(config: &Config, unreachable: &[Unreachable]) -> Option<usiz
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::{Config, ValidConfig};
 
-    fn config(keys: &str) -> Config {
+    fn config(keys: &str) -> ValidConfig {
         let text = format!(
             "[world]\nmap = [60, 60]\nleaders = [[10, 10], [10, 20]]\nfollowers = [[12, 10]]\npois = [[10, 40], [12, 12]]\n{keys}"
         );
-        Config::parse(&text, "test").unwrap()
+        Config::parse(&text, "test").unwrap().validate().unwrap()
     }
 
     fn found(keys: &str) -> Vec<(usize, String)> {
-        unreachable(&config(keys)).into_iter().map(|found| (found.poi, found.to_string())).collect()
+        unreachable(config(keys).as_ref()).into_iter().map(|found| (found.poi, found.to_string())).collect()
     }
 
     #[test]
@@ -241,8 +242,8 @@ mod tests {
     #[test]
     fn as_many_steps_as_are_named_are_enough() {
         let near = config("coupling = 1\nsteps = 25\n");
-        assert_eq!(fewest_steps(&near, &unreachable(&near)), Some(26));
+        assert_eq!(fewest_steps(near.as_ref(), &unreachable(near.as_ref())), Some(26));
         let still = config("coupling = 1\n[motion]\nmax_speed = 0\n");
-        assert_eq!(fewest_steps(&still, &unreachable(&still)), None);
+        assert_eq!(fewest_steps(still.as_ref(), &unreachable(still.as_ref())), None);
     }
 }

@@ -9,7 +9,7 @@ use glam::Vec2;
 
 use crate::backend::compare::{Mismatch, first_mismatch};
 use crate::backend::{Backend, BackendError, Group, GroupScores};
-use crate::config::{Config, Fitness, LAYOUTS, Paradigm, Sharing, ValidConfig};
+use crate::config::{Config, Fitness, LAYOUTS, Paradigm, Sharing, StageConfig, ValidConfig};
 use crate::credit::RecordRequest;
 use crate::evaluate::{SCORES, SCORES_AND_DT};
 use crate::evolve::{self, Breeding, Key, Purpose, UNCHANGED};
@@ -86,7 +86,7 @@ pub const KINDS: [&[Fitness]; 6] =
     [SCORES, &[Fitness::G], &[Fitness::D], &[Fitness::Df], &[Fitness::Dpp], &[Fitness::Dt]];
 
 impl Teams {
-    fn new(config: &Config, teams: usize, seed: u64, sights: bool) -> Teams {
+    fn new(config: &StageConfig, teams: usize, seed: u64, sights: bool) -> Teams {
         let world = World::new(config);
         let policies = teams.min(64);
         let leaders = world.leaders();

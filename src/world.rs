@@ -1,15 +1,16 @@
 //! One experiment's constants and start state, as kernels and shaders read them.
 
+use std::ops::Deref;
+
 use glam::{DVec2, Vec2};
 
-use crate::config::{Config, LedBy, MAX_AGENTS, MAX_HIDDEN_UNITS, MAX_POIS, MAX_STEPS};
-use crate::config_enum::Choice;
+use crate::config::{Config, LedBy, StageConfig};
 use crate::model::couple::CoupleConstants;
 use crate::model::follow::FollowConstants;
 use crate::model::motion::MotionConstants;
 use crate::model::policy::PolicyConstants;
 use crate::model::rule::Rule;
-use crate::model::sense::{Density, SenseConstants};
+use crate::model::sense::SenseConstants;
 
 pub use crate::model::motion::GRID;
 pub use crate::model::policy::OUTPUTS;
@@ -17,8 +18,15 @@ pub use crate::model::sense::INPUTS;
 pub use crate::model::{Constants, Variant};
 
 /// One world: constants, start positions (leaders first), POIs, their coupling, and the rule of observation.
+///
+/// Its [parts](WorldParts) can be read, but not changed. Only a valid config makes a world, so that its parts agree with
+/// each other. Shaders run without bounds checks and rely on this.
 #[derive(Clone, Debug, PartialEq)]
-pub struct World {
+pub struct World(WorldParts);
+
+/// The parts of a [`World`].
+#[derive(Clone, Debug, PartialEq)]
+pub struct WorldParts {
     /// The constants of kernels.
     pub constants: Constants,
     /// Start positions in units, on the kernels' grid, `[agents]`.
@@ -50,11 +58,19 @@ impl Default for Led {
     }
 }
 
+impl Deref for World {
+    type Target = WorldParts;
+
+    fn deref(&self) -> &WorldParts {
+        &self.0
+    }
+}
+
 impl World {
     /// Builds the world of a valid config. In the all-leaders paradigm the followers are leaders too.
-    pub fn new(config: &Config) -> World {
-        let Config { world, motion, follow, sense, policy, .. } = config;
-        let (agents, leaders) = (world.leaders.len() + world.followers.len(), config.learners());
+    pub fn new(config: &impl AsRef<StageConfig>) -> World {
+        let Config { world, motion, follow, sense, policy, learning, .. } = &**config.as_ref();
+        let (agents, leaders) = (world.leaders.len() + world.followers.len(), config.as_ref().learners());
         let pois = world.pois.len();
         let motion = MotionConstants::new(motion, world.dt, world.map);
         let constants = Constants {
@@ -74,57 +90,29 @@ impl World {
         let map = Vec2::new(motion.map_x, motion.map_y);
         let points =
             |list: &[[f64; 2]]| list.iter().map(|&at| on_grid(DVec2::from(at).as_vec2(), map)).collect::<Vec<_>>();
-        World {
+        World(WorldParts {
             constants,
             starts: [points(&world.leaders), points(&world.followers)].concat(),
             headings: world.headings().into_iter().map(unit).collect(),
             pois: points(&world.pois),
             coupling: world.coupling.of_each(pois),
-            led: Led { within: config.learning.led_within, by: config.learning.led_by },
+            led: Led { within: learning.led_within, by: learning.led_by },
             rule: Rule::new(world.observers.among(leaders, agents - leaders), agents, &world.windows, &world.after),
-        }
+        })
+    }
+
+    /// Returns this world with its POIs at other positions, `[pois]`.
+    ///
+    /// # Panics
+    /// The number of POIs changes.
+    pub fn with_pois(mut self, pois: &[Vec2]) -> World {
+        self.0.pois.copy_from_slice(pois);
+        self
     }
 
     /// Returns the width and height of the map.
     pub fn map(&self) -> Vec2 {
         Vec2::new(self.constants.motion.map_x, self.constants.motion.map_y)
-    }
-
-    /// Checks that the fields agree with each other. Shaders run without bounds checks and rely on this.
-    ///
-    /// # Errors
-    /// The name of the first inconsistent field.
-    pub fn validate(&self) -> Result<(), &'static str> {
-        let (constants, pois) = (&self.constants, self.pois.len());
-        let PolicyConstants { layers, widths, parameters } = constants.policy;
-        let used = widths.get(..=layers as usize).unwrap_or_default();
-        let weights: Option<u32> = used
-            .windows(2)
-            .try_fold(0_u32, |sum, widths| sum.checked_add(widths[0].checked_add(1)?.checked_mul(widths[1])?));
-        let ends = used.len() > 1 && used[0] as usize == INPUTS && constants.policy.actions().is_some();
-        let small = used.iter().all(|&width| (1..=MAX_HIDDEN_UNITS.max(INPUTS) as u32).contains(&width));
-        let fits = [
-            ("leaders", constants.leaders > 0),
-            (
-                "agents",
-                constants.leaders.checked_add(constants.followers).is_some_and(|all| all as usize <= MAX_AGENTS),
-            ),
-            ("POIs", (1..=MAX_POIS).contains(&pois) && pois == self.coupling.len() && pois == constants.pois as usize),
-            ("steps", (1..=MAX_STEPS).contains(&(constants.steps as usize))),
-            (
-                "start positions",
-                self.starts.len() as u64 == u64::from(constants.leaders) + u64::from(constants.followers),
-            ),
-            ("start headings", self.headings.len() == self.starts.len()),
-            ("sets", constants.words as usize == self.starts.len().div_ceil(32)),
-            ("observers, windows and order of POIs", self.rule.fits(constants.words as usize, pois)),
-            ("density", (constants.variant.density as usize) < Density::ALL.len()),
-            (
-                "policies",
-                ends && small && weights == Some(parameters) && widths[used.len()..].iter().all(|&left| left == 0),
-            ),
-        ];
-        fits.into_iter().find(|(_, fits)| !fits).map_or(Ok(()), |(field, _)| Err(field))
     }
 
     /// Returns the number of leaders, the agents with a policy.
@@ -179,4 +167,37 @@ pub fn on_grid(place: Vec2, map: Vec2) -> Vec2 {
 fn unit(angle: f64) -> Vec2 {
     let tidy = |component: f64| if component.abs() < 1e-6 { 0.0 } else { component as f32 };
     Vec2::new(tidy(libm::cos(angle)), tidy(libm::sin(angle)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::MAX_HIDDEN_UNITS;
+    use crate::config_enum::Choice;
+    use crate::model::sense::Density;
+    use crate::sample;
+
+    /// Shaders run without bounds checks and rely on this.
+    #[test]
+    fn the_parts_of_a_world_agree() {
+        for seed in 0..200 {
+            let world = World::new(&sample::world(seed).validate().unwrap());
+            let WorldParts { constants, starts, headings, pois, coupling, rule, .. } = &*world;
+            let PolicyConstants { layers, widths, parameters } = constants.policy;
+            let (used, unused) = widths.split_at(layers as usize + 1);
+            let weights: u32 = used.windows(2).map(|widths| (widths[0] + 1) * widths[1]).sum();
+            assert!(constants.leaders > 0 && constants.pois > 0 && constants.steps > 0, "{seed}: {constants:?}");
+            assert_eq!([starts.len(), headings.len()], [world.agents(); 2], "{seed}");
+            assert_eq!([pois.len(), coupling.len()], [constants.pois as usize; 2], "{seed}");
+            assert_eq!(constants.words as usize, world.agents().div_ceil(32), "{seed}");
+            assert!(rule.fits(constants.words as usize, pois.len()), "{seed}: {rule:?}");
+            assert!((constants.variant.density as usize) < Density::ALL.len(), "{seed}");
+            assert_eq!((used[0] as usize, weights), (INPUTS, parameters), "{seed}: {widths:?}");
+            assert!(
+                constants.policy.actions().is_some() && unused.iter().all(|&width| width == 0),
+                "{seed}: {widths:?}"
+            );
+            assert!(used.iter().all(|&width| (1..=MAX_HIDDEN_UNITS as u32).contains(&width)), "{seed}: {widths:?}");
+        }
+    }
 }

@@ -384,7 +384,7 @@ proptest! {
     /// Checks that no constant is infinite, NaN or denormal. The exact arithmetic depends on it.
     #[test]
     fn a_valid_config_makes_normal_constants(config in configs()) {
-        let world = flotilla::world::World::new(&config);
+        let world = flotilla::world::World::new(&config.validate().unwrap());
         let headings = world.headings.iter().flat_map(|heading| heading.to_array());
         let constants = world.constants;
         let c = &constants;
@@ -541,7 +541,8 @@ fn followers_start_with_the_heading_of_the_nearest_leader() {
     assert_eq!(headings("1.5"), [1.5; 5]);
     assert_eq!(headings("[1.0, 2.0]"), [1.0, 2.0, 2.0, 1.0, 1.0]);
     assert_eq!(headings("[1, 2, 3, 4, 5]"), [1.0, 2.0, 3.0, 4.0, 5.0]);
-    let world = flotilla::world::World::new(&Config::parse(&text("[0, 3.141592653589793]"), "headings").unwrap());
+    let turned = Config::parse(&text("[0, 3.141592653589793]"), "headings").unwrap();
+    let world = flotilla::world::World::new(&turned.validate().unwrap());
     let x: Vec<f32> = world.headings.iter().map(|heading| heading.x).collect();
     assert_eq!(x, [1.0, -1.0, -1.0, 1.0, 1.0]);
 }

@@ -2,11 +2,10 @@
 //!
 //! Random records cover every rule, fitness and memory layout. Small records made by hand test one property each.
 
-use flotilla::config::{Choice, Fitness, LedBy, Observers};
+use crate::support;
+use flotilla::config::{Choice, Coupling, Fitness, LedBy, MAX_AGENTS, Observers, WorldConfig};
 use flotilla::credit::{Credit, Episode, RecordRequest, Scores, Seen, Strided, owner_bits};
-use flotilla::model::rule;
-use flotilla::world::{Constants, Led, World};
-use glam::Vec2;
+use flotilla::world::{Led, World};
 use rand::rngs::ChaCha8Rng;
 use rand::seq::SliceRandom;
 use rand::{RngExt, SeedableRng};
@@ -51,26 +50,32 @@ const PLAIN: Rule = Rule { observers: Observers::All, windows: vec![], after: ve
 
 impl Record {
     fn world(&self) -> World {
-        let agents = self.leaders + self.followers;
-        World {
-            constants: Constants {
-                leaders: self.leaders as u32,
-                followers: self.followers as u32,
-                pois: self.coupling.len() as u32,
-                steps: self.near.len() as u32,
-                words: agents.div_ceil(32) as u32,
-                ..bytemuck::Zeroable::zeroed()
-            },
-            starts: vec![Vec2::ZERO; agents],
-            headings: vec![Vec2::X; agents],
-            pois: vec![Vec2::ZERO; self.coupling.len()],
-            coupling: self.coupling.clone(),
-            rule: {
-                let Rule { observers, windows, after } = &self.rule;
-                rule::Rule::new(observers.among(self.leaders, self.followers), agents, windows, after)
-            },
-            led: self.led,
-        }
+        let mut config = support::layout("generally_forward");
+        let Rule { observers, windows, after } = self.rule.clone();
+        let place = [1.0, 1.0];
+        config.world = WorldConfig {
+            leaders: vec![place; self.leaders],
+            followers: vec![place; self.followers],
+            pois: vec![place; self.coupling.len()],
+            coupling: Coupling::Each(self.coupling.iter().map(|&coupling| coupling as usize).collect()),
+            steps: self.near.len(),
+            observers,
+            windows,
+            after,
+            ..config.world
+        };
+        (config.learning.led_within, config.learning.led_by) = (self.led.within, self.led.by);
+        World::new(&config.validate().unwrap())
+    }
+
+    /// Adds followers that are never at a POI, until no coupling exceeds the number of observers.
+    fn with_enough_observers(mut self) -> Record {
+        let wanted = *self.coupling.iter().max().unwrap() as usize;
+        let leaders = if self.rule.observers == Observers::Followers { 0 } else { self.leaders };
+        self.followers = self.followers.max(wanted.saturating_sub(leaders));
+        self.seen.resize(self.followers, vec![0; self.leaders]);
+        self.sights.iter_mut().for_each(|sights| sights.resize(self.followers, vec![]));
+        self
     }
 
     /// Returns the sets, counts and sights in a backend's memory layout. The words of neighbouring teams are noise.
@@ -271,7 +276,7 @@ fn random(rng: &mut ChaCha8Rng, agents: usize) -> Record {
     }
     let within = if rng.random_bool(0.3) { 0 } else { rng.random_range(1..=steps + 1) };
     let led = Led { within, by: if rng.random_bool(0.5) { LedBy::MostSeen } else { LedBy::AnySeen } };
-    Record { leaders, followers, coupling, near, seen, sights, rule: PLAIN, led }
+    Record { leaders, followers, coupling, near, seen, sights, rule: PLAIN, led }.with_enough_observers()
 }
 
 /// Returns the record with a random rule.
@@ -297,7 +302,15 @@ fn with_random_rule(rng: &mut ChaCha8Rng, record: Record) -> Record {
             after[order[place]] = some.collect();
         }
     }
-    Record { rule: Rule { observers, windows, after }, ..record }
+    let mut record = Record { rule: Rule { observers, windows, after }, ..record };
+    // At most as many as the leaders, or the followers that fit, can be needed.
+    let most = match observers {
+        Observers::All => MAX_AGENTS,
+        Observers::Leaders => record.leaders,
+        Observers::Followers => MAX_AGENTS - record.leaders,
+    };
+    record.coupling.iter_mut().for_each(|coupling| *coupling = (*coupling).min(most as u32));
+    record.with_enough_observers()
 }
 
 /// Compares the scores of a record with their definition, for strided and packed words. Returns them.
@@ -394,7 +407,7 @@ fn scores_of(record: &Record) -> Scores {
     let mut record = record.clone();
     // If a record omits the sights, no follower saw a leader.
     record.sights.resize(record.near.len(), vec![vec![]; record.followers]);
-    compare(&record, &mut Credit::default(), &mut ChaCha8Rng::seed_from_u64(0), 8)
+    compare(&record.with_enough_observers(), &mut Credit::default(), &mut ChaCha8Rng::seed_from_u64(0), 8)
 }
 
 /// Equations 1 and 2 with C = 2.

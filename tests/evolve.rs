@@ -115,12 +115,13 @@ proptest! {
     fn starts_stay_on_the_map_and_on_the_grid(
         seed: u64, jitter in 1e-6..30.0f64, width in 1.0..60.0f64, height in 1.0..60.0f64,
     ) {
-        let world = World::new(&config(GENERALLY_FORWARD, |config| {
+        let config = config(GENERALLY_FORWARD, |config| {
             config.world.map = [width, height];
             for places in [&mut config.world.leaders, &mut config.world.followers, &mut config.world.pois] {
                 places.iter_mut().for_each(|place| *place = [place[0].min(width), place[1].min(height)]);
             }
-        }));
+        });
+        let world = World::new(&config.validate().unwrap());
         let mut starts = vec![Vec2::NAN; 2];
         evolve::jitter_starts(Key::new(seed, 0, Purpose::Starts), 7, 1, &world, jitter, &mut starts);
         prop_assert_eq!(starts.len(), world.agents());
@@ -157,7 +158,7 @@ fn all_ways_to_form_teams_are_equally_likely() {
 
 #[test]
 fn start_jitter_is_uniform_and_differs_between_episodes() {
-    let world = World::new(&config(GENERALLY_FORWARD, |_| ()));
+    let world = World::new(&config(GENERALLY_FORWARD, |_| ()).validate().unwrap());
     let key = Key::new(1, 2, Purpose::Starts);
     let mut starts = Vec::new();
     evolve::jitter_starts(key, 3, 4, &world, 0.0, &mut starts);
@@ -762,7 +763,7 @@ impl PlainTrial<'_> {
     /// episodes, and each leader's mean score.
     fn play(&self, generation: usize, stage: &Config, team: &[usize]) -> (f64, Vec<f32>) {
         let Learning { fitness, episodes_per_team, start_jitter, poi_jitter, .. } = stage.learning;
-        let world = World::new(stage);
+        let world = World::new(&stage.validate().unwrap());
         let population = |leader: usize| &self.policies[if self.policies.len() == 1 { 0 } else { leader }];
         let weights: Vec<f32> =
             team.iter().enumerate().flat_map(|(leader, &policy)| population(leader)[policy].clone()).collect();
@@ -952,7 +953,7 @@ fn a_shared_policy_scores_the_mean_of_its_leaders() {
         (config.world.coupling, config.world.steps) = (flotilla::config::Coupling::Same(1), 80);
         config.world.observation_radius = 8.0;
     });
-    let (world, leaders) = (World::new(&config), config.learners());
+    let (world, leaders) = (World::new(&config.validate().unwrap()), config.learners());
     let mut trainer = Trainer::new([config.validate().unwrap()]);
     let weights = trainer.weights(0, 0).unwrap().chunks(world.parameters()).map(<[f32]>::to_vec).collect();
     let plain = PlainTrial { config: &config, world, trial: 0, policies: vec![weights] };
@@ -971,7 +972,8 @@ fn a_shared_policy_scores_the_mean_of_its_leaders() {
 /// Tests that POIs are moved like starts, with separate random numbers. Without jitter, no places of POIs are appended.
 #[test]
 fn pois_are_jittered_with_separate_random_numbers() {
-    let world = World::new(&config(GENERALLY_FORWARD, |config| config.world.pois[0] = [0.5, 49.5]));
+    let config = config(GENERALLY_FORWARD, |config| config.world.pois[0] = [0.5, 49.5]);
+    let world = World::new(&config.validate().unwrap());
     let [starts, pois] = [Purpose::Starts, Purpose::Pois].map(|purpose| Key::new(4, 0, purpose));
     let draw = |key, generation, episode| {
         let mut places = vec![];
@@ -1009,7 +1011,7 @@ fn the_trainer_equals_algorithm_1() {
     for (experiment, (rows, policies)) in train(&configs).into_iter().enumerate() {
         let config = &configs[experiment];
         for (trial, policies) in policies.iter().enumerate() {
-            let world = World::new(config);
+            let world = World::new(&config.validate().unwrap());
             let key = Key::new(config.learning.seed, trial, Purpose::Weights);
             let policy = |leader, slot| {
                 let mut weights = vec![0.0; world.parameters()];

@@ -165,7 +165,7 @@ fn long_episodes_agree() {
 #[test]
 fn small_batches_give_the_same_scores() {
     let config = sample::world(3);
-    let world = World::new(&config);
+    let world = World::new(&config.validate().unwrap());
     let (policies, teams) = (4, 300);
     let weights = sample::weights(&world, policies, 1);
     let choice: Vec<u32> = (0..teams * world.leaders()).map(|i| (i * 7 % policies) as u32).collect();
@@ -241,7 +241,7 @@ fn held_out_episodes_give_the_same_results_on_every_backend() {
     let mut config = support::layout("generally_forward");
     // In longer episodes, agents see each other at different steps.
     config.world.steps = 40;
-    let world = World::new(&config);
+    let world = World::new(&config.validate().unwrap());
     let (policies, leaders) = (5, world.leaders());
     let weights = sample::weights(&world, policies, 11);
     let teams: Vec<u32> = (0..policies as u32).flat_map(|policy| std::iter::repeat_n(policy, leaders)).collect();
@@ -265,7 +265,7 @@ fn held_out_episodes_give_the_same_results_on_every_backend() {
 /// The error names the inconsistency. No team is played.
 #[test]
 fn inconsistent_input_is_an_error_on_every_backend() {
-    let world = World::new(&support::layout("generally_forward"));
+    let world = World::new(&support::layout("generally_forward").validate().unwrap());
     let (policies, leaders) = (3, world.leaders());
     let weights = sample::weights(&world, policies, 1);
     let teams: Vec<u32> = (0..2 * leaders as u32).map(|place| place % 3).collect();
@@ -334,12 +334,12 @@ fn kernels_are_compiled_for_few_worlds_and_shared() {
     let gains = (1..5).map(|gain| {
         let mut config = config.clone();
         config.follow.wall_gain = f64::from(gain);
-        World::new(&config)
+        World::new(&config.validate().unwrap())
     });
     let sizes = (1..=20).map(|pois| {
         let mut config = config.clone();
         config.world.pois = (0..pois).map(|poi| [2.0 * f64::from(poi), 15.0]).collect();
-        World::new(&config)
+        World::new(&config.validate().unwrap())
     });
     let (gains, sizes): (Vec<_>, Vec<_>) = (gains.collect(), sizes.collect());
     for (request, info) in support::adapters("kernels_are_compiled_for_few_worlds_and_shared") {
@@ -362,7 +362,7 @@ fn the_number_of_kernels_is_limited_without_changing_scores() {
             let text = format!(
                 "[world]\nleaders = [[10.0, 5.0]]\npois = [{places}]\nsteps = 9\ncoupling = 1\n[policy]\nhidden = []"
             );
-            World::new(&Config::parse(&text, "small.toml").unwrap())
+            World::new(&Config::parse(&text, "small.toml").unwrap().validate().unwrap())
         })
         .collect();
     let weights: Vec<Vec<f32>> = worlds.iter().map(|world| sample::weights(world, 7, 0)).collect();
@@ -399,7 +399,7 @@ fn own_headings_and_ranges_of_zero_agree() {
     let ranges = ["poi_range = 0", "agent_range = 0", "poi_range = 0\nagent_range = 0\ndensity = 'inverse'", ""];
     let worlds: Vec<_> = ranges.map(|ranges| (ranges.to_string(), config(ranges))).into();
     for (ranges, config) in &worlds {
-        let world = World::new(config);
+        let world = World::new(&config.validate().unwrap());
         let weights = sample::weights(&world, 3, 5);
         let teams: Vec<u32> = (0..6).map(|slot| slot / 2).collect();
         let group = group_of_teams(&world, &weights, 3, &teams);

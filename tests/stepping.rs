@@ -6,11 +6,10 @@
 use crate::support;
 use fearless_simd::Level;
 use flotilla::backend::cpu::{Cpu, level_name};
-use flotilla::backend::{Backend, BackendError, Group, Moment, Trace};
-use flotilla::config::{Fitness, MAX_AGENTS, MAX_POIS, MAX_POPULATION, Sharing};
+use flotilla::backend::{Backend, Group, Moment, Trace};
+use flotilla::config::{Fitness, MAX_POPULATION, Sharing};
 use flotilla::credit::{self, Credit, Scores};
 use flotilla::evaluate::Starts;
-use flotilla::model::rule::Rule;
 use flotilla::sample;
 use flotilla::stepping::{StepError, Stepper};
 use flotilla::world::World;
@@ -25,7 +24,7 @@ struct Played {
 
 impl Played {
     fn new(seed: u64, teams: usize) -> Played {
-        let world = World::new(&sample::world(seed));
+        let world = World::new(&sample::world(seed).validate().unwrap());
         let starts = match seed % 2 {
             0 => world.starts.clone(),
             _ => Starts::Drawn { episodes: 1, seed, jitter: 0.7, poi_jitter: 0.0 }.of(0, &world),
@@ -173,15 +172,7 @@ fn each_team_can_be_reset_at_any_step() {
 }
 
 fn world() -> World {
-    World::new(&support::layout("generally_forward"))
-}
-
-const RULE: &str = "observers, windows and order of POIs";
-
-/// Sets the layer widths of a world's policies, with the number of parameters for one hidden layer.
-fn network(world: &mut World, widths: [u32; 5]) {
-    let policy = &mut world.constants.policy;
-    (policy.widths, policy.parameters) = (widths, (widths[0] + 1) * widths[1] + (widths[1] + 1) * widths[2]);
+    World::new(&support::layout("generally_forward").validate().unwrap())
 }
 
 #[test]
@@ -190,62 +181,6 @@ fn invalid_input_is_refused_and_changes_nothing() {
     assert!(matches!(Stepper::new(world.clone(), 0), Err(StepError::Teams(0))));
     assert!(matches!(Stepper::new(world.clone(), MAX_POPULATION + 1), Err(StepError::Teams(_))));
     assert!(matches!(Stepper::new(world.clone(), usize::MAX), Err(StepError::Teams(_))));
-    let changed = |change: fn(&mut World)| {
-        let mut world = world.clone();
-        change(&mut world);
-        let error = Stepper::new(world.clone(), 1).err().expect("the world is inconsistent");
-        let weights = vec![0.0; world.leaders() * world.parameters()];
-        let teams = vec![0; world.leaders()];
-        let group = Group {
-            world: &world,
-            starts: &world.starts,
-            weights: weights[..].into(),
-            policies: 1,
-            sharing: Sharing::PerLeader,
-            teams: &teams,
-            fitnesses: &[],
-        };
-        let refused = Cpu::default().play(&[group]).expect_err("the world is inconsistent");
-        assert!(matches!(refused, BackendError::InvalidInput(_)), "{refused}");
-        error
-    };
-    for (what, change) in [
-        ("leaders", (|world| world.constants.leaders = 0) as fn(&mut World)),
-        ("agents", |world| world.constants.followers = u32::MAX),
-        ("agents", |world| world.constants.followers = MAX_AGENTS as u32),
-        ("POIs", |world| world.coupling.clear()),
-        ("POIs", |world| (world.pois, world.coupling, world.constants.pois) = (vec![], vec![], 0)),
-        ("POIs", |world| {
-            let (poi, count) = (world.pois[0], MAX_POIS + 1);
-            (world.pois, world.coupling, world.constants.pois) = (vec![poi; count], vec![1; count], count as u32);
-        }),
-        ("POIs", |world| world.constants.pois += 1),
-        ("steps", |world| world.constants.steps = 0),
-        ("steps", |world| world.constants.steps = u32::MAX),
-        ("start positions", |world| _ = world.starts.pop()),
-        ("start positions", |world| world.constants.followers += 1),
-        ("sets", |world| world.constants.words = 2),
-        // Too many agents, windows for too few POIs, a window from step 0, an order for too few POIs, a cycle.
-        (RULE, |world| world.rule = Rule::new(0..1, 64, &[], &[])),
-        (RULE, |world| world.rule = Rule::new(0..12, 12, &[[1, 2]; 3], &[])),
-        (RULE, |world| world.rule = Rule::new(0..12, 12, &[[0, 2]; 4], &[])),
-        (RULE, |world| world.rule = Rule::new(0..12, 12, &[], &[vec![], vec![0]])),
-        (RULE, |world| world.rule = Rule::new(0..12, 12, &[], &[vec![1], vec![0], vec![], vec![]])),
-        ("density", |world| world.constants.variant.density = 9),
-        ("policies", |world| world.constants.policy.parameters += 1),
-        ("policies", |world| world.constants.policy.layers = 9),
-        ("policies", |world| world.constants.policy.layers = 0),
-        ("policies", |world| world.constants.policy.widths[1] = u32::MAX),
-        // The number of weights is right, but the network is too wide, or has 9 inputs, 3 outputs, or an extra width.
-        ("policies", |world| network(world, [8, 65, 2, 0, 0])),
-        ("policies", |world| network(world, [9, 10, 2, 0, 0])),
-        ("policies", |world| network(world, [8, 10, 3, 0, 0])),
-        ("policies", |world| network(world, [8, 10, 2, 1, 0])),
-    ] {
-        let error = changed(change);
-        assert!(matches!(error, StepError::World(found) if found == what), "{what}: {error}");
-    }
-
     let mut stepper = Stepper::new(world.clone(), 3).expect("three teams are allowed");
     let (good, leaders) = ([0.25; 24], world.leaders());
     stepper.step(&good).expect("the actions are valid");
@@ -315,7 +250,7 @@ fn actions_are_clamped_and_starts_are_rounded_to_the_grid() {
     (config.motion.max_speed, config.motion.max_acceleration) = (f64::from(3f32.next_up()), 100.0);
     config.world.speed = 0.5 + f64::from(f32::EPSILON);
     let speed = |wanted: f32| {
-        let mut stepper = Stepper::new(World::new(&config), 1).expect("one team is allowed");
+        let mut stepper = Stepper::new(World::new(&config.validate().unwrap()), 1).expect("one team is allowed");
         stepper.step(&[0.0, wanted].repeat(stepper.world().leaders())).expect("the actions are valid");
         stepper.states().speeds[0]
     };
@@ -337,7 +272,7 @@ fn actions_are_clamped_and_starts_are_rounded_to_the_grid() {
 fn a_restored_stepper_continues_with_the_same_bits() {
     for seed in 0..12 {
         let config = sample::world(seed);
-        let world = World::new(&config);
+        let world = World::new(&config.validate().unwrap());
         let (teams, leaders, agents, pois) = (13, world.leaders(), world.agents(), world.pois.len());
         let make = |level| {
             let stepper = Stepper::at_level(level, world.clone(), teams, true).unwrap();
@@ -399,7 +334,7 @@ fn a_restored_stepper_continues_with_the_same_bits() {
 
 #[test]
 fn an_invalid_saved_state_is_refused_and_changes_nothing() {
-    let world = World::new(&sample::world(1));
+    let world = World::new(&sample::world(1).validate().unwrap());
     let make = |teams| Stepper::recording(world.clone(), teams).and_then(Stepper::with_sights).unwrap();
     let mut stepper = make(3);
     stepper.step(&vec![0.5; 3 * world.leaders() * 2]).unwrap();
@@ -436,7 +371,8 @@ fn an_invalid_saved_state_is_refused_and_changes_nothing() {
 
 #[test]
 fn each_team_can_have_its_own_pois() {
-    let world = World::new(&sample::world(2));
+    let mut config = sample::world(2);
+    let world = World::new(&config.validate().unwrap());
     let (teams, agents, pois) = (9, world.agents(), world.pois.len());
     let starts = Starts::Drawn { episodes: teams as u32, seed: 5, jitter: 1.0, poi_jitter: 3.0 };
     let drawn: Vec<Vec<Vec2>> = (0..teams).map(|team| starts.of(team, &world)).collect();
@@ -446,8 +382,8 @@ fn each_team_can_have_its_own_pois() {
     let actions = vec![0.75; world.leaders() * 2];
     for (team, places) in drawn.iter().enumerate() {
         // The same world with the POIs of this team.
-        let own = World { pois: places[agents..].to_vec(), ..world.clone() };
-        let mut alone = Stepper::new(own, 1).unwrap();
+        config.world.pois = places[agents..].iter().map(|place| place.as_dvec2().to_array()).collect();
+        let mut alone = Stepper::new(World::new(&config.validate().unwrap()), 1).unwrap();
         let start: Vec<f32> = places[..agents].iter().flat_map(|place| place.to_array()).collect();
         alone.reset_to(&start).unwrap();
         together.reset_to(&flat).unwrap();

@@ -7,7 +7,7 @@ use std::f32::consts::PI;
 
 use serde::{Deserialize, Serialize};
 
-use flotilla::config::Config;
+use flotilla::config::{Config, StageConfig};
 use flotilla::stepping::{StepError, Stepper};
 use flotilla::world::World;
 
@@ -68,7 +68,7 @@ impl Script {
     ///
     /// # Errors
     /// There is too little memory, or a target is not finite, see [`Script::check`].
-    pub fn play(&self, config: &Config) -> Result<Vec<Option<u32>>, StepError> {
+    pub fn play(&self, config: &StageConfig) -> Result<Vec<Option<u32>>, StepError> {
         let mut stepper = Stepper::new(World::new(config), 1)?;
         let (leaders, max_speed) = (config.learners(), config.motion.max_speed as f32);
         let mut first = vec![None; config.world.pois.len()];

@@ -81,7 +81,7 @@ impl StartLayout {
         };
         let farthest = short.world.pois.iter().map(nearest).fold(0.0, f64::max);
         let most = flotilla::config::MAX_STEPS;
-        let travel = reach::travel(&World::new(&short), most);
+        let travel = reach::travel(&World::new(&short.validate()?), most);
         let enough = travel.iter().position(|&travel| travel >= 1.5 * farthest + BEHIND).unwrap_or(most);
         let text = self.with_steps(enough.next_multiple_of(5).clamp(25, most));
         Config::parse(&text, "layout").map(|_| text)

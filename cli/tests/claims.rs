@@ -6,7 +6,7 @@ use fearless_simd::Level;
 use flotilla::backend::cpu::Cpu;
 use flotilla::backend::{Backend, Group};
 use flotilla::baseline::{self, Baseline, Baselines};
-use flotilla::config::{Fitness, Override, Paradigm, Sharing};
+use flotilla::config::{Fitness, Override, Paradigm, Sharing, ValidConfig};
 use flotilla::evaluate::{self, Starts};
 use flotilla::evolve::{self, Key, Purpose};
 use flotilla::statistics::{self, Average, Estimate, Tested};
@@ -156,11 +156,11 @@ fn played(mut baselines: Baselines) -> Baselines {
 fn random_baselines_equal_the_best_teams_that_a_backend_plays() {
     let arms = arms(2, 2);
     let configs = paper::baseline_configs(&arms);
-    let found = played(Baselines::new(configs.clone())).found();
+    let found = played(Baselines::new(&ValidConfig::all(&configs).unwrap())).found();
     assert!(found.iter().all(|found| found.constant[1] == [1.0; 3]), "a constant speed solves every layout");
     assert!(found.iter().any(|found| found.random[0] != found.random[1]), "both trials drew the same policies");
     for (config, found) in configs.iter().zip(&found) {
-        let world = World::new(config);
+        let world = World::new(&config.validate().unwrap());
         let (population, parameters) = (config.learning.population, world.parameters());
         for purpose in [Purpose::Baseline, Purpose::ConstantActions] {
             let mut best = 0.0f64;
@@ -200,7 +200,7 @@ fn observed(world: &World, weights: &[f32], policies: usize) -> Vec<u32> {
 #[test]
 fn constant_speed_baselines_equal_stepped_teams_and_solve_every_layout() {
     for (place, config) in paper::baseline_configs(&arms(1, 0)).into_iter().enumerate() {
-        let found = played(Baselines::of_trial(config.clone(), 0));
+        let found = played(Baselines::of_trial(&config.validate().unwrap(), 0));
         let outcome = found.outcomes(&mut Cpu::default(), 1).unwrap().concat().remove(0);
         let teams = baseline::SPEEDS;
         let mut stepper = flotilla::stepper(&config, teams, false).unwrap();
@@ -224,9 +224,9 @@ fn constant_speed_baselines_equal_stepped_teams_and_solve_every_layout() {
 fn baselines_with_moved_pois_are_measured_from_held_out_starts() {
     let mut config = paper::baseline_configs(&arms(2, 3))[1].clone();
     (config.learning.poi_jitter, config.learning.population, config.learning.episodes_per_team) = (5.0, 6, 2);
-    let baselines = played(Baselines::of_trial(config.clone(), 5));
+    let baselines = played(Baselines::of_trial(&config.validate().unwrap(), 5));
     let outcome = baselines.outcomes(&mut Cpu::default(), 30).unwrap().concat().remove(0);
-    let world = World::new(&config);
+    let world = World::new(&config.validate().unwrap());
     let constants = baseline::constants(config.policy.actions);
     let policies = constants.len();
     let mut weights = vec![0.0; world.leaders() * policies * world.parameters()];
@@ -244,8 +244,11 @@ fn baselines_with_moved_pois_are_measured_from_held_out_starts() {
     }
     assert!(g.iter().any(|&other| other != g[0]) && outcome.network > 0.0 && outcome.action > 0.0, "{outcome:?}");
     // Another trial has the same constant actions, but other random teams.
-    let other =
-        self::played(Baselines::of_trial(config, 6)).outcomes(&mut Cpu::default(), 30).unwrap().concat().remove(0);
+    let other = self::played(Baselines::of_trial(&config.validate().unwrap(), 6))
+        .outcomes(&mut Cpu::default(), 30)
+        .unwrap()
+        .concat()
+        .remove(0);
     assert_eq!(other.constants, outcome.constants);
     assert_ne!((other.network, other.action), (outcome.network, outcome.action));
 }

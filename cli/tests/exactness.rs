@@ -263,7 +263,7 @@ fn only_results_compared_as_integers_need_no_guard() {
 /// Returns every shader, and the specialised episode kernels of the paper's six experiments.
 fn kernels() -> Vec<(String, String)> {
     let specialised = short_trainings().into_iter().flat_map(|(name, config)| {
-        let world = World::new(&config);
+        let world = World::new(&config.validate().unwrap());
         [64, 256, 1024].map(|threads| {
             let text = episode::shader_of(&world, Kernel::Specialised, threads);
             (format!("{name}, {threads} threads"), text)

@@ -227,9 +227,10 @@ fn observed_pois_are_never_reported_as_unreachable() {
         // Short episodes, so that some POIs are unreachable.
         config.world.steps = 4 + (seed as usize % 5) * 4;
         config.world.windows.clear();
-        let (world, teams) = (World::new(&config), 12);
+        let (world, teams) = (World::new(&config.validate().unwrap()), 12);
         let weights = sample::weights(&world, teams, seed);
-        let unreachable: Vec<usize> = reach::unreachable(&config).iter().map(|entry| entry.poi).collect();
+        let unreachable: Vec<usize> =
+            reach::unreachable(config.validate().unwrap().as_ref()).iter().map(|entry| entry.poi).collect();
         let traced = flotilla::trace(&config, &mut Cpu::default(), teams, &weights, &Starts::Own, 0).unwrap();
         let pois = world.pois.len();
         for team in 0..teams {

@@ -258,7 +258,7 @@ fn play_and_trace_treat_each_team_separately() {
     let mut backend = Cpu::default();
     for seed in 0..12 {
         let (config, teams) = (sample::world(seed), 1 + seed as usize * 3);
-        let world = World::new(&config);
+        let world = World::new(&config.validate().unwrap());
         let (leaders, parameters) = (world.leaders(), world.parameters());
         let starts = Starts::Drawn { episodes: 5, seed, jitter: 0.4, poi_jitter: 0.0 };
         let weights = sample::weights(&world, teams, seed);

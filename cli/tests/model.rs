@@ -381,7 +381,7 @@ impl Tally {
 /// Plays teams in a world, and compares every step of every agent with the model.
 fn check(cpu: &mut Cpu, world: &Config, model: &Model, seed: u64) -> Tally {
     const TEAMS: usize = 9;
-    let compiled = World::new(world);
+    let compiled = World::new(&world.validate().unwrap());
     let rng = &mut ChaCha8Rng::seed_from_u64(seed);
     let policies = 4;
     let weights = sample::weights(&compiled, policies, seed);
@@ -544,7 +544,7 @@ fn kernels_follow_the_model() {
             if seed % 3 == 0 {
                 // Moves every POI to the place of another, and the last one to the first leader's start.
                 model.pois.rotate_left(1);
-                *model.pois.last_mut().unwrap() = World::new(&config).starts[0].as_dvec2();
+                *model.pois.last_mut().unwrap() = World::new(&config.validate().unwrap()).starts[0].as_dvec2();
                 model.moved = Some(model.pois.clone());
             }
             let tally = check(cpu, &config, &model, seed);
@@ -593,7 +593,7 @@ actions = 'behaviours'";
         (&[0, 1, 2, 3, 4], [0.0, -1.0]),
     ];
     let config = Config::parse(text, "choice").unwrap();
-    let world = World::new(&config);
+    let world = World::new(&config.validate().unwrap());
     for (largest, expected) in cases {
         let mut weights = vec![0.0; world.parameters()];
         let biases = weights.len() - 5;
@@ -615,7 +615,7 @@ actions = 'behaviours'";
     }
     // Without the POI in the back right, the first of two equally dense quadrants is the front right.
     let two_pois = Config::parse(&text.replace("[30, 20], ", ""), "choice").unwrap();
-    let world = World::new(&two_pois);
+    let world = World::new(&two_pois.validate().unwrap());
     let mut weights = vec![0.0; world.parameters() * 2];
     let biases = world.parameters() - 5;
     weights[biases + 1] = 0.5;

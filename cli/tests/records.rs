@@ -26,7 +26,7 @@ struct Teams {
 
 impl Teams {
     fn new(config: &Config, teams: usize, random: bool) -> Teams {
-        let world = World::new(config);
+        let world = World::new(&config.validate().unwrap());
         let mut weights = sample::weights(&world, 5, config.learning.seed);
         if !random {
             weights.fill(0.0);

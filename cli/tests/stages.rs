@@ -53,7 +53,7 @@ fn each_stage_changes_the_config_of_the_file() {
     let froms: Vec<usize> = stages.iter().map(|(from, _)| *from).collect();
     assert_eq!(froms, [0, 2, 4]);
     let without_stages = Config { stages: vec![], ..config.clone() };
-    assert_eq!(stages[0].1, without_stages);
+    assert_eq!(*stages[0].1, without_stages);
     // Changes of one stage do not carry over to the next.
     assert_eq!((stages[1].1.world.steps, stages[2].1.world.steps), (14, 9));
     assert_eq!((stages[1].1.world.pois.len(), stages[2].1.world.pois.len(), valid.pois()), (2, 3, None));

@@ -87,7 +87,7 @@ fn trials_csv_agrees_with_training_and_the_page() {
 #[ignore = "trains for minutes; .ci/nightly runs it"]
 fn pages_agree_with_the_full_study() {
     let arms = train_experiments(TRIALS);
-    let mut baselines = Baselines::new(paper::baseline_configs(&arms));
+    let mut baselines = Baselines::new(&ValidConfig::all(&paper::baseline_configs(&arms)).unwrap());
     while !baselines.is_done() {
         baselines.advance(&mut Cpu::default()).unwrap();
     }

@@ -27,9 +27,10 @@ fn task_files(ending: &str) -> Vec<PathBuf> {
 
 fn play(config: &Config, path: &Path) -> Vec<Option<u32>> {
     let script = Script::parse(&fs::read_to_string(path).unwrap()).unwrap();
+    let config = &config.validate().unwrap();
     // A team that does not move observes nothing, so the script matters.
-    assert!(Script::default().play(config).unwrap().iter().all(Option::is_none), "{}", path.display());
-    script.play(config).unwrap()
+    assert!(Script::default().play(config.as_ref()).unwrap().iter().all(Option::is_none), "{}", path.display());
+    script.play(config.as_ref()).unwrap()
 }
 
 #[test]

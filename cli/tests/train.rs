@@ -620,7 +620,7 @@ fn held_out_starts_are_never_training_starts() {
 
     let mut config = Config::parse(SMALL, "small").unwrap();
     (config.learning.start_jitter, config.learning.poi_jitter) = (2.0, 2.0);
-    let world = World::new(&config);
+    let world = World::new(&config.validate().unwrap());
     // Returns the bits of the agents' starts, and of the POIs.
     let bits = |places: &[glam::Vec2]| -> [Vec<u32>; 2] {
         let (starts, pois) = places.split_at(world.agents());

@@ -147,7 +147,7 @@ pub fn record<'py>(
     }
     let [positions, headings, speeds, inputs, outputs, actions] = slices;
     let (near, observed_at) = (contiguous(&mut near)?, contiguous(&mut observed_at)?);
-    let world = World::new(&config.0);
+    let world = World::new(&config.0.validate().raise()?);
     let sets = if near.is_empty() { 0 } else { near.len() / world.agents() * world.constants.words as usize };
     let deviations: Option<Vec<[f32; OUTPUTS]>> = noise.as_ref().map(|(_, deviations)| {
         let deviations = deviations.as_array();
@@ -268,7 +268,7 @@ pub fn starts<'py>(
     first: usize,
     count: usize,
 ) -> PyResult<Bound<'py, PyArray3<f32>>> {
-    let world = World::new(&config.0);
+    let world = World::new(&config.0.validate().raise()?);
     let places = world.agents() + if poi_jitter > 0.0 { world.pois.len() } else { 0 };
     let bytes = (count as u128) * places as u128 * 8;
     if ![jitter, poi_jitter].iter().all(|jitter| jitter.is_finite() && *jitter >= 0.0)

@@ -66,13 +66,10 @@ impl<'a> Group<'a> {
     /// number.
     ///
     /// # Errors
-    /// An array has the wrong length, the world is inconsistent, or a team plays a policy that does not exist.
+    /// An array has the wrong length, or a team plays a policy that does not exist.
     pub fn check(&self) -> Result<(), BackendError> {
         let Group { world, starts, weights, policies, teams, .. } = *self;
         let invalid = |text: String| Err(BackendError::InvalidInput(text));
-        if let Err(field) = world.validate() {
-            return invalid(format!("the world is inconsistent: its {field} do not match the rest"));
-        }
         let (agents, leaders) = (world.agents(), world.leaders());
         if starts.len() != agents && starts.len() != agents + world.pois.len() {
             return invalid(format!("{} start positions for {agents} agents", starts.len()));

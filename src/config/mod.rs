@@ -28,7 +28,7 @@ pub use load::name;
 pub use load::{is_standard_input, read_file};
 pub use stages::MAX_STAGES;
 pub use stages::{GENERATIONS, STAGES, Stage};
-pub use valid::ValidConfig;
+pub use valid::{StageConfig, ValidConfig};
 pub use world::{MAX_AGENTS, MAX_POIS, MAX_STEPS, WorldConfig};
 
 mod learning;

@@ -5,12 +5,24 @@ use std::ops::Deref;
 
 use super::{Config, ConfigError};
 
+/// A config whose every key is in its range: one that a [`World`](crate::world::World) is made from.
+#[derive(Clone, Debug, PartialEq)]
+pub struct StageConfig(Config);
+
+impl Deref for StageConfig {
+    type Target = Config;
+
+    fn deref(&self) -> &Config {
+        &self.0
+    }
+}
+
 /// A config whose every key is in its range, with its stages resolved. Only reading or [`Config::validate`] returns one.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ValidConfig {
-    config: Config,
+    config: StageConfig,
     /// Each stage's first generation and config; never empty.
-    stages: Vec<(usize, Config)>,
+    stages: Vec<(usize, StageConfig)>,
 }
 
 impl Deref for ValidConfig {
@@ -21,14 +33,28 @@ impl Deref for ValidConfig {
     }
 }
 
+impl AsRef<StageConfig> for StageConfig {
+    fn as_ref(&self) -> &StageConfig {
+        self
+    }
+}
+
+/// The config's own keys, without its stages.
+impl AsRef<StageConfig> for ValidConfig {
+    fn as_ref(&self) -> &StageConfig {
+        &self.config
+    }
+}
+
 impl ValidConfig {
     /// Returns a config with the resolved configs of its stages.
     pub(super) fn new(config: Config, of_stages: Vec<Config>) -> ValidConfig {
-        let mut stages: Vec<_> = config.stages.iter().map(|stage| stage.from).zip(of_stages).collect();
+        let mut stages: Vec<_> =
+            config.stages.iter().map(|stage| stage.from).zip(of_stages.into_iter().map(StageConfig)).collect();
         if stages.first().is_none_or(|(from, _)| *from > 0) {
-            stages.insert(0, (0, Config { stages: vec![], ..config.clone() }));
+            stages.insert(0, (0, StageConfig(Config { stages: vec![], ..config.clone() })));
         }
-        ValidConfig { config, stages }
+        ValidConfig { config: StageConfig(config), stages }
     }
 
     /// Validates several configs.
@@ -41,7 +67,7 @@ impl ValidConfig {
 
     /// Returns the config of each stage with its first generation, in order. If the first stage starts after generation
     /// 0, the file's own config comes before it.
-    pub fn stages(&self) -> &[(usize, Config)] {
+    pub fn stages(&self) -> &[(usize, StageConfig)] {
         &self.stages
     }
 
@@ -51,12 +77,12 @@ impl ValidConfig {
     }
 
     /// Returns the config that a generation plays with.
-    pub fn at(&self, generation: usize) -> &Config {
+    pub fn at(&self, generation: usize) -> &StageConfig {
         &self.stages[self.stage_of(generation)].1
     }
 
     /// Returns the number of generations that each stage plays, including generation 0, with the stage's config.
-    pub fn stage_lengths(&self) -> impl Iterator<Item = (usize, &Config)> {
+    pub fn stage_lengths(&self) -> impl Iterator<Item = (usize, &StageConfig)> {
         let ends = self.stages.iter().skip(1).map(|(from, _)| *from).chain([self.learning.generations + 1]);
         self.stages.iter().zip(ends).map(|((from, config), end)| (end.saturating_sub(*from), config))
     }
@@ -78,12 +104,12 @@ impl ValidConfig {
 
     /// Returns the config as it was read, without its resolved stages.
     pub fn into_config(self) -> Config {
-        self.config
+        self.config.0
     }
 
     /// Returns the config with at most this number of generations. Stages that begin later are never played.
     pub(crate) fn ending_at(mut self, generation: usize) -> ValidConfig {
-        self.config.learning.generations = self.config.learning.generations.min(generation);
+        self.config.0.learning.generations = self.config.0.learning.generations.min(generation);
         self
     }
 }

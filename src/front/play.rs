@@ -209,7 +209,7 @@ pub fn trace(
 /// # Errors
 /// The config is invalid, the number of teams is not allowed, or memory is insufficient.
 pub fn stepper(config: &Config, teams: usize, recording: bool) -> Result<Stepper, Failure> {
-    let world = World::new(&*config.validate()?);
+    let world = World::new(&config.validate()?);
     Ok(match (recording, config.learning.fitness) {
         (false, _) => Stepper::new(world, teams)?,
         (true, Fitness::Dt) => Stepper::recording(world, teams)?.with_sights()?,
@@ -228,7 +228,7 @@ struct CheckedTeams<'a> {
 
 impl<'a> CheckedTeams<'a> {
     fn new(config: &Config, teams: usize, weights: &'a [f32], starts: &Starts) -> Result<CheckedTeams<'a>, Failure> {
-        let world = World::new(&*config.validate()?);
+        let world = World::new(&config.validate()?);
         if !(1..=MAX_POPULATION).contains(&teams) {
             return Err(Failure::Teams(teams));
         }

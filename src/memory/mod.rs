@@ -63,7 +63,7 @@ impl Peaks {
         let [mut block, mut order, mut populations, mut held] = [0_u64; 4];
         for config in configs {
             let staged: Vec<(&Config, World)> =
-                config.stages().iter().map(|(_, config)| (config, World::new(config))).collect();
+                config.stages().iter().map(|(_, config)| (&**config, World::new(config))).collect();
             // The largest stage determines each size.
             let most = |size: &dyn Fn(&Config, &World) -> u64| {
                 staged.iter().map(|(config, world)| size(config, world)).max().unwrap_or(0)

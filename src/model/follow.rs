@@ -241,7 +241,8 @@ mod tests {
              [follow]\nattraction_radius = {LONGEST:?}\nrepulsion_radius = {LONGEST:?}\nattraction_gain = {MAX_GAIN:?}\n\
              repulsion_gain = {MAX_GAIN:?}\nwall_gain = {MAX_GAIN:?}"
         );
-        let world = World::new(&Config::parse(&text, "largest.toml").expect("the largest values are valid"));
+        let config = Config::parse(&text, "largest.toml").expect("the largest values are valid");
+        let world = World::new(&config.validate().unwrap());
         fn squared<S: Simd>(simd: S, world: &World) -> f32 {
             let (lanes, zero) = (Lanes::new(simd, world.constants), splat(simd, 0.0));
             let force2 = sizes::<S>(&force::<S>(&lanes, &Sums::new(simd), zero, zero)).0;

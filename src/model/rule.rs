@@ -180,7 +180,7 @@ pub(crate) const NEVER: u32 = u32::MAX;
 impl Rule {
     /// Creates a rule from the observers, of `agents`, the windows, `[pois]`, and the POIs that each comes after,
     /// `[pois]`. Either list may be empty.
-    pub fn new(counted: Range<usize>, agents: usize, windows: &[[usize; 2]], after: &[Vec<usize>]) -> Rule {
+    pub(crate) fn new(counted: Range<usize>, agents: usize, windows: &[[usize; 2]], after: &[Vec<usize>]) -> Rule {
         let mut bits = vec![0; agents.div_ceil(32)];
         counted.clone().for_each(|agent| bits[agent / 32] |= 1 << (agent % 32));
         let after = if after.iter().all(Vec::is_empty) { vec![] } else { after.to_vec() };
@@ -194,7 +194,8 @@ impl Rule {
 
     /// Reports whether the rule is consistent with the words of a set and the number of POIs: sizes match, windows
     /// start at step 1 or later, and no POI waits for itself.
-    pub fn fits(&self, words: usize, pois: usize) -> bool {
+    #[cfg(test)]
+    pub(crate) fn fits(&self, words: usize, pois: usize) -> bool {
         let fits = |len: usize, wanted: usize| len == 0 || len == wanted;
         fits(self.counted.len(), words)
             && fits(self.windows.len(), pois)

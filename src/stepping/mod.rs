@@ -7,7 +7,7 @@
 //! use flotilla::{config::Config, stepping::Stepper, world::World};
 //!
 //! let config = Config::parse(include_str!("../../configs/generally_forward.toml"), "generally_forward.toml")?;
-//! let mut stepper = Stepper::new(World::new(&config), 64)?;
+//! let mut stepper = Stepper::new(World::new(&config.validate()?), 64)?;
 //! // Every leader of every team straight ahead at full speed: [teams][leaders][2].
 //! let ahead = [0.0, 1.0].repeat(64 * stepper.world().leaders());
 //! while !stepper.is_over(0) {
@@ -62,9 +62,6 @@ pub enum StepError {
     /// The number of teams is 0 or too large.
     #[error("{0} teams; there may be 1 to {MAX_POPULATION}")]
     Teams(usize),
-    /// The world is inconsistent.
-    #[error("the world's {0} do not fit its numbers of agents and POIs")]
-    World(&'static str),
     /// The system has too little memory.
     #[error("not enough memory for {teams} teams, {bytes} bytes")]
     Memory {
@@ -161,9 +158,6 @@ impl Stepper {
     pub fn at_level(level: Level, world: World, teams: usize, recording: bool) -> Result<Stepper, StepError> {
         if !(1..=MAX_POPULATION).contains(&teams) {
             return Err(StepError::Teams(teams));
-        }
-        if let Err(field) = world.validate() {
-            return Err(StepError::World(field));
         }
         let (agents, leaders, pois) = (world.agents(), world.leaders(), world.pois.len());
         let words = world.constants.words as usize;

@@ -6,7 +6,7 @@ use fearless_simd::Level;
 use glam::Vec2;
 
 use super::stages::{Stage, Stages};
-use crate::config::{Config, Learning, Sharing};
+use crate::config::{Learning, Sharing};
 use crate::evolve::{self, Key, Purpose};
 use crate::parallel::*;
 
@@ -104,7 +104,7 @@ impl TeamSchedule {
 
 /// Draws the start positions of all episodes of a stage's generation.
 fn draw_starts(stage: &Stage, trial: usize, generation: usize, episodes: &mut Vec<Vec<Vec2>>) {
-    let Stage { config: Config { learning, .. }, world, .. } = stage;
+    let (learning, world) = (&stage.config.learning, &stage.world);
     episodes.resize(learning.episodes_per_team, vec![]);
     for (episode, starts) in episodes.iter_mut().enumerate() {
         evolve::episode_positions(learning, trial, generation, episode, world, starts);

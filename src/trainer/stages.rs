@@ -1,12 +1,12 @@
 //! The stages of a curriculum, resolved once.
 
-use crate::config::{Config, ValidConfig};
+use crate::config::{StageConfig, ValidConfig};
 use crate::world::World;
 
 /// One stage: what plays from `first_generation` on.
 pub(super) struct Stage {
     first_generation: usize,
-    pub config: Config,
+    pub config: StageConfig,
     pub world: World,
 }
 
@@ -20,7 +20,7 @@ pub(super) struct Stages {
 
 impl Stages {
     pub fn new(config: &ValidConfig) -> Stages {
-        let stage = |(first_generation, config): &(usize, Config)| Stage {
+        let stage = |(first_generation, config): &(usize, StageConfig)| Stage {
             first_generation: *first_generation,
             world: World::new(config),
             config: config.clone(),

@@ -171,7 +171,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         let name = &task.name;
         context.message(format_args!("{name}: playing baselines and training on {on}"));
         let small = &configs[0];
-        let played = baseline::play(small, SEEDS, EPISODES, &mut *backend.0, context.quiet())?;
+        let played = baseline::play(&small.validate()?, SEEDS, EPISODES, &mut *backend.0, context.quiet())?;
         let g = |of: fn(&Played) -> f64| played.iter().map(of).collect();
         let baselines = [g(|played| played.constants[played.best_constant]), g(|p| p.action), g(|p| p.network)];
         let mut trained = Vec::new();
@@ -199,7 +199,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
 fn play_script(script: &Script, name: &str, config: &Config) -> Result<f64, Error> {
     let invalid = |error: String| Error::Usage(format!("{name}: scripted team: {error}").into());
     script.check(config).map_err(invalid)?;
-    let observed = script.play(config).map_err(|error| invalid(error.to_string()))?;
+    let observed = script.play(config.validate()?.as_ref()).map_err(|error| invalid(error.to_string()))?;
     Ok(observed.iter().flatten().count() as f64 / config.world.pois.len() as f64)
 }
 

@@ -58,7 +58,7 @@ pub fn papers_worlds() -> Vec<(String, World)> {
         .map(|(name, (paradigm, suffix))| {
             let mut config = layout(name);
             config.learning.paradigm = paradigm;
-            (format!("{}{suffix}", name.replace('_', " ")), World::new(&config))
+            (format!("{}{suffix}", name.replace('_', " ")), World::new(&config.validate().unwrap()))
         })
         .collect()
 }

@@ -112,7 +112,7 @@ pub fn answer(session: &mut Session, text: &str, bytes: &[u8]) -> Result<Answer,
             words(json!({ "labels": runs::labels(&names, &configs) }))
         }
         Ask::Random { text } => {
-            session.random = Some(Random::new(parse(&text)?));
+            session.random = Some(Random::new(&parse(&text)?.validate()?));
             words(json!({}))
         }
         Ask::MoreRandom { milliseconds } => {

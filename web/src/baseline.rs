@@ -2,7 +2,7 @@
 
 use flotilla::backend::cpu::Cpu;
 use flotilla::baseline::{self, Baselines};
-use flotilla::config::Config;
+use flotilla::config::{Config, ValidConfig};
 use flotilla::host::Instant;
 use serde_json::{Value, json};
 
@@ -16,14 +16,14 @@ const EPISODES: u32 = 20;
 /// # Errors
 /// The backend fails.
 pub fn constant(mut config: Config) -> Result<Value, Refusal> {
+    config.stages.clear();
     let learning = &mut config.learning;
-    // Constant actions need no population. Without jitter, all generations and trials are equal.
-    learning.population = 2;
+    // Without jitter, all generations and trials are equal.
     if learning.start_jitter == 0.0 && learning.poi_jitter == 0.0 {
         (learning.generations, learning.trials) = (0, 1);
     }
     let (actions, trials) = (config.policy.actions, config.learning.trials as f64);
-    let (mut baselines, mut cpu) = (Baselines::new(vec![config]), Cpu::default());
+    let (mut baselines, mut cpu) = (Baselines::of_constants(&config.validate()?), Cpu::default());
     while !baselines.is_done() {
         baselines.advance(&mut cpu).map_err(refuse)?;
     }
@@ -37,8 +37,8 @@ pub fn constant(mut config: Config) -> Result<Value, Refusal> {
 pub struct Random(Baselines);
 
 impl Random {
-    pub fn new(config: Config) -> Random {
-        Random(Baselines::new(vec![config]))
+    pub fn new(config: &ValidConfig) -> Random {
+        Random(Baselines::new(std::slice::from_ref(config)))
     }
 
     /// Plays generations for `time` milliseconds, at least one. Returns G of the best so far per generation, as means

@@ -160,7 +160,7 @@ impl Training {
         }
         let config = config.at(generation);
         // Under Dt, what Dt needs is recorded, and every other credit, too.
-        let mut timed = config.clone();
+        let mut timed = Config::clone(config);
         timed.learning.fitness = Fitness::Dt;
         let mut played = replay::best(&timed, &mut trainer, trial, &mut cpu).map_err(refuse)?;
         if config.learning.fitness != Fitness::Dt {

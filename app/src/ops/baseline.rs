@@ -7,7 +7,7 @@ use super::{BackendSource, ConfigText, Context, Error, Processor};
 use crate::choice::Work;
 use flotilla::backend::Backend;
 use flotilla::baseline::{self, Baselines, SPEEDS};
-use flotilla::config::{Actions, Config, Paradigm};
+use flotilla::config::{Actions, Paradigm, ValidConfig};
 use flotilla::statistics;
 
 /// Request of baselines.
@@ -88,8 +88,8 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     if request.seeds == 0 {
         return Err(Error::Usage("--seeds 0: allowed 1 or more".into()));
     }
-    let config = request.config.read()?;
-    let ((backend, machine), on) = backends.open(Work::of([&config]))?;
+    let config = request.config.read()?.validate()?;
+    let ((backend, machine), on) = backends.open(Work::of([&*config]))?;
     context.message(format_args!("playing on {on}"));
     let outcomes = play(&config, request.seeds as usize, request.episodes, &mut **backend, context);
     context.pause();
@@ -135,7 +135,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
 
 /// Plays the baselines of a config from several seeds.
 pub fn play(
-    config: &Config,
+    config: &ValidConfig,
     seeds: usize,
     episodes: u32,
     backend: &mut dyn Backend,
@@ -144,7 +144,7 @@ pub fn play(
     let generations = config.learning.generations + 1;
     let mut outcomes = Vec::new();
     for seed in 0..seeds {
-        let mut baselines = Baselines::of_trial(config.clone(), seed);
+        let mut baselines = Baselines::of_trial(config, seed);
         while !baselines.is_done() {
             baselines.advance(backend)?;
             let done = seed * generations + baselines.generation();

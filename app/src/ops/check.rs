@@ -46,7 +46,7 @@ pub fn run(request: &Request, context: Context<'_>) -> Result<Outcome, Error> {
     let picture = request.out.as_deref().map(|out| Ok::<_, Error>((out, plot::kind_of(out)?))).transpose()?;
     let (config, notes) = request.config.read_noted(context)?;
     if let Some((out, kind)) = picture {
-        output::write(out, &plot::content(&map::layout(&request.name, &config), kind, out)?)?;
+        output::write(out, &plot::content(&map::layout(&request.name, config.as_ref()), kind, out)?)?;
     }
     context.warn_of_unreachable(&config);
     Ok(Outcome { cost: Cost::of(&config), config: config.into_config(), notes })

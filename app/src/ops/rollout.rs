@@ -146,13 +146,13 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
                 let stages = numbered(config.stages().len(), "stage");
                 return Err(Error::Usage(format!("--stage {stage}: the config has {stages}").into()));
             };
-            config.clone()
+            Config::clone(config)
         }
     };
     let starts = request.starts(config.learning.start_jitter, config.learning.poi_jitter)?;
     verify(&config_path, &policies, request.unverified, context)?;
     let policies = policies::read(&policies, &config, request.trial)?;
-    let world = World::new(&config);
+    let world = World::new(&config.validate()?);
     let work = Work::of_teams(&config, policies.policies * request.episodes.unwrap_or(1) as usize);
     let ((backend, machine), on) = backends.open(work)?;
     context.message(format_args!("playing on {on}"));

@@ -274,7 +274,7 @@ fn plan(args: &Request) -> Result<(Plan, Option<Duration>), Error> {
         Some((name, text)) => {
             let config = Config::read(text, name, &[], &args.set)?.validate()?;
             let later = config.stages().iter().enumerate().skip(1);
-            let later = later.map(|(stage, (_, config))| (format!("{name}, stage {stage}"), config.clone()));
+            let later = later.map(|(stage, (_, config))| (format!("{name}, stage {stage}"), Config::clone(config)));
             let worlds = [(name.clone(), Config::clone(&config))].into_iter().chain(later).collect();
             Plan { worlds, teams, seed, generations: 5 }
         }

@@ -9,7 +9,7 @@ use crate::record::disk::Disk;
 use crate::record::folder::{self, Note, Start};
 use crate::run::{self, RunError, Session, SessionEnd};
 use flotilla::backend::OpenBackend;
-use flotilla::config::{Config, ValidConfig};
+use flotilla::config::{Config, StageConfig, ValidConfig};
 
 /// Maximum number of points per batch. Each keeps two files open, and most systems allow a process at least 1024.
 const MAX_BATCH: usize = 400;
@@ -62,7 +62,7 @@ pub fn bytes(config: &ValidConfig) -> usize {
 
 /// Returns the team-steps of a point.
 fn team_steps(config: &ValidConfig) -> u128 {
-    let of_stage = |(generations, config): (usize, &Config)| {
+    let of_stage = |(generations, config): (usize, &StageConfig)| {
         let teams = config.learning.trials * config.max_teams() * config.learning.episodes_per_team;
         teams as u128 * config.world.steps as u128 * generations as u128
     };

@@ -6,7 +6,7 @@ use std::fmt::{self, Display};
 use std::str::FromStr;
 
 use super::Point;
-use flotilla::config::Config;
+use flotilla::config::StageConfig;
 use flotilla::world::World;
 
 /// Maximum number of shards of a sweep.
@@ -123,7 +123,7 @@ pub fn cost(point: &Point) -> u128 {
     point.config.stage_lengths().map(cost_of_stage).sum()
 }
 
-fn cost_of_stage((generations, config): (usize, &Config)) -> u128 {
+fn cost_of_stage((generations, config): (usize, &StageConfig)) -> u128 {
     let learning = &config.learning;
     let world = World::new(config);
     let wide = |count: usize| count as u128;

@@ -176,7 +176,7 @@ pub(crate) fn measure(
     subject: &mut Subject,
     generations: Generations,
 ) -> Result<Timing, BackendError> {
-    let world = World::new(config);
+    let world = World::new(&config.validate()?);
     let ceiling = &mut subject.ceiling()?;
     let ([rollout, ceiling], mean_g, reach) = rollout(config, &world, subject.backend(), ceiling)?;
     let (generation, profile) = match generations {
@@ -331,20 +331,18 @@ mod tests {
 
     #[test]
     fn its_own_number_of_agents_is_the_papers_layout() {
-        assert_eq!(World::new(&with_agents(&config(), 12).unwrap()), World::new(&config()));
+        assert_eq!(with_agents(&config(), 12).unwrap(), config());
     }
 
     #[test]
     fn any_number_of_agents_keeps_the_ratio_and_nobody_shares_a_start() {
         for agents in [1, 2, 3, 12, 24, 100, 256, 768] {
             let config = with_agents(&config(), agents).unwrap();
-            let world = World::new(&config);
+            let world = World::new(&config.validate().unwrap());
             assert_eq!(world.agents(), agents);
             assert!((world.leaders() as f64 - agents as f64 / 3.0).abs() <= 1.0, "{} of {agents}", world.leaders());
             let starts: HashSet<_> = world.starts.iter().map(|start| start.to_array().map(f32::to_bits)).collect();
             assert_eq!(starts.len(), agents);
-            // The config is valid.
-            Config::parse(&config.to_toml(), "laid out").unwrap();
         }
         let refusal = with_agents(&config(), 1024).unwrap_err();
         assert!(refusal.contains("341 leaders and 683 followers"), "{refusal}");

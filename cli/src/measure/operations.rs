@@ -181,7 +181,7 @@ mod tests {
     use flotilla::sample;
 
     fn world(text: &str) -> World {
-        World::new(&Config::parse(text, "test.toml").expect("a good config"))
+        World::new(&Config::parse(text, "test.toml").unwrap().validate().expect("a good config"))
     }
 
     fn reach(world: &World, teams: usize) -> Reach {

@@ -193,7 +193,7 @@ fn episode_with(gpu: &Gpu, density: Density) -> Result<Option<Deviation>, Device
     const TEAMS: usize = 8;
     let mut config = Config::parse(CONFIG, "generally_forward.toml").expect("the project's own config");
     config.sense.density = density;
-    let world = World::new(&config);
+    let world = World::new(&config.validate().expect("the project's own config"));
     let weights = sample::weights(&world, TEAMS, 0);
     let teams: Vec<u32> = (0..TEAMS as u32).flat_map(|team| vec![team; world.leaders()]).collect();
     let group = Group {
@@ -224,7 +224,7 @@ fn episode_with(gpu: &Gpu, density: Density) -> Result<Option<Deviation>, Device
 fn breeding(gpu: &Gpu) -> Result<Option<Deviation>, DeviceError> {
     const SLOTS: usize = 64;
     let config = Config::parse(CONFIG, "generally_forward.toml").expect("the project's own config");
-    let world = World::new(&config);
+    let world = World::new(&config.validate().expect("the project's own config"));
     let sizes = [2, SLOTS, world.parameters()];
     let weights = &sample::weights(&world, SLOTS, 0)[..sizes.iter().product()];
     let parents: Vec<u32> = (0..2 * SLOTS).map(|place| (place * 5 % SLOTS) as u32).collect();
@@ -249,7 +249,7 @@ fn breeding(gpu: &Gpu) -> Result<Option<Deviation>, DeviceError> {
 fn training(gpu: &Gpu) -> Result<Option<Deviation>, DeviceError> {
     const TEAMS: usize = 64;
     let config = Config::parse(CONFIG, "generally_forward.toml").expect("the project's own config");
-    let world = World::new(&config);
+    let world = World::new(&config.validate().expect("the project's own config"));
     let (leaders, parameters) = (world.leaders(), world.parameters());
     let weights = sample::weights(&world, TEAMS, 1);
     let place = |place: usize| ((place / leaders * (2 * (place % leaders) + 1) + place % leaders) % TEAMS) as u32;

@@ -230,7 +230,7 @@ impl Study {
         for (poi_jitter, episodes) in [(0.0, 1), (jitter, EPISODES)] {
             let mut config = config.clone();
             config.learning.poi_jitter = poi_jitter;
-            let world = World::new(&config);
+            let world = World::new(&config.validate().map_err(BackendError::from)?);
             let teams = evaluate::aligned_teams(trials, world.leaders());
             let seed = config.learning.seed;
             let starts = match episodes {
@@ -260,9 +260,9 @@ impl Study {
 /// Returns the policy of the constant speed that observes most of the moved POIs. The episodes that choose it are not
 /// those that measure it.
 fn best_constant(config: &Config, jitter: f64, backend: &mut dyn Backend) -> Result<Vec<f32>, BackendError> {
-    let mut config = config.clone();
-    (config.learning.poi_jitter, config.learning.generations, config.learning.population) = (jitter, 0, 2);
-    let mut baselines = Baselines::of_trial(config.clone(), 0);
+    let mut config = Config { stages: vec![], ..config.clone() };
+    (config.learning.poi_jitter, config.learning.generations, config.learning.trials) = (jitter, 0, 1);
+    let mut baselines = Baselines::of_constants(&config.validate()?);
     while !baselines.is_done() {
         baselines.advance(backend)?;
     }

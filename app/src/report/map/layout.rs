@@ -4,12 +4,12 @@ use glam::DVec2;
 
 use super::{Legend, Marker, Poi, Team, Viewport, counted, poi_label};
 use crate::report::scene::{Anchor, BLACK, Scene};
-use flotilla::config::{Config, Observers};
+use flotilla::config::{Observers, StageConfig};
 use flotilla::model::rule::Rule;
 use flotilla::world::World;
 
 /// Draws the layout of a config before training: start positions, headings and the coupling of each POI.
-pub fn layout(name: &str, config: &Config) -> Scene {
+pub fn layout(name: &str, config: &StageConfig) -> Scene {
     const LEFT: f64 = 11.0;
     const EDGE: f64 = 3.0;
     const HEAD: f64 = 6.5;

@@ -16,7 +16,7 @@ use crate::record::checkpoint;
 use crate::record::digests::Verification;
 use crate::record::folder::{CHECKPOINTS, POLICIES, RUN, Run};
 use flotilla::backend::{Backend, BackendError, Group, Trace};
-use flotilla::config::Config;
+use flotilla::config::{Config, StageConfig};
 use flotilla::credit::{self, Credit, Scores, Strided};
 use flotilla::escape::PathExt;
 use flotilla::evolve;
@@ -382,7 +382,7 @@ fn team(
 /// Plays and traces the champion of the generation that a trainer with a single trial has just finished. `config` is
 /// the config of that generation.
 fn champion(
-    config: &Config,
+    config: &StageConfig,
     trainer: &mut Trainer,
     trial: usize,
     backend: &mut dyn Backend,
@@ -474,8 +474,7 @@ pub fn one(group: &Group<'_>, backend: &mut dyn Backend) -> Result<Replayed, Bac
     let observed = credit::observed_at(episode.sets, world);
     let team_g = f64::from(scores.observed) / world.pois.len() as f64;
     // POIs are drawn where this episode had them.
-    let pois = group.moved_pois().unwrap_or(&world.pois).to_vec();
-    let world = World { pois, ..world.clone() };
+    let world = world.clone().with_pois(group.moved_pois().unwrap_or(&world.pois));
     let (trial, generation, which, team, episodes, unverified) = (0, 0, Which::Champion, 0, 1, false);
     Ok(Replayed {
         trial,

@@ -415,7 +415,7 @@ mod tests {
     fn no_batch_outgrows_a_buffer() {
         let text = "[world]\nleaders = [[1, 1]]\nfollowers = [FOLLOWERS]\npois = [[9, 9]]\nsteps = 45\n";
         let text = text.replace("FOLLOWERS", &vec!["[2, 2]"; 255].join(", "));
-        let world = World::new(&Config::parse(&text, "large").unwrap());
+        let world = World::new(&Config::parse(&text, "large").unwrap().validate().unwrap());
         let (policies, population) = (vec![0.0; world.parameters()], 27_000);
         let group = Group {
             world: &world,
@@ -445,7 +445,7 @@ mod tests {
     fn groups_of_one_team_do_not_outgrow_a_buffer() {
         let text = "[world]\nleaders = [[1, 1]]\nfollowers = [FOLLOWERS]\npois = [[9, 9]]\nsteps = 1\n";
         let text = text.replace("FOLLOWERS", &vec!["[2, 2]"; 255].join(", "));
-        let world = World::new(&Config::parse(&text, "large").unwrap());
+        let world = World::new(&Config::parse(&text, "large").unwrap().validate().unwrap());
         let policies = vec![0.0; world.parameters()];
         let group = Group {
             world: &world,

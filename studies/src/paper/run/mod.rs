@@ -8,7 +8,7 @@ use crate::paper::claims::Claim;
 use crate::paper::{self, Evidence, Experiment, Summary, Trajectory, claims, tables};
 use flotilla::backend::OpenBackend;
 use flotilla::baseline::{Baseline, Baselines};
-use flotilla::config::{Actions, Config, Fitness, Override, Paradigm, ValidConfig};
+use flotilla::config::{Actions, Fitness, Override, Paradigm, ValidConfig};
 use flotilla::escape::PathExt;
 use flotilla::memory;
 use flotilla::parallel::current_num_threads;
@@ -160,7 +160,12 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     }
     experiments.record_copies(&disk)?;
     experiments.read_metrics()?;
-    let baselines = play_baselines(paper::baseline_configs(&experiments.all), learning.generations, backend, context)?;
+    let baselines = play_baselines(
+        &ValidConfig::all(&paper::baseline_configs(&experiments.all))?,
+        learning.generations,
+        backend,
+        context,
+    )?;
 
     let found = Evidence { arms: &experiments.all, baselines: &baselines };
     let publish =
@@ -216,7 +221,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
 /// # Errors
 /// The backend fails, or the user stops.
 fn play_baselines(
-    configs: Vec<Config>,
+    configs: &[ValidConfig],
     last: usize,
     backend: &mut OpenBackend,
     context: Context<'_>,
