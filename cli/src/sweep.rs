@@ -235,11 +235,9 @@ pub fn run(mut args: Args) -> Result<(), Error> {
             false => print(&format!("When all shards are done: {command}\n")),
         };
     }
-    let found =
-        console::run_without_backend(args.quiet, |context| ops::sweep::collect(&request, &sweep, &axes, context))
-            .map_err(|error| {
-                error.or_advise(|| format!("run its shards first: {}", args.command(&out, &["--shard", "1/N"])))
-            })?;
+    let found = console::run_without_backend(args.quiet, |_| ops::sweep::collect(&request, &sweep, &axes)).map_err(
+        |error| error.or_advise(|| format!("run its shards first: {}", args.command(&out, &["--shard", "1/N"]))),
+    )?;
     match args.json {
         true => print_json(&found)?,
         false => print(&found.text)?,

@@ -142,18 +142,19 @@ fn rollout_detects_policies_of_another_run() {
 }
 
 #[test]
-fn runs_without_digests_are_read_with_a_note() {
+fn a_finished_run_without_digests_is_damaged() {
     let place = place();
     let text = place.read("run/run.json");
     let mut record: Value = serde_json::from_str(&text).unwrap();
     let fields = record.as_object_mut().unwrap();
     assert!(fields.remove("files").is_some() && fields.remove("origin").is_some());
     place.write("run/run.json", record.to_string());
-    edit_metrics(&place, "run/metrics.csv");
-    let output = output_of(&place, 0, "plot run");
-    assert_eq!(output.matches("are not verified").count(), 1, "{output}");
-    let (_, stderr) = place.good("train small.toml --out run --resume");
-    assert!(stderr.contains("metrics.csv has changed since"), "{stderr}");
+    let stderr = place.refused(1, "plot run");
+    assert!(stderr.contains("run.json: not the record of a run"), "{stderr}");
+    place.good("plot run --unverified");
+    place.good("train small.toml --out run --resume");
+    assert_eq!(place.read("run/run.json").matches("\"digest\"").count(), 1);
+    place.good("plot run");
 }
 
 #[test]

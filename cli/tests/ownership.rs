@@ -167,6 +167,58 @@ fn temporary_files_of_others_are_kept() {
 }
 
 #[test]
+fn the_list_of_pictures_stays_short_and_complete() {
+    let place = with_run();
+    place.good("replay run");
+    let list = place.path("run/.flotilla.sha256");
+    let of_run = fs::read_to_string(&list).unwrap();
+    let digests = |count: usize| (0..count).map(|index| format!("{index:064x}  replay.html\n")).collect::<String>();
+    // The newest lines are at the end, after more bytes than are read.
+    fs::write(&list, digests(300_000) + &of_run).unwrap();
+    place.good("replay run --generation 1");
+    place.good("replay run --generation 2");
+    let lines = fs::read_to_string(&list).unwrap().lines().count();
+    assert!(lines < 100, "{lines}");
+    for line in of_run.lines().filter(|line| line.ends_with("curves.svg")) {
+        assert!(fs::read_to_string(&list).unwrap().contains(line));
+    }
+}
+
+#[test]
+fn checkpoints_of_other_runs_are_not_replayed() {
+    let place = with_run();
+    place.good("train small.toml --quiet --out other --seed 9");
+    place.good("train small.toml --quiet --out warm --init other/policies.safetensors --set checkpoint.generations=2");
+    let page = || {
+        place.good("replay run --generation 5 --out page.html");
+        place.read("page.html")
+    };
+    fs::remove_dir_all(place.path("run/checkpoints")).unwrap();
+    fs::create_dir(place.path("run/checkpoints")).unwrap();
+    let before = page();
+    for entry in fs::read_dir(place.path("warm/checkpoints")).unwrap() {
+        let name = entry.unwrap().file_name();
+        fs::copy(place.path("warm/checkpoints").join(&name), place.path("run/checkpoints").join(&name)).unwrap();
+    }
+    place.write("run/checkpoints/000000005.safetensors", "mine");
+    assert!(page() == before);
+}
+
+#[test]
+#[cfg(unix)]
+fn nothing_is_written_at_the_root_of_the_file_system() {
+    let place = place();
+    std::os::unix::fs::symlink("/", place.path("top")).unwrap();
+    for words in ["train small.toml", "train small.toml --resume", "sweep sweep.toml"] {
+        for out in ["/", "/../.", "top"] {
+            place.write("sweep.toml", format!("{SMALL}[grid]\n\"learning.fitness\" = ['D', 'Df']\n"));
+            let stderr = place.refused(1, &*format!("{words} --out {out}"));
+            assert!(stderr.contains("it is the root of the file system; choose a folder in it"), "{stderr}");
+        }
+    }
+}
+
+#[test]
 fn an_animation_does_not_replace_pictures_of_others() {
     let place = with_run();
     place.write("p0003.png", "precious");

@@ -170,6 +170,121 @@ fn no_checkpoint_is_due_by_time_while_the_previous_one_is_written() {
 }
 
 #[test]
+fn one_slow_write_does_not_stop_timed_checkpoints() {
+    let (folder, _, paths) = stopped_run(&small());
+    let checkpoint = Checkpoint::read(fs::File::open(&paths[1]).unwrap(), &small()).unwrap();
+    let slow = Duration::from_millis(500);
+    let disk = Disk::failing(move |operation, _| {
+        if operation == Operation::Rename {
+            std::thread::sleep(slow);
+        }
+        Ok(())
+    });
+    let metrics = Disk::default().create(&folder.path().join("metrics")).unwrap();
+    let mut writer = CheckpointWriter::new(disk, folder.path().into(), small(), vec![], 4);
+    writer.save(checkpoint, metrics, Instant::now()).unwrap();
+    writer.wait().unwrap();
+    let written = Instant::now();
+    // The average counts: a quarter of the time, and not all of it, is multiplied by 20.
+    let schedule = |seconds| Schedule { generations: 0, seconds };
+    while !writer.is_due(&schedule(0.3), 10) {
+        assert!(written.elapsed() < slow * 12);
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    // A checkpoint is always due after ten times the interval.
+    assert!(writer.is_due(&schedule(0.01), 10));
+}
+
+/// Returns the names and contents of the files in a folder.
+#[cfg(unix)]
+fn contents(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
+    let mut files = Vec::new();
+    for entry in fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        match path.is_dir() {
+            true => files.extend(contents(&path)),
+            false => files.push((path.clone(), fs::read(path).unwrap())),
+        }
+    }
+    files.sort();
+    files
+}
+
+#[test]
+#[cfg(unix)]
+fn a_copy_of_hard_links_is_not_changed_and_not_locked() {
+    fn link(from: &Path, to: &Path) {
+        fs::create_dir(to).unwrap();
+        for entry in fs::read_dir(from).unwrap() {
+            let (path, to) = (entry.as_ref().unwrap().path(), to.join(entry.unwrap().file_name()));
+            if path.is_dir() { link(&path, &to) } else { fs::hard_link(path, to).unwrap() }
+        }
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let [path, copy] = ["run", "copy"].map(|name| folder.path().join(name));
+    session(&small(), &path, Start::Fresh, Disk::default(), cpu(), Some(9));
+    // A list of pictures, to which lines are added.
+    fs::write(path.join(".flotilla.sha256"), "0  x\n").unwrap();
+    link(&path, &copy);
+    let before = contents(&copy);
+    let disk = Disk::default().within(&path).unwrap();
+    disk.extend(&path.join(".flotilla.sha256"), b"1  y\n").unwrap();
+    let (results, _) = resume(&small(), &path);
+    assert_eq!(results, reference(&small()).0);
+    assert_eq!(contents(&copy), before);
+    // Both can be used at the same time.
+    let open = |path: &Path| Folder::open(path, Start::Resume, &small(), StartFrom::Random, Disk::default());
+    let (_run, _copy) = (open(&path).unwrap(), open(&copy).unwrap());
+    for (path, name) in [(&path, "run"), (&copy, "copy")] {
+        assert!(matches!(open(path), Err(RecordError::Locked { .. })), "{name}");
+    }
+}
+
+#[test]
+fn a_finished_run_is_resumed_where_nothing_can_be_written() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("run");
+    session(&small(), &path, Start::Fresh, Disk::default(), cpu(), None);
+    for kind in [io::ErrorKind::ReadOnlyFilesystem, io::ErrorKind::PermissionDenied] {
+        let disk = Disk::failing(move |operation, _| match operation {
+            Operation::CreateFolder => Ok(()),
+            _ => Err(kind.into()),
+        });
+        let done = session(&small(), &path, Start::Resume, disk.clone(), cpu(), None);
+        assert!(matches!(done.end, Ok(SessionEnd::Finished)), "{:?}", done.end);
+        assert_eq!(done.results, Some(reference(&small()).0));
+        // A longer run cannot be written.
+        let longer = session(&with_generations(&small(), 20), &path, Start::Resume, disk.clone(), cpu(), None);
+        assert!(matches!(longer.end, Err(RunError::Record(RecordError::Write { .. }))), "{:?}", longer.end);
+        let force = session(&small(), &path, Start::Force, disk, cpu(), None);
+        assert!(matches!(force.end, Err(RunError::Record(RecordError::Write { .. }))), "{:?}", force.end);
+    }
+}
+
+#[test]
+fn names_are_flushed_once_and_after_the_last_file() {
+    let (folder, operations) = (tempfile::tempdir().unwrap(), Arc::new(Mutex::new(Vec::new())));
+    let (path, seen) = (folder.path().join("run"), operations.clone());
+    let disk = Disk::failing(move |operation, path| {
+        seen.lock().unwrap().push((operation, path.to_path_buf()));
+        Ok(())
+    });
+    let mut config = small();
+    config.checkpoint.generations = 0;
+    session(&config, &path, Start::Fresh, disk, cpu(), None);
+    let operations = operations.lock().unwrap();
+    let is_flush = |(operation, _): &&(Operation, PathBuf)| *operation == Operation::Flush;
+    // config.toml, run.json three times, metrics.csv, policies.safetensors, a checkpoint and two folders.
+    assert_eq!(operations.iter().filter(is_flush).count(), 9, "{operations:?}");
+    for (at, (operation, name)) in operations.iter().enumerate() {
+        if *operation == Operation::Rename {
+            let mut later = operations[at..].iter().filter(is_flush);
+            assert!(later.any(|(_, flushed)| Some(&**flushed) == name.parent()), "{}", name.display());
+        }
+    }
+}
+
+#[test]
 fn a_run_stopped_before_any_generation_resumes_to_the_same_results() {
     let config = small();
     let expected = reference(&config);
@@ -197,6 +312,7 @@ fn a_finished_run_is_not_trained_again() {
     let before = fs::read(path.join(METRICS)).unwrap();
     let disk = Disk::failing(|operation, path| match operation {
         Operation::CreateFolder => Ok(()),
+        _ if path.ends_with(".lock") => Ok(()),
         _ => panic!("{operation:?} {}", path.display()),
     });
     let outcome = session(&config, &path, Start::Resume, disk, cpu(), None);

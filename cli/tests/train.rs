@@ -1,5 +1,6 @@
 //! Tests `train` and `rollout` as a user runs them: the files, the output on each stream, and the exit codes.
 
+use std::cell::Cell;
 use std::collections::{BTreeMap, HashMap};
 use std::fs;
 use std::ops::ControlFlow::Continue;
@@ -859,4 +860,104 @@ fn compare_files(method: &str) {
             "{folder}"
         );
     }
+}
+
+/// Runs a use case. `meanwhile` is called once, after some generations.
+fn answer(request: &serde_json::Value, meanwhile: &dyn Fn()) -> serde_json::Value {
+    let (request, moved) = (serde_json::from_value(request.clone()).unwrap(), Cell::new(false));
+    let report = |event: ops::Event<'_>| {
+        let begun = match event {
+            ops::Event::Rows { next, .. } => next == 3,
+            ops::Event::Fraction(part, _) => part > 0.4,
+            _ => false,
+        };
+        if begun && !moved.replace(true) {
+            meanwhile();
+        }
+    };
+    let outcome = flotilla_cli::request::answer(&request, &mut &mut front::cpu(), ops::Context::new(&report)).unwrap();
+    assert!(moved.get());
+    outcome
+}
+
+/// A request to train `small.toml` with a seed into a folder.
+fn training(out: &Path, seed: u64) -> serde_json::Value {
+    let text = SMALL.replace("[learning]", &format!("[learning]\nseed = {seed}"));
+    let config = serde_json::json!({ "text": text, "name": "small.toml" });
+    serde_json::json!({ "use_case": "train", "name": "small", "out": out, "start": "fresh", "config": config })
+}
+
+/// Returns the files of a folder that do not depend on the time and the place.
+fn results(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let names =
+        ["config.toml", "curves.svg", "policies.safetensors", "points/0001/policies.safetensors", "results.csv"];
+    names.into_iter().filter_map(|name| Some((name.into(), fs::read(folder.join(name)).ok()?))).collect()
+}
+
+#[test]
+fn a_run_whose_folder_is_moved_ends_where_it_is() {
+    let place = place();
+    let expected = answer(&training(&place.path("reference"), 1), &|| ());
+    let other = answer(&training(&place.path("other"), 2), &|| ());
+    assert_ne!(expected["digest"], other["digest"]);
+    let check = |outcome: serde_json::Value, moved: &str, path: &str| {
+        assert_eq!(outcome["digest"], expected["digest"]);
+        assert_eq!(outcome["last"], expected["last"]);
+        assert_eq!(results(&place.path(moved)), results(&place.path("reference")), "{moved}");
+        assert_eq!(results(&place.path(path)), results(&place.path("other")), "{path}");
+        for (folder, of) in [(moved, &expected), (path, &other)] {
+            assert_eq!(
+                Run::read(&place.path(folder).join("run.json")).unwrap().digest.as_deref(),
+                of["digest"].as_str()
+            );
+            place.good(&*format!("replay {folder}"));
+        }
+    };
+    // Another run takes the path.
+    let moved = answer(&training(&place.path("run"), 1), &|| {
+        fs::rename(place.path("run"), place.path("moved")).unwrap();
+        answer(&training(&place.path("run"), 2), &|| ());
+    });
+    check(moved, "moved", "run");
+    // The path is a link, which leads to another folder later.
+    #[cfg(unix)]
+    {
+        let lead = |to: &str| {
+            let _ = fs::remove_file(place.path("latest"));
+            fs::create_dir(place.path(to)).unwrap();
+            std::os::unix::fs::symlink(to, place.path("latest")).unwrap();
+        };
+        lead("first");
+        let linked = answer(&training(&place.path("latest"), 1), &|| {
+            lead("second");
+            answer(&training(&place.path("latest"), 2), &|| ());
+        });
+        check(linked, "first", "latest");
+    }
+    // Nothing takes the path.
+    let moved = answer(&training(&place.path("run-2"), 1), &|| {
+        fs::rename(place.path("run-2"), place.path("moved-2")).unwrap();
+    });
+    check(moved, "moved-2", "other");
+    assert!(!place.path("run-2").exists());
+}
+
+#[test]
+fn a_sweep_whose_folder_is_moved_ends_where_it_is() {
+    let place = place();
+    let sweep = |out: &str, seed: u64| {
+        let text = SMALL.replace("[learning]", &format!("[learning]\nseed = {seed}"));
+        let text = format!("{text}\n[grid]\n\"learning.fitness\" = ['D', 'Df']\n");
+        serde_json::json!({ "use_case": "sweep", "text": text, "name": "small.toml", "out": place.path(out),
+            "named": true, "start": "fresh" })
+    };
+    answer(&sweep("reference", 1), &|| ());
+    answer(&sweep("other", 2), &|| ());
+    answer(&sweep("grid", 1), &|| {
+        fs::rename(place.path("grid"), place.path("moved")).unwrap();
+        answer(&sweep("grid", 2), &|| ());
+    });
+    assert_eq!(results(&place.path("reference")).len(), 3);
+    assert_eq!(results(&place.path("moved")), results(&place.path("reference")));
+    assert_eq!(results(&place.path("grid")), results(&place.path("other")));
 }

@@ -345,11 +345,13 @@ def train(
             outcome, played, times = _native.train(config._native, name, told, bool(champions))
             return Run(outcome, played, times, None)
         where = os.path.join(folder, "run") if temporary else folder
+        absolute = os.path.abspath(where)
         start = "resume" if resume else "force" if force else "fresh"
         with tempfile.TemporaryDirectory(prefix="flotilla-") as aside:
             first = None if init is None else _init_file(init, config, aside)
             _native.train_into(config._native, where, start, first, name, _command(), told)
-        run = Run.open(where)
+        # A callback may change the working directory.
+        run = Run.open(where if os.path.abspath(where) == absolute else absolute)
         if temporary:
             run._temporary = True
             weakref.finalize(run, shutil.rmtree, folder, True)

@@ -181,6 +181,16 @@ def test_a_failed_picture_does_not_lose_the_run(config):
     assert Run.open("run").digest == run.digest
 
 
+def test_a_callback_may_change_the_working_directory(config, tmp_path):
+    (tmp_path / "other").mkdir()
+    expected = flotilla.train(config, out="reference")
+    run = flotilla.train(config, out="run", callback=lambda generation: os.chdir(tmp_path / "other"))
+    assert run.digest == expected.digest
+    for name in ["config.toml", "curves.svg", "policies.safetensors"]:
+        assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "reference" / name).read_bytes()
+    assert os.listdir(tmp_path / "other") == []
+
+
 def test_init_starts_from_the_policies_of_another_run(config, program):
     first = train(config, out="first")
     second = config.replace(learning={"fitness": "G", "population": 30, "seed": 9})

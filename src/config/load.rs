@@ -1,6 +1,6 @@
 //! Reads configs from files and standard input.
 
-use std::io::{ErrorKind, Read};
+use std::io::{self, ErrorKind, Read};
 use std::path::Path;
 
 use super::{Config, ConfigError};
@@ -35,18 +35,23 @@ pub fn name(path: &Path) -> String {
 /// # Errors
 /// Fails if the file cannot be read, is a folder, is larger than [`MAX_FILE_BYTES`] or is not UTF-8.
 pub fn read_file(path: &Path) -> Result<String, ConfigError> {
-    let fail = |reason: String| ConfigError::Unreadable { name: name(path), reason, is_missing: false };
-    let missing = |error: std::io::Error| ConfigError::Unreadable {
-        name: name(path),
-        reason: error.to_string(),
-        is_missing: error.kind() == ErrorKind::NotFound,
-    };
-    let file: Box<dyn Read> = if is_standard_input(path) {
-        Box::new(std::io::stdin())
+    let name = name(path);
+    if is_standard_input(path) {
+        read_text(Ok(std::io::stdin()), &name)
     } else if path.is_dir() {
-        return Err(fail("it is a directory; name a config file in it".into()));
+        let reason = "it is a directory; name a config file in it".into();
+        Err(ConfigError::Unreadable { name, reason, is_missing: false })
     } else {
-        Box::new(file::open(path).map_err(missing)?)
-    };
-    file::text(file, MAX_FILE_BYTES).map_err(|error| fail(error.to_string()))
+        read_text(file::open(path), &name)
+    }
+}
+
+/// Reads the text of an open file as [`read_file`] does.
+///
+/// # Errors
+/// See [`read_file`].
+pub fn read_text(file: io::Result<impl Read>, name: &str) -> Result<String, ConfigError> {
+    let unreadable = |reason: String, is_missing| ConfigError::Unreadable { name: name.into(), reason, is_missing };
+    let file = file.map_err(|error| unreadable(error.to_string(), error.kind() == ErrorKind::NotFound))?;
+    file::text(file, MAX_FILE_BYTES).map_err(|error| unreadable(error.to_string(), false))
 }

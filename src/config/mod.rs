@@ -25,7 +25,7 @@ pub use learning::{
     MAX_PARTNERS, MAX_POPULATION, MAX_TRIALS, Method, Mutation, Paradigm, Parents, Sharing,
 };
 pub use load::name;
-pub use load::{is_standard_input, read_file};
+pub use load::{is_standard_input, read_file, read_text};
 pub use stages::MAX_STAGES;
 pub use stages::{GENERATIONS, STAGES, Stage};
 pub use valid::{StageConfig, ValidConfig};

@@ -184,7 +184,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
                 disk.create_folder(&parent).map_err(RecordError::write(&parent))?;
                 let folder = parent.join(format!("{}-{fitness}", config.learning.population));
                 train(&config, name, &folder, request.start, &disk, backend, context)?;
-                trained.push(measure(&config, &folder, &mut *backend.0)?);
+                trained.push(measure(&config, &disk, &folder, &mut *backend.0)?);
             }
         }
         let pois = small.world.pois.len();
@@ -232,17 +232,17 @@ fn train(
 }
 
 /// Reads a finished run. If starts or POIs move, its champions play held-out episodes.
-fn measure(config: &Config, folder: &Path, backend: &mut dyn Backend) -> Result<Trained, Error> {
+fn measure(config: &Config, disk: &Disk, folder: &Path, backend: &mut dyn Backend) -> Result<Trained, Error> {
     let learning = &config.learning;
     let (population, fitness, none) = (learning.population, learning.fitness, vec![0.0; learning.trials]);
     let mut trained = Trained { population, fitness, champion_g: none.clone(), best_g: none };
-    runs::metrics(folder, config, Verification::Required, |row| {
+    runs::metrics(disk.at(folder), config, Verification::Required, |row| {
         if row.generation == learning.generations {
             (trained.champion_g[row.trial], trained.best_g[row.trial]) = (row.champion_g, row.best_g);
         }
     })?;
     if learning.start_jitter > 0.0 || learning.poi_jitter > 0.0 {
-        let weights = champions(&folder.join(POLICIES), config)?;
+        let weights = champions(disk.at(&folder.join(POLICIES)), config)?;
         let starts = Starts::Drawn {
             episodes: EPISODES,
             seed: 0,

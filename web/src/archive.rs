@@ -147,7 +147,7 @@ pub fn read(text: Option<&str>, bytes: &[u8]) -> Result<Answer, Refusal> {
     let (metrics, weights) = (file(folder::METRICS)?, file(folder::POLICIES)?);
     let run = Run::parse(&String::from_utf8_lossy(&file(folder::RUN)?))
         .map_err(|error| refuse(format!("run.json: {error}")))?;
-    if run.origin.is_some_and(|origin| origin != Origin::of(&config)) {
+    if run.origin != Origin::of(&config) {
         return Err(refuse("config.toml is not the config that this run was trained with"));
     }
     let expected = run.digest.ok_or_else(|| {

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{Context, Error, with_remedy};
 use crate::record;
-use crate::record::digests::{self, Verification};
+use crate::record::digests::Verification;
 use crate::record::folder::{self, CONFIG, RUN, Run, SWEEP};
 use crate::report::comparison::{self, At, Cohort, Comparison, ComparisonError, Question};
 use crate::report::runs::{self, MAX_RUNS, ReadError};
@@ -98,8 +98,6 @@ pub fn run(args: &Request, context: Context<'_>) -> Result<Outcome, Error> {
         [folder] if folder::collection(folder) == Some("a sweep") => of_sweep(folder, args, &mut notes)?,
         folders => vec![(String::new(), of_runs(folders, args, &mut notes)?)],
     };
-    let folders = groups.iter().flat_map(|(_, arms)| arms).flat_map(|arm| &arm.folders);
-    digests::without(folders.map(|folder| &**folder)).into_iter().for_each(|note| context.warn(note));
     // Printed even if nothing can be compared, because the notes may explain that.
     let report = |notes: &[String]| notes.iter().for_each(|note| context.warn(format_args!("note: {note}")));
     report(&notes);

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::output::Destination;
 use super::{Context, Error, escaped, with_remedy};
 use crate::record::RecordError;
-use crate::record::digests::{self, Verification};
+use crate::record::digests::Verification;
 use crate::record::ownership::CURVES;
 use crate::report::curves::{Band, PRINT};
 use crate::report::runs::{self, MAX_RUNS, TeamKind};
@@ -64,8 +64,7 @@ pub fn run(request: &Request, context: Context<'_>) -> Result<Outcome, Error> {
     };
     let out = place.path();
     let kind = kind_of(out)?;
-    let scene = runs::figure(runs, request.measure, request.band, verification)?.scene();
-    digests::without(runs.iter().map(|run| &**run)).into_iter().for_each(|note| context.note(note));
+    let scene = runs::figure(&runs, request.measure, request.band, verification)?.scene();
     place.check()?;
     place.write(&content(&scene, kind, out)?)?;
     if runs::paired(runs, verification)? {

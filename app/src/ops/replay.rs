@@ -9,7 +9,7 @@ use super::output::{self, Destination};
 use super::{BackendSource, Context, Error, escaped, points, with_remedy};
 use crate::choice::Work;
 use crate::record::RecordError;
-use crate::record::digests::{self, Verification};
+use crate::record::digests::Verification;
 use crate::record::disk::Disk;
 use crate::record::ownership::{self, REPLAY};
 use crate::report::curves::PRINT;
@@ -190,7 +190,6 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let kind = Form::of(out)?;
     kind.takes(out, request)?;
     let config = points::config(folder, verification)?.validate()?;
-    digests::without([folder]).into_iter().for_each(|note| context.note(note));
     let trial = request.trial.find(folder, &config, generation, team, verification)?;
     let generation = match generation {
         Some(generation) => generation,

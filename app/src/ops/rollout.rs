@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{BackendSource, ConfigText, Context, Error, Processor, output, points, with_remedy};
 use crate::choice::Work;
-use crate::record::digests::{self, Digests, Verification};
+use crate::record::digests::{Digests, Verification};
 use crate::record::{folder, policies, tensors};
 use crate::report::map;
 use crate::report::replay::numbered;
@@ -150,7 +150,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         }
     };
     let starts = request.starts(config.learning.start_jitter, config.learning.poi_jitter)?;
-    verify(&config_path, &policies, request.unverified, context)?;
+    verify(&config_path, &policies, request.unverified)?;
     let policies = policies::read(&policies, &config, request.trial)?;
     let world = World::new(&config.validate()?);
     let work = Work::of_teams(&config, policies.policies * request.episodes.unwrap_or(1) as usize);
@@ -202,20 +202,15 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
 }
 
 /// Compares a config and policies with the digests in `run.json`, if they belong to a run.
-fn verify(config: &Path, policies: &Path, unverified: bool, context: Context<'_>) -> Result<(), Error> {
+fn verify(config: &Path, policies: &Path, unverified: bool) -> Result<(), Error> {
     let verification = Verification::unless(unverified);
-    let mut folders = Vec::new();
     if config.ends_with(folder::CONFIG) {
         Digests::read(file::folder(config), verification)?.compare_config(config, &Config::load(config)?)?;
-        folders.push(file::folder(config));
     }
     if policies.ends_with(folder::POLICIES) {
         let checksum = tensors::open(policies)?.checksum().map(String::from);
         Digests::read(file::folder(policies), verification)?.compare_policies(policies, checksum.as_deref())?;
-        folders.push(file::folder(policies));
     }
-    folders.dedup();
-    digests::without(folders).into_iter().for_each(|note| context.note(note));
     Ok(())
 }
 

@@ -11,8 +11,8 @@ use serde_json::Value;
 use super::{BackendSource, Context, Error, Event, check_memory};
 use crate::choice::Work;
 use crate::record::RecordError;
-use crate::record::digests::{self, UNVERIFIED, Verification};
-use crate::record::disk::Disk;
+use crate::record::digests::{UNVERIFIED, Verification};
+use crate::record::disk::{Disk, Place};
 use crate::record::folder::{self, CONFIG, RUN, Run, SWEEP, Start};
 use crate::record::ownership;
 use crate::record::runs;
@@ -196,8 +196,8 @@ impl Outcome {
 pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
     let sweep = request.read()?;
     let axes = picture_axes(&sweep, &request.results.axes)?;
-    train(request, &sweep, backends, context)?;
-    collect(request, &sweep, &axes, context)
+    let disk = train(request, &sweep, backends, context)?;
+    write_results(request, &sweep, &axes, &disk, disk.at(&request.out))
 }
 
 /// Returns the axes that pictures have across and down.
@@ -298,7 +298,7 @@ fn open_folder(out: &Path, named: bool) -> Result<Disk, Error> {
     Ok(disk)
 }
 
-/// Trains the points of a request's shard.
+/// Trains the points of a request's shard. Returns the disk in the sweep's folder.
 ///
 /// # Errors
 /// The folder cannot be used, or training fails or is stopped.
@@ -307,7 +307,7 @@ pub fn train(
     sweep: &Sweep,
     backends: &mut dyn BackendSource,
     context: Context<'_>,
-) -> Result<(), Error> {
+) -> Result<Disk, Error> {
     let out = &*request.out;
     check(&request.results)?;
     let shard = request.shard.map_or(Ok(Shard::WHOLE), |(index, count)| Shard::new(index, count));
@@ -337,7 +337,7 @@ pub fn train(
         (context.report)(Event::Fraction(played as f64 / total.max(1) as f64, text));
     };
     match train_points(context, sweep, &points, out, request.start, &disk, memory, backend, &share)? {
-        SessionEnd::Finished => Ok(()),
+        SessionEnd::Finished => Ok(disk),
         SessionEnd::Stopped => Err(Error::Stopped("everything is saved".into())),
     }
 }
@@ -452,20 +452,33 @@ pub fn free_memory() -> usize {
 ///
 /// # Errors
 /// The folder holds no such sweep, or files cannot be written.
-pub fn collect(request: &Request, sweep: &Sweep, axes: &[usize], context: Context<'_>) -> Result<Outcome, Error> {
+pub fn collect(request: &Request, sweep: &Sweep, axes: &[usize]) -> Result<Outcome, Error> {
     let out = &*request.out;
     if !runs::exists(&out.join(SWEEP))? {
         return Err(Error::Usage(format!("{} holds no sweep", out.escaped()).into()));
     }
     same_sweep(sweep, out)?;
     check(&request.results)?;
-    open_folder(out, request.named)?;
+    let disk = open_folder(out, request.named)?;
+    // Points may be links to runs elsewhere.
+    write_results(request, sweep, axes, &disk, out.into())
+}
+
+/// Writes the results of the points in `place`, which is the sweep's folder, and the pictures.
+fn write_results(
+    request: &Request,
+    sweep: &Sweep,
+    axes: &[usize],
+    disk: &Disk,
+    place: Place<'_>,
+) -> Result<Outcome, Error> {
+    let out = place.path();
     let Results { every, reach, unverified, measure, band, .. } = request.results;
     let options = results::Detail { every, reach, verification: Verification::unless(unverified), measure, band };
     let folders: Vec<PathBuf> = sweep.points.iter().map(|point| results::point_folder(out, point)).collect();
-    digests::without(folders.iter().map(|folder| &**folder)).into_iter().for_each(|note| context.warn(note));
-    let outcomes = results::write(sweep, out, &options)?;
-    let (pictures, note) = pictures::draw(sweep, &outcomes, &options, axes, out)?;
+    let outcomes = results::write(sweep, place, &options, disk)?;
+    let (pictures, note) = pictures::draw(sweep, &outcomes, &options, axes, out, disk)?;
+    disk.sync_folder(out).map_err(RecordError::write(out))?;
     let mut text = summary(sweep, &outcomes, &options);
     let rows = if every == 1 { "generation by generation".into() } else { format!("every {every} generations") };
     let _ = write!(
@@ -491,7 +504,7 @@ pub fn collect(request: &Request, sweep: &Sweep, axes: &[usize], context: Contex
             .collect(),
         missing: outcome.as_ref().err().map(ToString::to_string),
         found: outcome.as_ref().ok().map(|outcome| Found {
-            digest: Run::read(&folder.join(RUN)).ok().and_then(|run| run.digest),
+            digest: Run::read(place.at(&folder.join(RUN))).ok().and_then(|run| run.digest),
             best_g: outcome.best().mean(),
             best_g_error: outcome.best().error(),
             champion_g: outcome.champion().mean(),

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::ffi::OsString;
-use std::fs;
+use std::io;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
@@ -18,8 +18,8 @@ use crate::record::finished::{Finished, Storage};
 use crate::record::folder::{self, CONFIG, FirstAndLastRows, METRICS, POLICIES, RUN, Start};
 use crate::record::ownership::{self, CURVES};
 use crate::record::policies::{self, Init};
-use crate::report::curves::Band;
-use crate::report::runs;
+use crate::record::runs;
+use crate::report::runs::{RunMetrics, figure_of, figure_of_metrics};
 use crate::report::scene::Scene;
 use crate::run::{Progress, RunError, Session, SessionEnd};
 use crate::shell;
@@ -186,13 +186,29 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     }
     let last = train(&mut session, request, &folder, backend, context)?;
     let (config, results) = (session.config(0), session.results(0).expect("the run is done"));
+    let (disk, curves) = (session.disk(0), folder.join(CURVES));
+    let (mut metrics, mut most) = (RunMetrics::default(), 0.0_f64);
+    runs::metrics(disk.at(&folder), config, Verification::Required, |row| {
+        metrics.add(row);
+        most = most.max(row.best_g).max(row.champion_g);
+    })?;
     // A session that ended after the run but before its picture left an older picture, or none.
-    let is_drawn = || fs::read_to_string(folder.join(CURVES)).is_ok_and(|svg| Scene::shows(&svg, &results.digest));
-    if let Some(error) = (!was_done || !is_drawn()).then(|| draw(session.disk(0), &folder).err()).flatten() {
-        // Everything that was learned is already saved.
-        context.warn(format_args!("{}: not drawn: {}", folder.join(CURVES).escaped(), error.message()));
+    let is_drawn = || {
+        let svg = disk.at(&curves).open().and_then(io::read_to_string);
+        svg.is_ok_and(|svg| Scene::shows(&svg, &results.digest))
+    };
+    if !was_done || !is_drawn() {
+        let svg = figure_of_metrics(config, metrics, &results.digest).scene().svg();
+        let drawn = ownership::publish(disk, &curves, |output| output.write_all(svg.as_bytes()))
+            .and_then(|()| disk.sync_folder(&folder).map_err(RecordError::write(&folder)));
+        if let Err(error) = drawn.map_err(Error::from) {
+            // Everything that was learned is already saved.
+            context.warn(format_args!("{}: not drawn: {}", curves.escaped(), error.message()));
+        }
     }
-    warn_if_nothing_was_observed(&folder, config, context);
+    if most == 0.0 {
+        warn_that_nothing_was_observed(&folder, context);
+    }
     let learning = &config.learning;
     Ok(Outcome {
         config: request.name.clone(),
@@ -282,20 +298,14 @@ fn train(
     Ok(last)
 }
 
-/// Warns if no team observed a POI in any generation.
-fn warn_if_nothing_was_observed(folder: &Path, config: &Config, context: Context<'_>) {
-    let mut ever = false;
-    let read = runs::metrics(folder, config, Verification::Required, |row| {
-        ever |= row.best_g > 0.0 || row.champion_g > 0.0;
-    });
-    if read.is_ok() && !ever {
-        context.warn(format_args!(
-            "warning: no team observed any POI in any generation, so there was nothing to learn from; try more \
-             world.steps, a smaller world.coupling, POIs nearer to the starts, or a larger learning.population; \
-             `flotilla replay {}` shows what teams do",
-            shell::quoted(shell::argument(folder))
-        ));
-    }
+/// Warns that no team observed a POI in any generation.
+fn warn_that_nothing_was_observed(folder: &Path, context: Context<'_>) {
+    context.warn(format_args!(
+        "warning: no team observed any POI in any generation, so there was nothing to learn from; try more \
+         world.steps, a smaller world.coupling, POIs nearer to the starts, or a larger learning.population; \
+         `flotilla replay {}` shows what teams do",
+        shell::quoted(shell::argument(folder))
+    ));
 }
 
 /// The results of a training in memory.
@@ -354,14 +364,7 @@ pub fn in_memory(
 pub fn save(finished: Finished<'_>, storage: &mut dyn Storage) -> Result<String, RecordError> {
     let (config, rows) = (finished.config, finished.rows);
     let digest = finished.write(storage)?;
-    let figure = runs::figure_of(config, rows.iter().map(|(row, _)| row), &digest);
+    let figure = figure_of(config, rows.iter().map(|(row, _)| row), &digest);
     storage.publish(CURVES, figure.scene().svg().as_bytes())?;
     Ok(digest)
-}
-
-/// Draws the run's curves.
-fn draw(disk: &Disk, folder: &Path) -> Result<(), Error> {
-    let runs = [folder.to_path_buf()];
-    let svg = runs::figure(&runs, None, Band::Interval, Verification::Required)?.scene().svg();
-    Ok(ownership::publish(disk, &folder.join(CURVES), |output| output.write_all(svg.as_bytes()))?)
 }

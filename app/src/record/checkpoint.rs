@@ -9,7 +9,7 @@
 //! fame it has weights of its own, because the run continues from more than the policies.
 
 use std::collections::BTreeMap;
-use std::fs;
+use std::ffi::OsString;
 use std::io::{ErrorKind, Read, Seek, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -17,7 +17,7 @@ use std::time::Duration;
 
 use safetensors::tensor::Dtype;
 
-use super::disk::{self, Disk, Output};
+use super::disk::{self, Disk, Output, Place};
 use super::metrics::Extent;
 use super::policies;
 use super::tensors::{self, Tensor, TensorFile};
@@ -45,8 +45,11 @@ const EXTENSION: &str = ".safetensors";
 const DIGITS: usize = 9;
 /// Number of recent checkpoints that are kept.
 const KEPT: usize = 2;
-/// Checkpoints that are due by time take at most one part in `SHARE` of the run's time.
-const SHARE: u32 = 20;
+/// Checkpoints that are due by time take one part in `SHARE` of the run's time on average, unless [`MAX_STRETCH`] times
+/// their interval is shorter.
+const SHARE: f64 = 20.0;
+/// Maximum extension of an interval. A stalled disk must not stop checkpoints for long.
+const MAX_STRETCH: f64 = 10.0;
 
 /// State of a run before a generation.
 #[derive(Clone, Debug, PartialEq)]
@@ -145,8 +148,7 @@ impl Checkpoint {
         let metrics = Extent { bytes: number("metrics_bytes")?, sha256: text("metrics_sha256")? };
         let generation = number("generation")? as usize;
         let learning = &of.learning;
-        // Earlier versions did not write this key, and their runs were never extended.
-        let last = file.metadata(LAST).map_or(Ok(learning.generations as u64), |_| number(LAST))? as usize;
+        let last = number(LAST)? as usize;
         if generation > last + 1 {
             return Err(format!("its generation is {generation}, past the last, {last}"));
         }
@@ -236,20 +238,21 @@ impl Shapes {
 ///
 /// # Errors
 /// The folder cannot be read.
-pub fn list(folder: &Path) -> Result<Vec<usize>, RecordError> {
-    let entries = match fs::read_dir(folder) {
-        Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => return Ok(vec![]),
-        // Wine has another error for a file in the folder's place.
-        Err(_) if folder.is_file() => return Ok(vec![]),
-        entries => entries.map_err(RecordError::read(folder))?,
-    };
-    let mut generations = Vec::new();
-    for entry in entries {
-        let entry = entry.map_err(RecordError::read(folder))?;
-        generations.extend(entry.file_name().to_str().and_then(generation_of));
-    }
+pub fn list<'a>(folder: impl Into<Place<'a>>) -> Result<Vec<usize>, RecordError> {
+    let mut generations: Vec<usize> =
+        names(folder.into())?.iter().filter_map(|name| name.to_str().and_then(generation_of)).collect();
     generations.sort_unstable();
     Ok(generations)
+}
+
+/// Returns the names in a folder. A missing folder has none.
+fn names(folder: Place<'_>) -> Result<Vec<OsString>, RecordError> {
+    match folder.list() {
+        Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => Ok(vec![]),
+        // Wine has another error for a file in the folder's place.
+        Err(_) if folder.path().is_file() => Ok(vec![]),
+        names => names.map_err(RecordError::read(folder.path())),
+    }
 }
 
 /// Returns the generation in the file name of a checkpoint, or `None` for any other name.
@@ -268,8 +271,14 @@ pub fn path(folder: &Path, generation: usize) -> PathBuf {
 ///
 /// # Errors
 /// The checkpoint or the policies cannot be read, or the checkpoint is damaged.
-pub fn read(path: &Path, policies: &Path, config: &Config) -> Result<Option<Checkpoint>, RecordError> {
-    let file = file::open(path).map_err(RecordError::read(path))?;
+pub fn read<'a>(
+    place: impl Into<Place<'a>>,
+    policies: impl Into<Place<'a>>,
+    config: &Config,
+) -> Result<Option<Checkpoint>, RecordError> {
+    let place = place.into();
+    let path = place.path();
+    let file = place.open().map_err(RecordError::read(path))?;
     let mut found = Checkpoint::read(file, config).map_err(|reason| RecordError::damaged(path, reason))?;
     let whole = !found.snapshot.weights.is_empty()
         || match tensors::open(policies) {
@@ -288,7 +297,7 @@ pub fn read(path: &Path, policies: &Path, config: &Config) -> Result<Option<Chec
 pub struct Schedule {
     /// Number of generations between checkpoints. Training waits if the previous checkpoint is still being written.
     pub generations: usize,
-    /// Seconds between checkpoints. The interval is extended until writing took at most 1/20 of it.
+    /// Seconds between checkpoints. The interval is extended, up to tenfold, until writing takes at most 1/20 of it.
     pub seconds: f64,
 }
 
@@ -300,27 +309,35 @@ pub struct CheckpointWriter {
     /// Generations of the complete checkpoints, oldest first.
     kept: Vec<usize>,
     writing: Option<BackgroundTask<Result<(usize, Duration), RecordError>>>,
-    /// Generation, time and cost of the last checkpoint.
-    last: (usize, Instant, Duration),
+    /// Generation and time of the last checkpoint.
+    last: (usize, Instant),
+    /// Average time that a checkpoint takes, in seconds. Later ones count more.
+    cost: f64,
 }
 
 impl CheckpointWriter {
     /// Creates a writer for an existing folder with the checkpoints `kept`. The run resumes before `generation`.
     pub fn new(disk: Disk, folder: PathBuf, config: Config, kept: Vec<usize>, generation: usize) -> CheckpointWriter {
-        let last = (generation, Instant::now(), Duration::ZERO);
-        CheckpointWriter { disk, folder, config: Arc::new(config), kept, writing: None, last }
+        let last = (generation, Instant::now());
+        CheckpointWriter { disk, folder, config: Arc::new(config), kept, writing: None, last, cost: 0.0 }
     }
 
     /// Reports whether a checkpoint is due before a generation is played.
     pub fn is_due(&self, schedule: &Schedule, generation: usize) -> bool {
-        let (last, moment, cost) = self.last;
+        let (last, moment) = self.last;
         if generation == last {
             return false;
         }
         let writing = self.writing.as_ref().is_some_and(|writing| !writing.is_finished());
-        let (elapsed, seconds) = (moment.elapsed(), schedule.seconds);
+        let seconds = schedule.seconds;
         schedule.generations > 0 && generation - last >= schedule.generations
-            || seconds > 0.0 && !writing && elapsed.as_secs_f64() >= seconds && elapsed >= cost * SHARE
+            || seconds > 0.0
+                && !writing
+                && moment.elapsed().as_secs_f64() >= (self.cost * SHARE).clamp(seconds, MAX_STRETCH * seconds)
+    }
+
+    fn add_cost(&mut self, cost: Duration) {
+        self.cost += (cost.as_secs_f64() - self.cost) / 4.0;
     }
 
     /// Starts to write a checkpoint after the previous one is complete. `metrics` is flushed to the disk first. The
@@ -331,12 +348,13 @@ impl CheckpointWriter {
     pub fn save(&mut self, checkpoint: Checkpoint, metrics: Output, since: Instant) -> Result<(), RecordError> {
         self.wait()?;
         let generation = checkpoint.snapshot.generation;
-        self.last = (generation, Instant::now(), since.elapsed());
+        self.last = (generation, Instant::now());
         let (disk, config) = (self.disk.clone(), self.config.clone());
         let path = path(&self.folder, generation);
         self.writing = Some(BackgroundTask::start(move || {
             metrics.sync().map_err(RecordError::write(metrics.path()))?;
             checkpoint.write(&disk, &path, &config).map_err(RecordError::write(&path))?;
+            disk.sync_folder(file::folder(&path)).map_err(RecordError::write(&path))?;
             Ok((generation, since.elapsed()))
         }));
         Ok(())
@@ -357,7 +375,9 @@ impl CheckpointWriter {
         let path = path(&self.folder, generation);
         metrics.sync().map_err(RecordError::write(metrics.path()))?;
         checkpoint.write(&self.disk, &path, &self.config).map_err(RecordError::write(&path))?;
-        self.last = (generation, Instant::now(), since.elapsed());
+        self.disk.sync_folder(&self.folder).map_err(RecordError::write(&path))?;
+        self.last = (generation, Instant::now());
+        self.add_cost(since.elapsed());
         self.keep(generation)
     }
 
@@ -368,7 +388,7 @@ impl CheckpointWriter {
     pub fn wait(&mut self) -> Result<(), RecordError> {
         let Some(writing) = self.writing.take() else { return Ok(()) };
         let (generation, cost) = writing.finish()?;
-        self.last.2 = cost;
+        self.add_cost(cost);
         self.keep(generation)
     }
 
@@ -394,7 +414,7 @@ impl CheckpointWriter {
         self.wait()?;
         for &generation in &self.kept {
             let path = path(&self.folder, generation);
-            let file = file::open(&path).map_err(RecordError::read(&path))?;
+            let file = self.disk.at(&path).open().map_err(RecordError::read(&path))?;
             let mut kept =
                 Checkpoint::read(file, &self.config).map_err(|reason| RecordError::damaged(&path, reason))?;
             kept.config = config_digest(config);
@@ -433,9 +453,9 @@ impl Drop for CheckpointWriter {
 /// # Errors
 /// The folder cannot be read or written.
 pub(crate) fn remove_temporary_files(disk: &Disk, folder: &Path) -> Result<Vec<usize>, RecordError> {
-    let generations = list(folder)?;
-    for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
-        let path = entry.path();
+    let generations = list(disk.at(folder))?;
+    for name in names(disk.at(folder))? {
+        let path = folder.join(name);
         let whole = disk::of_temporary(&path);
         if whole.is_some_and(|name| generation_of(name).is_some()) {
             disk.remove(&path).map_err(RecordError::write(&path))?;

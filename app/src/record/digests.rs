@@ -7,10 +7,11 @@
 //! - the policies, through the checksum in their file.
 
 use std::io::ErrorKind;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use sha2::{Digest, Sha256};
 
+use super::disk::Place;
 use super::folder::{FileSums, Origin, RUN, Run, Status};
 use super::{RecordError, hex};
 use flotilla::config::Config;
@@ -40,7 +41,7 @@ impl Verification {
     }
 }
 
-/// Digests of a finished run. Unfinished runs have no digests. Runs of earlier versions have no digests of their files.
+/// Digests of a finished run. Unfinished runs have no digests.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Digests {
     /// See [`Run::digest`].
@@ -54,12 +55,15 @@ impl Digests {
     ///
     /// # Errors
     /// `run.json` is damaged or cannot be read.
-    pub fn read(folder: &Path, verification: Verification) -> Result<Digests, RecordError> {
+    pub fn read<'a>(folder: impl Into<Place<'a>>, verification: Verification) -> Result<Digests, RecordError> {
+        let folder = folder.into();
         if verification.is_skipped() {
             return Ok(Digests::default());
         }
-        match Run::read(&folder.join(RUN)) {
-            Ok(Run { state: Status::Done, digest, origin, files, .. }) => Ok(Digests { run: digest, origin, files }),
+        match Run::read(folder.at(&folder.path().join(RUN))) {
+            Ok(Run { state: Status::Done, digest, origin, files, .. }) => {
+                Ok(Digests { run: digest, origin: Some(origin), files })
+            }
             Ok(_) => Ok(Digests::default()),
             Err(RecordError::Read { error, .. }) if error.kind() == ErrorKind::NotFound => Ok(Digests::default()),
             Err(error) => Err(error),
@@ -93,16 +97,4 @@ impl Digests {
 
 fn same(path: &Path, same: bool) -> Result<(), RecordError> {
     if same { Ok(()) } else { Err(RecordError::Differs { path: path.into() }) }
-}
-
-/// Returns one note about all finished runs that have no digests of their files, or `None` if all have them.
-pub fn without<'a>(folders: impl IntoIterator<Item = &'a Path>) -> Option<String> {
-    let lacks =
-        |folder: &&Path| Run::read(&folder.join(RUN)).is_ok_and(|run| run.state == Status::Done && run.files.is_none());
-    let all: Vec<PathBuf> = folders.into_iter().filter(lacks).map(Path::to_path_buf).collect();
-    let first = all.first()?.display();
-    let more = if all.len() > 1 { format!(" and {} more", all.len() - 1) } else { String::new() };
-    Some(format!(
-        "note: {first}{more}: an earlier version made this run, without digests of its files, so these are not verified"
-    ))
 }

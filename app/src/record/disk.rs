@@ -1,7 +1,8 @@
 //! Access to the disk for everything that is written. Files are replaced whole or not at all, and tests can make any
 //! single operation fail.
 
-use std::fs::{self, File, OpenOptions, Permissions};
+use std::ffi::OsString;
+use std::fs::{self, File, OpenOptions, Permissions, TryLockError};
 use std::io::{self, BufWriter, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -39,6 +40,68 @@ pub struct Disk {
     root: Option<Arc<RootedFolder>>,
 }
 
+/// A file or a folder to read: at any path, or in the folder that a disk is limited to.
+///
+/// The files of a run that is being written are read in the second way, because the path of its folder may lead to
+/// another folder by now.
+#[derive(Clone, Copy)]
+pub struct Place<'a> {
+    disk: Option<&'a Disk>,
+    path: &'a Path,
+}
+
+impl<'a, P: AsRef<Path> + ?Sized> From<&'a P> for Place<'a> {
+    fn from(path: &'a P) -> Place<'a> {
+        Place { disk: None, path: path.as_ref() }
+    }
+}
+
+impl<'a> Place<'a> {
+    /// Returns the path.
+    pub fn path(&self) -> &'a Path {
+        self.path
+    }
+
+    /// Returns another place, which is reached in the same way.
+    pub(crate) fn at<'b>(&self, path: &'b Path) -> Place<'b>
+    where
+        'a: 'b,
+    {
+        Place { disk: self.disk, path }
+    }
+
+    /// Opens a plain file for reading.
+    ///
+    /// # Errors
+    /// Returns the system's error. Also fails for a link in a disk's folder.
+    pub fn open(&self) -> io::Result<File> {
+        self.disk.map_or_else(|| file::open(self.path), |disk| disk.read(self.path))
+    }
+
+    /// Reports whether the file or folder exists.
+    ///
+    /// # Errors
+    /// Returns the system's error.
+    pub fn exists(&self) -> io::Result<bool> {
+        match self.disk.map_or_else(|| file::exists(self.path), |disk| Ok(disk.kind(self.path)?.is_some())) {
+            // A path below a file cannot exist.
+            Err(error) if error.kind() == io::ErrorKind::NotADirectory => Ok(false),
+            exists => exists,
+        }
+    }
+
+    /// Returns the names in the folder.
+    ///
+    /// # Errors
+    /// Returns the system's error.
+    pub(crate) fn list(&self) -> io::Result<Vec<OsString>> {
+        match self.disk.and_then(Disk::root) {
+            Some(root) => root.list(self.path),
+            None => fs::read_dir(self.path)?.map(|entry| Ok(entry?.file_name())).collect(),
+        }
+    }
+}
+
 impl Disk {
     /// Returns a disk whose operations fail if `fault_hook` returns an error. A failed write still writes the first half
     /// of its bytes.
@@ -66,6 +129,11 @@ impl Disk {
     /// Returns the folder that the disk is limited to, if any.
     pub(super) fn root(&self) -> Option<&RootedFolder> {
         self.root.as_deref()
+    }
+
+    /// Returns the place of a path on this disk.
+    pub fn at<'a>(&'a self, path: &'a Path) -> Place<'a> {
+        Place { disk: Some(self).filter(|disk| disk.root.is_some()), path }
     }
 
     fn check(&self, operation: Operation, path: &Path) -> io::Result<()> {
@@ -139,7 +207,7 @@ impl Disk {
     /// # Errors
     /// Returns the system's error.
     pub fn append(&self, path: &Path, length: u64) -> io::Result<Output> {
-        let mut file = self.entry(path)?.write()?;
+        let mut file = self.unshared(path, FolderEntry::write)?;
         self.check(Operation::Truncate, path)?;
         file.set_len(length)?;
         file.seek(SeekFrom::End(0))?;
@@ -152,14 +220,27 @@ impl Disk {
     /// Returns the system's error.
     pub fn extend(&self, path: &Path, bytes: &[u8]) -> io::Result<Output> {
         self.check(Operation::Create, path)?;
-        let file = self.entry(path)?.extend()?;
+        let file = self.unshared(path, FolderEntry::extend)?;
         let mut output = Output { disk: self.clone(), path: path.into(), file };
         output.write_all(bytes)?;
         Ok(output)
     }
 
+    /// Opens a file to change it. A file with other names is copied first, because a backup may consist of hard links.
+    fn unshared(&self, path: &Path, open: fn(&FolderEntry) -> io::Result<File>) -> io::Result<File> {
+        let entry = self.entry(path)?;
+        let file = open(&entry)?;
+        if entry.links(&file)? <= 1 {
+            return Ok(file);
+        }
+        let mut content = self.read(path)?;
+        self.replace_shared(path, |output| io::copy(&mut content, output).map(drop), || Ok(()))?;
+        open(&self.entry(path)?)
+    }
+
     /// Replaces the content of a file. After a crash at any moment, the file has either all of the old content or all
-    /// of the new. Only one process at a time may replace a file.
+    /// of the new. The new content is certain after [`Disk::sync_folder`], which is called once for all files of a
+    /// folder. Only one process at a time may replace a file.
     ///
     /// # Errors
     /// Returns the system's error.
@@ -280,16 +361,13 @@ impl Disk {
         self.replace_with(path, permissions, content, || Ok(()))
     }
 
-    /// Renames a file and flushes the new name to the disk.
+    /// Renames a file.
     ///
     /// # Errors
     /// Returns the system's error.
     pub(crate) fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
         self.check(Operation::Rename, to)?;
-        let target = self.entry(to)?;
-        self.entry(from)?.rename(&target)?;
-        self.check(Operation::Flush, file::folder(to))?;
-        target.sync_folder()
+        self.entry(from)?.rename(&self.entry(to)?)
     }
 
     /// Removes a file if it exists.
@@ -312,13 +390,48 @@ impl Disk {
         self.entry(path)?.read()
     }
 
-    /// Opens a lock file, and creates it if it is missing.
+    /// Opens and locks a file, which is created if it is missing. The lock lasts while the file is open. Returns `None` if
+    /// the file system has no locks.
     ///
     /// # Errors
-    /// The entry is not a plain file, or the system returns an error.
-    pub(crate) fn open_lock(&self, path: &Path) -> io::Result<File> {
-        self.entry(path)?.extend()
+    /// Another process holds the lock (`WouldBlock`), the entry is not a plain file, or the system returns an error.
+    pub(crate) fn lock(&self, path: &Path) -> io::Result<Option<File>> {
+        self.check(Operation::Create, path)?;
+        for attempt in 0.. {
+            let file = self.entry(path)?.extend()?;
+            match file.try_lock() {
+                Ok(()) => {}
+                Err(TryLockError::WouldBlock) => return Err(io::ErrorKind::WouldBlock.into()),
+                Err(TryLockError::Error(error)) if has_no_locks(&error) => return Ok(None),
+                Err(TryLockError::Error(error)) => return Err(error),
+            }
+            match self.entry(path)?.links(&file)? {
+                1 => return Ok(Some(file)),
+                // Another process replaced the file before it was locked here. Some file systems number files anew.
+                0 if attempt < 100 => {}
+                0 => return Ok(Some(file)),
+                // The file is also the lock of a copy that was made with hard links. While it is locked, no process
+                // uses it.
+                _ => match self.create(path) {
+                    Err(error) if error.kind() != io::ErrorKind::AlreadyExists => return Err(error),
+                    _ => {}
+                },
+            }
+        }
+        unreachable!("there are more numbers than attempts")
     }
+
+    /// Flushes the names in a folder to the disk, if the system can.
+    pub fn sync_folder(&self, path: &Path) -> io::Result<()> {
+        self.check(Operation::Flush, path)?;
+        self.entry(&path.join("x"))?.sync_folder()
+    }
+}
+
+/// Reports whether the file system does not support locks. NFS without its lock service returns `ENOLCK`.
+fn has_no_locks(error: &io::Error) -> bool {
+    const ENOLCK: i32 = if cfg!(target_os = "linux") { 37 } else { 77 };
+    error.kind() == io::ErrorKind::Unsupported || cfg!(unix) && error.raw_os_error() == Some(ENOLCK)
 }
 
 /// Removes the path of a temporary file from an error, because the user does not know that file.

@@ -20,7 +20,7 @@ pub trait Storage {
     /// The file cannot be written.
     fn put(&mut self, name: &str, content: Content<'_>) -> Result<(), RecordError>;
 
-    /// Writes a picture of the run, and lists it as made by flotilla.
+    /// Writes a picture of the run, and lists it as made by flotilla. It is the last file of the run.
     ///
     /// # Errors
     /// The file cannot be written.
@@ -41,7 +41,10 @@ impl Storage for Folder {
     }
 
     fn publish(&mut self, name: &str, content: &[u8]) -> Result<(), RecordError> {
-        ownership::publish(&self.disk, &self.file(name), |output| output.write_all(content))
+        ownership::publish(&self.disk, &self.file(name), |output| output.write_all(content))?;
+        let checkpoints = self.file(CHECKPOINTS);
+        self.disk.sync_folder(&checkpoints).map_err(RecordError::write(&checkpoints))?;
+        self.sync()
     }
 }
 

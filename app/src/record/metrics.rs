@@ -12,10 +12,9 @@ use std::path::Path;
 
 use sha2::{Digest, Sha256};
 
-use super::disk::{Disk, Output};
+use super::disk::{Disk, Output, Place};
 use super::{RecordError, hex};
 use flotilla::config::{Config, MAX_GENERATIONS, MAX_TRIALS};
-use flotilla::file;
 use flotilla::trainer::Row;
 pub use flotilla::trainer::digest::digest;
 use flotilla::trainer::digest::line as shared;
@@ -97,26 +96,9 @@ impl Writer {
     /// # Errors
     /// Returns the system's error.
     pub fn resume(disk: &Disk, path: &Path, mark: &Extent, config: &Config) -> io::Result<Option<Writer>> {
-        let mut hash = Sha256::new();
-        let mut file = match file::open(path) {
-            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
-            file => BufReader::new(file?).take(mark.bytes),
-        };
+        let Some((first, hash)) = before(disk.at(path), mark)? else { return Ok(None) };
         // A run that was shortened to end before its later stages keeps the column `stage`.
-        let mut first = Vec::new();
-        file.by_ref().take(MAX_LINE).read_until(b'\n', &mut first)?;
-        hash.update(&first);
         let lines = Lines { staged: first.starts_with(STAGED.as_bytes()), ..Lines::of(config) };
-        let mut chunk = [0; 1 << 14];
-        loop {
-            match file.read(&mut chunk)? {
-                0 => break,
-                read => hash.update(&chunk[..read]),
-            }
-        }
-        if file.limit() > 0 || hex(&hash.clone().finalize()) != mark.sha256 {
-            return Ok(None);
-        }
         let output = BufWriter::new(disk.append(path, mark.bytes)?);
         Ok(Some(Writer { output, bytes: mark.bytes, hash, lines }))
     }
@@ -154,13 +136,39 @@ impl Writer {
     }
 }
 
+/// Returns the first line of a file and the hash of its content up to a mark. Returns `None` if the file is missing or
+/// has other content.
+fn before(place: Place<'_>, mark: &Extent) -> io::Result<Option<(Vec<u8>, Sha256)>> {
+    let mut file = match place.open() {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+        file => BufReader::new(file?).take(mark.bytes),
+    };
+    let (mut first, mut hash) = (Vec::new(), Sha256::new());
+    file.by_ref().take(MAX_LINE).read_until(b'\n', &mut first)?;
+    hash.update(&first);
+    let mut chunk = [0; 1 << 14];
+    loop {
+        match file.read(&mut chunk)? {
+            0 => break,
+            read => hash.update(&chunk[..read]),
+        }
+    }
+    let same = file.limit() == 0 && hex(&hash.clone().finalize()) == mark.sha256;
+    Ok(same.then_some((first, hash)))
+}
+
+/// Reports whether a file has had the given extent.
+pub(crate) fn has_extent<'a>(place: impl Into<Place<'a>>, mark: &Extent) -> bool {
+    before(place.into(), mark).is_ok_and(|found| found.is_some())
+}
+
 /// Reports whether a file starts like a metrics file. The header may be incomplete.
 ///
 /// # Errors
 /// Returns the system's error.
-pub(crate) fn begins(path: &Path) -> io::Result<bool> {
+pub(crate) fn begins(place: Place<'_>) -> io::Result<bool> {
     let mut start = Vec::new();
-    file::open(path)?.take("trial,generation,".len() as u64).read_to_end(&mut start)?;
+    place.open()?.take("trial,generation,".len() as u64).read_to_end(&mut start)?;
     Ok(HEADER.as_bytes().starts_with(&start))
 }
 
@@ -287,7 +295,8 @@ impl<R: BufRead> Iterator for Rows<R> {
 ///
 /// # Errors
 /// The file is missing or has another header.
-pub fn open(path: &Path) -> Result<Rows<BufReader<File>>, RecordError> {
-    let file = file::open(path).map_err(RecordError::read(path))?;
-    Rows::new(BufReader::new(file)).map_err(|reason| RecordError::damaged(path, reason))
+pub fn open<'a>(place: impl Into<Place<'a>>) -> Result<Rows<BufReader<File>>, RecordError> {
+    let place = place.into();
+    let file = place.open().map_err(RecordError::read(place.path()))?;
+    Rows::new(BufReader::new(file)).map_err(|reason| RecordError::damaged(place.path(), reason))
 }

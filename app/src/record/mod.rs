@@ -23,7 +23,8 @@ use std::path::{Path, PathBuf};
 
 use sha2::{Digest, Sha256};
 
-use flotilla::config::{self, Config};
+use disk::Place;
+use flotilla::config::{self, Config, ConfigError};
 use flotilla::escape::{self, PathExt};
 use flotilla::file::{self, TextError};
 
@@ -215,12 +216,20 @@ impl RecordError {
 }
 
 /// Reads a text file of at most `most` bytes.
-fn read_text(path: &Path, most: u64) -> Result<String, RecordError> {
-    let file = file::open(path).map_err(RecordError::read(path))?;
+fn read_text<'a>(place: impl Into<Place<'a>>, most: u64) -> Result<String, RecordError> {
+    let place = place.into();
+    let path = place.path();
+    let file = place.open().map_err(RecordError::read(path))?;
     file::text(file, most).map_err(|error| match error {
         TextError::Read(error) => RecordError::read(path)(error),
         wrong => RecordError::damaged(path, wrong),
     })
+}
+
+/// Reads the config of a run.
+pub(crate) fn load_config(place: Place<'_>) -> Result<Config, ConfigError> {
+    let name = config::name(place.path());
+    Config::parse(&config::read_text(place.open(), &name)?, &name)
 }
 
 /// Keys of later versions with their default values. A config's digest omits these lines, so that runs of earlier

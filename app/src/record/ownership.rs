@@ -11,14 +11,15 @@
 //!   sweep or paper ([`super::folder::around`]).
 
 use std::collections::BTreeMap;
-use std::io::{self, BufRead, BufReader, ErrorKind, Read, Write};
+use std::fs;
+use std::io::{self, BufRead, BufReader, ErrorKind, Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 use sha2::{Digest, Sha256};
 
-use super::disk::Disk;
-use super::{RecordError, checkpoint, hex, metrics, policies, read_text, tensors, without_checkpoint};
+use super::disk::{Disk, Place};
+use super::{RecordError, checkpoint, hex, load_config, metrics, policies, read_text, tensors, without_checkpoint};
 use flotilla::config::Config;
 use flotilla::file;
 
@@ -50,8 +51,12 @@ pub(crate) const REPLAY: &str = "replay.html";
 pub const LIST: &str = ".flotilla.sha256";
 /// Maximum size of `run.json` in bytes.
 pub(super) const MAX_RUN_BYTES: u64 = 1 << 16;
-/// Maximum number of bytes that are read from [`LIST`].
+/// Maximum number of bytes that are read from [`LIST`], from its end.
 const MAX_LIST_BYTES: u64 = 1 << 24;
+/// Number of lines above which [`LIST`] is written anew, without the lines of files that no longer exist.
+const MAX_LIST_LINES: usize = 500;
+/// Number of newest lines that are always kept, because another process may be about to write these files.
+const NEW_LINES: usize = 50;
 
 /// Prepares a folder for writing. No symbolic link below it is followed. `named` is true if the user named the folder
 /// as the output folder.
@@ -72,8 +77,12 @@ pub(crate) fn open_output_folder(disk: &Disk, folder: &Path, named: bool) -> Res
 /// Creates a folder if it is missing, and prepares it as [`open_output_folder`] does.
 ///
 /// # Errors
-/// The folder cannot be created, or see [`open_output_folder`].
+/// The folder cannot be created or is the root of the file system, or see [`open_output_folder`].
 pub fn create_output_folder(disk: &Disk, folder: &Path, named: bool) -> Result<Disk, RecordError> {
+    if fs::canonicalize(folder).is_ok_and(|folder| folder.parent().is_none()) {
+        let error = io::Error::new(ErrorKind::InvalidInput, "it is the root of the file system; choose a folder in it");
+        return Err(RecordError::write(folder)(error));
+    }
     disk.create_folder(folder).map_err(RecordError::write(folder))?;
     open_output_folder(disk, folder, named)
 }
@@ -96,47 +105,47 @@ struct RunMark {
 ///
 /// # Errors
 /// The folder has a file that a run would replace but holds no run, or it cannot be read.
-pub fn holds_run(folder: &Path, config: &Config) -> Result<bool, RecordError> {
+pub(crate) fn holds_run(folder: Place<'_>, config: &Config) -> Result<bool, RecordError> {
     let find = |name: &str| {
-        let path = folder.join(name);
-        let exists = file::exists(&path).map_err(RecordError::read(&path))?;
+        let path = folder.path().join(name);
+        let exists = folder.at(&path).exists().map_err(RecordError::read(&path))?;
         Ok::<_, RecordError>(exists.then_some(path))
     };
     let refuse = |path: PathBuf| Err(RecordError::NotOurs { path });
     let run = find(RUN)?;
     if let Some(path) = &run {
-        match read_text(path, MAX_RUN_BYTES) {
+        match read_text(folder.at(path), MAX_RUN_BYTES) {
             Ok(text) if serde_json::from_str::<RunMark>(&text).is_ok() => return Ok(true),
             Ok(_) | Err(RecordError::Damaged { .. }) => {}
             Err(error) => return Err(error),
         }
     }
-    let checkpoints = folder.join(CHECKPOINTS);
-    let saved = checkpoint::list(&checkpoints)?;
+    let checkpoints = folder.path().join(CHECKPOINTS);
+    let saved = checkpoint::list(folder.at(&checkpoints))?;
     let paths = || saved.iter().map(|&generation| checkpoint::path(&checkpoints, generation));
-    if paths().any(|path| tensors::open(&path).is_ok_and(|file| file.kind().is_some())) {
+    if paths().any(|path| tensors::open(folder.at(&path)).is_ok_and(|file| file.kind().is_some())) {
         return Ok(true);
     }
-    let no_folder = find(CHECKPOINTS)?.filter(|path| !path.is_dir());
+    let no_folder = find(CHECKPOINTS)?.filter(|path| folder.at(path).list().is_err());
     if let Some(path) = run.or_else(|| paths().next()).or(no_folder) {
         return refuse(path);
     }
     if let Some(path) = find(CONFIG)? {
         // A run may start from a config with the same content.
-        match Config::load(&path) {
+        match load_config(folder.at(&path)) {
             Ok(existing) if without_checkpoint(&existing) == without_checkpoint(config) => {}
             _ => return refuse(path),
         }
     }
     let mut left = false;
     if let Some(path) = find(METRICS)? {
-        if !metrics::begins(&path).map_err(RecordError::read(&path))? {
+        if !metrics::begins(folder.at(&path)).map_err(RecordError::read(&path))? {
             return refuse(path);
         }
         left = true;
     }
     if let Some(path) = find(POLICIES)? {
-        if !policies::belongs_to(&path, config) {
+        if !policies::belongs_to(folder.at(&path), config) {
             return refuse(path);
         }
         left = true;
@@ -195,6 +204,9 @@ pub fn publish(
         if listed.contains(&line) {
             return Ok(());
         }
+        if listed.len() >= MAX_LIST_LINES {
+            return shorten_list(disk, folder, &line);
+        }
         // A crash may have left an incomplete last line.
         let torn = listed.last().is_some_and(|last| !last.ends_with('\n'));
         disk.extend(&folder.join(LIST), format!("{}{line}", if torn { "\n" } else { "" }).as_bytes())?.sync()
@@ -232,13 +244,37 @@ pub(super) fn line(digest: &str, path: &Path) -> String {
     format!("{digest}  {}\n", path.file_name().unwrap_or_default().to_string_lossy())
 }
 
+/// Writes the [`LIST`] of a folder anew, with one more line and without those that no file has any more.
+fn shorten_list(disk: &Disk, folder: &Path, new: &str) -> io::Result<()> {
+    let lines = listed(disk, folder).map_err(io::Error::other)?;
+    let (mut current, mut kept) = (BTreeMap::new(), Vec::new());
+    for (index, text) in lines.iter().enumerate() {
+        let Some((_, name)) = text.trim_end().split_once("  ") else { continue };
+        let is_current = current.entry(name).or_insert_with(|| {
+            let path = folder.join(name);
+            digest(disk, &path).ok().flatten().map(|digest| line(&digest, &path))
+        });
+        if is_current.as_ref() == Some(text) || index + NEW_LINES >= lines.len() {
+            kept.push(&**text);
+        }
+    }
+    disk.replace_shared(
+        &folder.join(LIST),
+        |output| kept.into_iter().chain([new]).try_for_each(|line| output.write_all(line.as_bytes())),
+        || Ok(()),
+    )
+}
+
 /// Reads the lines of the [`LIST`] in a folder.
 fn listed(disk: &Disk, folder: &Path) -> Result<Vec<String>, RecordError> {
     let path = folder.join(LIST);
     let list = match disk.read(&path) {
         Err(error) if error.kind() == ErrorKind::NotFound => return Ok(vec![]),
-        list => BufReader::new(list.map_err(RecordError::read(&path))?),
+        list => list.map_err(RecordError::read(&path))?,
     };
+    let bytes = list.metadata().map_err(RecordError::read(&path))?.len();
+    let mut list = BufReader::new(list);
+    list.seek(SeekFrom::Start(bytes.saturating_sub(MAX_LIST_BYTES))).map_err(RecordError::read(&path))?;
     let mut list = list.take(MAX_LIST_BYTES);
     let (mut lines, mut line) = (Vec::new(), Vec::new());
     while list.read_until(b'\n', &mut line).map_err(RecordError::read(&path))? > 0 {

@@ -15,7 +15,7 @@ use safetensors::tensor::Dtype;
 use sha2::{Digest, Sha256};
 
 use super::RecordError;
-use super::disk::Disk;
+use super::disk::{Disk, Place};
 use super::tensors::{self, Tensor, TensorFile};
 use flotilla::config::{Config, MAX_POPULATION, Sharing};
 use flotilla::escape;
@@ -61,13 +61,13 @@ pub fn write(disk: &Disk, path: &Path, config: &Config, trials: &[impl AsRef<[f3
 }
 
 /// Reports whether a file can be read and belongs to a run of this config.
-pub(crate) fn belongs_to(path: &Path, config: &Config) -> bool {
-    digests_in(path).0 == Some(super::config_digest(config))
+pub(crate) fn belongs_to(place: Place<'_>, config: &Config) -> bool {
+    digests_in(place).0 == Some(super::config_digest(config))
 }
 
 /// Returns the config digest and the checksum in a file. Each is `None` if it is missing or the file cannot be read.
-pub(crate) fn digests_in(path: &Path) -> (Option<String>, Option<String>) {
-    let Ok(file) = tensors::open(path) else { return (None, None) };
+pub(crate) fn digests_in(place: Place<'_>) -> (Option<String>, Option<String>) {
+    let Ok(file) = tensors::open(place) else { return (None, None) };
     (file.metadata(CONFIG).map(String::from), file.checksum().map(String::from))
 }
 
@@ -89,8 +89,10 @@ pub fn put(output: &mut dyn Write, config: &Config, trials: &[impl AsRef<[f32]>]
 ///
 /// # Errors
 /// The file is missing or damaged, its shape does not match the config, or its weights are not allowed.
-pub fn read(path: &Path, config: &Config, trial: Option<usize>) -> Result<Policies, RecordError> {
-    let mut file = tensors::open(path)?;
+pub fn read<'a>(place: impl Into<Place<'a>>, config: &Config, trial: Option<usize>) -> Result<Policies, RecordError> {
+    let place = place.into();
+    let path = place.path();
+    let mut file = tensors::open(place)?;
     from_file(&mut file, config, &[config.learners(), 1], trial).map_err(|reason| match trial {
         Some(trial) if file.kind().is_none_or(|kind| kind == KIND) && file.info(&tensor(trial)).is_none() => {
             RecordError::NoTrial { path: path.into(), reason }
@@ -113,11 +115,13 @@ pub struct Init {
 ///
 /// # Errors
 /// See [`read`].
-pub fn read_init(path: &Path, config: &Config) -> Result<Init, RecordError> {
+pub fn read_init<'a>(place: impl Into<Place<'a>>, config: &Config) -> Result<Init, RecordError> {
+    let place = place.into();
+    let path = place.path();
     let mut hash = Sha256::new();
-    io::copy(&mut flotilla::file::open(path).map_err(RecordError::read(path))?, &mut HashWriter(&mut hash))
+    io::copy(&mut place.open().map_err(RecordError::read(path))?, &mut HashWriter(&mut hash))
         .map_err(RecordError::read(path))?;
-    let mut file = tensors::open(path)?;
+    let mut file = tensors::open(place)?;
     let trial = |trial| {
         let own = file.info(&tensor(trial)).is_some() || file.info(ALL).is_none();
         from_file(&mut file, config, &[config.populations()], own.then_some(trial))
@@ -145,8 +149,9 @@ impl Write for HashWriter<'_> {
 ///
 /// # Errors
 /// See [`read`]. It is also an error if the number of policies is not the config's population size.
-pub fn read_all(path: &Path, config: &Config) -> Result<Vec<Vec<f32>>, RecordError> {
-    let mut file = tensors::open(path)?;
+pub fn read_all<'a>(place: impl Into<Place<'a>>, config: &Config) -> Result<Vec<Vec<f32>>, RecordError> {
+    let place = place.into();
+    let mut file = tensors::open(place)?;
     let trial = |trial| {
         let Policies { policies, weights, .. } = from_file(&mut file, config, &[config.populations()], Some(trial))?;
         let population = config.learning.population;
@@ -158,7 +163,7 @@ pub fn read_all(path: &Path, config: &Config) -> Result<Vec<Vec<f32>>, RecordErr
     (0..config.learning.trials)
         .map(trial)
         .collect::<Result<_, String>>()
-        .map_err(|reason| RecordError::damaged(path, reason))
+        .map_err(|reason| RecordError::damaged(place.path(), reason))
 }
 
 /// Reads like [`read`], from any source.

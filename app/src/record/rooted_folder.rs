@@ -85,6 +85,11 @@ impl RootedFolder {
         Ok(())
     }
 
+    /// Returns the names in a folder, which is this one or below it.
+    pub(crate) fn list(&self, folder: &Path) -> io::Result<Vec<OsString>> {
+        system::list(&self.entry(&folder.join("x"))?.parent, folder)
+    }
+
     /// Splits a path below this folder into the folders on the way and the last name.
     fn names<'a>(&self, path: &'a Path) -> io::Result<(Vec<&'a OsStr>, &'a OsStr)> {
         let elsewhere = || {
@@ -166,6 +171,12 @@ impl FolderEntry {
         system::extend(&self.parent, &self.name, &self.path)
     }
 
+    /// Returns the number of names of an open file, or 0 if it does not have this one, because another file replaced
+    /// it.
+    pub(crate) fn links(&self, file: &File) -> io::Result<u64> {
+        system::links(&self.parent, &self.name, file)
+    }
+
     /// Removes a plain file.
     ///
     /// # Errors
@@ -233,9 +244,10 @@ mod without_unnamed_files {
 
 #[cfg(unix)]
 mod system {
-    use std::ffi::OsStr;
+    use std::ffi::{OsStr, OsString};
     use std::fs::File;
     use std::io::{self, ErrorKind};
+    use std::os::unix::ffi::OsStrExt;
     use std::path::Path;
 
     use rustix::fs::{self, AtFlags, FileType, Mode, OFlags};
@@ -333,11 +345,29 @@ mod system {
     pub fn sync(handle: &Handle) -> io::Result<()> {
         Ok(fs::fsync(&handle.0)?)
     }
+
+    pub fn list(handle: &Handle, _: &Path) -> io::Result<Vec<OsString>> {
+        let name =
+            |entry: rustix::io::Result<fs::DirEntry>| Ok(OsStr::from_bytes(entry?.file_name().to_bytes()).into());
+        let names = fs::Dir::read_from(&handle.0)?.map(name).collect::<io::Result<Vec<OsString>>>()?;
+        Ok(names.into_iter().filter(|name| name != "." && name != "..").collect())
+    }
+
+    pub fn links(parent: &Handle, name: &OsStr, file: &File) -> io::Result<u64> {
+        let open = fs::fstat(file)?;
+        let there = match fs::statat(&parent.0, name, AtFlags::SYMLINK_NOFOLLOW) {
+            Err(error) if io::Error::from(error).kind() == ErrorKind::NotFound => return Ok(0),
+            there => there?,
+        };
+        let same = (open.st_dev, open.st_ino) == (there.st_dev, there.st_ino);
+        #[allow(clippy::unnecessary_cast, reason = "the type depends on the system")]
+        Ok(if same { open.st_nlink as u64 } else { 0 })
+    }
 }
 
 #[cfg(not(unix))]
 mod system {
-    use std::ffi::OsStr;
+    use std::ffi::{OsStr, OsString};
     use std::fs::{self, File, OpenOptions};
     use std::io::{self, ErrorKind};
     use std::path::Path;
@@ -409,5 +439,13 @@ mod system {
 
     pub fn sync(_: &Handle) -> io::Result<()> {
         Ok(())
+    }
+
+    pub fn list(_: &Handle, path: &Path) -> io::Result<Vec<OsString>> {
+        fs::read_dir(path)?.map(|entry| Ok(entry?.file_name())).collect()
+    }
+
+    pub fn links(_: &Handle, _: &OsStr, _: &File) -> io::Result<u64> {
+        Ok(1)
     }
 }

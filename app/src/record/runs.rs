@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use super::RecordError;
 use super::digests::{Digests, Verification};
+use super::disk::Place;
 use super::folder::{self, CONFIG, METRICS, POLICIES};
 use super::metrics::{self, RowsError};
 use super::{finished, policies};
@@ -98,22 +99,23 @@ pub(crate) fn exists(path: &Path) -> Result<bool, RecordError> {
 /// # Errors
 /// The metrics are missing, belong to another run, or were changed after the run. The last error may appear only after
 /// all rows.
-pub fn metrics(
-    folder: &Path,
+pub fn metrics<'a>(
+    place: impl Into<Place<'a>>,
     config: &Config,
     verification: Verification,
     mut each: impl FnMut(&Row),
 ) -> Result<(), ReadError> {
-    let path = folder.join(METRICS);
+    let place = place.into();
+    let (folder, path) = (place.path(), place.path().join(METRICS));
     // The digests are read before the metrics, because the run may finish in between.
-    let digests = Digests::read(folder, verification)?;
+    let digests = Digests::read(place, verification)?;
     let unfinished = |reason: String| ReadError::Unfinished { folder: folder.into(), reason };
-    if !exists(&path)? {
+    if !place.at(&path).exists().map_err(RecordError::read(&path))? {
         return Err(unfinished(format!("it has no {METRICS} yet")));
     }
     let damaged = |reason: String| ReadError::Record(RecordError::Damaged { path: path.clone(), reason });
     let mut count = 0;
-    let mut rows = metrics::open(&path)?;
+    let mut rows = metrics::open(place.at(&path))?;
     for row in &mut rows {
         let row = match row {
             Ok((row, _)) => row,

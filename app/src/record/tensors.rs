@@ -9,14 +9,13 @@
 
 use std::collections::BTreeMap;
 use std::io::{self, BufReader, Read, Seek, SeekFrom, Write};
-use std::path::Path;
 
 use safetensors::tensor::{Dtype, Metadata, TensorInfo};
 use serde_json::{Map, Value, json};
 use sha2::{Digest, Sha256};
 
+use super::disk::Place;
 use super::{RecordError, hex};
-use flotilla::file;
 
 /// Maximum size of a file's header in bytes.
 pub const MAX_HEADER_BYTES: u64 = 1 << 20;
@@ -217,8 +216,8 @@ impl<R: Read + Seek> TensorFile<R> {
 
 /// Checks whether a file has a newer format than this program writes. If so, returns the version that wrote it, or
 /// `Some(None)` if the file does not contain it. A file that cannot be read gives `None`.
-pub(crate) fn newer(path: &Path) -> Option<Option<String>> {
-    let mut file = file::open(path).ok()?;
+pub(crate) fn newer(place: Place<'_>) -> Option<Option<String>> {
+    let mut file = place.open().ok()?;
     let mut length = [0; 8];
     file.read_exact(&mut length).ok()?;
     let mut header = vec![0; usize::try_from(u64::from_le_bytes(length).min(MAX_HEADER_BYTES)).ok()?];
@@ -228,15 +227,16 @@ pub(crate) fn newer(path: &Path) -> Option<Option<String>> {
     // All current formats have version 1. A damaged byte may look like a newer version, but then the checksum does not
     // match.
     let (_, format) = metadata.get(KIND)?.rsplit_once(' ')?;
-    let later = format.parse::<u64>().ok()? > 1 && open(path).is_ok();
+    let later = format.parse::<u64>().ok()? > 1 && open(place).is_ok();
     later.then(|| metadata.get(VERSION).cloned())
 }
 
-/// Opens the file at a path.
+/// Opens a file.
 ///
 /// # Errors
 /// The file is missing, cannot be read or is damaged.
-pub fn open(path: &Path) -> Result<TensorFile<std::fs::File>, RecordError> {
-    let file = file::open(path).map_err(RecordError::read(path))?;
-    TensorFile::open(file).map_err(|reason| RecordError::damaged(path, reason))
+pub fn open<'a>(place: impl Into<Place<'a>>) -> Result<TensorFile<std::fs::File>, RecordError> {
+    let place = place.into();
+    let file = place.open().map_err(RecordError::read(place.path()))?;
+    TensorFile::open(file).map_err(|reason| RecordError::damaged(place.path(), reason))
 }

@@ -105,7 +105,7 @@ impl RunMetrics {
         Ok(run)
     }
 
-    fn add(&mut self, row: &Row) {
+    pub(crate) fn add(&mut self, row: &Row) {
         let added = [(&mut self.best, row.best_g), (&mut self.mean, row.mean_g), (&mut self.champion, row.champion_g)];
         for (averages, g) in added {
             if averages.len() <= row.generation {
@@ -168,6 +168,11 @@ pub fn figure(
 pub(crate) fn figure_of<'a>(config: &Config, rows: impl Iterator<Item = &'a Row>, digest: &str) -> Figure {
     let mut run = RunMetrics::default();
     rows.for_each(|row| run.add(row));
+    figure_of_metrics(config, run, digest)
+}
+
+/// Returns the learning curves of one run as [`figure`] does, from its metrics and its digest.
+pub(crate) fn figure_of_metrics(config: &Config, run: RunMetrics, digest: &str) -> Figure {
     let figure = figure_of_runs(&[run], std::slice::from_ref(config), Vec::new, None);
     Figure { source: Some(digest.into()), ..figure }
 }

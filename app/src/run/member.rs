@@ -145,8 +145,11 @@ impl Member {
         let failed = self.metrics_failed();
         let Some(Unfinished { experiment, metrics, checkpoints, .. }) = &mut self.unfinished else { return Ok(()) };
         checkpoints.wait()?;
-        if checkpoints.newest() == Some(next) {
-            return Ok(());
+        match checkpoints.newest() {
+            Some(newest) if newest == next => return Ok(()),
+            Some(_) => {}
+            // The first checkpoint needs the names of the files that were written at the start.
+            None => self.folder.sync()?,
         }
         let since = Instant::now();
         let (metrics, output) = metrics.mark().map_err(failed)?;
@@ -185,7 +188,7 @@ impl Member {
             checkpoints.save_now(&last, &output, since)?;
         }
         let path = self.folder.file(POLICIES);
-        if path.exists() {
+        if self.folder.has(POLICIES)? {
             // The old checkpoints of an extended run need the old policies. The new checkpoint must be complete before
             // the policies are replaced.
             checkpoints.wait()?;
@@ -195,6 +198,7 @@ impl Member {
         checkpoints.wait()?;
         self.run.files = Some(FileSums { metrics, policies: checksum });
         self.write_run(Status::Done, next, seconds, Some(digest.clone()))?;
+        self.folder.sync()?;
         self.results = Some(Results { rows, digest });
         self.unfinished = None;
         Ok(())

@@ -170,7 +170,7 @@ impl Session {
         for member in self.members.iter_mut().filter(|member| member.unfinished.is_some()) {
             member.run.sessions = member.run.sessions.saturating_add(1);
             member.run.command = options.command.into();
-            member.run.origin = Some(Origin::of(&member.config));
+            member.run.origin = Origin::of(&member.config);
         }
         self.record_machine(backend);
         self.write_runs(Status::Running)?;
@@ -248,7 +248,7 @@ impl Session {
                 if shorter != member.config {
                     checkpoints.shorten(&shorter)?;
                     member.folder.write_config(&shorter)?;
-                    member.run.origin = Some(Origin::of(&shorter));
+                    member.run.origin = Origin::of(&shorter);
                     member.config = shorter;
                 }
             }

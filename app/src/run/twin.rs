@@ -33,21 +33,20 @@ pub fn record_twins(twins: Vec<Twin>, start: Start, disk: &Disk) -> Result<(), R
 impl Twin {
     fn record(self, start: Start, disk: &Disk) -> Result<(), RunError> {
         let Twin { of, of_config, folder, config } = self;
-        let run = Run::read(&of.join(folder::RUN))?;
+        let run = Run::read(disk.at(&of.join(folder::RUN)))?;
         let (folder, found) = Folder::open(&folder, start, &config, StartFrom::Random, disk.clone())?;
         let existing = found.run.filter(|_| found.finished.is_some());
         if existing.is_some_and(|existing| existing.digest == run.digest) {
             return Ok(());
         }
         let (from, path) = (of.join(METRICS), folder.file(METRICS));
-        let copy =
-            folder.disk.replace(&path, |output| std::io::copy(&mut std::fs::File::open(&from)?, output).map(drop));
+        let copy = folder.disk.replace(&path, |output| std::io::copy(&mut disk.at(&from).open()?, output).map(drop));
         copy.map_err(|error| RecordError::Write { path, error })?;
         let policies = of.join(POLICIES);
-        let policies = policies::read_all(&policies, &of_config)?;
+        let policies = policies::read_all(disk.at(&policies), &of_config)?;
         let checksum = policies::write(&folder.disk, &folder.file(POLICIES), &config, &policies)?;
         let (_, RunSums { run: digest, metrics }) = folder.digest(&config, &policies)?;
         let files = Some(FileSums { metrics, policies: checksum });
-        Ok(folder.write_run(&Run { digest: Some(digest), origin: Some(Origin::of(&config)), files, ..run })?)
+        Ok(folder.write_run(&Run { digest: Some(digest), origin: Origin::of(&config), files, ..run })?)
     }
 }

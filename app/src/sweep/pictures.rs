@@ -52,6 +52,7 @@ pub fn draw(
     options: &Detail,
     axes: &[usize],
     out: &Path,
+    disk: &Disk,
 ) -> Result<(Vec<String>, Option<String>), RecordError> {
     let scenes = if sweep.axes.iter().any(|axis| axis.varied) {
         dots(sweep, outcomes, options).map(|dots| vec![(FIGURES[0], dots.scene())])
@@ -66,7 +67,6 @@ pub fn draw(
         Ok(scenes) => scenes,
         Err(reason) => return Ok((vec![], Some(reason))),
     };
-    let disk = ownership::open_output_folder(&Disk::default(), out, true)?;
     let mut names = Vec::new();
     for (name, mut scene) in scenes {
         if options.verification.is_skipped() {
@@ -76,7 +76,7 @@ pub fn draw(
             let name = format!("{name}.{}", kind.extension());
             let path = out.join(&name);
             let bytes = scene.file(kind, PRINT).map_err(RecordError::write(&path))?;
-            ownership::publish(&disk, &path, |output| output.write_all(&bytes))?;
+            ownership::publish(disk, &path, |output| output.write_all(&bytes))?;
             names.push(name);
         }
     }

@@ -6,15 +6,13 @@ use std::path::{Path, PathBuf};
 
 use super::{Axis, Point, Sweep};
 use crate::record::digests::{Digests, Verification};
-use crate::record::disk::Disk;
+use crate::record::disk::{Disk, Place};
 use crate::record::folder::{CONFIG, METRICS, POINTS, RESULTS};
-use crate::record::{RecordError, without_checkpoint};
+use crate::record::{RecordError, load_config, without_checkpoint};
 use crate::record::{metrics, ownership};
 use crate::report::curves::Band;
 use crate::report::runs::TeamKind;
-use flotilla::config::Config;
 use flotilla::escape::{self, PathExt};
-use flotilla::file;
 use flotilla::statistics::Average;
 use flotilla::trainer::Row;
 
@@ -92,12 +90,18 @@ pub enum Missing {
     Damaged(String),
 }
 
-/// Writes `results.csv` and `points.csv` of the finished points. Returns the results of every point.
+/// Writes `results.csv` and `points.csv` of the finished points to a disk in the sweep's folder. The points are read
+/// in `place`. Returns the results of every point.
 ///
 /// # Errors
 /// The files cannot be written.
-pub fn write(sweep: &Sweep, out: &Path, options: &Detail) -> Result<Vec<Result<Outcome, Missing>>, RecordError> {
-    let disk = ownership::open_output_folder(&Disk::default(), out, true)?;
+pub fn write(
+    sweep: &Sweep,
+    place: Place<'_>,
+    options: &Detail,
+    disk: &Disk,
+) -> Result<Vec<Result<Outcome, Missing>>, RecordError> {
+    let out = place.path();
     let mut outcomes = Vec::new();
     let path = out.join(RESULTS);
     let rows = |output: &mut dyn Write| {
@@ -105,7 +109,7 @@ pub fn write(sweep: &Sweep, out: &Path, options: &Detail) -> Result<Vec<Result<O
         let columns = ["point", "trial", "generation", "best_g", "mean_g", "champion_g"];
         table.write_record(sweep.axes.iter().map(|axis| &*axis.key).chain(columns))?;
         for point in &sweep.points {
-            outcomes.push(match read(point, out, options) {
+            outcomes.push(match read(point, place, options) {
                 Ok((rows, outcome)) => {
                     for row in rows {
                         let Row { trial, generation, best_g, mean_g, champion_g, .. } = row;
@@ -120,11 +124,11 @@ pub fn write(sweep: &Sweep, out: &Path, options: &Detail) -> Result<Vec<Result<O
         }
         table.flush()
     };
-    ownership::publish(&disk, &path, rows)?;
+    ownership::publish(disk, &path, rows)?;
 
     let path = out.join(POINTS);
     let summary = |output: &mut dyn Write| summary(sweep, &outcomes, options, output);
-    ownership::publish(&disk, &path, summary)?;
+    ownership::publish(disk, &path, summary)?;
     Ok(outcomes)
 }
 
@@ -164,15 +168,16 @@ fn summary(
 }
 
 /// Reads the rows of a finished point for `results.csv`, by trial and generation, and its results.
-fn read(point: &Point, out: &Path, options: &Detail) -> Result<(Vec<Row>, Outcome), Missing> {
-    let folder = point_folder(out, point);
+fn read(point: &Point, place: Place<'_>, options: &Detail) -> Result<(Vec<Row>, Outcome), Missing> {
+    let folder = point_folder(place.path(), point);
     let damaged = |error: &dyn std::fmt::Display| Missing::Damaged(error.to_string());
     let path = folder.join(METRICS);
-    if !file::exists(&path).map_err(|error| damaged(&format!("{}: cannot be read: {error}", path.escaped())))? {
+    let exists = place.at(&path).exists();
+    if !exists.map_err(|error| damaged(&format!("{}: cannot be read: {error}", path.escaped())))? {
         return Err(Missing::NotRun);
     }
-    let digests = Digests::read(&folder, options.verification).map_err(|error| damaged(&error))?;
-    let config = Config::load(&folder.join(CONFIG)).map_err(|error| damaged(&error))?;
+    let digests = Digests::read(place.at(&folder), options.verification).map_err(|error| damaged(&error))?;
+    let config = load_config(place.at(&folder.join(CONFIG))).map_err(|error| damaged(&error))?;
     if without_checkpoint(&config) != without_checkpoint(&point.config) {
         return Err(Missing::Damaged(format!("{}: it is of another config", folder.escaped())));
     }
@@ -181,7 +186,7 @@ fn read(point: &Point, out: &Path, options: &Detail) -> Result<(Vec<Row>, Outcom
     let mut rows: Vec<Vec<Row>> = vec![Vec::new(); trials];
     let mut reached = vec![None; trials];
     let mut next = 0;
-    let mut source = metrics::open(&path).map_err(|error| damaged(&error))?;
+    let mut source = metrics::open(place.at(&path)).map_err(|error| damaged(&error))?;
     for row in &mut source {
         let (row, _) = row.map_err(|error| damaged(&format!("{}: {error}", path.escaped())))?;
         let Row { trial, generation, best_g, .. } = row;

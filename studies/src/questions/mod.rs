@@ -17,6 +17,7 @@ use flotilla::world::World;
 use flotilla_app::ops::Error;
 use flotilla_app::record::RecordError;
 use flotilla_app::record::digests::Verification;
+use flotilla_app::record::disk::Place;
 use flotilla_app::record::folder::POLICIES;
 use flotilla_app::record::policies::{self, Policies};
 use flotilla_app::report::comparison::{self, At, Cohort, Comparison, Mean, Measure, Measured, Named};
@@ -276,11 +277,12 @@ fn best_constant(config: &Config, jitter: f64, backend: &mut dyn Backend) -> Res
 ///
 /// # Errors
 /// The policies cannot be read, or belong to another config.
-pub fn champions(path: &Path, config: &Config) -> Result<Vec<f32>, RecordError> {
+pub fn champions<'a>(place: impl Into<Place<'a>>, config: &Config) -> Result<Vec<f32>, RecordError> {
+    let place = place.into();
     let (leaders, trials, parameters) = (config.learners(), config.learning.trials, config.parameters());
     let mut champions = vec![0.0; leaders * trials * parameters];
     for trial in 0..trials {
-        let Policies { policies, weights, .. } = policies::read(path, config, Some(trial))?;
+        let Policies { policies, weights, .. } = policies::read(place, config, Some(trial))?;
         for (leader, population) in weights.chunks(policies * parameters).enumerate() {
             champions[(leader * trials + trial) * parameters..][..parameters]
                 .copy_from_slice(&population[..parameters]);

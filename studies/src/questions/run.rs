@@ -185,7 +185,11 @@ fn train(
             continue;
         }
         let runs = warm[at].iter().map(|run| {
-            Ok((run.config.clone(), run.folder.clone(), Some(policies::read_init(&run.policies, &run.config)?)))
+            Ok((
+                run.config.clone(),
+                run.folder.clone(),
+                Some(policies::read_init(disk.at(&run.policies), &run.config)?),
+            ))
         });
         let (mut session, _) = Session::open_from(runs.collect::<Result<_, RecordError>>()?, start, disk)?;
         let mut watch = |_: &flotilla_app::run::Progress<'_>| {

@@ -7,7 +7,7 @@
 //! | [`paths`] | recognition and numbering of folders |
 
 use std::fmt;
-use std::fs::{File, TryLockError};
+use std::fs::File;
 use std::io::{self, ErrorKind};
 use std::path::{Path, PathBuf};
 
@@ -17,9 +17,8 @@ pub(crate) use super::ownership::CHECKPOINTS;
 use super::ownership::{self, CURVES, REPLAY};
 pub use super::ownership::{ARMS, PAPER, POINTS, RESULTS};
 pub use super::ownership::{CONFIG, METRICS, POLICIES, RUN, SWEEP};
-use super::{RecordError, metrics, read_text};
-use flotilla::config::Config;
-use flotilla::file;
+use super::{RecordError, load_config, metrics, read_text};
+use flotilla::config::{Config, ConfigError};
 
 mod paths;
 mod resume;
@@ -79,6 +78,7 @@ pub struct Folder {
 }
 
 /// State of a run that was found in its folder.
+#[derive(Default)]
 pub struct Resumed {
     /// Newest usable checkpoint, and the metrics truncated to match it.
     pub checkpoint: Option<(Checkpoint, metrics::Writer)>,
@@ -166,27 +166,34 @@ impl Folder {
         if path.is_file() {
             return Err(RecordError::NoFolder { path: path.into() });
         }
-        let holds_run = || match ownership::holds_run(path, config)? {
+        let disk = ownership::create_output_folder(&disk, path, true)?;
+        ownership::refuse_links(&disk, path)?;
+        let holds_run = || match ownership::holds_run(disk.at(path), config)? {
             true if start == Start::Fresh => Err(RecordError::Exists { path: path.into() }),
             holds => Ok(holds),
         };
         holds_run()?;
-        disk.create_folder(path).map_err(RecordError::write(path))?;
-        let disk = ownership::open_output_folder(&disk, path, true)?;
-        ownership::refuse_links(&disk, path)?;
         let mark = path.join(INIT_MARK);
-        if from.digest().is_some() && !file::exists(&path.join(RUN)).map_err(RecordError::read(path))? {
+        if from.digest().is_some() && !disk.at(&path.join(RUN)).exists().map_err(RecordError::read(path))? {
             // If the process is killed before `run.json` is complete, a resumed run must not start from random
             // policies.
             disk.create(&mark).map_err(RecordError::write(&mark))?;
         }
-        let lock = lock(&disk, path)?;
+        let lock = match lock(&disk, path) {
+            Err(RecordError::Write { path: name, error }) if start == Start::Resume && is_read_only(&error) => {
+                let (folder, mut found) = (Folder { path: path.into(), disk, lock: None }, Resumed::default());
+                folder.find_finished(config, from, &mut found)?;
+                let failed = RecordError::Write { path: name, error };
+                return found.finished.is_some().then_some((folder, found)).ok_or(failed);
+            }
+            lock => lock?,
+        };
         // Another process may have written here before the lock was taken, so the check is repeated.
         let holds_run = holds_run()?;
         let folder = Folder { path: path.into(), disk, lock };
-        let mut found = Resumed { checkpoint: None, kept: vec![], run: None, finished: None, notes: vec![] };
+        let mut found = Resumed::default();
         found.notes.extend(folder.lock.is_none().then_some(Note::NotLocked));
-        let interrupted = Run::read(&folder.file(RUN)).ok().filter(|run| run.state == Status::Replacing);
+        let interrupted = folder.read_run().ok().filter(|run| run.state == Status::Replacing);
         match (start, interrupted) {
             (Start::Force, _) if holds_run => {
                 folder.clear(&Run { init: from.digest(), ..Run::new(config) }, config, &mut found)?;
@@ -201,7 +208,7 @@ impl Folder {
             folder.find(config, from, &mut found)?;
         }
         if found.finished.is_some() {
-            if Config::load(&folder.file(CONFIG)).is_err() {
+            if folder.config().is_err() {
                 found.notes.extend(folder.write_config(config)?);
             }
             return Ok((folder, found));
@@ -211,7 +218,7 @@ impl Folder {
         let checkpoints = folder.file(CHECKPOINTS);
         folder.disk.create_folder(&checkpoints).map_err(RecordError::write(&checkpoints))?;
         // A config with the same content may have the user's comments, so it is not replaced.
-        if Config::load(&folder.file(CONFIG)).ok().as_ref() != Some(config) {
+        if folder.config().ok().as_ref() != Some(config) {
             found.notes.extend(folder.write_config(config)?);
         }
         Ok((folder, found))
@@ -227,8 +234,6 @@ impl Folder {
         if run.state == Status::Done {
             run = Run { state: Status::Running, digest: None, files: None, ..run };
         }
-        // Earlier versions did not write the origin.
-        run.origin = run.origin.or_else(|| Some(Origin::of(config)));
         if before.as_ref() != Some(&run) {
             self.write_run(&run)?;
         }
@@ -245,7 +250,7 @@ impl Folder {
 
     /// Copies `config.toml` unless flotilla wrote its text. Returns the path of the copy.
     fn keep_config(&self) -> Result<Option<PathBuf>, RecordError> {
-        let Ok(text) = read_text(&self.file(CONFIG), MAX_KEPT_BYTES) else { return Ok(None) };
+        let Ok(text) = read_text(self.disk.at(&self.file(CONFIG)), MAX_KEPT_BYTES) else { return Ok(None) };
         if Config::parse(&text, CONFIG).is_ok_and(|config| config.to_toml() == text) {
             return Ok(None);
         }
@@ -258,7 +263,7 @@ impl Folder {
                 return Ok(Some(path));
             }
             // An interrupted session already made this copy.
-            if read_text(&path, MAX_KEPT_BYTES).is_ok_and(|existing| existing == text) {
+            if read_text(self.disk.at(&path), MAX_KEPT_BYTES).is_ok_and(|existing| existing == text) {
                 return Ok(Some(path));
             }
         }
@@ -269,6 +274,7 @@ impl Folder {
     /// and the data of the new run.
     fn clear(&self, by: &Run, config: &Config, found: &mut Resumed) -> Result<(), RecordError> {
         self.write_run(&Run { state: Status::Replacing, ..by.clone() })?;
+        self.sync()?;
         let checkpoints = self.file(CHECKPOINTS);
         let generations = checkpoint::remove_temporary_files(&self.disk, &checkpoints)?;
         let old = generations.into_iter().map(|generation| checkpoint::path(&checkpoints, generation));
@@ -279,7 +285,7 @@ impl Folder {
             ownership::remove_published(&self.disk, &self.file(name))?;
         }
         // The config is replaced as a whole, because the new run may have been read from it.
-        if Config::load(&self.file(CONFIG)).ok().as_ref() != Some(config) {
+        if self.config().ok().as_ref() != Some(config) {
             found.notes.extend(self.write_config(config)?);
         }
         self.write_run(&Run { state: Status::Running, ..by.clone() })
@@ -297,6 +303,27 @@ impl Folder {
     /// The file cannot be written.
     pub fn write_run(&self, run: &Run) -> Result<(), RecordError> {
         self.write_text(RUN, &run.to_json())
+    }
+
+    /// Flushes the names in the folder to the disk, so that they survive a power loss.
+    pub(crate) fn sync(&self) -> Result<(), RecordError> {
+        self.disk.sync_folder(&self.path).map_err(RecordError::write(&self.path))
+    }
+
+    /// Reads `run.json`.
+    fn read_run(&self) -> Result<Run, RecordError> {
+        Run::read(self.disk.at(&self.file(RUN)))
+    }
+
+    /// Reads `config.toml`.
+    fn config(&self) -> Result<Config, ConfigError> {
+        load_config(self.disk.at(&self.file(CONFIG)))
+    }
+
+    /// Reports whether a file exists in the folder.
+    pub(crate) fn has(&self, name: &str) -> Result<bool, RecordError> {
+        let path = self.file(name);
+        self.disk.at(&path).exists().map_err(RecordError::read(&path))
     }
 
     /// Returns the path of a file in the folder.
@@ -321,15 +348,23 @@ pub fn check<'a>(
     start: Start,
 ) -> Result<(), RecordError> {
     for (path, config) in folders {
-        if ownership::holds_run(path, config)? && start == Start::Fresh {
+        let disk = match disk.within(path) {
+            // No run is in a folder that does not exist. Opening the run reports a file that has the folder's path.
+            Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => continue,
+            disk => disk.map_err(RecordError::write(path))?,
+        };
+        if ownership::holds_run(disk.at(path), config)? && start == Start::Fresh {
             return Err(RecordError::Exists { path: path.into() });
         }
         // Without a lock file, no process trains in the folder.
-        if start != Start::Fresh && path.join(LOCK).exists() {
+        let name = path.join(LOCK);
+        if start != Start::Fresh && disk.at(&name).exists().map_err(RecordError::read(&name))? {
             // Closing the file may not release the lock, because a process that is being started can briefly hold a
             // copy of the file.
-            if let Some(lock) = lock(&disk.within(path).map_err(RecordError::write(path))?, path)? {
-                let _ = lock.unlock();
+            match lock(&disk, path) {
+                // A finished run needs no lock. Opening the run reports any other.
+                Err(RecordError::Write { error, .. }) if start == Start::Resume && is_read_only(&error) => {}
+                lock => drop(lock?.map(|lock| lock.unlock())),
             }
         }
     }
@@ -345,23 +380,19 @@ impl Drop for Folder {
     }
 }
 
+/// Reports whether a write failed because nothing may be written.
+fn is_read_only(error: &io::Error) -> bool {
+    matches!(error.kind(), ErrorKind::ReadOnlyFilesystem | ErrorKind::PermissionDenied)
+}
+
 /// Locks a folder for this process while the returned file is open. Returns `None` if the file system has no locks.
 ///
 /// # Errors
 /// Another process holds the lock, or the file cannot be written.
 pub fn lock(disk: &Disk, path: &Path) -> Result<Option<File>, RecordError> {
     let name = path.join(LOCK);
-    let file = disk.open_lock(&name).map_err(RecordError::write(&name))?;
-    match file.try_lock() {
-        Ok(()) => Ok(Some(file)),
-        Err(TryLockError::WouldBlock) => Err(RecordError::Locked { path: path.into() }),
-        Err(TryLockError::Error(error)) if has_no_locks(&error) => Ok(None),
-        Err(TryLockError::Error(error)) => Err(RecordError::write(&name)(error)),
-    }
-}
-
-/// Reports whether the file system does not support locks. NFS without its lock service returns `ENOLCK`.
-fn has_no_locks(error: &io::Error) -> bool {
-    const ENOLCK: i32 = if cfg!(target_os = "linux") { 37 } else { 77 };
-    error.kind() == ErrorKind::Unsupported || cfg!(unix) && error.raw_os_error() == Some(ENOLCK)
+    disk.lock(&name).map_err(|error| match error.kind() {
+        ErrorKind::WouldBlock => RecordError::Locked { path: path.into() },
+        _ => RecordError::write(&name)(error),
+    })
 }

@@ -13,7 +13,6 @@ use crate::record::metrics::{self, RowsError};
 use crate::record::{RecordError, checkpoint, config_digest, hex, policies, tensors, without_checkpoint};
 use flotilla::config::{Config, MAX_STAGES};
 use flotilla::escape::PathExt;
-use flotilla::file;
 use flotilla::trainer::Row;
 
 /// Rows of a run's first and last generation, `[trials]` each.
@@ -31,18 +30,11 @@ impl Folder {
         let (checkpoints, init) = (self.file(CHECKPOINTS), from.digest());
         let init = init.as_deref();
         self.refuse_newer(&checkpoints)?;
+        let before = self.find_finished(config, from, found)?;
+        if found.finished.is_some() {
+            return Ok(());
+        }
         let mut kept = checkpoint::remove_temporary_files(&self.disk, &checkpoints)?;
-        let before = self.compare(config, found, !kept.is_empty())?;
-        match Run::read(&self.file(RUN)) {
-            Ok(run) => found.run = Some(run),
-            Err(RecordError::Read { error, .. }) if error.kind() == ErrorKind::NotFound => {}
-            Err(error @ RecordError::Damaged { .. }) => found.notes.push(Note::Rewritten(error.to_string())),
-            Err(error) => return Err(error),
-        }
-        found.finished = found.run.as_ref().map_or(Ok(None), |run| self.finished(run, config))?;
-        if let Some(run) = found.run.as_ref().filter(|_| found.finished.is_some()) {
-            return self.check_init(run.init.clone(), init);
-        }
         let origin_error = self.origin_error(config, found.run.as_ref(), before.is_some());
         let (is_other, had_checkpoints) = (origin_error.is_some(), !kept.is_empty());
         found.checkpoint =
@@ -72,10 +64,31 @@ impl Folder {
         Ok((newest, kept))
     }
 
+    /// Reads `run.json`, and the results if the run is finished. Returns the config in the folder, if it can be read.
+    pub(super) fn find_finished(
+        &self,
+        config: &Config,
+        from: StartFrom<'_>,
+        found: &mut Resumed,
+    ) -> Result<Option<Config>, RecordError> {
+        let before = self.compare(config, found)?;
+        match self.read_run() {
+            Ok(run) => found.run = Some(run),
+            Err(RecordError::Read { error, .. }) if error.kind() == ErrorKind::NotFound => {}
+            Err(error @ RecordError::Damaged { .. }) => found.notes.push(Note::Rewritten(error.to_string())),
+            Err(error) => return Err(error),
+        }
+        found.finished = found.run.as_ref().map_or(Ok(None), |run| self.finished(run, config))?;
+        if let Some(run) = found.run.as_ref().filter(|_| found.finished.is_some()) {
+            self.check_init(run.init.clone(), from.digest().as_deref())?;
+        }
+        Ok(before)
+    }
+
     /// Returns an error if the run's origin does not allow the given config. `has_config` says that `config.toml` could
     /// be read. It then agrees with the given config, so that a mismatch means that it was edited.
     fn origin_error(&self, config: &Config, run: Option<&Run>, has_config: bool) -> Option<RecordError> {
-        let origin = run?.origin.as_ref().filter(|origin| !origin.allows(config))?;
+        let origin = Some(&run?.origin).filter(|origin| !origin.allows(config))?;
         let (path, existing, requested) = (self.path.clone(), origin.generations, config.learning.generations);
         Some(match existing > requested {
             true => RecordError::Shorter { path, existing, requested },
@@ -104,8 +117,9 @@ impl Folder {
         let checkpoints = self.file(CHECKPOINTS);
         while let Some(&generation) = kept.last() {
             let path = checkpoint::path(&checkpoints, generation);
-            // Checkpoints of earlier versions lack the number of generations. The config in the folder has it.
-            let reason = match checkpoint::read(&path, &self.file(POLICIES), before.unwrap_or(config)) {
+            let policies = self.file(POLICIES);
+            let at = |path| self.disk.at(path);
+            let reason = match checkpoint::read(at(&path), at(&policies), config) {
                 Ok(Some(checkpoint)) if checkpoint.is_of(config) => {
                     self.check_init(checkpoint.init.clone(), init)?;
                     let metrics = self.file(METRICS);
@@ -144,9 +158,12 @@ impl Folder {
     fn check_start(&self, run: Option<&Run>, from: StartFrom<'_>, had_checkpoints: bool) -> Result<(), RecordError> {
         let path = self.path.clone();
         let Some(run) = run else {
-            let exists = |name: &str| file::exists(&self.file(name)).map_err(RecordError::read(&self.file(name)));
             if from == StartFrom::Unspecified
-                && (had_checkpoints || exists(INIT_MARK)? || exists(RUN)? || exists(METRICS)? || exists(POLICIES)?)
+                && (had_checkpoints
+                    || self.has(INIT_MARK)?
+                    || self.has(RUN)?
+                    || self.has(METRICS)?
+                    || self.has(POLICIES)?)
             {
                 return Err(RecordError::OriginUnknown { path });
             }
@@ -162,12 +179,12 @@ impl Folder {
 
     /// Fails if a newer version of the program wrote any of the files. Callers check this before they change a file.
     fn refuse_newer(&self, checkpoints: &Path) -> Result<(), RecordError> {
-        let generations = checkpoint::list(checkpoints)?.into_iter();
+        let generations = checkpoint::list(self.disk.at(checkpoints))?.into_iter();
         let files = generations.map(|generation| checkpoint::path(checkpoints, generation));
         for path in files.chain([self.file(POLICIES)]) {
-            if let Some(version) = tensors::newer(&path) {
+            if let Some(version) = tensors::newer(self.disk.at(&path)) {
                 // Only checkpoints contain the version that wrote them.
-                let recorded = || Some(Run::read(&self.file(RUN)).ok()?.version);
+                let recorded = || Some(self.read_run().ok()?.version);
                 return Err(RecordError::Newer { path, version: version.or_else(recorded) });
             }
         }
@@ -186,9 +203,8 @@ impl Folder {
 
     /// Fails if the given config differs from the one in the folder. Only more generations are allowed. Returns the
     /// config in the folder, if it can be read.
-    fn compare(&self, config: &Config, found: &mut Resumed, checkpoints: bool) -> Result<Option<Config>, RecordError> {
-        let path = self.file(CONFIG);
-        match Config::load(&path) {
+    fn compare(&self, config: &Config, found: &mut Resumed) -> Result<Option<Config>, RecordError> {
+        match self.config() {
             Ok(before) => {
                 let (existing, requested) = (before.learning.generations, config.learning.generations);
                 let mut as_long = before.clone();
@@ -202,7 +218,9 @@ impl Folder {
                 }
                 Ok(Some(before))
             }
-            Err(_) if !path.exists() && !checkpoints => Ok(None),
+            Err(_) if !self.has(CONFIG)? && checkpoint::list(self.disk.at(&self.file(CHECKPOINTS)))?.is_empty() => {
+                Ok(None)
+            }
             Err(error) => {
                 found.notes.push(Note::Rewritten(error.to_string()));
                 Ok(None)
@@ -225,7 +243,7 @@ impl Folder {
     ) -> Result<(FirstAndLastRows, RunSums), RecordError> {
         let path = self.file(METRICS);
         let damaged = |reason: String| RecordError::damaged(&path, reason);
-        let mut rows = metrics::open(&path)?;
+        let mut rows = metrics::open(self.disk.at(&path))?;
         let (trials, last) = (config.learning.trials, config.learning.generations);
         let mut ends = FirstAndLastRows { first: vec![], last: vec![] };
         let mut count = 0;
@@ -261,12 +279,12 @@ impl Folder {
         if run.generations != config.learning.generations + 1 {
             return Ok(None);
         }
-        if run.origin.as_ref().is_some_and(|origin| *origin != Origin::of(config)) {
+        if run.origin != Origin::of(config) {
             return Ok(None);
         }
         let path = self.file(POLICIES);
-        let policies = policies::read_all(&path, config);
-        let (of_config, checksum) = policies::digests_in(&path);
+        let policies = policies::read_all(self.disk.at(&path), config);
+        let (of_config, checksum) = policies::digests_in(self.disk.at(&path));
         if policies.is_ok() && of_config != Some(config_digest(config)) {
             return Ok(None);
         }

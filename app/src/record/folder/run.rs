@@ -1,10 +1,10 @@
 //! `run.json`: the machine of a run and its progress.
 
-use std::path::Path;
 use std::time::{Duration, UNIX_EPOCH};
 
 use serde::{Deserialize, Serialize};
 
+use crate::record::disk::Place;
 use crate::record::ownership::MAX_RUN_BYTES;
 use crate::record::{RecordError, checkpoint, config_digest, read_text};
 use flotilla::config::Config;
@@ -47,10 +47,9 @@ pub struct Run {
     pub generations: usize,
     /// See [`RunSums::run`]. Only for a finished run.
     pub digest: Option<String>,
-    /// Config that the run was started with. Runs of earlier versions do not have it.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub origin: Option<Origin>,
-    /// Digests of the files of a finished run. Runs of earlier versions do not have them.
+    /// Config that the run was started with.
+    pub origin: Origin,
+    /// Digests of the files. Only for a finished run.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub files: Option<FileSums>,
     /// [`crate::record::policies::Init::digest`] of the policies that the run started from. `None` for a random start.
@@ -140,7 +139,7 @@ impl Run {
             sessions: 0,
             generations: 0,
             digest: None,
-            origin: Some(Origin::of(config)),
+            origin: Origin::of(config),
             files: None,
             init: None,
             command: String::new(),
@@ -148,15 +147,16 @@ impl Run {
         }
     }
 
-    /// Reads `run.json` from a path.
+    /// Reads `run.json`.
     ///
     /// # Errors
     /// The file cannot be read, has invalid content, or a newer version wrote it.
-    pub fn read(path: &Path) -> Result<Run, RecordError> {
-        let text = read_text(path, MAX_RUN_BYTES)?;
+    pub fn read<'a>(place: impl Into<Place<'a>>) -> Result<Run, RecordError> {
+        let place = place.into();
+        let text = read_text(place, MAX_RUN_BYTES)?;
         Run::parse(&text).map_err(|reason| match newer_version(&text) {
-            Some(version) => RecordError::Newer { path: path.into(), version: Some(version) },
-            None => RecordError::damaged(path, reason),
+            Some(version) => RecordError::Newer { path: place.path().into(), version: Some(version) },
+            None => RecordError::damaged(place.path(), reason),
         })
     }
 
@@ -165,7 +165,11 @@ impl Run {
     /// # Errors
     /// Returns a description of the problem.
     pub fn parse(text: &str) -> Result<Run, String> {
-        serde_json::from_str(text).map_err(|error| format!("not the record of a run: {error}"))
+        let run: Run = serde_json::from_str(text).map_err(|error| format!("not the record of a run: {error}"))?;
+        match run.state == Status::Done && (run.digest.is_none() || run.files.is_none()) {
+            true => Err("not the record of a run: it is finished and has no digests".into()),
+            false => Ok(run),
+        }
     }
 
     /// Returns the text of `run.json`.

@@ -14,7 +14,8 @@ use super::map;
 use super::runs::{self, ReadError};
 use crate::record::checkpoint;
 use crate::record::digests::Verification;
-use crate::record::folder::{CHECKPOINTS, POLICIES, RUN, Run};
+use crate::record::folder::{CHECKPOINTS, METRICS, POLICIES, RUN, Run};
+use crate::record::metrics;
 use flotilla::backend::{Backend, BackendError, Group, Trace};
 use flotilla::config::{Config, StageConfig};
 use flotilla::credit::{self, Credit, Scores, Strided};
@@ -332,7 +333,11 @@ fn nearest(
     found.into_iter().find_map(|generation| {
         let path = checkpoint::path(&checkpoints, generation);
         let found = checkpoint::read(&path, &folder.join(POLICIES), config).ok()??;
-        if !found.is_of(config) || found.snapshot.generation != generation {
+        // Somebody may have copied a checkpoint of another run here.
+        let other_start = Run::read(&folder.join(RUN)).is_ok_and(|run| run.init != found.init);
+        let is_of_run =
+            found.is_of(config) && !other_start && metrics::has_extent(&folder.join(METRICS), &found.metrics);
+        if !is_of_run || found.snapshot.generation != generation {
             return None;
         }
         let Snapshot { last, mut weights, mut fitness, mut pending, .. } = found.snapshot;

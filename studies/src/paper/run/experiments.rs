@@ -133,10 +133,10 @@ impl Experiments {
     ///
     /// # Errors
     /// Metrics are missing or were changed after the run.
-    pub(super) fn read_metrics(&mut self) -> Result<(), Error> {
+    pub(super) fn read_metrics(&mut self, disk: &Disk) -> Result<(), Error> {
         for (experiment, folder) in self.all.iter_mut().zip(&self.folders) {
             let config = experiment.config.clone();
-            runs::metrics(folder, &config, Verification::Required, |row| experiment.add(row))?;
+            runs::metrics(disk.at(folder), &config, Verification::Required, |row| experiment.add(row))?;
         }
         Ok(())
     }

@@ -159,7 +159,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         experiments.train(&mut session, backend, &on, out, context)?;
     }
     experiments.record_copies(&disk)?;
-    experiments.read_metrics()?;
+    experiments.read_metrics(&disk)?;
     let baselines = play_baselines(
         &ValidConfig::all(&paper::baseline_configs(&experiments.all))?,
         learning.generations,
@@ -198,6 +198,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     };
     let summary = serde_json::to_string(&summary).expect("plain fields are JSON") + "\n";
     publish(SUMMARY, summary.as_bytes())?;
+    disk.sync_folder(out).map_err(RecordError::write(out))?;
     let digest = |index: usize| session.results(experiments.config_of[index]).map(|results| results.digest.clone());
     let outcome =
         |index: usize| ExperimentOutcome::of(&experiments.all[index], &experiments.folders[index], digest(index));
