@@ -26,8 +26,8 @@ ORDER = [
     ("Configs", ["Config", "Key", "ConfigError", "Problem"]),
     ("Training", ["train", "Run", "Generation", "Error", "loggers"]),
     ("Your own fitness", ["Coevolution", "Proposal", "Played"]),
-    ("Looking", ["Replay", "Episode", "Figure", "plot", "compare"]),
-    ("Evaluating", ["rollout", "Rollout", "Trace", "forward", "collect", "Collected", "to_onnx"]),
+    ("Looking", ["Replay", "Episode", "Figure", "plot", "compare", "Comparison"]),
+    ("Evaluating", ["rollout", "Rollout", "Trace", "replay", "forward", "collect", "Collected", "to_onnx"]),
     ("Environments", ["VectorEnv", "team_env", "parallel_env"]),
     ("Many runs", ["sweep", "Sweep", "Point", "paper"]),
     ("The machine", ["devices", "verify"]),
@@ -82,7 +82,7 @@ def signature(name: str, thing: object) -> str:
 
 # Default arguments that are strings.
 DEFAULTS = {
-    "auto", "last", "Df", "G", "generally_forward", "leader-follower", "best_g", "the config", "paper", "next_step"
+    "auto", "last", "Df", "G", "generally_forward", "leader-follower", "best_g", "the config", "paper", "next_step", "best"
 }
 
 
@@ -100,7 +100,7 @@ def entry(name: str, thing: object, level: str) -> str:
 
 
 # Classes that users do not construct, because functions return them. Their signatures are not shown.
-HIDDEN = {"Run", "Replay", "Figure", "Rollout", "Trace", "Sweep", "Generation", "Proposal", "Played", "Collected"}
+HIDDEN = {"Run", "Replay", "Figure", "Rollout", "Trace", "Sweep", "Generation", "Proposal", "Played", "Collected", "Comparison"}
 
 
 def page() -> str:
@@ -113,8 +113,6 @@ def page() -> str:
             if inspect.isclass(thing):
                 members = [(member, value) for member, value in vars(thing).items() if not member.startswith("_")]
                 for member, value in members:
-                    if (inspect.getdoc(value) or "").startswith("The former name of"):
-                        continue
                     function = getattr(value, "__func__", value)
                     if inspect.isfunction(function) or (isinstance(value, property) and inspect.getdoc(value)):
                         parts.append(entry(f"{name}.{member}", function, "####"))

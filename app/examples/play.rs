@@ -32,7 +32,7 @@ pub fn main() -> Result<(), Box<dyn Error>> {
     println!("and {:.2} of them on average from jittered starts", played.observed[0]);
     println!("its leaders' D are {:.2?}, their Df {:.2?}", played.d, played.df);
 
-    let traced = flotilla::trace(&config, &mut *backend, 1, policy, &Starts::Own, 0)?;
+    let traced = flotilla::trace(&config, 1, policy, &Starts::Own, 0)?;
     let last = &traced.positions[traced.positions.len() - config.world.leaders.len().max(1) * 2..];
     println!("the last agents end at {last:.1?}");
     Ok(())

@@ -219,7 +219,7 @@ fn unreachable_pois_print_warnings_before_and_after_training() {
 /// Plays random teams. The bound for reachability must not exclude a POI that any of them observes.
 #[test]
 fn observed_pois_are_never_reported_as_unreachable() {
-    use flotilla::{backend::cpu::Cpu, evaluate::Starts, reach, sample, world::World};
+    use flotilla::{evaluate::Starts, reach, sample, world::World};
     let (mut unreachable_count, mut observed_count) = (0, 0);
     for seed in 0..150 {
         let mut config = sample::world(seed);
@@ -231,7 +231,7 @@ fn observed_pois_are_never_reported_as_unreachable() {
         let weights = sample::weights(&world, teams, seed);
         let unreachable: Vec<usize> =
             reach::unreachable(config.validate().unwrap().as_ref()).iter().map(|entry| entry.poi).collect();
-        let traced = flotilla::trace(&config, &mut Cpu::default(), teams, &weights, &Starts::Own, 0).unwrap();
+        let traced = flotilla::trace(&config, teams, &weights, &Starts::Own, 0).unwrap();
         let pois = world.pois.len();
         for team in 0..teams {
             let mut observed = vec![u32::MAX; pois];

@@ -281,7 +281,7 @@ fn play_and_trace_treat_each_team_separately() {
             flotilla::play(&config, &mut backend, 1, &own(0).repeat(leaders), &starts).expect("valid weights");
         assert_eq!(shared, repeated, "seed {seed}");
 
-        let traced = flotilla::trace(&config, &mut backend, teams, &weights, &starts, 3).expect("valid weights");
+        let traced = flotilla::trace(&config, teams, &weights, &starts, 3).expect("valid weights");
         let episode_starts = starts.of(3, &world);
         let order: Vec<u32> = (0..teams as u32).flat_map(|team| vec![team; leaders]).collect();
         let group = Group {
@@ -323,7 +323,7 @@ fn invalid_input_returns_an_error() {
     let mut backend = Cpu::default();
     let valid = vec![0.5; leaders * 2 * parameters];
     let mut play = |config: &Config, teams, weights: &[f32], starts| {
-        let traced = flotilla::trace(config, &mut backend, teams, weights, &starts, 0).map(drop);
+        let traced = flotilla::trace(config, teams, weights, &starts, 0).map(drop);
         let played = flotilla::play(config, &mut backend, teams, weights, &starts).map(drop);
         assert_eq!(played.as_ref().map_err(ToString::to_string), traced.as_ref().map_err(ToString::to_string));
         played
@@ -354,7 +354,7 @@ fn invalid_input_returns_an_error() {
     }
 
     let drawn = Starts::Drawn { episodes: 2, seed: 1, jitter: 0.1, poi_jitter: 0.0 };
-    let trace = |episode| flotilla::trace(&config, &mut Cpu::default(), 2, &valid, &drawn, episode);
+    let trace = |episode| flotilla::trace(&config, 2, &valid, &drawn, episode);
     trace(1).expect("the last episode exists");
     assert!(matches!(trace(2), Err(Failure::NoEpisode { episode: 2, episodes: 2 })));
 
@@ -366,7 +366,7 @@ fn invalid_input_returns_an_error() {
     );
     let large = Config::parse(&text, "large.toml").expect("a valid config");
     let weights = vec![0.5; large.parameters() * MAX_POPULATION];
-    let traced = flotilla::trace(&large, &mut Cpu::default(), MAX_POPULATION, &weights, &Starts::Own, 0);
+    let traced = flotilla::trace(&large, MAX_POPULATION, &weights, &Starts::Own, 0);
     assert!(matches!(traced, Err(Failure::Memory { what: "all steps of all teams", .. })));
 
     // Configs that were built in code are validated like files.

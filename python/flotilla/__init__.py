@@ -16,8 +16,8 @@ from flotilla import _native, loggers
 from flotilla._coevolution import Coevolution, Played, Proposal
 from flotilla._config import Config, Key
 from flotilla._errors import ConfigError, Error, Problem
-from flotilla._play import Collected, Rollout, Trace, collect, forward, rollout, to_onnx
-from flotilla._program import compare, devices, paper, verify
+from flotilla._play import Collected, Rollout, Trace, collect, forward, replay, rollout, to_onnx
+from flotilla._program import Comparison, compare, devices, paper, verify
 from flotilla._run import Generation, Run, plot, train
 from flotilla._show import Episode, Figure, Replay
 from flotilla._sweep import Point, Sweep, sweep
@@ -32,6 +32,7 @@ __version__: str = _native.__version__
 __all__ = [
     "Coevolution",
     "Collected",
+    "Comparison",
     "Config",
     "ConfigError",
     "Episode",
@@ -57,6 +58,7 @@ __all__ = [
     "paper",
     "parallel_env",
     "plot",
+    "replay",
     "rollout",
     "sweep",
     "team_env",

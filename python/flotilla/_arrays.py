@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import operator
-import warnings
 from collections.abc import Iterator
 from typing import Any
 
@@ -51,9 +50,10 @@ class ArraySupply:
         return ArraySupply, (self.shape,)
 
 
-def floats(what: str, values: ArrayLike, axes: int) -> Floats:
-    """Converts values to a float32 array with the given number of axes, without a copy if they are one already."""
-    if type(values) is np.ndarray and values.dtype == np.float32 and values.ndim == axes and values.flags.carray:
+def floats(what: str, values: ArrayLike, axes: str) -> Floats:
+    """Converts values to a float32 array with the named axes, without a copy if they are one already."""
+    count = axes.count(",") + 1
+    if type(values) is np.ndarray and values.dtype == np.float32 and values.ndim == count and values.flags.carray:
         return values
     try:
         array = np.asarray(values)
@@ -61,8 +61,8 @@ def floats(what: str, values: ArrayLike, axes: int) -> Floats:
         raise ValueError(f"{what} are not an array: {error}") from None
     if array.dtype.kind not in "fiu":
         raise TypeError(f"{what} are {array.dtype}, allowed are float32 (other numbers are converted to it)")
-    if array.ndim != axes:
-        raise ValueError(f"{what} have the shape {array.shape}, allowed are {axes} axes")
+    if array.ndim != count:
+        raise ValueError(f"{what} have the shape {array.shape}, allowed are {count} axes: [{axes}]")
     with np.errstate(over="ignore"):
         return np.require(array, np.float32, ["C", "A"])
 
@@ -98,13 +98,8 @@ def text(what: str, value: Any) -> str:
     return value
 
 
-def backend_name(value: Any) -> str:
-    """Returns a backend as text: its name, or an adapter's name or number."""
-    if isinstance(value, int) and not isinstance(value, bool):
+def word(what: str, value: Any) -> str:
+    """Returns a word or a whole number as text."""
+    if isinstance(value, (int, np.integer)) and not isinstance(value, bool):
         return str(value)
-    return text("backend", value)
-
-
-def renamed(old: str, new: str) -> None:
-    """Warns the caller's caller that a name has changed."""
-    warnings.warn(f"{old} is now {new}; the old name goes with the next version", DeprecationWarning, stacklevel=3)
+    return text(what, value)

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import hashlib
+import tempfile
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flotilla import _native
-from flotilla._arrays import Floats, backend_name, floats
+from flotilla._arrays import Floats, floats, word
 from flotilla._config import Config, check_config
-from flotilla._run import Generation, Run, first_policies
+from flotilla._run import Generation, Run, first_policies, init_file
 
 
 class Proposal(NamedTuple):
@@ -36,10 +39,14 @@ class Played(NamedTuple):
     """The config's fitness of each leader, `[trials, teams, leaders]`."""
 
 
+STATE = ("generation", "policies", "fitness", "pending", "rows", "own_fitness")
+
+
 class Coevolution:
     """Training by ask and tell, with a fitness of your own for each leader of each team.
 
-    With the config's own fitness, the result has the digest of `train`. It can be pickled between generations.
+    With the config's own fitness, the result has the digest of `train`. With any other, the run says so: see
+    `Run.own_fitness`. It can be pickled between generations.
 
     Args:
         config: what to train.
@@ -81,18 +88,27 @@ class Coevolution:
     ) -> None:
         check_config(config)
         self.config = config if seed is None else config.replace(learning={"seed": seed})
-        self._backend = backend_name(backend)
+        self._backend = word("backend", backend)
         self._native = _native.Coevolution(self.config._native)
         self._trials = int(self.config["learning.trials"])
         # In the format of `run.json`.
         self._started = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+        self._init: str | None = None
         if init is not None:
             self._native.start_from(first_policies(init))
+            with tempfile.TemporaryDirectory(prefix="flotilla-") as aside:
+                file = Path(init_file(init, self.config, aside))
+                self._init = hashlib.sha256(file.read_bytes()).hexdigest()
 
     @property
     def generation(self) -> int:
         """The generation that plays next; 0 is the initial one."""
         return self._native.generation
+
+    @property
+    def own_fitness(self) -> bool:
+        """Whether any fitness so far was not the config's."""
+        return self._native.own_fitness
 
     @property
     def done(self) -> bool:
@@ -127,7 +143,7 @@ class Coevolution:
         Raises:
             ValueError: the fitness has another shape or is not finite, or all generations have one.
         """
-        values = floats("fitness", fitness, 3)
+        values = floats("fitness", fitness, "trials, teams, leaders")
         shape = (self._trials, self._native.teams, self.config.num_learners)
         if not self.done and values.shape != shape:
             raise ValueError(f"fitness has the shape {values.shape}, allowed is [trials, teams, leaders] = {shape}")
@@ -152,13 +168,11 @@ class Coevolution:
         Raises:
             ValueError: a state that is set is of another config.
         """
-        names = ("generation", "policies", "fitness", "pending", "rows")
-        return dict(zip(names, self._native.state()))
+        return dict(zip(STATE, self._native.state()))
 
     @state.setter
     def state(self, state: dict[str, Any]) -> None:
-        names = ("generation", "policies", "fitness", "pending", "rows")
-        self._native.restore(tuple(state[name] for name in names))
+        self._native.restore(tuple(state[name] for name in STATE))
 
     @property
     def run(self) -> Run:
@@ -169,15 +183,17 @@ class Coevolution:
         """
         if not self.done:
             raise ValueError(f"generation {self.generation} has no fitness yet; a run has results once all generations have one")
-        played = ("cpu", "ask and tell", None, None, _native.threads(), self._started, None)
+        threads = _native.threads()
+        played = ("cpu", "ask and tell", None, None, threads, self._started, self._init, self.own_fitness)
         return Run(self._native.finish(), played, None, None)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"config": self.config, "backend": self._backend, "state": self.state, "started": self._started}
+        kept = {"started": self._started, "init": self._init}
+        return {"config": self.config, "backend": self._backend, "state": self.state, **kept}
 
     def __setstate__(self, saved: dict[str, Any]) -> None:
         Coevolution.__init__(self, saved["config"], backend=saved["backend"])
-        self.state, self._started = saved["state"], saved["started"]
+        self.state, self._started, self._init = saved["state"], saved["started"], saved["init"]
 
     def __repr__(self) -> str:
         last = self.config["learning.generations"]

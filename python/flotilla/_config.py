@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, KeysView, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from flotilla import _native as native
-from flotilla._arrays import number, renamed
+from flotilla._arrays import number
+from flotilla._errors import no_key
 
 
 class Key(NamedTuple):
@@ -40,16 +41,6 @@ def _flat(sections: Mapping[str, Any]) -> list[tuple[str, Any]]:
         else:
             keys.append((section, entries))
     return keys
-
-
-class _Keys:
-    """`config.keys()` are the sections, as of any mapping. `Config.keys()` is the former name of `Config.reference()`."""
-
-    def __get__(self, config: Config | None, owner: type[Config]) -> Callable[[], Any]:
-        if config is not None:
-            return lambda: KeysView(config)
-        renamed("Config.keys", "Config.reference")
-        return owner.reference
 
 
 class Config(Mapping[str, Any]):
@@ -134,8 +125,6 @@ class Config(Mapping[str, Any]):
         """
         return [Key(*key) for key in native.keys()]
 
-    keys = _Keys()  # pyright: ignore[reportAssignmentType]
-
     def replace(self, **sections: Mapping[str, Any] | Sequence[Any]) -> Config:
         """Returns this config with some keys changed. All other keys stay.
 
@@ -174,7 +163,7 @@ class Config(Mapping[str, Any]):
         found: Any = self.to_dict()
         for part in str(key).split("."):
             if not isinstance(found, dict) or part not in found:
-                raise KeyError(key)
+                raise no_key(key, "key", [*self, *(name for name, _ in _flat(self.to_dict()) if "." in name)])
             found = found[part]
         return found
 
@@ -188,12 +177,6 @@ class Config(Mapping[str, Any]):
     def num_learners(self) -> int:
         """Number of agents that learn: the leaders and, in the all-leaders paradigm, everyone."""
         return self._native.learners
-
-    @property
-    def leaders(self) -> int:
-        """The former name of `num_learners`."""
-        renamed("Config.leaders", "Config.num_learners")
-        return self.num_learners
 
     @property
     def parameters(self) -> int:

@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import re
+import sys
+import warnings
+from collections.abc import Iterable
+from difflib import get_close_matches
 from typing import NamedTuple
 
 
@@ -53,6 +59,43 @@ class ConfigError(ValueError):
 
     def __str__(self) -> str:
         return str(self.args[0])
+
+
+# Flags without a value.
+SWITCHES = ("force", "paired", "resume", "unverified")
+PACKAGE = os.path.dirname(__file__) + os.sep
+
+
+def keywords(text: str) -> str:
+    """Returns a message of the program with its flags as arguments. Commands in backticks stay.
+
+    Example:
+        >>> keywords("--at 9: choose an earlier one, or pass --force to `flotilla train --force`")
+        'at=9: choose an earlier one, or pass force=True to `flotilla train --force`'
+    """
+
+    def argument(flag: re.Match[str]) -> str:
+        name = flag[1].replace("-", "_")
+        return f"{name}=True" if name in SWITCHES else f"{name}={flag[2] or ''}"
+
+    parts = text.split("`")
+    parts[::2] = [re.sub(r"(?<![\w-])--([a-z][a-z-]*)(?: ([^\s:]+)(?=: ))?", argument, part) for part in parts[::2]]
+    return "`".join(parts)
+
+
+def warn(text: str, category: type[Warning]) -> None:
+    """Warns the code that called the package, whichever function it called."""
+    frame, level = sys._getframe(), 1
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(PACKAGE):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(keywords(text), category, stacklevel=level)
+
+
+def no_key(key: object, kind: str, names: Iterable[str]) -> KeyError:
+    """Returns the error of a key that does not exist. It offers similar ones, or else all."""
+    every, key = list(names), str(key)
+    similar = [name for name in every if name.rpartition(".")[2] == key] or get_close_matches(key, every)
+    return KeyError(f"{key}: no such {kind}; {'did you mean' if similar else 'there are'} {', '.join(similar or every)}")
 
 
 def config_error(text: str, problems: list[tuple[int | None, str, str]]) -> ConfigError:

@@ -67,7 +67,7 @@ class TeamEnv(ParallelEnv[str, Array, Array]):  # type: ignore[misc, unused-igno
     ) -> tuple[
         dict[str, Array], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]
     ]:
-        if not self.agents:
+        if not self.agents and self._teams.started:
             return {}, {}, {}, {}, {}
         wanted = np.empty((1, self._teams.leaders, _native.OUTPUTS), np.float32)
         for leader, agent in enumerate(self.agents):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import time
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -13,8 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flotilla import _native
-from flotilla._arrays import Floats, backend_name, floats, renamed, whole
+from flotilla._arrays import Floats, floats, whole, word
 from flotilla._config import Config, check_config, jitters
+from flotilla._errors import no_key, warn
+from flotilla._show import Replay
 
 MAX_EPISODES = 1_000_000
 
@@ -33,6 +34,10 @@ class Trace:
             states.
         agents_at_poi: which agents are within the observation radius of each POI after each step,
             `[teams, steps, pois, agents]`, bool.
+        poi_distances: the distance from each POI to each agent after each step, `[teams, steps, pois, agents]`, in map
+            units. The nearest agents of a POI are the first of `np.sort(trace.poi_distances)`.
+        agent_distances: the distance from each agent to the nearest other agent after each step,
+            `[teams, steps, agents]`; infinite for an agent that is alone.
 
     Example:
         >>> config = flotilla.Config.paper()
@@ -48,12 +53,8 @@ class Trace:
     inputs: Any = None
     outputs: Any = None
     agents_at_poi: Any = None
-
-    @property
-    def near(self) -> Any:
-        """The former name of `agents_at_poi`."""
-        renamed("Trace.near", "Trace.agents_at_poi")
-        return self.agents_at_poi
+    poi_distances: Any = None
+    agent_distances: Any = None
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ class Rollout:
         scores: dict[str, NDArray[Any] | None] = {"G": self.g, "D": self.d, "Df": self.df, "D++": self.dpp, "Dt": self.dt}
         found = scores.get(fitness)
         if found is None:
-            raise KeyError(f"{fitness}: the scores are {', '.join(name for name in scores if scores[name] is not None)}")
+            raise no_key(fitness, "score", [name for name in scores if scores[name] is not None])
         return found
 
     def __repr__(self) -> str:
@@ -103,7 +104,7 @@ class Rollout:
         return f"<flotilla.Rollout: {teams} teams of {leaders} leaders, G {self.g.mean():.3f} on average>"
 
 
-FIELDS = ("positions", "headings", "speeds", "inputs", "outputs", "agents_at_poi")
+FIELDS = ("positions", "headings", "speeds", "inputs", "outputs", "agents_at_poi", "poi_distances", "agent_distances")
 # Seconds that a block of episodes should take, so that Ctrl-C is answered soon.
 BLOCK_SECONDS = 0.2
 # Steps of agents in the first block, before it is known how long they take.
@@ -113,7 +114,7 @@ FIRST_BLOCK = 4_000_000
 def _checked(config: Any, policies: ArrayLike) -> Floats:
     """Returns policies as an array `[leaders, teams, parameters]` with at least one team."""
     check_config(config)
-    array = floats("policies", policies, 3)
+    array = floats("policies", policies, "leaders, teams, parameters")
     if array.shape[1] == 0:
         raise ValueError(f"policies are {list(array.shape)}: no teams; pass [leaders, teams, parameters] with 1 team or more")
     return array
@@ -130,13 +131,35 @@ def _shapes(config: Config, teams: int) -> dict[str, tuple[int, ...]]:
         "outputs": (teams, steps, leaders, _native.OUTPUTS),
         "actions": (teams, steps, leaders, _native.OUTPUTS),
         "agents_at_poi": (teams, steps, pois, agents),
+        "poi_distances": (teams, steps, pois, agents),
+        "agent_distances": (teams, steps, agents),
     }
+
+
+Starts = tuple[int, int, float, float]
+
+
+def _drawn(config: Config, episodes: int, seed: int, jitter: float | None, poi_jitter: float | None) -> Starts:
+    """Returns the number of held-out starts, their seed and their jitters."""
+    reaches = jitters(config, jitter, poi_jitter)
+    return (whole("episodes", episodes, 1, MAX_EPISODES), whole("seed", seed, 0, 2**63 - 1), *reaches)
+
+
+def _starts(
+    config: Config, episodes: int | None, seed: int, jitter: float | None, poi_jitter: float | None
+) -> Starts | None:
+    """Returns held-out starts, or None for the config's own start."""
+    if episodes is not None:
+        return _drawn(config, episodes, seed, jitter, poi_jitter)
+    if jitter is not None or poi_jitter is not None:
+        raise ValueError("a jitter applies to drawn starts; pass episodes= with their number")
+    return None
 
 
 def _record(
     config: Config,
     policies: Floats,
-    starts: tuple[int, int, float, float] | None,
+    starts: Starts | None,
     noise: tuple[int, Floats] | None,
     arrays: dict[str, Any],
 ) -> list[Any]:
@@ -155,10 +178,11 @@ def _record(
         chosen = policies if count == teams or whole_teams else np.ascontiguousarray(policies[:, first : first + count])
         begin, end = (first * teams, (first + count) * teams) if whole_teams else (first, first + count)
         of_block = {name: array[begin:end] for name, array in arrays.items()}
-        states, others = [of_block.get(name) for name in (*FIELDS[:5], "actions")], ("agents_at_poi", "observed_at")
+        states, distances = ([of_block.get(name) for name in names] for names in ((*FIELDS[:5], "actions"), FIELDS[6:]))
+        near, observed_at = of_block.get("agents_at_poi"), of_block.get("observed_at")
         span = (first, first + count) if whole_teams else (0, 1)
         began = time.perf_counter()
-        parts.append(_native.record(config._native, chosen, starts, span, noise, states, *map(of_block.get, others)))
+        parts.append(_native.record(config._native, chosen, starts, span, noise, states, near, observed_at, distances))
         took = time.perf_counter() - began
         first += count
         block = block * 2 if took < BLOCK_SECONDS / 2 else max(block // 2, 1) if took > BLOCK_SECONDS * 2 else block
@@ -215,17 +239,11 @@ def rollout(
         >>> held_out.episodes.shape, held_out.interval.shape
         ((100, 1), (1, 2))
     """
-    array, name = _checked(config, policies), backend_name(backend)
+    array, name = _checked(config, policies), word("backend", backend)
     fields = _fields(record, trace, out)
-    starts = None
-    if episodes is not None:
-        reaches = jitters(config, jitter, poi_jitter)
-        starts = (whole("episodes", episodes, 1, MAX_EPISODES), whole("seed", seed, 0, 2**63 - 1), *reaches)
-        if starts[0] > 1 and max(reaches) == 0:
-            text = f"{episodes} episodes without jitter are all the same; pass jitter= or poi_jitter="
-            warnings.warn(text, UserWarning, stacklevel=2)
-    elif jitter is not None or poi_jitter is not None:
-        raise ValueError("a jitter applies to drawn starts; pass episodes= with their number")
+    starts = _starts(config, episodes, seed, jitter, poi_jitter)
+    if starts is not None and starts[0] > 1 and max(starts[2:]) == 0:
+        warn(f"{episodes} episodes without jitter are all the same; pass jitter= or poi_jitter=", UserWarning)
     _, pois, _ = config._native.sizes
     traced = None
     if fields:
@@ -245,7 +263,7 @@ def rollout(
 
 def _fields(record: Sequence[str], trace: bool, out: Mapping[str, Any] | None) -> tuple[str, ...]:
     """Returns the fields of a trace that are wanted."""
-    named = ("agents_at_poi" if field == "near" else field for field in ((record,) if isinstance(record, str) else record))
+    named = (record,) if isinstance(record, str) else record
     fields = FIELDS if trace else tuple(dict.fromkeys([*named, *(out or ())]))
     for field in fields:
         if field not in FIELDS:
@@ -338,8 +356,7 @@ def collect(
     if deviations.shape not in ((), (2,), (config.num_learners, 2)) or not (np.isfinite(deviations) & (deviations >= 0)).all():
         raise ValueError("noise must be a number from 0 on, or an array of them, [2] or [leaders, 2]")
     deviations = np.ascontiguousarray(np.broadcast_to(deviations, (config.num_learners, 2)))
-    number = whole("seed", seed, 0, 2**63 - 1)
-    starts = (whole("episodes", episodes, 1, MAX_EPISODES), number, *jitters(config, jitter, poi_jitter))
+    starts = _drawn(config, episodes, seed, jitter, poi_jitter)
     total = starts[0] * array.shape[1]
     shapes = _shapes(config, total)
     arrays: dict[str, NDArray[Any]] = {name: np.empty(shapes[name], np.float32) for name in ("inputs", "outputs", "actions")}
@@ -347,7 +364,7 @@ def collect(
     at = np.empty((total, pois), np.uint32)
     if reward == "G":
         arrays["observed_at"] = at
-    observed, d, df, dpp, dt = _record(scored, array, starts, (number, deviations), arrays)
+    observed, d, df, dpp, dt = _record(scored, array, starts, (starts[1], deviations), arrays)
     rewards = np.zeros((total, steps, config.num_learners), np.float32)
     if reward == "G":
         team, poi = np.nonzero(at)
@@ -358,6 +375,45 @@ def collect(
     masks = np.ones((total, steps), np.bool_)
     masks[:, -1] = False
     return Collected(arrays["inputs"], arrays["actions"], arrays["outputs"], rewards, masks, observed / pois)
+
+
+def replay(
+    config: Config,
+    policies: ArrayLike,
+    team: ArrayLike = 0,
+    *,
+    episodes: int | None = None,
+    seed: int = 0,
+    jitter: float | None = None,
+    poi_jitter: float | None = None,
+) -> Replay:
+    """Plays teams of policies from anywhere, such as another optimiser. `Run.replay` does so for trained teams.
+
+    Args:
+        config: the world, and the policies' network.
+        policies: see `rollout`.
+        team: the team that plays, from 0; or a list of teams, side by side.
+        episodes: see `rollout`, as for the next three. The first episode is played.
+        seed: seed of held-out starts.
+        jitter: largest offset of a start on each axis, in map units.
+        poi_jitter: the same for POIs.
+
+    Raises:
+        ValueError: the policies have another shape, there is no such team, or another argument is not allowed.
+
+    Example:
+        >>> config = flotilla.Config.paper()
+        >>> policies = np.random.default_rng(0).normal(size=(4, 200, config.parameters))
+        >>> best = int(flotilla.rollout(config, policies).g.argmax())
+        >>> flotilla.replay(config, policies, best).save("found.gif", width=300)
+    """
+    array = _checked(config, policies)
+    starts = _starts(config, episodes, seed, jitter, poi_jitter)
+    teams = [whole("team", each, 0, array.shape[1] - 1) for each in np.atleast_1d(np.asarray(team))]
+    if not 1 <= len(teams) <= 24:
+        raise ValueError(f"{len(teams)} teams, allowed are 1 to 24")
+    chosen = [(each, np.ascontiguousarray(array[:, each : each + 1])) for each in teams]
+    return Replay(_native.replay_policies(config._native, chosen, starts))
 
 
 def _layers(config: Config | None, parameters: int) -> list[int]:
@@ -438,7 +494,7 @@ def to_onnx(policy: ArrayLike, path: str | os.PathLike[str], config: Config | No
     import onnx
     from onnx import TensorProto, helper, numpy_helper
 
-    weights = floats("policy", policy, 1)
+    weights = floats("policy", policy, "parameters")
     layers, at, value = _layers(config, weights.size), 0, "inputs"
     nodes, tensors = [], []
     for index, (before, after) in enumerate(zip(layers, layers[1:])):

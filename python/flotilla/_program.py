@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, SupportsIndex, overload
 
 from flotilla import _native
-from flotilla._arrays import backend_name, text, whole
-from flotilla._run import Run, _command
+from flotilla._arrays import number, text, whole, word
+from flotilla._errors import keywords
+from flotilla._run import Runs, _command, run_folders
 
 
 def program(use_case: str, backend: str = "auto", **request: Any) -> dict[str, Any]:
@@ -20,18 +21,75 @@ def program(use_case: str, backend: str = "auto", **request: Any) -> dict[str, A
     return outcome
 
 
+class Comparison(list[dict[str, Any]]):
+    """The result of `compare`: a list of rows that `pandas.DataFrame(comparison)` reads, one per measure and arm.
+
+    A row has `measure`, `generation`, `arm`, `trials`, the mean `value` and its 95 % interval from `low` to `high`, and what
+    `flotilla compare --json` has besides.
+
+    Attributes:
+        pairs: rows, too, one per measure and pair of arms: `arm` and `other`, the difference of their means as `value`,
+            `low` and `high`, and the test of it: `a`, `p` and `p_holm`.
+        json: the whole object that `docs/reference/json.md` describes for `flotilla compare RUN RUN --json`. Its entries
+            can be read from the comparison, too: `comparison["test"]`.
+
+    Example:
+        >>> config = flotilla.Config.paper().replace(learning={"generations": 3})
+        >>> runs = [flotilla.train(config.replace(learning={"fitness": fitness})) for fitness in ("G", "Df")]
+        >>> comparison = flotilla.compare(runs)
+        >>> [(row["measure"], row["arm"]) for row in comparison[:2]]
+        [('best_g', 'fitness G'), ('best_g', 'fitness Df')]
+        >>> comparison.pairs[0]["arm"], comparison.pairs[0]["other"], comparison["test"]
+        ('fitness G', 'fitness Df', 'mann-whitney')
+    """
+
+    def __init__(self, outcome: dict[str, Any]) -> None:
+        super().__init__()
+        self.json, self.pairs = outcome, list[dict[str, Any]]()
+        for contest in outcome["comparisons"]:
+            arms = [{"arm": arm["name"], "trials": arm["trials"]} for arm in contest["arms"]]
+            place = {"where": contest["where"]} if contest["where"] else {}
+            for measured in contest["measures"]:
+                what = {**place, **{name: value for name, value in measured.items() if name not in ("arms", "pairs")}}
+                self += [{**what, **arm, **mean} for arm, mean in zip(arms, measured["arms"])]
+                for pair in measured["pairs"]:
+                    one, other = (arms[index]["arm"] for index in pair["arms"])
+                    self.pairs.append({**what, **pair, "arm": one, "other": other})
+        for pair in self.pairs:
+            del pair["arms"]
+
+    @overload
+    def __getitem__(self, key: SupportsIndex) -> dict[str, Any]: ...
+    @overload
+    def __getitem__(self, key: slice) -> list[dict[str, Any]]: ...
+    @overload
+    def __getitem__(self, key: str) -> Any: ...
+    def __getitem__(self, key: SupportsIndex | slice | str) -> Any:
+        return self.json[key] if isinstance(key, str) else super().__getitem__(key)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Comparison, (self.json,)
+
+    def __repr__(self) -> str:
+        return f"<flotilla.Comparison: {len(self)} means, {len(self.pairs)} differences>"
+
+
 def compare(
-    runs: Sequence[Run | str | os.PathLike[str]], *, at: str | int | Sequence[str | int] = "last", paired: bool = False
-) -> dict[str, Any]:
+    runs: Runs,
+    *,
+    at: str | int | Sequence[str | int] = "last",
+    paired: bool = False,
+    reach: float = 0.75,
+    by: str | None = None,
+) -> Comparison:
     """Runs side by side: means, 95 % intervals, and a test of every pair, as `flotilla compare` prints them.
 
     Args:
         runs: at least two runs or their directories, or the directory of one sweep.
         at: generations to compare at: `[0, 50, "last"]`.
         paired: compare pair by pair: trials with one seed and number are pairs.
-
-    Returns:
-        the object that `docs/reference/json.md` describes for `flotilla compare RUN RUN --json`.
+        reach: also compare the first generation whose best team has this G, 0 to 1.
+        by: the axis of a sweep whose values are compared. None is the only axis.
 
     Raises:
         ValueError: there is nothing to compare.
@@ -40,17 +98,29 @@ def compare(
     Example:
         >>> config = flotilla.Config.paper().replace(learning={"generations": 3})
         >>> runs = [flotilla.train(config.replace(learning={"fitness": fitness})) for fitness in ("G", "Df")]
-        >>> flotilla.compare(runs)["comparisons"][0]["generation"]
-        3
+        >>> import pandas
+        >>> table = pandas.DataFrame(flotilla.compare(runs, at=[0, 3], reach=1))
+        >>> table.groupby("measure")["generation"].max().to_dict()
+        {'best_g': 3, 'champion_g': 3, 'generations_to_reach': 3}
     """
-    folders = [run.folder if isinstance(run, Run) else os.fspath(run) for run in runs]
+    folders, unverified = run_folders(runs)
     if not folders:
         raise ValueError("no runs, allowed are two at least or the folder of a sweep")
-    wanted = [at] if isinstance(at, (str, int)) else list(at) if isinstance(at, Sequence) else []
-    if not wanted or not all(isinstance(each, (str, int)) and not isinstance(each, bool) for each in wanted):
-        raise TypeError(f"at is {at!r}, allowed are generations: a number, 'last', or a list of these")
-    generations = [part.strip() for each in wanted for part in str(each).split(",")]
-    return program("compare", folders=[text("a run", folder) for folder in folders], at=generations, paired=bool(paired))
+    wanted = at if isinstance(at, Sequence) and not isinstance(at, str) else [at]
+    generations = [part.strip() for each in wanted for part in word("at", each).split(",")]
+    if not generations:
+        raise ValueError("at is empty, allowed are generations: a number, 'last', or a list of these")
+    outcome = program(
+        "compare",
+        folders=folders,
+        at=generations,
+        paired=bool(paired),
+        reach=number("reach", reach, 0, 1),
+        by=None if by is None else text("by", by),
+        unverified=unverified,
+    )
+    outcome["notes"] = [keywords(note) for note in outcome["notes"]]
+    return Comparison(outcome)
 
 
 def paper(
@@ -93,7 +163,7 @@ def paper(
     given = {key: whole(key, value, 0, 2**63 - 1) for key, value in keys.items() if value is not None}
     set_ = [{"key": f"learning.{key}", "text": str(value), "name": key} for key, value in given.items()]
     folder = text("out", os.fspath(out))
-    return program("paper", backend_name(backend), out=folder, start=start, set=set_)
+    return program("paper", word("backend", backend), out=folder, start=start, set=set_)
 
 
 def verify(*, worlds: int | None = None, teams: int | None = None, adapter: str | int | None = None) -> dict[str, Any]:
@@ -112,7 +182,7 @@ def verify(*, worlds: int | None = None, teams: int | None = None, adapter: str 
     """
     given = {"worlds": worlds, "teams": teams}
     counts: dict[str, Any] = {name: whole(name, value, 1, 100_000) for name, value in given.items() if value is not None}
-    return program("verify", adapter=None if adapter is None else backend_name(adapter), **counts)
+    return program("verify", adapter=None if adapter is None else word("adapter", adapter), **counts)
 
 
 def devices() -> list[dict[str, str | int]]:

@@ -8,15 +8,16 @@ import shutil
 import sys
 import tempfile
 import weakref
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, Any, Union
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flotilla import _native
-from flotilla._arrays import Floats, backend_name, floats, whole
+from flotilla._arrays import Floats, floats, text, whole, word
 from flotilla._config import Config, check_config
+from flotilla._errors import no_key
 from flotilla._show import Figure, Replay
 
 if TYPE_CHECKING:
@@ -27,6 +28,13 @@ Callback = Callable[[Generation], Any]
 Init = Any
 
 METRICS = ("best_g", "mean_g", "champion_g")
+
+
+class Metrics(dict[str, NDArray[np.float64]]):
+    """A run's metrics by name."""
+
+    def __missing__(self, name: object) -> Any:
+        raise no_key(name, "metric", self)
 
 
 class Run:
@@ -43,6 +51,8 @@ class Run:
         digest: a checksum of the results, equal to the command line's for this config and seed.
         backend: the processor that trained it, in words.
         unverified: True if its files were not compared with their digests.
+        own_fitness: True if a `Coevolution` was told another fitness than the config's. Only the first generation's best
+            team and the last champion can be replayed then, and the run cannot be extended.
 
     Example:
         >>> config = flotilla.Config.paper("chaotic").replace(learning={"generations": 3, "trials": 2})
@@ -58,6 +68,7 @@ class Run:
         self.digest: str = digest
         self._show_arrays()
         self.backend = played[1]
+        self.own_fitness = played[7]
         self._played, self._times, self._folder = played, times, folder
         # Whether the folder is a temporary one of this process.
         self._temporary = False
@@ -69,7 +80,7 @@ class Run:
             metric.flags.writeable = False
         for policies in self._policies:
             policies.flags.writeable = False
-        self.metrics: dict[str, NDArray[np.float64]] = dict(zip(METRICS, self._metrics))
+        self.metrics = Metrics(zip(METRICS, self._metrics))
         self.policies: list[Floats] = list(self._policies)
 
     @classmethod
@@ -130,7 +141,7 @@ class Run:
             ['metrics.csv', 'policies.safetensors', 'run.json']
         """
         self._write(os.fspath(folder), force)
-        if self._temporary and self._folder is not None and self._played[-1] is not None:
+        if self._temporary and self._folder is not None and self._played[6] is not None:
             # Only its checkpoints have the policies that it started from.
             shutil.copytree(self._folder, folder, dirs_exist_ok=True)
 
@@ -158,43 +169,57 @@ class Run:
         return pandas.DataFrame({**columns, **{name: self.metrics[name].T.ravel() for name in METRICS}})
 
     def replay(
-        self, trial: int = 0, generation: int | None = None, compare: int | None = None, backend: str | int = "auto"
+        self,
+        trial: int | str = 0,
+        generation: int | None = None,
+        compare: int | None = None,
+        backend: str | int = "auto",
+        *,
+        team: int | str = "best",
     ) -> Replay:
-        """The episode of the best team of a trial and generation, as it was scored.
+        """The episode of one team of a trial and generation, as it was scored.
 
         Args:
-            trial: from 0.
+            trial: from 0; or `"best"` or `"worst"`, the one with the largest or smallest G of that generation.
             generation: None is the last.
             compare: another generation, side by side.
             backend: as of `train`.
+            team: `"best"`, `"champion"`, or the number of a team, from 0.
 
         Raises:
-            ValueError: there is no such trial or generation, or the worlds of the two generations differ: they are of
+            ValueError: there is no such trial, generation or team, or the worlds of the two generations differ: they are of
                 different stages, or POIs move (`learning.poi_jitter`).
-            Error: the run was made with another version of the program, or the backend fails.
+            Error: the run was made with another version of the program or with a fitness that is not its config's, or the
+                backend fails.
 
         Example:
             >>> run = flotilla.train(flotilla.Config.paper().replace(learning={"generations": 5}))
             >>> [episode.generation for episode in run.replay(compare=0).episodes]
             [0, 5]
+            >>> champion = run.replay(trial="best", team="champion").episodes[0]
+            >>> bool(champion.best_g == run.metrics["champion_g"][:, -1].max())
+            True
         """
         last = int(self.config["learning.generations"])
         shown = [generation if generation is not None else last]
         if compare is not None:
             shown.insert(0, compare)
         generations = [whole("generation", shown_one, 0, 2**63 - 1) for shown_one in shown]
-        number = whole("trial", trial, 0, 2**63 - 1)
-        return Replay(_native.replay(self.folder, number, generations, self.unverified, backend_name(backend)))
+        chosen = word("trial", trial), word("team", team)
+        return Replay(_native.replay(self.folder, *chosen, generations, self.unverified, word("backend", backend)))
 
-    def plot(self) -> Figure:
+    def plot(self, measure: str | None = None) -> Figure:
         """The learning curves: best team, champion and mean team, each with its 95 % interval over trials.
+
+        Args:
+            measure: draw only one of them: `"best"`, `"champion"` or `"mean"`.
 
         Example:
             >>> run = flotilla.train(flotilla.Config.paper().replace(learning={"generations": 2}))
             >>> run.plot()
             <flotilla.Figure: .save(path) writes it as .svg, .pdf or .png>
         """
-        return plot([self])
+        return plot(self, measure)
 
     def __getstate__(self) -> dict[str, Any]:
         # A temporary folder belongs to this process. A copy of the run makes its own.
@@ -209,6 +234,7 @@ class Run:
         best = self.metrics["best_g"][:, -1]
         where = f", in {self._folder}" if self._folder is not None and not self._temporary else ""
         where += ", unverified" if self.unverified else ""
+        where += ", by a fitness that is not the config's" if self.own_fitness else ""
         last = self.metrics["best_g"].shape[1] - 1
         return (
             f"<flotilla.Run: {len(best)} trials, {last} generations, best G {best.mean():.3f} "
@@ -216,10 +242,30 @@ class Run:
         )
 
 
-def plot(runs: Sequence[Run]) -> Figure:
-    """The learning curves of one run, or the best teams of several side by side.
+Runs = Union[Run, str, os.PathLike[str], Iterable[Union[Run, str, os.PathLike[str]]]]
+
+
+def run_folders(runs: Runs) -> tuple[list[str], bool]:
+    """Returns the directories of one run or of several, and whether any was opened unverified."""
+    if isinstance(runs, (Run, str, os.PathLike)):
+        runs = [runs]
+    if not isinstance(runs, Iterable):
+        raise TypeError(f"runs is {type(runs).__name__}, allowed are runs and their directories, one or a list")
+    every = list(runs)
+    folders = [text("a run", run.folder if isinstance(run, Run) else os.fspath(run)) for run in every]
+    return folders, any(isinstance(run, Run) and run.unverified for run in every)
+
+
+def plot(runs: Runs, measure: str | None = None) -> Figure:
+    """The learning curves of one run, or one kind of team of several runs side by side.
+
+    Args:
+        runs: runs or their directories, one or a list.
+        measure: the teams that are drawn: `"best"`, `"champion"` or `"mean"`. None draws all three of one run, and the best
+            of several.
 
     Raises:
+        ValueError: there are no runs or too many, or there is no such measure.
         Error: a run cannot be read.
 
     Example:
@@ -228,10 +274,10 @@ def plot(runs: Sequence[Run]) -> Figure:
         >>> flotilla.plot(runs).svg()[:4]
         '<svg'
     """
-    folders = [run.folder for run in runs]
+    folders, unverified = run_folders(runs)
     if not 1 <= len(folders) <= 24:
         raise ValueError(f"{len(folders)} runs, allowed are 1 to 24")
-    return Figure(_native.figure(folders, any(run.unverified for run in runs)))
+    return Figure(_native.figure(folders, None if measure is None else text("measure", measure), unverified))
 
 
 def _command() -> str:
@@ -336,7 +382,7 @@ def train(
         raise ValueError("resume continues a run and force overwrites it: leave out one of the two")
     if seed is not None:
         config = config.replace(learning={"seed": seed})
-    name = backend_name(backend)
+    name = word("backend", backend)
     told, end = _with_bar(called, config, progress)
     temporary = init is not None and out is None
     folder = tempfile.mkdtemp(prefix="flotilla-") if temporary else "" if out is None else os.fspath(out)
@@ -348,7 +394,7 @@ def train(
         absolute = os.path.abspath(where)
         start = "resume" if resume else "force" if force else "fresh"
         with tempfile.TemporaryDirectory(prefix="flotilla-") as aside:
-            first = None if init is None else _init_file(init, config, aside)
+            first = None if init is None else init_file(init, config, aside)
             _native.train_into(config._native, where, start, first, name, _command(), told)
         # A callback may change the working directory.
         run = Run.open(where if os.path.abspath(where) == absolute else absolute)
@@ -380,13 +426,13 @@ def first_policies(init: Any) -> list[Floats]:
     try:
         if np.ndim(init) == 0:
             raise TypeError
-        return [floats("init", trial, 3) for trial in trials]
+        return [floats("init", trial, "leaders, policies, parameters") for trial in trials]
     except TypeError:
         kind = type(init).__name__
         raise TypeError(f"init is {kind}, allowed are a Run, a file of policies, or arrays [leaders, policies, parameters]") from None
 
 
-def _init_file(init: Any, config: Config, aside: str) -> str:
+def init_file(init: Any, config: Config, aside: str) -> str:
     """Returns a file with initial policies. Arrays are written to a folder."""
     if isinstance(init, Run):
         return os.path.join(init.folder, "policies.safetensors")

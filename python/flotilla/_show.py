@@ -49,18 +49,19 @@ class Figure:
 class Episode(NamedTuple):
     """One episode of a replay."""
 
-    trial: int
-    generation: int
-    team: int
-    """The best of its generation."""
+    trial: int | None
+    """None if the policies were given, as for the generation."""
+    generation: int | None
+    team: int | None
+    """Its number in its generation or among the given teams. The champion has none."""
     best_g: float
-    """Its G, as in the run's metrics."""
+    """G of the team, as in the run's metrics."""
     observed: int
     """POIs that it observed."""
 
 
 class Replay:
-    """The episodes on which the best teams of generations were scored. In a notebook they are shown with a player.
+    """The episodes on which teams were scored. In a notebook they are shown with a player.
 
     Example:
         >>> run = flotilla.train(flotilla.Config.paper().replace(learning={"generations": 5}))
@@ -118,5 +119,9 @@ class Replay:
             raise ValueError(f"{os.fspath(path)}: its name must end in .html, .gif, .svg, .pdf or .png")
 
     def __repr__(self) -> str:
-        told = ", ".join(f"trial {e.trial} generation {e.generation} (G {e.best_g:.2f})" for e in self.episodes)
-        return f"<flotilla.Replay: {told}>"
+        def told(episode: Episode) -> str:
+            who = "champion" if episode.team is None else f"team {episode.team}"
+            of = "" if episode.trial is None else f" of trial {episode.trial} generation {episode.generation}"
+            return f"{who}{of} (G {episode.best_g:.2f})"
+
+        return f"<flotilla.Replay: {', '.join(map(told, self.episodes))}>"

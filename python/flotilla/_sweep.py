@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import tempfile
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -12,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flotilla import _native
-from flotilla._arrays import backend_name
 from flotilla._arrays import text as check_text
+from flotilla._arrays import word
 from flotilla._config import Config
-from flotilla._errors import Error
+from flotilla._errors import Error, warn
 from flotilla._program import program
 from flotilla._run import Run, train
 
@@ -123,7 +122,7 @@ def sweep(
     given = _with_grid(sweep, grid) if isinstance(sweep, Config) and grid is not None else os.fspath(sweep)  # type: ignore[arg-type]
     is_text = not isinstance(sweep, os.PathLike) and "\n" in given
     name, text = ("the sweep", given) if is_text else (given, _text(given))
-    machine = backend_name(backend)
+    machine = word("backend", backend)
     axes, points, normal = _native.sweep(text, name, skip_impossible)
     values = [dict(zip(axes, of)) for _, of, _ in points]
     if executor is None:
@@ -240,5 +239,5 @@ def _taken(executor: Any, config: str, backend: str, future: Any) -> Run:
             # Any other error means that a worker is lost.
             lost = error
             future = _hand(executor, config, backend) if attempt < TRIES else None
-    warnings.warn(f"a point is trained here, since no worker plays it: {lost or 'none is left'!r}", RuntimeWarning, stacklevel=4)
+    warn(f"a point is trained here, since no worker plays it: {lost or 'none is left'!r}", RuntimeWarning)
     return _play(config, backend)

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flotilla import _native
-from flotilla._arrays import ArraySupply, Floats, aligned, floats, renamed, whole
+from flotilla._arrays import ArraySupply, Floats, aligned, floats, whole
 from flotilla._config import Config, check_config, jitters
+from flotilla._errors import Error
 
 if TYPE_CHECKING:
     from gymnasium import spaces
@@ -60,6 +61,7 @@ class TeamBatch:
         self.jitters = jitters(config, jitter, poi_jitter)
         self.seed: int | None = None
         self.drawn = 0
+        self.started = False
         self.rewards = np.zeros((self.count, self.leaders), np.float32)
         self.new_inputs = ArraySupply((self.count, self.leaders, _native.INPUTS))
 
@@ -104,9 +106,12 @@ class TeamBatch:
             starts = _native.starts(self.config._native, self.seed, *self.jitters, self.drawn, self.count)
             self.drawn += self.count
         self.stepper.reset(chosen, starts)
+        self.started = True
 
     def step(self, actions: Floats, idle: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
         """Plays a step and sets `rewards`. Returns which teams have just finished, except the `idle` ones."""
+        if not self.started:
+            raise Error("step was called before the first reset; call reset() first")
         finished_before = None if self.reward == "G" else self.steps >= self.length
         self.stepper.step(actions, self.rewards if finished_before is None else None)
         finished: NDArray[np.bool_] = self.steps >= self.length
@@ -327,6 +332,7 @@ class VectorEnv(Base):
         Raises:
             ValueError: the actions have another shape or are not all finite, or another thread is stepping this
                 environment. No team has moved then.
+            Error: the environment was never reset.
 
         Example:
             >>> env = flotilla.VectorEnv(flotilla.Config.paper(), 2, reward="Df", autoreset="same_step")
@@ -337,7 +343,7 @@ class VectorEnv(Base):
             (array([ True,  True]), (2, 4), (2, 4, 8))
         """
         teams, infos = self._teams, dict[str, Any]()
-        array = floats("actions", actions, 2 if self.layout == "flat" else 3)
+        array = floats("actions", actions, "num_envs, 2" if self.layout == "flat" else "num_envs, leaders, 2")
         if self.layout == "flat":
             if array.shape != (self.num_envs, _native.OUTPUTS):
                 raise ValueError(f"actions are {list(array.shape)}, allowed is [num_envs, 2] = [{self.num_envs}, 2]")
@@ -370,34 +376,25 @@ class VectorEnv(Base):
             found[name], found[f"_{name}"] = np.repeat(values, copies, axis=0), ended.copy()
         return found
 
+    @property
     def states(self) -> tuple[Floats, Floats, Floats]:
         """Positions and headings `[teams, agents, 2]` and speeds `[teams, agents]`, leaders first.
 
         Example:
-            >>> flotilla.VectorEnv(flotilla.Config.paper(), 2).states()[0].shape
+            >>> flotilla.VectorEnv(flotilla.Config.paper(), 2).states[0].shape
             (2, 12, 2)
         """
         return self._teams.stepper.states()
 
+    @property
     def agents_at_poi(self) -> NDArray[np.bool_]:
         """Agents within the observation radius of each POI after the last step, `[teams, pois, agents]`.
 
         Example:
-            >>> flotilla.VectorEnv(flotilla.Config.paper(), 2).agents_at_poi().shape
+            >>> flotilla.VectorEnv(flotilla.Config.paper(), 2).agents_at_poi.shape
             (2, 4, 12)
         """
         return self._teams.stepper.near
-
-    def near(self) -> NDArray[np.bool_]:
-        """The former name of `agents_at_poi`."""
-        renamed("VectorEnv.near", "VectorEnv.agents_at_poi")
-        return self.agents_at_poi()
-
-    @property
-    def leaders(self) -> int:
-        """The former name of `num_learners`."""
-        renamed("VectorEnv.leaders", "VectorEnv.num_learners")
-        return self.num_learners
 
     @property
     def observed(self) -> NDArray[np.bool_]:

@@ -14,13 +14,15 @@ use crate::errors::Raise;
 use crate::train::{Generation, Outcomes, outcomes};
 use crate::workers;
 
-/// The state of a training, with one array for all trials, and the rows as `[generation, trial, best, mean, champion]`.
+/// The state of a training, with one array for all trials, the rows as `[generation, trial, best, mean, champion]`, and
+/// whether any fitness was not the config's.
 type State<'py> = (
     usize,
     Bound<'py, PyArray1<f32>>,
     Bound<'py, PyArray1<f32>>,
     Vec<(usize, usize, f64, f64, f64)>,
     Vec<(usize, usize, f64, f64, f64)>,
+    bool,
 );
 type Given<'py> = (
     usize,
@@ -28,6 +30,7 @@ type Given<'py> = (
     PyReadonlyArray1<'py, f32>,
     Vec<(usize, usize, f64, f64, f64)>,
     Vec<(usize, usize, f64, f64, f64)>,
+    bool,
 );
 /// Policies `[trials, populations, slots, parameters]`, teams `[trials, teams, leaders]`, and starts
 /// `[trials, episodes, agents (+ pois), 2]`.
@@ -91,6 +94,12 @@ impl Coevolution {
         Ok(self.lock()?.is_done())
     }
 
+    /// Whether any fitness so far was not the config's.
+    #[getter]
+    fn own_fitness(&self) -> PyResult<bool> {
+        Ok(self.lock()?.own_fitness())
+    }
+
     fn ask<'py>(&self, py: Python<'py>) -> PyResult<Candidates<'py>> {
         let mut inner = self.lock()?;
         let config = inner.config().clone();
@@ -152,16 +161,16 @@ impl Coevolution {
     }
 
     fn state<'py>(&self, py: Python<'py>) -> PyResult<State<'py>> {
-        let front::Progress { snapshot, rows } = self.lock()?.state().raise()?;
+        let front::Progress { snapshot, rows, own_fitness } = self.lock()?.state().raise()?;
         let Snapshot { generation, weights, fitness, pending, .. } = snapshot;
         let whole = |trials: Vec<Vec<f32>>| PyArray1::from_vec(py, trials.concat());
         let pending = pending.iter().flatten().map(flat).collect();
-        Ok((generation, whole(weights), whole(fitness), pending, rows.iter().map(flat).collect()))
+        Ok((generation, whole(weights), whole(fitness), pending, rows.iter().map(flat).collect(), own_fitness))
     }
 
     fn restore(&self, state: Given<'_>) -> PyResult<()> {
         let mut inner = self.lock()?;
-        let (generation, weights, fitness, pending, rows) = state;
+        let (generation, weights, fitness, pending, rows, own_fitness) = state;
         let (trials, last) = (inner.config().learning.trials, inner.config().learning.generations);
         let split = |numbers: &[f32]| {
             numbers.chunks(numbers.len().div_ceil(trials).max(1)).map(<[f32]>::to_vec).collect::<Vec<_>>()
@@ -170,7 +179,8 @@ impl Coevolution {
             if generation == 0 { vec![None; trials] } else { pending.into_iter().map(|r| Some(row(r))).collect() };
         let (weights, fitness) = (split(weights.as_slice()?), split(fitness.as_slice()?));
         let snapshot = Snapshot { generation, last, weights, fitness, pending };
-        inner.restore(front::Progress { snapshot, rows: rows.into_iter().map(row).collect() }).raise()
+        let rows = rows.into_iter().map(row).collect();
+        inner.restore(front::Progress { snapshot, rows, own_fitness }).raise()
     }
 
     /// Returns the results of a training that is done.

@@ -36,6 +36,14 @@ fn made(by: &str, arguments: impl for<'py> pyo3::call::PyCallArgs<'py>) -> PyErr
     })
 }
 
+/// Returns a message of the program with its flags as arguments of Python.
+fn in_python(text: String) -> String {
+    Python::attach(|py| {
+        let named = py.import("flotilla._errors").and_then(|module| module.call_method1("keywords", (&text,)));
+        named.and_then(|named| named.extract()).unwrap_or(text)
+    })
+}
+
 /// Returns a `flotilla.Error`: the request was valid, but failed.
 pub fn failed(text: impl ToString) -> PyErr {
     made("Error", (text.to_string(),))
@@ -106,7 +114,7 @@ impl Raised for runs::ReadError {
 impl Raised for ops::Error {
     fn raised(self) -> PyErr {
         // Advice is about flags of the program.
-        let text = self.message();
+        let text = in_python(self.message());
         match self {
             ops::Error::Config(error) => error.raised(),
             ops::Error::Stopped(_) => PyKeyboardInterrupt::new_err(text),

@@ -29,7 +29,7 @@ mod _native {
     #[pymodule_export]
     use crate::program::{adapters, answer, main};
     #[pymodule_export]
-    use crate::show::{Figure, Replay, figure, replay, write};
+    use crate::show::{Figure, Replay, figure, replay, replay_policies, write};
     #[pymodule_export]
     use crate::step::Stepper;
     #[pymodule_export]

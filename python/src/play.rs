@@ -11,6 +11,7 @@ use flotilla::front::{self, ActionNoise, Failure, Played};
 use flotilla::model::policy::{MAX_HIDDEN_LAYERS, PolicyConstants};
 use flotilla::world::{INPUTS, OUTPUTS, World};
 use flotilla_app::choice::Work;
+use glam::Vec2;
 use numpy::{
     Element, PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3,
     PyReadwriteArray2, PyReadwriteArrayDyn, PyUntypedArrayMethods,
@@ -24,7 +25,7 @@ use crate::errors::Raise;
 use crate::workers;
 
 /// Returns the starts of episodes: the config's own, or held-out ones, from `(episodes, seed, jitter, poi_jitter)`.
-fn drawn(drawn: Option<(u32, u64, f64, f64)>) -> Starts {
+pub fn drawn(drawn: Option<(u32, u64, f64, f64)>) -> Starts {
     drawn.map_or(Starts::Own, |(episodes, seed, jitter, poi_jitter)| Starts::Drawn {
         episodes,
         seed,
@@ -34,7 +35,7 @@ fn drawn(drawn: Option<(u32, u64, f64, f64)>) -> Starts {
 }
 
 /// Returns the number of teams and the policies, `[leaders or 1][teams][parameters]`, without a copy.
-fn weights<'a>(config: &Config, policies: &'a PyReadonlyArray3<'_, f32>) -> PyResult<(usize, &'a [f32])> {
+pub fn weights<'a>(config: &Config, policies: &'a PyReadonlyArray3<'_, f32>) -> PyResult<(usize, &'a [f32])> {
     let (&[leaders, teams, parameters], config) = (policies.shape(), &config.0) else { unreachable!("three axes") };
     let (all, expected) = (config.learners(), config.parameters());
     if parameters != expected || ![1, all].contains(&leaders) || teams == 0 {
@@ -123,8 +124,10 @@ pub fn rollout<'py>(
 /// The arrays are positions and headings `[teams, steps + 1, agents, 2]`, speeds `[teams, steps + 1, agents]`, inputs
 /// `[teams, steps, leaders, 8]`, outputs and actions `[teams, steps, leaders, 2]`, all float32, and near
 /// `[teams, steps, pois, agents]`, bool, whether each agent is within the observation radius of each POI. `observed_at`,
-/// `[teams, pois]`, uint32, is the step at which each POI was observed, from 1, or 0. The teams of all episodes follow each
-/// other. `noise` is a seed and the standard deviations `[leaders, 2]`.
+/// `[teams, pois]`, uint32, is the step at which each POI was observed, from 1, or 0. `distances` are those from every POI
+/// to every agent, `[teams, steps, pois, agents]`, and from every agent to the nearest other one, `[teams, steps, agents]`,
+/// after each step. The teams of all episodes follow each other. `noise` is a seed and the standard deviations
+/// `[leaders, 2]`.
 #[pyfunction]
 #[expect(clippy::too_many_arguments, reason = "these are all that an episode is")]
 pub fn record<'py>(
@@ -137,14 +140,17 @@ pub fn record<'py>(
     arrays: [Option<PyReadwriteArrayDyn<'py, f32>>; 6],
     near: Option<PyReadwriteArrayDyn<'py, bool>>,
     observed_at: Option<PyReadwriteArrayDyn<'py, u32>>,
+    distances: [Option<PyReadwriteArrayDyn<'py, f32>>; 2],
 ) -> PyResult<Scores<'py>> {
     let (teams, weights) = weights(config, &policies)?;
     let starts = drawn(starts);
-    let (mut arrays, mut near, mut observed_at) = (arrays, near, observed_at);
+    let (mut arrays, mut near, mut observed_at, mut distances) = (arrays, near, observed_at, distances);
     let mut slices = [(); 6].map(|()| Default::default());
     for (slice, array) in slices.iter_mut().zip(&mut arrays) {
         *slice = contiguous(array)?;
     }
+    let [of_pois, of_agents] = &mut distances;
+    let (of_pois, of_agents) = (contiguous(of_pois)?, contiguous(of_agents)?);
     let [positions, headings, speeds, inputs, outputs, actions] = slices;
     let (near, observed_at) = (contiguous(&mut near)?, contiguous(&mut observed_at)?);
     let world = World::new(&config.0.validate().raise()?);
@@ -158,11 +164,26 @@ pub fn record<'py>(
     let scores = workers::aside(py, || {
         let mut sets = vec![0; sets];
         let near_sets = &mut sets[..];
-        let arrays =
-            StepArrays { positions, headings, speeds, inputs, outputs, actions, agents_at_poi: near_sets, observed_at };
-        let scores = front::record(&config.0, teams, weights, &starts, episodes.0..episodes.1, noise, arrays);
+        let states = (episodes.1.saturating_sub(episodes.0)) * teams * (world.steps() + 1) * world.agents() * 2;
+        let hidden = positions.is_empty() && !(of_pois.is_empty() && of_agents.is_empty());
+        let mut own = vec![0.0; if hidden { states } else { 0 }];
+        let positions = if hidden { &mut own[..] } else { positions };
+        let arrays = StepArrays {
+            positions: &mut *positions,
+            headings,
+            speeds,
+            inputs,
+            outputs,
+            actions,
+            agents_at_poi: near_sets,
+            observed_at,
+        };
+        let scores =
+            front::record(&config.0, teams, weights, &starts, episodes.0..episodes.1, noise, arrays).raise()?;
         write_members(&sets, world.agents(), near);
-        scores.raise()
+        let places = |team: usize| starts.of(episodes.0 + team / teams, &world).split_off(world.agents());
+        write_distances(&world, positions, &places, of_pois, of_agents);
+        PyResult::Ok(scores)
     })?;
     let (leaders, fitnesses) = (world.leaders(), evaluate::scores_beside(config.0.learning.fitness));
     let rows = |index: usize| {
@@ -196,6 +217,41 @@ pub fn write_members(sets: &[u32], agents: usize, members: &mut [bool]) {
         let bytes = set.iter().flat_map(|word| word.to_le_bytes());
         for (members, byte) in members.chunks_mut(8).zip(bytes) {
             members.copy_from_slice(&BITS[usize::from(byte)][..members.len()]);
+        }
+    });
+}
+
+/// Writes distances after each step, `[teams][steps][pois][agents]` and `[teams][steps][agents]` to the nearest other
+/// agent, unless their slices are empty. `positions` are `[teams][steps + 1][agents][2]`, and `moved_pois` returns the POIs
+/// of a team, or none if they are where the world has them.
+fn write_distances(
+    world: &World,
+    positions: &[f32],
+    moved_pois: &(dyn Fn(usize) -> Vec<Vec2> + Sync),
+    of_pois: &mut [f32],
+    of_agents: &mut [f32],
+) {
+    let (agents, steps, pois) = (world.agents(), world.steps(), world.pois.len());
+    let place = |place: &[f32]| Vec2::new(place[0], place[1]);
+    let teams =
+        || positions.par_chunks((steps + 1) * agents * 2).map(|team| team[agents * 2..].chunks_exact(agents * 2));
+    teams().zip(of_pois.par_chunks_mut(steps * pois * agents)).enumerate().for_each(|(team, (steps, distances))| {
+        let moved = moved_pois(team);
+        let pois = if moved.is_empty() { &world.pois } else { &moved };
+        let rows = steps.flat_map(|step| pois.iter().map(move |&poi| (poi, step)));
+        for ((poi, step), row) in rows.zip(distances.chunks_exact_mut(agents)) {
+            row.iter_mut()
+                .zip(step.chunks_exact(2))
+                .for_each(|(distance, agent)| *distance = poi.distance(place(agent)));
+        }
+    });
+    teams().zip(of_agents.par_chunks_mut(steps * agents)).for_each(|(steps, distances)| {
+        for (step, row) in steps.zip(distances.chunks_exact_mut(agents)) {
+            for (agent, distance) in row.iter_mut().enumerate() {
+                let others = step.chunks_exact(2).enumerate().filter(|&(other, _)| other != agent);
+                let at = place(&step[agent * 2..]);
+                *distance = others.map(|(_, other)| at.distance(place(other))).fold(f32::INFINITY, f32::min);
+            }
         }
     });
 }

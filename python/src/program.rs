@@ -1,7 +1,7 @@
 //! The command-line program, its use cases, and the adapters it can use.
 
 use std::cell::Cell;
-use std::ffi::{CString, OsString};
+use std::ffi::OsString;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 
@@ -65,12 +65,8 @@ pub fn perform<R: Send>(
             let is_due = asked.get().elapsed() >= PATIENCE;
             let generation = |a: &Row, b: &Row| a.generation == b.generation;
             let found = match event {
-                Event::Warning(text) => {
-                    Python::attach(|py| warn(py, text.trim_start_matches("warning: "))).map(|()| false)
-                }
-                Event::Note(text) if text.starts_with("note: ") => {
-                    Python::attach(|py| warn(py, text.trim_start_matches("note: "))).map(|()| false)
-                }
+                Event::Warning(text) => Python::attach(|py| warn(py, &text)).map(|()| false),
+                Event::Note(text) if text.starts_with("note: ") => Python::attach(|py| warn(py, &text)).map(|()| false),
                 Event::Begin(_, _, to) => {
                     last.set(to);
                     Ok(false)
@@ -114,9 +110,11 @@ pub fn perform<R: Send>(
     Ok(outcome)
 }
 
+/// Warns the code that called the package.
 fn warn(py: Python<'_>, text: &str) -> PyResult<()> {
-    let text = CString::new(text.replace('\0', " ")).unwrap_or_default();
-    PyErr::warn(py, &py.get_type::<PyRuntimeWarning>(), &text, 2)
+    let text = text.trim_start_matches("warning: ").trim_start_matches("note: ");
+    let warn = py.import("flotilla._errors")?.getattr("warn")?;
+    warn.call1((text, py.get_type::<PyRuntimeWarning>())).map(drop)
 }
 
 /// A backend by name, opened when it is needed.

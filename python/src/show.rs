@@ -1,22 +1,33 @@
 //! Replays and learning curves.
 
 use std::path::PathBuf;
+use std::str::FromStr;
 
-use flotilla_app::ops::replay::{Played, play};
+use flotilla::backend::cpu::Cpu;
+use flotilla::evaluate::Starts;
+use flotilla::front;
+use flotilla_app::ops::replay::{Played, WhichTrial, play};
 use flotilla_app::ops::{self, output};
 use flotilla_app::record::RecordError;
 use flotilla_app::record::digests::Verification;
 use flotilla_app::report::curves::{Band, PRINT};
 use flotilla_app::report::replay::{self as again, Film, Replayed, Which};
-use flotilla_app::report::runs;
+use flotilla_app::report::runs::{self, TeamKind};
 use flotilla_app::report::scene::{Format, Scene};
+use numpy::PyReadonlyArray3;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 
+use crate::config::Config;
 use crate::errors::{Raise, Raised};
+use crate::play::{drawn, weights};
 use crate::program::perform;
 use crate::workers;
+
+/// Trial, generation, team, G and number of observed POIs of an episode. Given policies have no trial and no generation,
+/// and the champion is no team of its generation.
+type Episode = (Option<usize>, Option<usize>, Option<usize>, f64, usize);
 
 /// Replayed episodes.
 #[pyclass(frozen)]
@@ -27,32 +38,71 @@ pub struct Replay {
     played: Vec<Replayed>,
 }
 
-/// Replays the best teams of some generations of a trial.
+/// Parses a word or number that `what` names.
+fn parsed<T: FromStr<Err = String>>(what: &str, text: &str) -> PyResult<T> {
+    text.parse().map_err(|reason| PyValueError::new_err(format!("{what} {text:?}: {reason}")))
+}
+
+/// Replays one team of each of some generations of a trial.
 #[pyfunction]
 pub fn replay(
     py: Python<'_>,
     folder: PathBuf,
-    trial: usize,
+    trial: &str,
+    team: &str,
     generations: Vec<usize>,
     unverified: bool,
     backend: &str,
 ) -> PyResult<Replay> {
     let verification = Verification::unless(unverified);
+    let (trial, team): (WhichTrial, Which) = (parsed("trial", trial)?, parsed("team", team)?);
     let Played { config, episodes, .. } = perform(py, backend, "", &|_, _, _| Ok(false), |backends, context| {
-        play(&folder, trial, &generations, Which::Best, verification, backends, context)
+        let config = runs::config(&folder, verification)?;
+        let trial = trial.find(&folder, &config, generations.last().copied(), team, verification)?;
+        play(&folder, trial, &generations, team, verification, backends, context)
     })?;
     let name = folder.file_name().map_or("run".into(), |name| name.to_string_lossy().into_owned());
     Ok(Replay { name, config, played: episodes })
 }
 
+/// Plays one episode of each of several teams on the CPU: their numbers, and their policies, `[leaders or 1, 1,
+/// parameters]`. All have the same start, of `(episodes, seed, jitter, poi_jitter)` the first.
+#[pyfunction]
+pub fn replay_policies(
+    py: Python<'_>,
+    config: &Config,
+    teams: Vec<(usize, PyReadonlyArray3<'_, f32>)>,
+    starts: Option<(u32, u64, f64, f64)>,
+) -> PyResult<Replay> {
+    let starts = drawn(starts);
+    let mut played = Vec::new();
+    for (team, policies) in &teams {
+        let (_, weights) = weights(config, policies)?;
+        let one = workers::aside(py, || {
+            front::with_team(&config.0, weights, &starts, |group| again::one(group, &mut Cpu::default()))
+        });
+        let one = one.raise()?.raise()?;
+        played.push(Replayed { which: Which::Number(*team), team: *team, given: true, ..one });
+    }
+    let mut config = config.0.clone();
+    // Pages and pictures draw moved POIs if the config moves them.
+    config.learning.poi_jitter = match starts {
+        Starts::Own => 0.0,
+        Starts::Drawn { poi_jitter, .. } => poi_jitter,
+    };
+    Ok(Replay { name: "Given policies".into(), config, played })
+}
+
 #[pymethods]
 impl Replay {
-    /// Trial, generation, team, G and number of observed POIs, per episode.
+    /// Returns the episodes, in the order in which they are shown.
     #[getter]
-    fn episodes(&self) -> Vec<(usize, usize, usize, f64, usize)> {
+    fn episodes(&self) -> Vec<Episode> {
         let row = |played: &Replayed| {
-            let Replayed { trial, generation, team, team_g, ref observed, .. } = *played;
-            (trial, generation, team, team_g, observed.iter().flatten().count())
+            let Replayed { trial, generation, which, team, team_g, ref observed, given, .. } = *played;
+            let of_run = |number| (!given).then_some(number);
+            let team = (which != Which::Champion).then_some(team);
+            (of_run(trial), of_run(generation), team, team_g, observed.iter().flatten().count())
         };
         self.played.iter().map(row).collect()
     }
@@ -80,12 +130,13 @@ impl Replay {
 #[pyclass(frozen)]
 pub struct Figure(Scene);
 
-/// Returns the learning curves of one run, or of several side by side.
+/// Returns the learning curves of one run, or of several side by side. `measure` is the team that is shown.
 #[pyfunction]
-pub fn figure(py: Python<'_>, folders: Vec<PathBuf>, unverified: bool) -> PyResult<Figure> {
+pub fn figure(py: Python<'_>, folders: Vec<PathBuf>, measure: Option<&str>, unverified: bool) -> PyResult<Figure> {
     let verification = Verification::unless(unverified);
+    let measure: Option<TeamKind> = measure.map(|measure| parsed("measure", measure)).transpose()?;
     workers::aside(py, || {
-        runs::figure(&folders, None, Band::Interval, verification).map(|figure| Figure(figure.scene()))
+        runs::figure(&folders, measure, Band::Interval, verification).map(|figure| Figure(figure.scene()))
     })
     .raise()
 }

@@ -146,13 +146,13 @@ pub fn outcomes(py: Python<'_>, trained: Trained, digest: String) -> PyResult<Ou
 /// State that a longer run continues from: of each trial the weights, if they are needed, and the scores.
 type End<T> = Option<(Vec<T>, Vec<T>)>;
 
-/// The fields of [`Processor`], the time when the training started, and the digest of the initial policies if they were
-/// given.
-type Played = (String, String, Option<String>, Option<String>, usize, String, Option<String>);
+/// The fields of [`Processor`], the time when the training started, the digest of the initial policies if they were
+/// given, and whether the fitness was not the config's.
+type Played = (String, String, Option<String>, Option<String>, usize, String, Option<String>, bool);
 
-fn played(processor: Processor, started: String, init: Option<String>) -> Played {
+fn played(processor: Processor, started: String, init: Option<String>, own_fitness: bool) -> Played {
     let Processor { backend, description, adapter, driver, threads, .. } = processor;
-    (backend, description, adapter, driver, threads, started, init)
+    (backend, description, adapter, driver, threads, started, init, own_fitness)
 }
 
 /// Trains in memory. Also returns the backend, and the seconds at which each generation was complete.
@@ -172,7 +172,7 @@ pub fn train<'py>(
             let digest = done.trained.digest();
             Ok((done, digest))
         })?;
-    Ok((outcomes(py, trained, digest)?, played(processor, started, None), seconds))
+    Ok((outcomes(py, trained, digest)?, played(processor, started, None, false), seconds))
 }
 
 /// Returns the number of policies, and the given policies, `[populations][policies][parameters]`, of each trial.
@@ -240,7 +240,7 @@ pub fn open(py: Python<'_>, folder: PathBuf, unverified: bool) -> PyResult<(Outc
         });
         Ok::<_, PyErr>((trained, digest, run, times.collect::<Result<_, _>>().raise()?))
     })?;
-    Ok((outcomes(py, trained, digest)?, played(Processor::of_run(&run), run.started, run.init), times))
+    Ok((outcomes(py, trained, digest)?, played(Processor::of_run(&run), run.started, run.init, run.own_fitness), times))
 }
 
 /// Writes the results of a training in memory as a run directory, and returns the digest.
@@ -292,7 +292,7 @@ pub fn save(
     };
     let rows: Vec<(Row, f64)> = rows.map(row).collect();
     workers::aside(py, || {
-        let (backend, description, adapter, driver, threads, started, init) = played;
+        let (backend, description, adapter, driver, threads, started, init, own_fitness) = played;
         let run = folder::Run {
             version: env!("CARGO_PKG_VERSION").into(),
             backend,
@@ -306,6 +306,7 @@ pub fn save(
             command: command.into(),
             commit: flotilla::COMMIT.map(String::from),
             init,
+            own_fitness,
             ..folder::Run::new(config)
         };
         let finished = Finished { config, rows: &rows, policies: &weights, ending, run };

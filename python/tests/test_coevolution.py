@@ -1,9 +1,11 @@
 """Tests `Coevolution`, the initial policies of `train`, and callbacks."""
 
 import gc
+import json
 import os
 import pickle
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -78,6 +80,53 @@ def test_another_fitness_gives_another_run(config):
     assert coevolution.run.digest != train(config, seed=3).digest
 
 
+def test_a_run_says_that_its_fitness_is_not_the_config_s(config, program):
+    theirs = Coevolution(config, seed=3)
+    while not theirs.done:
+        theirs.tell(theirs.play().fitness)
+    assert not theirs.own_fitness and not theirs.run.own_fitness
+    theirs.run.save("theirs")
+    assert "own_fitness" not in json.loads(Path("theirs/run.json").read_text())
+    ours = Coevolution(config, seed=3)
+    while not ours.done:
+        played = ours.play()
+        # Only one fitness differs, and a copy knows it.
+        ours.tell(-played.fitness if ours.generation == 2 else played.fitness)
+        ours = pickle.loads(pickle.dumps(ours))
+    ours.run.save("ours")
+    run = flotilla.Run.open("ours")
+    assert ours.own_fitness and run.own_fitness and "by a fitness that is not the config's" in repr(run)
+    run.save("again")
+    for folder in ("ours", "again"):
+        assert json.loads(Path(folder, "run.json").read_text())["own_fitness"] is True
+    arms = flotilla.compare(["ours", "theirs"])["comparisons"][0]["arms"]
+    assert [arm["name"] for arm in arms] == ["fitness own", "fitness Df"]
+    assert "fitness own" in flotilla.plot(["ours", "theirs"]).svg()
+    for generation, team in ((0, "best"), (6, "champion")):
+        page = run.replay(generation=generation, team=team).page()
+        assert '"fitness":"own"' in page and '"fitness":"Df"' not in page
+    with pytest.raises(flotilla.Error, match="fitness that is not the config's, so generation 6 cannot be trained again"):
+        run.replay()
+    with pytest.raises(flotilla.Error, match="cannot be extended"):
+        train(config.replace(learning={"seed": 3, "generations": 8}), out="ours", resume=True)
+    error = program("train", "ours/config.toml", "--out", "ours", "--resume", "--generations", "8", status=1)
+    assert "its fitness is not the config's" in error
+    assert train(run.config, out="ours", resume=True).own_fitness
+
+
+def test_a_run_from_given_policies_says_so(config):
+    initial = random_policies(config, 20)
+    coevolution = Coevolution(config, init=initial)
+    while not coevolution.done:
+        coevolution.tell(coevolution.play().fitness)
+    pickle.loads(pickle.dumps(coevolution)).run.save("kept")
+    train(config, init=initial, out="trained")
+    kept, trained = (json.loads(Path(folder, "run.json").read_text()) for folder in ("kept", "trained"))
+    assert kept["init"] == trained["init"] and kept["digest"] == trained["digest"]
+    with pytest.raises(flotilla.Error, match="started from given policies"):
+        flotilla.Run.open("kept").replay()
+
+
 def test_pickles_and_states_resume_with_the_same_bits(config):
     coevolution, expected = Coevolution(config, seed=1), train(config, seed=1).digest
     states = []
@@ -107,6 +156,8 @@ def test_an_invalid_fitness_is_rejected_and_changes_nothing(config):
             coevolution.tell(wrong)
     with pytest.raises(TypeError):
         coevolution.tell(valid > 0)
+    with pytest.raises(ValueError, match=r"allowed are 3 axes: \[trials, teams, leaders\]"):
+        coevolution.tell(valid[0])
     assert coevolution.generation == 0
     with pytest.raises(ValueError, match="no generation has a fitness yet"):
         coevolution.best

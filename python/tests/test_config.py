@@ -16,8 +16,9 @@ def test_a_file_is_read_and_written():
     assert Config.parse(config.to_toml()) == config == Config.paper("chaotic")
     assert config["world.steps"] == 50 and config["world"]["steps"] == 50
     assert (config.num_learners, config.parameters) == (4, 112)
-    with pytest.raises(KeyError):
-        config["world.step"]
+    for wrong, hint in (("world.step", "world.steps"), ("population", "learning.population"), ("learnin", "learning")):
+        with pytest.raises(KeyError, match=f"{wrong}: no such key; did you mean {hint}"):
+            config[wrong]
 
 
 def test_all_problems_are_reported_with_their_lines():

@@ -13,7 +13,7 @@ from conftest import ROOT
 
 import flotilla
 
-NEEDS = {"parallel_env": "pettingzoo", "team_env": "gymnasium", "VectorEnv": "gymnasium", "Run.to_pandas": "pandas"}
+NEEDS = {"parallel_env": "pettingzoo", "team_env": "gymnasium", "VectorEnv": "gymnasium", "compare": "pandas", "Run.to_pandas": "pandas"}
 
 
 def documented():

@@ -36,11 +36,11 @@ def test_steps_with_the_actions_of_policies_give_the_bits_of_a_rollout(seed, rew
     for step in range(steps):
         assert np.array_equal(inputs.view(np.uint32), trace.inputs[:, step].view(np.uint32)), step
         inputs, rewards, terminated, truncated, infos = env.step(actions_of(trace, step))
-        positions, headings, speeds = env.states()
+        positions, headings, speeds = env.states
         assert np.array_equal(positions.view(np.uint32), trace.positions[:, step + 1].view(np.uint32))
         assert np.array_equal(headings.view(np.uint32), trace.headings[:, step + 1].view(np.uint32))
         assert np.array_equal(speeds.view(np.uint32), trace.speeds[:, step + 1].view(np.uint32))
-        assert np.array_equal(env.agents_at_poi(), trace.agents_at_poi[:, step])
+        assert np.array_equal(env.agents_at_poi, trace.agents_at_poi[:, step])
         total += rewards
         assert truncated.all() == (step == steps - 1) and not terminated.any() and infos == {}
         if reward != "G" and step < steps - 1:
@@ -350,6 +350,7 @@ def test_a_reset_mask_resets_only_its_teams():
     for mode in ("disabled", "next_step", "same_step"):
         env, plain = VectorEnv(config, 6, autoreset=mode), VectorEnv(config, 6, autoreset="disabled")
         start = env.reset()[0].copy()
+        plain.reset()
         by_age = [start, *(plain.step(actions)[0].copy() for _ in range(4))]
         env.step(actions)
         env.step(actions)
@@ -523,7 +524,7 @@ def test_copies_and_pickles_continue_with_the_same_bits(layout, reward):
             actual = other.step(actions)
             assert all(np.array_equal(a, b) for a, b in zip(actual[:4], expected[:4]))
             assert actual[0].ctypes.data % 64 == 0
-            assert np.array_equal(other.states()[0], env.states()[0])
+            assert np.array_equal(other.states[0], env.states[0])
     assert env.observed.any()
 
 
@@ -548,7 +549,7 @@ def test_poi_jitter_moves_the_pois_of_each_team():
     fixed = VectorEnv(config, 6, jitter=1.0)
     seen, other = env.reset(seed=seed)[0], fixed.reset(seed=seed)[0]
     # Agents have the same starts in both, but sense other POIs.
-    assert np.array_equal(env.states()[0], fixed.states()[0])
+    assert np.array_equal(env.states[0], fixed.states[0])
     assert (seen[..., :4] != other[..., :4]).any(axis=(1, 2)).all()
     assert np.array_equal(seen[..., 4:], other[..., 4:])
     # Episode i of `collect` has the starts of team i.
@@ -561,18 +562,32 @@ def test_poi_jitter_moves_the_pois_of_each_team():
         assert np.array_equal(rewards, batch.rewards[:, step])
 
 
-def test_deprecated_names_warn():
+def test_state_is_read_as_properties():
     env = VectorEnv(Config.paper(), 2)
-    with pytest.warns(DeprecationWarning, match="num_learners"):
-        assert env.leaders == env.num_learners == 4
-    with pytest.warns(DeprecationWarning, match="agents_at_poi"):
-        assert np.array_equal(env.near(), env.agents_at_poi())
-    with pytest.warns(DeprecationWarning, match="Config.num_learners"):
-        assert Config.paper().leaders == 4
-    with pytest.warns(DeprecationWarning, match="Config.reference"):
-        assert Config.keys() == Config.reference()
-    with pytest.warns(DeprecationWarning, match="Trace.agents_at_poi"):
-        assert rollout(Config.paper(), np.zeros((1, 1, 112)), trace=True).trace.near.shape == (1, 25, 4, 12)
+    assert env.observed.shape == (2, 4) and env.agents_at_poi.shape == (2, 4, 12)
+    assert [state.shape for state in env.states] == [(2, 12, 2), (2, 12, 2), (2, 12)]
+
+
+def test_a_step_before_the_first_reset_raises():
+    many = VectorEnv(Config.paper(), 2)
+    with pytest.raises(flotilla.Error, match="step was called before the first reset; call reset"):
+        many.step(np.zeros((2, 4, 2)))
+    many.reset()
+    many.step(np.zeros((2, 4, 2)))
+    assert pickle.loads(pickle.dumps(many)).step(np.zeros((2, 4, 2)))[0].shape == (2, 4, 8)
+    pytest.importorskip("gymnasium", reason="gymnasium is not installed")
+    with pytest.raises(flotilla.Error, match="before the first reset"):
+        flotilla.team_env(Config.paper()).step(np.zeros((4, 2)))
+    pytest.importorskip("pettingzoo", reason="pettingzoo is not installed")
+    with pytest.raises(flotilla.Error, match="before the first reset"):
+        flotilla.parallel_env(Config.paper()).step({})
+
+
+def test_actions_with_other_axes_raise_with_the_names_of_the_axes():
+    with pytest.raises(ValueError, match=r"allowed are 3 axes: \[num_envs, leaders, 2\]"):
+        VectorEnv(Config.paper(), 2).step(np.zeros((4, 2)))
+    with pytest.raises(ValueError, match=r"allowed are 2 axes: \[num_envs, 2\]"):
+        VectorEnv(Config.paper(), 2, layout="flat").step(np.zeros((2, 4, 2)))
 
 
 def test_supersuit_concatenates_copies():

@@ -21,6 +21,7 @@ SMALL = Config(
 )
 RUN = flotilla.train(SMALL)
 ENV = VectorEnv(SMALL, 4, "Df")
+ENV.reset()
 # Calls per entry of FUNCTIONS: about 10 000 in total in the short form, and 200 000 in the long one.
 EXAMPLES = int(os.environ.get("FLOTILLA_WRONG", "10000" if os.environ.get("FLOTILLA_LONG") else "500"))
 
@@ -75,7 +76,11 @@ FUNCTIONS = {
     "train seed": lambda *a: flotilla.train(SMALL, a[0], callback=lambda generation: a[1]),
     "train anything": lambda *a: flotilla.train(a[0]),
     "train backend": lambda *a: flotilla.train(SMALL, backend=a[0]),
-    "replay": lambda *a: RUN.replay(*a[:3]),
+    "Run.replay": lambda *a: RUN.replay(*a[:3], team=a[3]),
+    "replay": lambda *a: flotilla.replay(SMALL, a[0], a[1]),
+    "replay team": lambda *a: flotilla.replay(SMALL, RUN.policies[0], a[0], episodes=1, seed=a[1], jitter=a[2]),
+    "plot": lambda *a: flotilla.plot(*a[:2]),
+    "compare": lambda *a: flotilla.compare(a[0], at=a[1], reach=a[2], by=a[3]),
     "VectorEnv": lambda *a: VectorEnv(SMALL, a[0] if not isinstance(a[0], int) or a[0] < 1000 else 3, a[1]),
     "VectorEnv.step": lambda *a: ENV.step(a[0]),
     "VectorEnv.reset": lambda *a: ENV.reset(seed=a[0], options={"reset_mask": a[1]} if a[1] is not None else None),
@@ -106,7 +111,7 @@ def test_wrong_arguments_raise_ordinary_exceptions(name):
 
 def test_every_public_function_is_called_or_exempt():
     # These take the same arguments as functions that are called here, or start the program, which has its own tests.
-    exempt = {"compare", "devices", "paper", "parallel_env", "plot", "sweep", "team_env", "to_onnx", "verify"}
+    exempt = {"devices", "paper", "parallel_env", "sweep", "team_env", "to_onnx", "verify"}
     public = {name for name in flotilla.__all__ if inspect.isfunction(getattr(flotilla, name))}
     assert public - exempt <= {name.split()[0] for name in FUNCTIONS}, public - exempt
 

@@ -107,7 +107,7 @@ def test_arrays_of_other_types_and_orders_are_converted(config):
         (lambda p: p[:3], ValueError, r"policies are \[3, 5, 112\], allowed is \[leaders, teams, parameters\] = \[4, "),
         (lambda p: p[:, :, 1:], ValueError, r"\[4, 5, 111\]"),
         (lambda p: p[:, :0], ValueError, r"\[4, 0, 112\]"),
-        (lambda p: p[0], ValueError, "3 axes"),
+        (lambda p: p[0], ValueError, r"allowed are 3 axes: \[leaders, teams, parameters\]"),
         (lambda p: p * np.nan, ValueError, "weight 0 of the policy of leader 0 in team 0 is NaN"),
         (lambda p: np.where(p == p[2, 3, 4], np.inf, p), ValueError, "weight 4 of the policy of leader 2 in team 3 is inf"),
         (lambda p: p.astype(complex), TypeError, "policies are complex128"),
@@ -159,7 +159,7 @@ def test_traces_change_no_score_and_have_the_requested_parts(seed):
     assert np.array_equal(plain.df, traced.df)
     # With several episodes, the trace is that of the first.
     first = rollout(config, policies, **{**drawn, "episodes": 1}, trace=True)
-    for name in ("positions", "headings", "speeds", "inputs", "outputs", "agents_at_poi"):
+    for name in flotilla._play.FIELDS:
         whole = getattr(traced.trace, name)
         assert np.array_equal(whole, getattr(first.trace, name))
         part = rollout(config, policies, **{**drawn, "episodes": 1}, record=(name,)).trace
@@ -189,13 +189,39 @@ def test_invalid_records_and_outputs_raise(config):
     for wrong in (np.empty((5, 26, 12, 1), np.float32), np.empty((5, 26, 12, 2)), [1, 2]):
         with pytest.raises(ValueError, match="positions"):
             rollout(config, policies, out={"positions": wrong})
-    with pytest.raises(KeyError):
+    with pytest.raises(KeyError, match="Dt: no such score; did you mean D"):
         rollout(config, policies)["Dt"]
 
 
-def test_episodes_without_jitter_warn(config):
-    with pytest.warns(UserWarning, match="without jitter"):
+def test_episodes_without_jitter_warn_in_the_caller_s_file(config):
+    with pytest.warns(UserWarning, match="without jitter") as warned:
         rollout(config, random_policies(config, 2), episodes=3)
+    assert warned[0].filename == __file__
+
+
+@pytest.mark.parametrize("drawn", [{}, {"episodes": 2, "seed": 3, "jitter": 1.0, "poi_jitter": 2.0}])
+@pytest.mark.parametrize("seed", range(4))
+def test_distances_are_those_between_positions(seed, drawn):
+    config = random_config(seed)
+    policies = random_policies(config, 7, seed)
+    fields = ("positions", "poi_distances", "agent_distances")
+    trace = rollout(config, policies, record=fields, **drawn).trace
+    (agents, pois, steps), at = config._native.sizes, trace.positions[:, 1:]
+    # The kernels round the POIs of a config to a grid of about a millionth of the map.
+    places, close = np.asarray(config["world.pois"], np.float32), 1e-5
+    if drawn:
+        close, places = 0, flotilla._native.starts(config._native, 3, 1.0, 2.0, 0, 1)[0, agents:]
+    apart = at[:, :, None] - places[:, None]
+    assert trace.poi_distances.shape == (7, steps, pois, agents)
+    between = np.sqrt(apart[..., 0] * apart[..., 0] + apart[..., 1] * apart[..., 1])
+    assert np.abs(trace.poi_distances - between).max() <= close
+    apart = at[:, :, None] - at[:, :, :, None]
+    between = np.sqrt(apart[..., 0] * apart[..., 0] + apart[..., 1] * apart[..., 1])
+    between[..., np.arange(agents), np.arange(agents)] = np.inf
+    assert np.array_equal(trace.agent_distances, between.min(-1))
+    # They need no positions that are returned.
+    alone = rollout(config, policies, record=fields[1:], **drawn).trace
+    assert alone.positions is None and np.array_equal(alone.poi_distances, trace.poi_distances)
 
 
 def test_spread_gives_each_episode_and_the_program_s_interval(config, program):
@@ -248,6 +274,7 @@ def test_collect_equals_the_steps_of_an_environment(reward, seed):
     assert np.array_equal(batch.means, forward(by_row, batch.observations, config))
     starts = flotilla._native.starts(config._native, 3, 1.0, 1.0, 0, 2)
     env = flotilla.VectorEnv(config, 10, reward, autoreset="disabled")
+    env.reset()
     env._teams.stepper.reset(None, np.repeat(starts, 5, axis=0))
     observations = env._teams.inputs()
     for step in range(config["world.steps"]):

@@ -2,16 +2,18 @@
 
 import json
 import os
+import pickle
 import signal
 import subprocess
 import sys
 import sysconfig
 import time
 
+import numpy as np
 import pytest
 
 import flotilla
-from flotilla import Run, train
+from flotilla import Config, Run, train
 
 
 def test_the_command_comes_with_the_package():
@@ -66,12 +68,57 @@ def test_runs_are_compared(config):
     best = comparison["comparisons"][0]["measures"][0]["arms"][0]
     assert best["value"] == pytest.approx(runs[0].metrics["best_g"][:, -1].mean())
     assert flotilla.compare(runs, paired=True)["test"] == "wilcoxon"
-    with pytest.raises(ValueError):
+    with pytest.raises(ValueError, match="^at=99: "):
         flotilla.compare(runs, at=99)
     with pytest.raises(ValueError, match="no runs"):
         flotilla.compare([])
     with pytest.raises(flotilla.Error, match="no such folder"):
         flotilla.compare(["one", "two"])
+    with pytest.raises(flotilla.Error, match="^/a/grid: no such folder"):
+        flotilla.compare("/a/grid")
+    with pytest.raises(ValueError, match="is one run"):
+        flotilla.compare(runs[0])
+    other = train(config, seed=8)
+    with pytest.raises(ValueError, match="^paired=True: "):
+        flotilla.compare([runs[0], other], paired=True)
+
+
+def test_comparisons_are_tables(config):
+    pandas = pytest.importorskip("pandas", reason="pandas is not installed")
+    runs = [train(config.replace(learning={"fitness": fitness})) for fitness in ("G", "D", "Df")]
+    comparison = flotilla.compare(runs, at=[0, "last"], reach=0.5)
+    table, pairs = pandas.DataFrame(comparison), pandas.DataFrame(comparison.pairs)
+    assert len(table) == 3 * 5 and len(pairs) == 3 * 5
+    last = table[(table.measure == "best_g") & (table.generation == 6)]
+    assert list(last.arm) == ["fitness G", "fitness D", "fitness Df"] and set(last.trials) == {2}
+    assert np.allclose(last.value, [run.metrics["best_g"][:, -1].mean() for run in runs])
+    assert set(table.reach.dropna()) == {0.5} and {"low", "high"} <= set(table.columns)
+    assert {"arm", "other", "value", "low", "high", "a", "p", "p_holm"} <= set(pairs.columns)
+    # What was an object is still read like one, and survives a pickle.
+    again = pickle.loads(pickle.dumps(comparison))
+    assert again == comparison and again.pairs == comparison.pairs and again["comparisons"][0]["generation"] == 6
+    assert comparison[0]["measure"] == "best_g" and len(comparison[:2]) == 2
+
+
+def test_a_sweep_is_compared_by_its_folder(config):
+    flotilla.sweep(config, grid={"world.coupling": [1, 2], "learning.fitness": ["G", "Df"]}, out="grid")
+    rows = flotilla.compare("grid", by="world.coupling")
+    assert rows == flotilla.compare(["grid"], by="world.coupling") and {row["where"] for row in rows} == {"fitness G", "fitness Df"}
+    with pytest.raises(ValueError, match="name one by by=: "):
+        flotilla.compare("grid")
+
+
+def test_warnings_name_the_caller_s_file_and_python_s_arguments(config):
+    runs = [train(config.replace(learning={"fitness": fitness})) for fitness in ("G", "Df")]
+    with pytest.warns(RuntimeWarning, match="paired=True compares pair by pair") as warned:
+        notes = flotilla.compare(runs)["notes"]
+    assert {each.filename for each in warned} == {__file__} and "--" not in "".join(notes)
+    alone = Config(world={"leaders": [[5, 5]], "pois": [[45, 45]], "steps": 1}, learning={"generations": 1, "trials": 1})
+    calls = (lambda: train(alone), lambda: flotilla.sweep(alone, grid={"learning.seed": [1]}), lambda: train(alone, out="r"))
+    for call in calls:
+        with pytest.warns(RuntimeWarning, match="cannot be reached") as warned:
+            call()
+        assert {each.filename for each in warned} == {__file__}
 
 
 def test_the_paper_is_reproduced():

@@ -1,11 +1,14 @@
 """Tests replays and pictures of runs, and that temporary runs are deleted."""
 
 import os
+from pathlib import Path
 
+import numpy as np
 import pytest
+from conftest import random_policies
 
 import flotilla
-from flotilla import Run, train
+from flotilla import Run, rollout, train
 
 
 def test_replays_are_shown_and_saved_in_each_format(config):
@@ -24,9 +27,46 @@ def test_replays_are_shown_and_saved_in_each_format(config):
             replay.save("team.txt")
         with pytest.raises(ValueError, match="step 26"):
             replay.still(26)
-    for wrong in ({"trial": 2}, {"generation": 7}, {"trial": -1}):
-        with pytest.raises(ValueError):
+    for wrong in ({"trial": 2}, {"generation": 7}, {"trial": -1}, {"trial": "first"}, {"team": 20}, {"team": "mean"}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
             run.replay(**wrong)
+
+
+def test_replays_show_any_team_and_trial(config):
+    run = train(config)
+    champions = run.metrics["champion_g"][:, -1]
+    for trial, g in (("best", champions.max()), ("worst", champions.min()), (1, champions[1])):
+        champion = run.replay(trial=trial, team="champion").episodes[0]
+        assert champion.best_g == g and champion.team is None and champion.generation == 6
+    assert run.replay(trial="best").episodes[0].best_g == run.metrics["best_g"][:, -1].max()
+    replay = run.replay(team=3, generation=0)
+    assert replay.episodes[0].team == 3 and repr(replay).startswith("<flotilla.Replay: team 3 of trial 0 generation 0 (G ")
+
+
+def test_policies_from_anywhere_are_replayed(config):
+    policies = random_policies(config, 30)
+    scores = rollout(config, policies)
+    best = np.argsort(-scores.g)[:2]
+    replay = flotilla.replay(config, policies, best)
+    assert [(episode.team, episode.best_g) for episode in replay.episodes] == [(team, scores.g[team]) for team in best]
+    assert replay.episodes[0].trial is None and replay.episodes[0].generation is None
+    page = replay.page()
+    assert '"given":true' in page and f"Team number {best[0]}" in page
+    assert "generation" not in replay.still().svg().lower() and "given policies" in replay.still().svg()
+    replay.save("found.gif", width=100, fps=2)
+    drawn = {"episodes": 1, "seed": 4, "jitter": 2.0, "poi_jitter": 3.0}
+    moved = flotilla.replay(config, policies[:, 7:8], **drawn)
+    assert moved.episodes[0].best_g == rollout(config, policies[:, 7:8], **drawn).g[0]
+    assert moved.still().svg() != flotilla.replay(config, policies[:, 7:8]).still().svg()
+    shared = random_policies(config, 2, leaders=1)
+    assert flotilla.replay(config, shared, 1).episodes[0].best_g == rollout(config, shared).g[1]
+    for wrong in (30, -1, [], "best", 0.5):
+        with pytest.raises((ValueError, TypeError), match="team"):
+            flotilla.replay(config, policies, wrong)
+    with pytest.raises(ValueError, match="is NaN"):
+        flotilla.replay(config, policies * np.nan)
+    with pytest.raises(ValueError, match="pass episodes="):
+        flotilla.replay(config, policies, jitter=1.0)
 
 
 def test_replays_have_the_world_of_their_stage(config):
@@ -57,6 +97,13 @@ def test_generations_with_different_worlds_are_not_shown_side_by_side(config):
 def test_curves_are_drawn(config):
     runs = [train(config), train(config.replace(learning={"fitness": "G"}))]
     assert runs[0].plot()._repr_svg_() != flotilla.plot(runs).svg()
+    runs[1].save("kept")
+    assert flotilla.plot([runs[0], "kept"]).svg()[:4] == "<svg"
+    assert flotilla.plot("kept").svg() == flotilla.plot(runs[1]).svg() == flotilla.plot([Path("kept")]).svg()
+    assert "G of the champion" in flotilla.plot(runs, measure="champion").svg() != flotilla.plot(runs).svg()
+    assert runs[0].plot("mean").svg() != runs[0].plot("best").svg()
+    with pytest.raises(ValueError, match='measure "worst": allowed best, champion or mean'):
+        flotilla.plot(runs, measure="worst")
     flotilla.plot(runs).save("curves.png", width=400)
     assert os.path.getsize("curves.png") > 1000
     with pytest.raises(ValueError, match="0 runs"):

@@ -58,6 +58,8 @@ def test_metrics_and_policies_have_the_documented_shapes(config):
     for name in ("best_g", "mean_g", "champion_g"):
         assert run.metrics[name].shape == (2, 7) and run.metrics[name].dtype == np.float64
     assert [trial.shape for trial in run.policies] == [(4, 20, 112)] * 2
+    with pytest.raises(KeyError, match="g: no such metric; there are best_g, mean_g, champion_g"):
+        pickle.loads(pickle.dumps(run)).metrics["g"]
     assert run.policies[0].dtype == np.float32 and run.policies[0].flags.c_contiguous
     assert run.digest != train(config, seed=4).digest
     unpickled = pickle.loads(pickle.dumps(run))

@@ -31,15 +31,18 @@ pub struct Coevolution {
     rows: Vec<Row>,
     /// Whether the present generation was played.
     played: bool,
+    own_fitness: bool,
 }
 
-/// The state of a [`Coevolution`] between two generations: the trainer's, and all complete rows.
+/// The state of a [`Coevolution`] between two generations.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Progress {
     /// The populations about to play.
     pub snapshot: Snapshot,
     /// All complete rows.
     pub rows: Vec<Row>,
+    /// See [`Coevolution::own_fitness`].
+    pub own_fitness: bool,
 }
 
 impl Coevolution {
@@ -50,7 +53,7 @@ impl Coevolution {
     pub fn new(config: &Config) -> Result<Coevolution, Failure> {
         let valid = config.validate()?;
         let config = Config::clone(&valid);
-        Ok(Coevolution { config, trainer: new_trainer(valid)?, rows: Vec::new(), played: false })
+        Ok(Coevolution { config, trainer: new_trainer(valid)?, rows: Vec::new(), played: false, own_fitness: false })
     }
 
     /// Replaces the random populations by given ones, see [`super::train_from`].
@@ -77,6 +80,12 @@ impl Coevolution {
     /// Reports whether all generations were played.
     pub fn is_done(&self) -> bool {
         self.trainer.is_done()
+    }
+
+    /// Reports whether any fitness so far differs from the config's. The run must say so, because its config does not
+    /// reproduce it.
+    pub fn own_fitness(&self) -> bool {
+        self.own_fitness
     }
 
     /// Returns the rows that are complete: all generations before the last one told.
@@ -141,6 +150,10 @@ impl Coevolution {
         if !self.played {
             self.trainer.play_candidates(0, backend)?;
         }
+        if let Some(told) = fitness.filter(|_| !self.own_fitness) {
+            let bits = |scores: &[f32]| scores.iter().map(|score| score.to_bits()).collect::<Vec<_>>();
+            self.own_fitness = bits(told) != bits(&self.trainer.played(0).1);
+        }
         let first = self.rows.len();
         self.rows.extend(self.trainer.tell(0, fitness));
         self.played = false;
@@ -178,7 +191,7 @@ impl Coevolution {
         let bytes = self.config.policy_bytes().into();
         let snapshot =
             self.trainer.snapshot(0).map_err(|_| Failure::Memory { what: "a copy of all policies", bytes })?;
-        Ok(Progress { snapshot, rows: self.rows.clone() })
+        Ok(Progress { snapshot, rows: self.rows.clone(), own_fitness: self.own_fitness })
     }
 
     /// Continues from a state of the same config.
@@ -205,7 +218,7 @@ impl Coevolution {
         if !fits || !self.trainer.restore(0, state.snapshot) {
             return Err(Failure::State);
         }
-        (self.rows, self.played) = (state.rows, false);
+        (self.rows, self.played, self.own_fitness) = (state.rows, false, state.own_fitness);
         Ok(())
     }
 

@@ -25,5 +25,5 @@ pub use error::Failure;
 pub use open::cpu;
 #[cfg(feature = "gpu")]
 pub use open::{Found, Processor, find_gpu, on_gpu, open};
-pub use play::{ActionNoise, Played, Traced, play, play_until, record, stepper, trace};
+pub use play::{ActionNoise, Played, Traced, play, play_until, record, stepper, trace, with_team};
 pub use train::{Generation, Trained, train, train_from, train_with_champions};

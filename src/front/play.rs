@@ -89,6 +89,21 @@ impl From<&Evaluation> for Played {
     }
 }
 
+/// Calls `look` with the first episode of one team of given policies. See [`play`] for the arguments.
+///
+/// # Errors
+/// The config, the weights or the starts are invalid.
+pub fn with_team<R>(
+    config: &Config,
+    weights: &[f32],
+    starts: &Starts,
+    look: impl FnOnce(&Group<'_>) -> R,
+) -> Result<R, Failure> {
+    let checked = CheckedTeams::new(config, 1, weights, starts)?;
+    let starts = starts.of(0, &checked.world);
+    Ok(look(&Group { fitnesses: scores_of(config), ..checked.group(&starts) }))
+}
+
 /// Noise on the actions of leaders: its seed, and the standard deviation of each leader's turn and speed, `[leaders]`.
 #[derive(Clone, Copy, Debug)]
 pub struct ActionNoise<'a> {
@@ -115,19 +130,11 @@ pub fn record(
     noise: Option<ActionNoise<'_>>,
     arrays: StepArrays<'_>,
 ) -> Result<Vec<GroupScores>, Failure> {
-    let checked = CheckedTeams::new(config, teams, weights, starts)?;
-    if episodes.end > starts.episodes() || episodes.is_empty() {
+    if episodes.is_empty() {
         return Err(Failure::NoEpisode { episode: episodes.end, episodes: starts.episodes() });
     }
-    let drawn: Vec<Vec<glam::Vec2>> = episodes.clone().map(|episode| starts.of(episode, &checked.world)).collect();
-    let fitnesses = scores_of(config);
-    let groups: Vec<Group<'_>> = drawn.iter().map(|starts| Group { fitnesses, ..checked.group(starts) }).collect();
-    let noise = noise.map(|ActionNoise { seed, deviations }| Noise {
-        key: Key::new(seed, 0, Purpose::Exploration),
-        deviations,
-        first: (episodes.start * teams) as u32,
-    });
-    Ok(Cpu::default().record(&groups, noise, arrays)?)
+    let checked = CheckedTeams::new(config, teams, weights, starts)?;
+    checked.record(starts, episodes, scores_of(config), noise, arrays)
 }
 
 /// The states, inputs, outputs and observations of every step of one episode.
@@ -150,13 +157,12 @@ pub struct Traced {
     pub agents_at_poi: Vec<u32>,
 }
 
-/// Plays one episode of given policies and records every step. See [`play`] for the arguments.
+/// Plays one episode of given policies on the CPU and records every step. See [`play`] for the arguments.
 ///
 /// # Errors
-/// The config, the weights or the starts are invalid, the memory is insufficient, or the backend fails.
+/// The config, the weights or the starts are invalid, or the memory is insufficient.
 pub fn trace(
     config: &Config,
-    backend: &mut dyn Backend,
     teams: usize,
     weights: &[f32],
     starts: &Starts,
@@ -167,39 +173,24 @@ pub fn trace(
         return Err(Failure::NoEpisode { episode, episodes: starts.episodes() });
     }
     let world = &checked.world;
-    let (agents, leaders, steps) = (world.agents(), world.leaders(), world.steps());
-    let words_per_team = (steps + 1) * agents * 5 + steps * leaders * (INPUTS + OUTPUTS) + world.set_words();
-    let bytes = words_per_team as u128 * 4 * teams as u128;
+    let (states, inputs) = (teams * (world.steps() + 1) * world.agents(), teams * world.steps() * world.leaders());
+    let words = states * 5 + inputs * (INPUTS + OUTPUTS) + teams * world.set_words();
+    let bytes = words as u128 * 4;
     let fits = usize::try_from(bytes).is_ok_and(|bytes| Vec::<u8>::new().try_reserve_exact(bytes).is_ok());
     if !fits {
         return Err(Failure::Memory { what: "all steps of all teams", bytes });
     }
-    let states = teams * (steps + 1) * agents;
     let mut traced = Traced {
-        positions: Vec::with_capacity(states * 2),
-        headings: Vec::with_capacity(states * 2),
-        speeds: Vec::with_capacity(states),
-        inputs: Vec::with_capacity(teams * steps * leaders * INPUTS),
-        outputs: Vec::with_capacity(teams * steps * leaders * OUTPUTS),
-        agents_at_poi: Vec::with_capacity(teams * world.set_words()),
+        positions: vec![0.0; states * 2],
+        headings: vec![0.0; states * 2],
+        speeds: vec![0.0; states],
+        inputs: vec![0.0; inputs * INPUTS],
+        outputs: vec![0.0; inputs * OUTPUTS],
+        agents_at_poi: vec![0; teams * world.set_words()],
     };
-    let starts = starts.of(episode, world);
-    for (_, part) in evaluate::parts(&checked.group(&starts)) {
-        let trace = backend.trace(&part)?;
-        for (team, step) in (0..trace.teams).flat_map(|team| (0..=steps).map(move |step| (team, step))) {
-            for moment in (0..agents).map(|agent| trace.moment(step, team, agent)) {
-                traced.positions.extend(moment.position);
-                traced.headings.extend(moment.heading);
-                traced.speeds.push(moment.speed);
-            }
-            // A trace stores inputs and outputs with the state that they lead to.
-            for moment in (0..leaders).filter(|_| step > 0).map(|leader| trace.moment(step, team, leader)) {
-                traced.inputs.extend(moment.inputs);
-                traced.outputs.extend(moment.outputs);
-            }
-        }
-        traced.agents_at_poi.extend(trace.sets);
-    }
+    let Traced { positions, headings, speeds, inputs, outputs, agents_at_poi } = &mut traced;
+    let arrays = StepArrays { positions, headings, speeds, inputs, outputs, agents_at_poi, ..StepArrays::default() };
+    checked.record(starts, episode..episode + 1, &[], None, arrays)?;
     Ok(traced)
 }
 
@@ -258,6 +249,28 @@ impl<'a> CheckedTeams<'a> {
         let order = evaluate::aligned_teams(teams, leaders);
         let sharing = if shared { Sharing::Shared } else { Sharing::PerLeader };
         Ok(CheckedTeams { world, weights, policies: teams, sharing, teams: order })
+    }
+
+    /// Plays some episodes and writes their steps, see [`record`].
+    fn record(
+        &self,
+        starts: &Starts,
+        episodes: Range<usize>,
+        fitnesses: &[Fitness],
+        noise: Option<ActionNoise<'_>>,
+        arrays: StepArrays<'_>,
+    ) -> Result<Vec<GroupScores>, Failure> {
+        if episodes.end > starts.episodes() {
+            return Err(Failure::NoEpisode { episode: episodes.end, episodes: starts.episodes() });
+        }
+        let drawn: Vec<Vec<glam::Vec2>> = episodes.clone().map(|episode| starts.of(episode, &self.world)).collect();
+        let groups: Vec<Group<'_>> = drawn.iter().map(|starts| Group { fitnesses, ..self.group(starts) }).collect();
+        let noise = noise.map(|ActionNoise { seed, deviations }| Noise {
+            key: Key::new(seed, 0, Purpose::Exploration),
+            deviations,
+            first: (episodes.start * self.policies) as u32,
+        });
+        Ok(Cpu::default().record(&groups, noise, arrays)?)
     }
 
     fn group<'b>(&'b self, starts: &'b [glam::Vec2]) -> Group<'b> {

@@ -150,6 +150,12 @@ pub fn read(text: Option<&str>, bytes: &[u8]) -> Result<Answer, Refusal> {
     if run.origin != Origin::of(&config) {
         return Err(refuse("config.toml is not the config that this run was trained with"));
     }
+    if run.own_fitness {
+        // The page would show the config's fitness, and train generations again with it.
+        return Err(refuse(
+            "its fitness is not the config's, which this page needs; use `flotilla replay` and `flotilla plot`",
+        ));
+    }
     let expected = run.digest.ok_or_else(|| {
         refuse("run.json has no digest: the run is not finished; finish it with `flotilla train --resume`")
     })?;

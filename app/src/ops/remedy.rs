@@ -111,6 +111,9 @@ pub fn record(error: &RecordError, again: &str) -> String {
         RecordError::OriginUnknown { .. } => {
             "; pass the policies that it started from with --init, or start over with --force".into()
         }
+        RecordError::OwnFitness { .. } => {
+            "; start a new run from its policies with --init, or choose another --out".into()
+        }
         RecordError::Edited { path } => format!(
             "; restore what it was, or move {} away and name the run's own config, or choose another --out",
             path.display()
@@ -194,6 +197,7 @@ pub fn replayed(error: &ReplayError) -> String {
         | ReplayError::NoTrial { .. }
         | ReplayError::NoTeam { .. }
         | ReplayError::NoStart { .. }
+        | ReplayError::OwnFitness { .. }
         | ReplayError::Differs { .. }
         | ReplayError::Stopped => String::new(),
     }

@@ -157,7 +157,10 @@ impl std::str::FromStr for WhichTrial {
 
 impl WhichTrial {
     /// Returns the trial's number in a run.
-    fn find(
+    ///
+    /// # Errors
+    /// The run cannot be read or lacks the generation.
+    pub fn find(
         self,
         folder: &Path,
         config: &Config,

@@ -141,6 +141,14 @@ pub enum RecordError {
         /// Path of the folder.
         path: PathBuf,
     },
+    /// Only the program that trained the run knows its fitness.
+    #[error(
+        "{path}: its fitness is not the config's, but came from the program that trained it, so it cannot be extended"
+    )]
+    OwnFitness {
+        /// Path of the folder.
+        path: PathBuf,
+    },
     /// The config was changed after the run was started.
     #[error("{path}: it is not the config that this run was started with (run.json has another digest)")]
     Edited {

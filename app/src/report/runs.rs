@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::curves::{Band, Curve, Figure, Panel};
 use crate::record::RecordError;
 use crate::record::digests::{Digests, UNVERIFIED, Verification};
-use crate::record::folder::METRICS;
+use crate::record::folder::{METRICS, OWN_FITNESS, Run};
 pub use crate::record::runs::{ReadError, config, metrics};
 use flotilla::config::Config;
 use flotilla::escape::PathExt;
@@ -231,10 +231,17 @@ pub fn paired(folders: &[PathBuf], verification: Verification) -> Result<bool, R
     Ok(seeds.len() > 1 && seeds.iter().all(|seed| *seed == seeds[0]))
 }
 
-/// Labels runs by the config keys that differ between them, or by their directories if none differ.
+/// Labels runs by the config keys that differ between them, or by their directories if none differ. A fitness that is
+/// not the config's is labelled [`OWN_FITNESS`].
 pub fn labels(folders: &[PathBuf], configs: &[Config]) -> Vec<String> {
-    let table = |config: &Config| toml::Table::try_from(config).unwrap_or_default();
-    let tables: Vec<toml::Table> = configs.iter().map(table).collect();
+    let table = |(config, folder): (&Config, &PathBuf)| {
+        let mut table = toml::Table::try_from(config).unwrap_or_default();
+        if let Some(learning) = table.get_mut("learning").filter(|_| Run::has_own_fitness(folder)) {
+            learning["fitness"] = OWN_FITNESS.into();
+        }
+        table
+    };
+    let tables: Vec<toml::Table> = configs.iter().zip(folders).map(table).collect();
     let Some(first) = tables.first() else { return vec![] };
     let value = |table: &toml::Table, section: &str, key: &str| {
         let text = table.get(section).and_then(|section| section.get(key)).map_or("-".into(), toml::Value::to_string);

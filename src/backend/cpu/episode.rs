@@ -1,19 +1,33 @@
 //! Whole episodes of one vector of teams.
 
-use std::ops::Range;
-
 use fearless_simd::{Simd, prelude::*};
 
 use super::batch::WorldBatch;
 use super::block::Block;
 use super::network::Network;
-use super::pois::{PoiPosition, load_pois, with_pois};
+use super::pois::{load_pois, with_pois};
 use crate::credit::{Episode, Seen, Strided};
 use crate::world::World;
 
+/// Follows the episodes of one vector of teams. By default nothing is done.
+pub(super) trait Observer<S: Simd> {
+    /// The teams are at their start.
+    #[inline(always)]
+    fn started(&mut self, _: &Block<S>) {}
+
+    /// Policies have answered what leaders sense before this step, and agents are about to move. The outputs may be
+    /// changed.
+    #[inline(always)]
+    fn decided(&mut self, _: &mut Block<S>, _step: usize) {}
+
+    /// The agents have moved. `sets` are the agents at each POI, `[pois][words][lanes]`.
+    #[inline(always)]
+    fn moved(&mut self, _: &Block<S>, _sets: &[u32], _step: usize) {}
+}
+
 /// Whole episodes of one vector of teams: their state, policies and record.
 pub(super) struct EpisodeBlock<S: Simd> {
-    pub(super) block: Block<S>,
+    block: Block<S>,
     network: Network<S>,
     /// The group and team of each lane.
     places: Vec<(usize, usize)>,
@@ -49,9 +63,9 @@ impl<S: Simd> EpisodeBlock<S> {
         self.block.world.constants == world.constants && self.sights.len() == sight_words(world, sighted) * S::f32s::LEN
     }
 
-    /// Puts `teams` teams of the batch, from `first` on, at their start. Unused lanes repeat the first team.
+    /// Puts teams at their start, see [`EpisodeBlock::play`].
     #[inline(always)]
-    pub(super) fn load(&mut self, batch: &WorldBatch<'_>, first: usize, teams: usize) {
+    fn load(&mut self, batch: &WorldBatch<'_>, first: usize, teams: usize) {
         let EpisodeBlock { block, network, places, moved, .. } = self;
         places.clear();
         places.extend((0..S::f32s::LEN).map(|lane| batch.locate(first + if lane < teams { lane } else { 0 })));
@@ -69,44 +83,29 @@ impl<S: Simd> EpisodeBlock<S> {
         network.load(batch, places);
     }
 
-    /// Plays some steps. Calls `before` with the number of each step before it plays.
+    /// Plays the whole episode of `teams` teams of the batch, from `first` on. Unused lanes repeat the first team.
     #[inline(always)]
-    pub(super) fn play(&mut self, world: &World, steps: Range<usize>, before: impl Fn(usize)) {
-        let EpisodeBlock { block, network, moved, sets, sights, .. } = self;
-        with_pois!(moved, world, pois => for step in steps {
-            before(step);
-            sense(block, network, pois);
-            advance(block, pois, sets, sights, step);
+    pub(super) fn play(&mut self, batch: &WorldBatch<'_>, first: usize, teams: usize, observer: &mut impl Observer<S>) {
+        self.load(batch, first, teams);
+        let EpisodeBlock { block, network, moved, sets, seen, sights, .. } = self;
+        let steps = batch.world.steps();
+        let [sets_per_step, sights_per_step] = [sets.len() / steps, sights.len() / steps];
+        observer.started(block);
+        with_pois!(moved, batch.world, pois => for step in 0..steps {
+            block.sense(pois);
+            network.decide(&block.inputs, &mut block.outputs);
+            observer.decided(block, step);
+            if sights_per_step > 0 {
+                block.record_sightings(&mut sights[step * sights_per_step..]);
+            }
+            block.advance();
+            let sets = &mut sets[step * sets_per_step..][..sets_per_step];
+            block.record_poi_sets(pois, sets);
+            observer.moved(block, sets, step);
         });
-        self.store_counts();
-    }
-
-    /// Writes the counts to the record, after the last step that was played.
-    #[inline(always)]
-    pub(super) fn store_counts(&mut self) {
-        for (words, count) in self.seen.chunks_exact_mut(S::f32s::LEN).zip(&self.block.counts) {
+        for (words, count) in seen.chunks_exact_mut(S::f32s::LEN).zip(&block.counts) {
             count.store_slice(words);
         }
-    }
-
-    /// Plays the first half of a step, see [`sense`].
-    #[inline(always)]
-    pub(super) fn sense(&mut self, world: &World) {
-        let EpisodeBlock { block, network, moved, .. } = self;
-        with_pois!(moved, world, pois => sense(block, network, pois));
-    }
-
-    /// Plays the second half of a step, see [`advance`].
-    #[inline(always)]
-    pub(super) fn advance(&mut self, world: &World, step: usize) {
-        let EpisodeBlock { block, moved, sets, sights, .. } = self;
-        with_pois!(moved, world, pois => advance(block, pois, sets, sights, step));
-    }
-
-    /// Returns the sets of a step, `[pois * words][lanes]`.
-    #[inline(always)]
-    pub(super) fn sets_of(&self, step: usize, words: usize) -> &[u32] {
-        &self.sets[step * words * S::f32s::LEN..][..words * S::f32s::LEN]
     }
 
     /// Returns one lane's record.
@@ -115,30 +114,4 @@ impl<S: Simd> EpisodeBlock<S> {
         let seen = Seen::Counts(strided(&self.seen));
         Episode { sets: strided(&self.sets), seen, sights: strided(&self.sights) }
     }
-}
-
-/// Plays the first half of a step: leaders sense, and their policies answer.
-#[inline(always)]
-fn sense<S: Simd>(block: &mut Block<S>, network: &mut Network<S>, pois: &[impl PoiPosition<S>]) {
-    block.sense(pois);
-    network.decide(&block.inputs, &mut block.outputs);
-}
-
-/// Plays the second half of a step: all agents move, and the record is written. `sets` and `sights` are of all steps;
-/// `sights` may be empty.
-#[inline(always)]
-fn advance<S: Simd>(
-    block: &mut Block<S>,
-    pois: &[impl PoiPosition<S>],
-    sets: &mut [u32],
-    sights: &mut [u32],
-    step: usize,
-) {
-    let steps = block.world.constants.steps as usize;
-    let [sets_per_step, sights_per_step] = [sets.len() / steps, sights.len() / steps];
-    if sights_per_step > 0 {
-        block.record_sightings(&mut sights[step * sights_per_step..]);
-    }
-    block.advance();
-    block.record_poi_sets(pois, &mut sets[step * sets_per_step..]);
 }

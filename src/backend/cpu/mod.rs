@@ -4,12 +4,13 @@
 //! keep their order. The formulas are those of [`crate::model`].
 
 use std::any::Any;
+use std::ops::Range;
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
 use fearless_simd::{Level, Simd, dispatch, prelude::*};
 
 use super::scores::ScoreTable;
-use super::{Backend, BackendError, Group, GroupScores, Trace};
+use super::{Backend, BackendError, Group, GroupScores, Moment, Trace};
 use crate::config::Fitness;
 use crate::parallel::*;
 use crate::world::World;
@@ -35,7 +36,7 @@ pub(crate) use pois::{load_pois, with_pois};
 pub(crate) use transpose::{to_rows, transpose_rows};
 
 use batch::{WorldBatch, world_batches};
-use episode::{EpisodeBlock, sight_words};
+use episode::{EpisodeBlock, Observer, sight_words};
 
 /// Plays episodes on the CPU, with the widest instruction set that it has, on the threads of the current rayon pool.
 pub struct Cpu {
@@ -147,19 +148,13 @@ fn play<S: Simd>(simd: S, groups: &[Group<'_>], workspaces: &mut Option<Box<dyn 
                 _ => workspace.insert(EpisodeBlock::new(simd, batch.world, batch.sighted)),
             };
             let teams = width.min(batch.teams - first);
+            let ahead = match following {
+                Some((next, first)) if std::ptr::eq(*next, batch) => *first..(first + width).min(batch.teams),
+                _ => 0..0,
+            };
             simd.vectorize(
                 #[inline(always)]
-                || {
-                    episodes.load(batch, first, teams);
-                    match following {
-                        Some((next, first)) if std::ptr::eq(*next, batch) => {
-                            let teams = *first..(first + width).min(batch.teams);
-                            let prefetch = |step| batch.prefetch(teams.clone(), step);
-                            episodes.play(batch.world, 0..batch.world.steps(), prefetch);
-                        }
-                        _ => episodes.play(batch.world, 0..batch.world.steps(), |_| ()),
-                    }
-                },
+                || episodes.play(batch, first, teams, &mut Prefetch { batch, teams: ahead.clone() }),
             );
             for lane in 0..teams {
                 let (group, team) = batch.locate(first + lane);
@@ -171,30 +166,35 @@ fn play<S: Simd>(simd: S, groups: &[Group<'_>], workspaces: &mut Option<Box<dyn 
     *workspaces = Some(own);
 }
 
+/// Prefetches the policies of the teams that play next, during the steps of those before.
+struct Prefetch<'a> {
+    batch: &'a WorldBatch<'a>,
+    /// Empty if there are none.
+    teams: Range<usize>,
+}
+
+impl<S: Simd> Observer<S> for Prefetch<'_> {
+    #[inline(always)]
+    fn decided(&mut self, _: &mut Block<S>, step: usize) {
+        self.batch.prefetch(self.teams.clone(), step);
+    }
+}
+
 /// Plays a group, and records all quantities of every step.
 fn trace<S: Simd>(simd: S, group: &Group<'_>) -> Trace {
     let world = group.world;
     let (teams, agents, steps) = (group.team_count(), world.agents(), world.steps());
-    let sighted = group.records().sights();
     let batch = WorldBatch::new(std::slice::from_ref(group), 0);
     let mut moments = vec![bytemuck::Zeroable::zeroed(); (steps + 1) * teams * agents];
     let (mut sets, mut seen, mut sights) = (Vec::new(), Vec::new(), Vec::new());
-    let mut episodes = EpisodeBlock::new(simd, world, sighted);
+    let mut episodes = EpisodeBlock::new(simd, world, batch.sighted);
     for first in (0..teams).step_by(S::f32s::LEN) {
         let lanes = S::f32s::LEN.min(teams - first);
-        episodes.load(&batch, first, lanes);
-        for step in 0..=steps {
-            if step > 0 {
-                simd.vectorize(
-                    #[inline(always)]
-                    || episodes.play(world, step - 1..step, |_| ()),
-                );
-            }
-            for lane in 0..lanes {
-                let at = (step * teams + first + lane) * agents;
-                episodes.block.moments(lane, step > 0, &mut moments[at..at + agents]);
-            }
-        }
+        let mut observer = Moments { moments: &mut moments, teams, first, lanes };
+        simd.vectorize(
+            #[inline(always)]
+            || episodes.play(&batch, first, lanes, &mut observer),
+        );
         for lane in 0..lanes {
             let episode = episodes.episode(lane);
             sets.extend(episode.sets.iter());
@@ -203,6 +203,35 @@ fn trace<S: Simd>(simd: S, group: &Group<'_>) -> Trace {
         }
     }
     Trace { teams, agents, moments, sets, seen, sights }
+}
+
+/// Writes the moments of a vector of teams to those of all teams, `[steps + 1][teams][agents]`.
+struct Moments<'a> {
+    moments: &'a mut [Moment],
+    teams: usize,
+    first: usize,
+    lanes: usize,
+}
+
+impl Moments<'_> {
+    fn write<S: Simd>(&mut self, block: &Block<S>, row: usize) {
+        let agents = block.agents.len();
+        let at = (row * self.teams + self.first) * agents;
+        let moments = self.moments[at..at + self.lanes * agents].chunks_exact_mut(agents);
+        moments.enumerate().for_each(|(lane, moments)| block.moments(lane, row > 0, moments));
+    }
+}
+
+impl<S: Simd> Observer<S> for Moments<'_> {
+    #[inline(always)]
+    fn started(&mut self, block: &Block<S>) {
+        self.write(block, 0);
+    }
+
+    #[inline(always)]
+    fn moved(&mut self, block: &Block<S>, _: &[u32], step: usize) {
+        self.write(block, step + 1);
+    }
 }
 
 /// Returns the number of lanes of this CPU's vectors.

@@ -3,7 +3,8 @@
 use fearless_simd::{Simd, dispatch, prelude::*};
 
 use super::batch::{WorldBatch, world_batches};
-use super::episode::EpisodeBlock;
+use super::block::Block;
+use super::episode::{EpisodeBlock, Observer};
 use super::transpose::to_rows;
 use super::{BackendError, Cpu, Group, GroupScores, ScoreTable};
 use crate::credit;
@@ -52,7 +53,7 @@ pub struct Noise<'a> {
     pub key: Key,
     /// The standard deviation of each leader's turn and speed, `[leaders]`.
     pub deviations: &'a [[f32; OUTPUTS]],
-    /// The number of the first team, which with those after it selects the noise.
+    /// The number of the first team. A team's number selects its noise.
     pub first: u32,
 }
 
@@ -132,7 +133,14 @@ fn record<S: Simd>(
         for (first, teams, arrays) in parts {
             simd.vectorize(
                 #[inline(always)]
-                || play(simd, &mut block, batch, noise, *first, *teams, arrays),
+                || {
+                    block.play(
+                        batch,
+                        *first,
+                        *teams,
+                        &mut Recorder { world: batch.world, noise, first: *first, arrays },
+                    )
+                },
             );
             let mut observed_at = arrays.observed_at.chunks_exact_mut(batch.world.pois.len());
             for lane in 0..*teams {
@@ -150,29 +158,45 @@ fn record<S: Simd>(
 /// Vectors of teams per task.
 const VECTORS_PER_TASK: usize = 8;
 
-#[inline(always)]
-fn play<S: Simd>(
-    simd: S,
-    episode: &mut EpisodeBlock<S>,
-    batch: &WorldBatch<'_>,
-    noise: Option<Noise<'_>>,
+/// Writes the steps of one vector of teams, whose first is team `first`, and adds noise to their actions.
+struct Recorder<'a, 'b> {
+    world: &'a World,
+    noise: Option<Noise<'a>>,
     first: usize,
-    teams: usize,
-    arrays: &mut StepArrays<'_>,
-) {
-    let world = batch.world;
-    let (leaders, steps) = (world.leaders(), world.steps());
-    let sets = world.pois.len() * world.constants.words as usize;
-    episode.load(batch, first, teams);
-    write_states(simd, episode, arrays, (0, steps + 1));
-    for step in 0..steps {
-        episode.sense(world);
-        let (block, columns) = (&mut episode.block, leaders * OUTPUTS);
-        let row = (step, steps);
-        to_rows(simd, leaders * INPUTS, row, arrays.inputs, |column| block.inputs.as_flattened()[column].as_slice());
+    arrays: &'a mut StepArrays<'b>,
+}
+
+impl Recorder<'_, '_> {
+    /// Writes positions, headings and speeds to a row.
+    #[inline(always)]
+    fn write_states<S: Simd>(&mut self, block: &Block<S>, row: usize) {
+        let (simd, all, agents, row) = (block.simd, &block.agents, block.agents.len(), (row, self.world.steps() + 1));
+        to_rows(simd, agents * 2, row, self.arrays.positions, |column| {
+            if column % 2 == 0 { all[column / 2].x.as_slice() } else { all[column / 2].y.as_slice() }
+        });
+        to_rows(simd, agents * 2, row, self.arrays.headings, |column| {
+            if column % 2 == 0 { all[column / 2].hx.as_slice() } else { all[column / 2].hy.as_slice() }
+        });
+        to_rows(simd, agents, row, self.arrays.speeds, |column| all[column].speed.as_slice());
+    }
+}
+
+impl<S: Simd> Observer<S> for Recorder<'_, '_> {
+    #[inline(always)]
+    fn started(&mut self, block: &Block<S>) {
+        self.write_states(block, 0);
+    }
+
+    #[inline(always)]
+    fn decided(&mut self, block: &mut Block<S>, step: usize) {
+        let (simd, arrays, row) = (block.simd, &mut *self.arrays, (step, self.world.steps()));
+        let columns = self.world.leaders() * OUTPUTS;
+        to_rows(simd, self.world.leaders() * INPUTS, row, arrays.inputs, |column| {
+            block.inputs.as_flattened()[column].as_slice()
+        });
         to_rows(simd, columns, row, arrays.outputs, |column| block.outputs.as_flattened()[column].as_slice());
-        if let Some(Noise { key, deviations, first: number }) = noise {
-            let teams = S::u32s::from_fn(simd, |lane| number.wrapping_add((first + lane) as u32));
+        if let Some(Noise { key, deviations, first: number }) = self.noise {
+            let teams = S::u32s::from_fn(simd, |lane| number.wrapping_add((self.first + lane) as u32));
             for (leader, (outputs, deviations)) in block.outputs.iter_mut().zip(deviations).enumerate() {
                 let drawn = evolve::noise::<S>(key, step, leader, teams);
                 for ((output, &deviation), drawn) in outputs.iter_mut().zip(deviations).zip(drawn) {
@@ -181,29 +205,19 @@ fn play<S: Simd>(
             }
         }
         to_rows(simd, columns, row, arrays.actions, |column| block.outputs.as_flattened()[column].as_slice());
-        if noise.is_some() {
+        if self.noise.is_some() {
             for output in block.outputs.as_flattened_mut() {
                 *output = clamp_to::<S>(*output, splat(simd, -1.0), splat(simd, 1.0));
             }
         }
-        episode.advance(world, step);
-        write_states(simd, episode, arrays, (step + 1, steps + 1));
-        let agents_at_poi = bytemuck::cast_slice_mut(arrays.agents_at_poi);
-        let taken = bytemuck::cast_slice::<u32, f32>(episode.sets_of(step, sets));
-        to_rows(simd, sets, row, agents_at_poi, |column| &taken[column * S::f32s::LEN..][..S::f32s::LEN]);
     }
-    episode.store_counts();
-}
 
-/// Writes positions, headings and speeds after a step to this row of all rows.
-#[inline(always)]
-fn write_states<S: Simd>(simd: S, episode: &EpisodeBlock<S>, arrays: &mut StepArrays<'_>, row: (usize, usize)) {
-    let (all, agents) = (&episode.block.agents, episode.block.agents.len());
-    to_rows(simd, agents * 2, row, arrays.positions, |column| {
-        if column % 2 == 0 { all[column / 2].x.as_slice() } else { all[column / 2].y.as_slice() }
-    });
-    to_rows(simd, agents * 2, row, arrays.headings, |column| {
-        if column % 2 == 0 { all[column / 2].hx.as_slice() } else { all[column / 2].hy.as_slice() }
-    });
-    to_rows(simd, agents, row, arrays.speeds, |column| all[column].speed.as_slice());
+    #[inline(always)]
+    fn moved(&mut self, block: &Block<S>, sets: &[u32], step: usize) {
+        self.write_states(block, step + 1);
+        let (taken, agents_at_poi) = (bytemuck::cast_slice(sets), bytemuck::cast_slice_mut(self.arrays.agents_at_poi));
+        to_rows(block.simd, sets.len() / S::f32s::LEN, (step, self.world.steps()), agents_at_poi, |column| {
+            &taken[column * S::f32s::LEN..][..S::f32s::LEN]
+        });
+    }
 }

@@ -28,7 +28,7 @@ pub use paths::{around, collection, owner};
 pub use paths::{holds_run, latest, next_free};
 pub use resume::{FirstAndLastRows, differences};
 pub(crate) use run::RunSums;
-pub use run::{FileSums, Origin, Run, Status, now};
+pub use run::{FileSums, OWN_FITNESS, Origin, Run, Status, now};
 
 /// Exists while a run from given policies starts in a folder, until `run.json` records those policies.
 const INIT_MARK: &str = ".init";

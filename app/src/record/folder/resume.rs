@@ -34,6 +34,9 @@ impl Folder {
         if found.finished.is_some() {
             return Ok(());
         }
+        if found.run.as_ref().is_some_and(|run| run.own_fitness) {
+            return Err(RecordError::OwnFitness { path: self.path.clone() });
+        }
         let mut kept = checkpoint::remove_temporary_files(&self.disk, &checkpoints)?;
         let origin_error = self.origin_error(config, found.run.as_ref(), before.is_some());
         let (is_other, had_checkpoints) = (origin_error.is_some(), !kept.is_empty());

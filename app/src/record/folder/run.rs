@@ -4,8 +4,10 @@ use std::time::{Duration, UNIX_EPOCH};
 
 use serde::{Deserialize, Serialize};
 
+use std::path::Path;
+
 use crate::record::disk::Place;
-use crate::record::ownership::MAX_RUN_BYTES;
+use crate::record::ownership::{MAX_RUN_BYTES, RUN};
 use crate::record::{RecordError, checkpoint, config_digest, read_text};
 use flotilla::config::Config;
 use flotilla::host;
@@ -55,6 +57,9 @@ pub struct Run {
     /// [`crate::record::policies::Init::digest`] of the policies that the run started from. `None` for a random start.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub init: Option<String>,
+    /// Whether the run was trained with another fitness than its config's, which came from the caller.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub own_fitness: bool,
     /// Command of the last session, quoted for a shell.
     #[serde(default)]
     pub command: String,
@@ -84,6 +89,9 @@ impl Origin {
             && self.config == config_digest(&checkpoint::of_length(config, self.generations))
     }
 }
+
+/// Name of a fitness that is not the config's, in arms' names and on pages.
+pub const OWN_FITNESS: &str = "own";
 
 /// Digests of the files of a finished run.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -142,6 +150,7 @@ impl Run {
             origin: Origin::of(config),
             files: None,
             init: None,
+            own_fitness: false,
             command: String::new(),
             commit: None,
         }
@@ -158,6 +167,11 @@ impl Run {
             Some(version) => RecordError::Newer { path: place.path().into(), version: Some(version) },
             None => RecordError::damaged(place.path(), reason),
         })
+    }
+
+    /// Reports whether the run in a folder says that its fitness is not the config's.
+    pub fn has_own_fitness(folder: &Path) -> bool {
+        Run::read(&folder.join(RUN)).is_ok_and(|run| run.own_fitness)
     }
 
     /// Parses the text of `run.json`.

@@ -84,6 +84,17 @@ pub enum ReplayError {
         /// The requested generation, from 0.
         generation: usize,
     },
+    /// Only the program that trained the run knows its fitness, so no generation can be trained again.
+    #[error(
+        "{folder} was trained with a fitness that is not the config's, so generation {generation} cannot be trained \
+         again; only the best team of generation 0 and the champion of the last generation can be replayed"
+    )]
+    OwnFitness {
+        /// The run's folder.
+        folder: String,
+        /// The requested generation, from 0.
+        generation: usize,
+    },
     /// Retraining gives another result than the run's metrics.
     #[error(
         "{folder}: trained again, the {who} of trial {trial}, generation {generation} has G = {found}, but metrics.csv \
@@ -176,6 +187,10 @@ pub struct Replayed {
     pub observed: Vec<Option<usize>>,
     /// Whether the comparison of the run's files with their digests was skipped.
     pub unverified: bool,
+    /// Whether another fitness than the config's selected the team, see [`Run::own_fitness`].
+    pub own_fitness: bool,
+    /// Whether the policies were given and belong to no run. The trial and the generation then mean nothing.
+    pub given: bool,
 }
 
 /// The metrics of one trial.
@@ -285,6 +300,7 @@ pub fn replay(
     order.sort_by_key(|&index| generations[index]);
     let mut played: Vec<Option<Replayed>> = generations.iter().map(|_| None).collect();
     let mut trainer = Trainer::of_trial(&config, trial);
+    let own_fitness = Run::has_own_fitness(folder);
     for index in order {
         let generation = generations[index];
         // The champion is in its slot only after its generation is over.
@@ -298,6 +314,9 @@ pub fn replay(
             return Err(ReplayError::NoStart { folder: name(), generation });
         }
         while trainer.generation(0) < wanted {
+            if own_fitness {
+                return Err(ReplayError::OwnFitness { folder: name(), generation });
+            }
             if !watch(trainer.generation(0)) {
                 return Err(ReplayError::Stopped);
             }
@@ -316,7 +335,7 @@ pub fn replay(
             let who = if which == Which::Champion { "champion" } else { "best team" };
             return Err(ReplayError::Differs { folder: name(), who, trial, generation, found: g, expected });
         }
-        played[index] = Some(Replayed { unverified: verification.is_skipped(), ..found });
+        played[index] = Some(Replayed { unverified: verification.is_skipped(), own_fitness, ..found });
     }
     Ok(played.into_iter().flatten().collect())
 }
@@ -480,21 +499,22 @@ pub fn one(group: &Group<'_>, backend: &mut dyn Backend) -> Result<Replayed, Bac
     let team_g = f64::from(scores.observed) / world.pois.len() as f64;
     // POIs are drawn where this episode had them.
     let world = world.clone().with_pois(group.moved_pois().unwrap_or(&world.pois));
-    let (trial, generation, which, team, episodes, unverified) = (0, 0, Which::Champion, 0, 1, false);
     Ok(Replayed {
-        trial,
-        generation,
-        which,
-        team,
+        trial: 0,
+        generation: 0,
+        which: Which::Champion,
+        team: 0,
         team_g,
-        episodes,
+        episodes: 1,
         scores,
         owner,
         led,
         observed,
         trace,
         world,
-        unverified,
+        unverified: false,
+        own_fitness: false,
+        given: false,
     })
 }
 
@@ -525,7 +545,10 @@ impl Replayed {
 
     /// Names the trial and generation: "trial 0, generation 7".
     pub fn place(&self) -> String {
-        format!("trial {}, generation {}", self.trial, self.generation)
+        match self.given {
+            true => "given policies".into(),
+            false => format!("trial {}, generation {}", self.trial, self.generation),
+        }
     }
 
     /// Counts the observers within the observation radius of a POI after a step. At the start the count is 0.

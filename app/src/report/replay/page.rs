@@ -5,6 +5,7 @@ use base64::prelude::BASE64_STANDARD;
 use serde_json::json;
 
 use super::{Counterfactual, Replayed, near};
+use crate::record::folder::OWN_FITNESS;
 use crate::report::map::{GROUPS, GROUPS_DARK};
 use crate::report::scene::hex;
 use flotilla::config::Config;
@@ -93,10 +94,11 @@ pub fn data(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Val
         None => world.pois.clone(),
     };
     let unverified = if played.iter().any(|played| played.unverified) { " (unverified)" } else { "" };
-    json!({
+    let own_fitness = played.iter().any(|played| played.own_fitness);
+    let mut data = json!({
         "run": format!("{name}{unverified}"),
         "paradigm": config.learning.paradigm,
-        "fitness": config.learning.fitness,
+        "fitness": if own_fitness { OWN_FITNESS.into() } else { config.learning.fitness.to_string() },
         "map": world.map,
         "pois": pois,
         "observation_radius": world.observation_radius,
@@ -109,7 +111,11 @@ pub fn data(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Val
         "exact": exact,
         "colors": colors(),
         "episodes": episodes,
-    })
+    });
+    if played.iter().any(|played| played.given) {
+        data["given"] = true.into();
+    }
+    data
 }
 
 /// Returns the colours of leaders and their followers for light and dark backgrounds.
