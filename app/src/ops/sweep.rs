@@ -337,7 +337,14 @@ pub fn train(
         (context.report)(Event::Fraction(played as f64 / total.max(1) as f64, text));
     };
     match train_points(context, sweep, &points, out, request.start, &disk, memory, backend, &share)? {
-        SessionEnd::Finished => Ok(disk),
+        SessionEnd::Finished => {
+            let folder = out.join("points");
+            // A shard may have no points.
+            if disk.kind(&folder).map_err(RecordError::write(&folder))?.is_some() {
+                disk.sync_folder(&folder).map_err(RecordError::write(&folder))?;
+            }
+            Ok(disk)
+        }
         SessionEnd::Stopped => Err(Error::Stopped("everything is saved".into())),
     }
 }

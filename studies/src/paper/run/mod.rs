@@ -198,7 +198,9 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     };
     let summary = serde_json::to_string(&summary).expect("plain fields are JSON") + "\n";
     publish(SUMMARY, summary.as_bytes())?;
-    disk.sync_folder(out).map_err(RecordError::write(out))?;
+    for folder in [&out.join(folder::ARMS), out] {
+        disk.sync_folder(folder).map_err(RecordError::write(folder))?;
+    }
     let digest = |index: usize| session.results(experiments.config_of[index]).map(|results| results.digest.clone());
     let outcome =
         |index: usize| ExperimentOutcome::of(&experiments.all[index], &experiments.folders[index], digest(index));
