@@ -123,13 +123,13 @@ mod embedded {
 #[cfg(target_family = "wasm")]
 pub use embedded::*;
 
-#[cfg(all(feature = "parallel", not(target_family = "wasm")))]
+#[cfg(not(target_family = "wasm"))]
 pub use threads::MAX_THREADS;
-#[cfg(all(feature = "parallel", not(target_family = "wasm")))]
+#[cfg(not(target_family = "wasm"))]
 pub use threads::{Threads, start};
 
 /// Starts the threads that rayon shares work between, as many as the system allows.
-#[cfg(all(feature = "parallel", not(target_family = "wasm")))]
+#[cfg(not(target_family = "wasm"))]
 mod threads {
     use std::fmt::{self, Display};
     use std::sync::{OnceLock, mpsc};

@@ -119,8 +119,7 @@
 //!
 //! | feature | adds | total crates, approximately |
 //! |---|---|---|
-//! | (none) | training, evaluation and verification on one CPU thread; also on WebAssembly | 35 |
-//! | `parallel` (default) | all threads, using rayon; results keep the same bits | 40 |
+//! | (none) | training, evaluation and verification on the CPU; on WebAssembly with one thread | 35 |
 //! | `gpu` (default) | any GPU, using wgpu | 85 |
 
 #![deny(missing_docs)]

@@ -139,12 +139,10 @@ pub fn check(machine: &str, backend: &mut dyn Backend) {
     }
 }
 
-#[cfg(feature = "parallel")]
 fn on_threads(count: usize, work: impl FnOnce() + Send) {
     rayon::ThreadPoolBuilder::new().num_threads(count).build().unwrap().install(work);
 }
 
-#[cfg(feature = "parallel")]
 #[test]
 fn digests_are_the_same_on_any_number_of_threads() {
     for count in [1, 2, 8] {

@@ -243,7 +243,6 @@ fn searches_give_the_same_bits_on_any_instruction_set_and_threads() {
             }
             let first = policies / 4 * 2;
             assert_eq!(bits_from(Level::new(), first), expected[first * parameters..], "{method} from {first} on");
-            #[cfg(feature = "parallel")]
             for count in [1, 2, 8] {
                 let pool = rayon::ThreadPoolBuilder::new().num_threads(count).build().unwrap();
                 assert_eq!(pool.install(|| bits_from(Level::new(), 0)), expected, "{method}, {count} threads");

@@ -52,7 +52,7 @@ pub trait Backend: Send {
     fn trace(&mut self, group: &Group<'_>) -> Result<Trace, BackendError>;
 
     /// Copies the populations of one trial, `[populations][slots][parameters]`, to the device, to be bred there.
-    /// Returns `None` if they had better stay on the host.
+    /// Returns `None` if they are to stay on the host.
     ///
     /// # Errors
     /// The weights do not match the sizes, a size is 0, the device was asked to hold all populations and these do not

@@ -347,3 +347,66 @@ const BITS: [[u8; 8]; 256] = {
     }
     bits
 };
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Config;
+    use crate::evolve::{Purpose, random_policy};
+    use crate::kernels::splat;
+
+    /// [`mutate`], one weight after the other.
+    fn mutate_plainly<S: Simd>(simd: S, key: Key, learning: &Learning, weights: &mut [f32]) {
+        let threshold = mutation_threshold(learning.mutation_probability);
+        for (index, weight) in weights.iter_mut().enumerate() {
+            let chance = key.draw((index / 64 * 16 + index % 16) as u32)[index / 16 % 4];
+            if threshold.is_none_or(|threshold| chance < threshold) {
+                let [a, b] = [0, 1].map(|word| S::u32s::splat(simd, key.fork().draw(index as u32)[word]));
+                let noise = math::normal::<S>(a, b) * learning.mutation_sigma as f32;
+                let old = splat(simd, *weight);
+                let noise = if learning.mutation == Mutation::Scaled { noise * old } else { noise };
+                *weight = within_limits(simd, old + noise)[0];
+            }
+        }
+    }
+
+    #[test]
+    fn bred_policies_equal_plain_mutations_of_their_parents() {
+        const SLOTS: usize = 37;
+        let text = "[world]\nleaders = [[1, 1]]\npois = [[9, 9]]\ncoupling = 1\n";
+        let mut learning = Config::parse(text, "test.toml").unwrap().learning;
+        let key = Key::new(3, 1, Purpose::Mutation);
+        let planned = |slot: usize| (slot * 5 % SLOTS) as u32 | if slot % 4 == 3 { UNCHANGED } else { 0 };
+        let parents: Vec<u32> = (0..SLOTS).map(planned).collect();
+        for parameters in [1, 63, 64, 65, 112, 1000] {
+            let mut policies = vec![0.0; SLOTS * parameters];
+            random_policy(Level::new(), Key::new(3, 1, Purpose::Weights), &mut policies);
+            for (mutation, probability) in [
+                (Mutation::Scaled, 0.15),
+                (Mutation::Additive, 0.15),
+                (Mutation::Scaled, 0.0),
+                (Mutation::Additive, 1.0),
+            ] {
+                (learning.mutation, learning.mutation_probability) = (mutation, probability);
+                let offspring =
+                    Offspring { key, generation: 7, population: 2, first: 0, parents: &parents, policies: &policies };
+                let mut children = vec![f32::NAN; policies.len()];
+                breed(Level::new(), &learning, offspring, &mut children, &mut vec![7; 9]);
+                for (slot, child) in children.chunks_exact(parameters).enumerate() {
+                    let parent = (parents[slot] & !UNCHANGED) as usize;
+                    let mut expected = policies[parent * parameters..][..parameters].to_vec();
+                    if parents[slot] & UNCHANGED == 0 {
+                        let key = key.at(7, 2, slot);
+                        dispatch!(Level::new(), simd => mutate_plainly(simd, key, &learning, &mut expected));
+                    }
+                    let bits = |weights: &[f32]| weights.iter().map(|weight| weight.to_bits()).collect::<Vec<_>>();
+                    assert_eq!(
+                        bits(child),
+                        bits(&expected),
+                        "{mutation} {probability}, {parameters} weights, slot {slot}"
+                    );
+                }
+            }
+        }
+    }
+}

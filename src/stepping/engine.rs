@@ -47,7 +47,7 @@ pub(super) trait Vectors: Send + Sync {
     );
     /// Plays a step. `moved` are the POI positions, `[teams][pois]`; empty if all teams have the world's.
     fn step(&mut self, world: &World, moved: &[Vec2], actions: &[f32], observations: &mut Observations);
-    /// Puts all teams into a saved state, except what is shown of them; of that it sets the inputs.
+    /// Puts all teams into a saved state. Of the observations, it sets only the inputs.
     fn restore(&mut self, world: &World, saved: &Saved<'_>, moved: &[Vec2], observations: &mut Observations);
     /// Writes the positions, headings and speeds of all teams.
     fn states(&mut self, world: &World, observations: &mut Observations);
