@@ -1,9 +1,13 @@
 // Whole episodes: a workgroup plays some teams from start to end, with state in registers and workgroup memory. Long
 // episodes take several dispatches, with the state stored in between.
 //
+// Uses: lib/layout.wgsl, lib/math.wgsl, generic.wgsl (shape, set_shape, decide), sense.wgsl, policy.wgsl, follow.wgsl,
+// motion.wgsl, couple.wgsl.
+//
 // One text makes two kernels. In the specialised one all sizes are constants. In the generic one they are read with the
 // task (`generic.wgsl`). The host prepends:
 //   WORKGROUP  threads per workgroup
+//   ROLE       followers start at multiples of this many threads
 //   SLOTS      agents per thread, played one after another
 //   SHARED     agents of a workgroup's teams
 //   TRACE      whether every stage of every step is recorded
@@ -17,8 +21,6 @@
 // Neighbouring threads play the same agent of neighbouring teams. They execute the same code, load neighbouring
 // weights, and are often all out of reach of the same agent. Leaders come first. Followers start at the next multiple
 // of ROLE threads, so that the two rarely share a warp.
-
-const ROLE: u32 = 32u;
 
 // Sizes that are constant in a kernel, or for a task.
 struct Shape {

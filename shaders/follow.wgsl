@@ -1,5 +1,7 @@
 // The followers' preset behaviour: attraction to agents in sight, repulsion from close ones and walls (paper, Section
 // 4.1, Figure 2b).
+//
+// Uses: lib/math.wgsl, motion.wgsl (rotate), episode.wgsl (world), generic.wgsl (variant), and from src/model: TINY.
 
 // Sums and counts of the offsets to agents within a follower's radii.
 struct Sums {

@@ -1,5 +1,7 @@
 // The sizes of a task's world, which are constants in specialised kernels.
 //
+// Uses: lib/layout.wgsl (weights), policy.wgsl, episode.wgsl (world, Shape).
+//
 // The host prepends:
 //   WIDEST         the widest layer of any policy, inputs included
 //   CHOOSES        whether outputs choose a behaviour

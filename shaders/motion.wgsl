@@ -1,8 +1,6 @@
 // Motion: a proportional controller, limited in turn, acceleration and speed (paper, Section 3.1).
-
-// Positions are multiples of 1/GRID = 2^-18, or on a wall. Their differences are exact, and the squares of these far
-// from denormal.
-const GRID: f32 = 262144.0;
+//
+// Uses: lib/math.wgsl, episode.wgsl (world), and from src/model: TINY, GRID, INVERSE_GRID.
 
 // Rotates a heading to the left, by the angle of this cosine and sine.
 fn rotate(hx: f32, hy: f32, cosine: f32, sine: f32) -> vec2<f32> {
@@ -36,5 +34,5 @@ fn advance(at: f32, step: f32, heading: f32, size: f32) -> f32 {
 
 // Rounds a coordinate to the grid.
 fn snap(at: f32) -> f32 {
-    return floor(at * GRID + 0.5) * 0x1p-18f;
+    return floor(at * GRID + 0.5) * INVERSE_GRID;
 }

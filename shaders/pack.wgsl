@@ -5,6 +5,8 @@
 // agents come near, then shrink. So one pass is enough that keeps the sets that neither the previous kept set nor the
 // next set contains. A team's kept sets become the record of an episode with fewer steps.
 //
+// Uses: lib/layout.wgsl.
+//
 // The host prepends:
 //   WORKGROUP  threads per workgroup
 //   TEAMS      maximum teams per task

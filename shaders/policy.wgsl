@@ -1,15 +1,11 @@
 // A leader's policy: a fully connected network with biases and tanh in every layer (paper, Sections 2.4 and 3.1).
-
-// Sums smaller than this are flushed to 0.
-const TINY: f32 = 0x1p-30f;
+//
+// Uses: lib/math.wgsl, episode.wgsl (world), and from src/model: TINY, INPUTS, BEHAVIOURS.
 
 // Returns the tanh of a unit's sum. Small sums are flushed to 0, so that the next layer has no denormals.
 fn activate(sum: f32) -> f32 {
     return whole_tanh(half_tanh(limit_tanh(flush(sum, TINY))));
 }
-
-// Behaviours to choose among: hold, towards or away from POIs, towards or away from agents.
-const BEHAVIOURS: u32 = 5u;
 
 // Returns the turn to the middle of the quadrant of highest density, or to the opposite one, in half turns to the left.
 // 0 if nothing is sensed.

@@ -1,15 +1,14 @@
 // Populations that stay on the device. `breed` makes a population's next generation from the host's plan; `gather` lays
 // out the weights of a batch's teams for the episode. One buffer holds one population, `[slots][parameters]`.
 //
-// The host prepends:
-//   WORKGROUP            threads per workgroup, a multiple of TILE
-//   BreedJob, GatherJob  declared in src/backend/gpu/population.rs
-
-// The range of sizes of a weight other than 0.
-const MIN_WEIGHT: f32 = 0x1p-30f;
-const MAX_WEIGHT: f32 = 1048576.0;
-
-const UNCHANGED: u32 = 0x80000000u;
+// Uses: lib/math.wgsl.
+//
+// The host prepends, from src/evolve and src/backend/gpu/population.rs:
+//   WORKGROUP               threads per workgroup, a multiple of TILE
+//   TILE                    rows and columns of a tile of `gather`
+//   BreedJob, GatherJob     what to do
+//   MIN_WEIGHT, MAX_WEIGHT  the range of sizes of a weight other than 0
+//   UNCHANGED               the bit of a planned slot that does not mutate
 
 @group(0) @binding(1) var<storage, read> breed_job: BreedJob;
 // The slot that each slot is copied from, with UNCHANGED set if it does not mutate.
@@ -95,8 +94,6 @@ fn fill(slot: u32, counter: u32) {
         left &= left - 1u;
     }
 }
-
-const TILE: u32 = 32u;
 
 // Weights of some teams' leaders, `[leaders][teams][parameters]`. Rows have one word of padding, so that a column uses
 // all banks.

@@ -1,4 +1,6 @@
 // Sensing: the density of POIs and of agents in four quadrants around a leader's heading (paper, Section 3.1).
+//
+// Uses: lib/math.wgsl, episode.wgsl (world), generic.wgsl (variant), and from src/model: INPUTS, DENSITY_LINEAR.
 
 // Returns the density of an entity at offset (`dx`, `dy`). The caller checks that it is in range.
 fn density(dx: f32, dy: f32) -> f32 {

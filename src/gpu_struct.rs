@@ -1,4 +1,4 @@
-//! Structs that the host shares with its shaders.
+//! Structs and constants that the host shares with its shaders.
 
 use bytemuck::Pod;
 use fearless_simd::{Simd, prelude::*};
@@ -55,6 +55,48 @@ macro_rules! lists {
     )*};
 }
 lists!(u32 f32);
+
+/// The type of a constant that a shader shares with the host.
+pub trait Constant {
+    /// Returns the declaration in WGSL: `const NAME: type = value;`.
+    fn declared(self, name: &str) -> String;
+}
+
+impl Constant for u32 {
+    fn declared(self, name: &str) -> String {
+        format!("const {name}: u32 = {self}u;\n")
+    }
+}
+
+impl Constant for usize {
+    fn declared(self, name: &str) -> String {
+        u32::try_from(self).expect("shared numbers have 32 bits").declared(name)
+    }
+}
+
+impl Constant for bool {
+    fn declared(self, name: &str) -> String {
+        format!("const {name}: bool = {self};\n")
+    }
+}
+
+impl Constant for f32 {
+    fn declared(self, name: &str) -> String {
+        let (exponent, mantissa) = (self.to_bits() >> 23, self.to_bits() & 0x7f_ffff);
+        assert!(mantissa == 0 && (1..255).contains(&exponent), "{name} is no power of two, whose digits are exact");
+        format!("const {name}: f32 = 0x1p{}f;\n", exponent as i32 - 127)
+    }
+}
+
+/// Returns the WGSL of constants: `NAME` declares the Rust constant of this name, `NAME = value` another value.
+macro_rules! gpu_constants {
+    (@one $name:ident) => { $crate::gpu_struct::Constant::declared($name, stringify!($name)) };
+    (@one $name:ident $value:expr) => { $crate::gpu_struct::Constant::declared($value, stringify!($name)) };
+    ($($name:ident $(= $value:expr)?),+ $(,)?) => {
+        [$($crate::gpu_struct::gpu_constants!(@one $name $($value)?)),+].concat()
+    };
+}
+pub(crate) use gpu_constants;
 
 /// A struct with the same memory layout in Rust and WGSL, see `gpu_struct!`.
 pub trait GpuStruct: Pod {

@@ -7,12 +7,12 @@ use std::ops::Range;
 
 use glam::Vec2;
 
-use crate::backend::compare::{Mismatch, first_mismatch};
-use crate::backend::{Backend, BackendError, Group, GroupScores};
+use crate::backend::compare::{compare_breeding, compare_traces, first_difference};
+use crate::backend::{Backend, BackendError, Group};
 use crate::config::{Config, Fitness, LAYOUTS, Paradigm, Sharing, StageConfig, ValidConfig};
 use crate::credit::RecordRequest;
 use crate::evaluate::{SCORES, SCORES_AND_DT};
-use crate::evolve::{self, Breeding, Key, Purpose, UNCHANGED};
+use crate::evolve::{self, Key, Purpose};
 use crate::sample;
 use crate::trainer::{Row, Trainer};
 use crate::world::World;
@@ -123,7 +123,7 @@ pub fn compare(
     for (name, config) in &plan.worlds {
         // Only the first stage plays here. Training below plays all of them.
         let teams = Teams::new(config.validate()?.at(0), plan.teams, plan.seed, outcome.worlds % 2 == 0);
-        if let Some(mismatch) = compare_stages(&teams, reference, backend)? {
+        if let Some(mismatch) = compare_traces(&teams.group(), reference, backend)? {
             outcome.mismatch = Some(format!("{name}: {mismatch}"));
             return Ok(outcome);
         }
@@ -148,22 +148,15 @@ pub fn compare(
     outcome.agent_steps *= 2 + turns as u64;
     progress(&outcome);
     for ((name, config), teams) in plan.worlds.iter().zip(&all) {
-        if let Some(mismatch) = compare_breeding(config, teams, backend)? {
+        let Teams { world, policies, weights, .. } = teams;
+        let sizes = [weights.len() / policies / world.parameters(), *policies, world.parameters()];
+        if let Some(mismatch) = compare_breeding(weights, sizes, &config.learning, backend)? {
             outcome.mismatch = Some(format!("{name}: {mismatch}"));
             return Ok(outcome);
         }
     }
     outcome.mismatch = compare_training(plan, reference, backend)?;
     Ok(outcome)
-}
-
-fn compare_stages(
-    teams: &Teams,
-    reference: &mut dyn Backend,
-    backend: &mut dyn Backend,
-) -> Result<Option<Mismatch>, BackendError> {
-    let (expected, found) = (reference.trace(&teams.group())?, backend.trace(&teams.group())?);
-    Ok(first_mismatch(&teams.world, &expected, &found))
 }
 
 /// Plays groups as one batch. Returns the first group whose scores differ, and how.
@@ -173,21 +166,7 @@ fn compare_scores(
     backend: &mut dyn Backend,
 ) -> Result<Option<(usize, String)>, BackendError> {
     let (expected, found) = (reference.play(groups)?, backend.play(groups)?);
-    let differs = |(index, (expected, found)): (usize, (&GroupScores, &GroupScores))| {
-        let group = &groups[index];
-        let (per_team, fitnesses) = (group.fitnesses.len() * group.world.leaders(), group.fitnesses);
-        let of = |scores: &GroupScores, team: usize| {
-            let own = scores.scores[team * per_team..][..per_team].iter().map(|score| score.to_bits());
-            (scores.observed[team], own.collect::<Vec<u32>>())
-        };
-        let team = (0..group.team_count()).find(|&team| of(expected, team) != of(found, team))?;
-        let shown = |scores: &GroupScores| {
-            format!("{} POIs and {:?}", scores.observed[team], &scores.scores[team * per_team..][..per_team])
-        };
-        let (expected, found) = (shown(expected), shown(found));
-        Some((index, format!("team {team}, scores by {fitnesses:?}: expected {expected}, found {found}")))
-    };
-    Ok(expected.iter().zip(&found).enumerate().find_map(differs))
+    Ok(first_difference(groups, &expected, &found))
 }
 
 /// Plays all groups in three batches. Each group is scored by one of [`KINDS`], which changes with each turn. Returns
@@ -212,34 +191,6 @@ fn compare_kinds(
         }
     }
     Ok(None)
-}
-
-/// Breeds a world's policies on the device. Returns the first weight that differs.
-fn compare_breeding(config: &Config, teams: &Teams, backend: &mut dyn Backend) -> Result<Option<String>, BackendError> {
-    let Teams { world, policies, weights, .. } = teams;
-    let (slots, parameters) = (*policies, world.parameters());
-    let sizes = [weights.len() / slots / parameters, slots, parameters];
-    let Some(mut held) = backend.hold(weights, sizes)? else { return Ok(None) };
-    // Each slot's parent is the next slot. Every fourth slot does not mutate.
-    let planned = |place: usize| ((place + 1) % slots) as u32 | if place % 4 == 3 { UNCHANGED } else { 0 };
-    let parents: Vec<u32> = (0..sizes[0]).flat_map(|_| (0..slots).map(planned)).collect();
-    let (key, learning) = (Key::new(config.learning.seed, 0, Purpose::Mutation), &config.learning);
-    let breeding = Breeding { parents: &parents, key, generation: 0, learning };
-    held.breed(&breeding)?;
-    let mut found = vec![0.0; weights.len()];
-    held.fetch(&mut found)?;
-    let expected = breeding.on_host(sizes, weights)?;
-    let differs = |index: &usize| expected[*index].to_bits() != found[*index].to_bits();
-    Ok((0..found.len()).find(differs).map(|index| {
-        let (leader, slot, weight) = (index / parameters / slots, index / parameters % slots, index % parameters);
-        let (expected, found) = (expected[index], found[index]);
-        format!(
-            "stage breed, leader {leader}, slot {slot}, weight {weight}: expected {:#010x} ({expected:?}), \
-             found {:#010x} ({found:?})",
-            expected.to_bits(),
-            found.to_bits()
-        )
-    }))
 }
 
 /// Trains the first few worlds for a few generations side by side.

@@ -238,3 +238,50 @@ fn the_browser_page_has_every_fitness() {
         assert!(compare.contains(&format!("\"{word}\"")), "compare.js does not compare {word}");
     }
 }
+
+/// Returns the functions, types, constants and variables that a shader declares, and its code without comments.
+fn declared(text: &str) -> (Vec<String>, String) {
+    let code: Vec<&str> = text.lines().map(|line| line.split("//").next().unwrap()).collect();
+    let word = |text: &str| text.split(|c: char| !c.is_alphanumeric() && c != '_').next().unwrap().to_string();
+    let names = code.iter().filter_map(|line| {
+        // Functions are recognised by their calls, because variables may have the same name.
+        let function = line.strip_prefix("fn ").map(|rest| format!("{}(", word(rest)));
+        let other = ["struct ", "const "].iter().find_map(|keyword| line.strip_prefix(keyword)).map(word);
+        let variable = || (line.starts_with("var<") || line.starts_with('@')).then(|| line.split_once("> ")).flatten();
+        function.or(other).or_else(|| variable().map(|(_, rest)| word(rest)))
+    });
+    (names.collect(), code.join("\n"))
+}
+
+/// Shaders are joined to one text, in any order. Each names the files that it uses.
+#[test]
+fn every_shader_names_the_files_that_it_uses() {
+    const EPISODE: [&str; 9] =
+        ["lib/layout", "lib/math", "generic", "sense", "policy", "follow", "motion", "couple", "episode"];
+    let joined: [&[&str]; 3] = [&EPISODE, &["lib/layout", "pack"], &["lib/math", "population"]];
+    let read = |name: &str| fs::read_to_string(format!("shaders/{name}.wgsl")).unwrap();
+    let mut uses = 0;
+    for files in joined {
+        for name in files {
+            let text = read(name);
+            let (_, code) = declared(&text);
+            let line = text.split_once("// Uses: ").map_or("", |(_, rest)| rest.split("\n//\n").next().unwrap());
+            let line = line.split("\n\n").next().unwrap();
+            for other in files.iter().filter(|other| *other != name) {
+                let is_word_before =
+                    |at: usize| code[..at].ends_with(|c: char| c.is_alphanumeric() || "_.".contains(c));
+                let is_used = |used: &String| {
+                    code.match_indices(&**used).any(|(at, _)| {
+                        let after = code[at + used.len()..].starts_with(|c: char| c.is_alphanumeric() || c == '_');
+                        !is_word_before(at) && (!after || used.ends_with('('))
+                    })
+                };
+                let used: Vec<String> = declared(&read(other)).0.into_iter().filter(is_used).collect();
+                let is_named = line.contains(&format!("{other}.wgsl"));
+                uses += used.len();
+                assert!(used.is_empty() || is_named, "{name}.wgsl does not say that it uses {other}.wgsl: {used:?}");
+            }
+        }
+    }
+    assert!(uses > 30, "{uses}");
+}

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use flotilla::backend::gpu::device::{self, AdapterChoice, AdapterInfo, Binding, DeviceError, Kind, Request};
 use flotilla::backend::gpu::episode::{self, Kernel};
 use flotilla::backend::gpu::exact::{self, Pass, ShaderError};
-use flotilla::backend::gpu::{self, self_test, shaders};
+use flotilla::backend::gpu::{self, shaders};
 use flotilla::verify::short_trainings;
 use flotilla::world::World;
 use naga::back::{hlsl, msl};
@@ -476,8 +476,7 @@ fn the_probes_catch_a_device_without_a_pass() {
         let gpu = gpu::open(Request { pass: Some(Pass::Plain), ..request }).unwrap_or_else(|error| panic!("{error}"));
         let mismatch = gpu::self_test(&gpu).unwrap_or_else(|error| panic!("{error}"));
         if ["llvmpipe", "SwiftShader"].iter().any(|known| info.name.contains(known)) {
-            let mismatch = mismatch.unwrap_or_else(|| panic!("{info} reassociates, but no probe detects it"));
-            assert_ne!(mismatch.cpu, mismatch.gpu, "{mismatch}");
+            assert!(mismatch.is_some(), "{info} reassociates, but no probe detects it");
         }
     }
 }
@@ -624,8 +623,7 @@ fn running_out_of_memory_is_an_error() {
 
 #[test]
 fn a_refusal_names_the_device_and_the_probe() {
-    let mismatch =
-        self_test::Deviation { probe: "x*y + z".into(), values: vec![1.5f32.to_bits()], cpu: 1, gpu: 2 }.to_string();
+    let mismatch = "probe \"x*y + z\" gives 0x00000002 instead of 0x00000001 from 1.5e0".to_string();
     let failures = vec![(Pass::NoContraction, mismatch.clone()), (Pass::Guarded, mismatch)];
     let message = flotilla_cli::Error::from(DeviceError::Inexact { adapter: "Some GPU".into(), failures }).to_string();
     for part in ["Some GPU", "x*y + z", "no-contraction", "guarded", "0x00000002", "1.5e0", "--backend cpu"] {

@@ -1,8 +1,10 @@
-//! Comparison of two traces of the same teams.
+//! Comparison of two backends by traces, scores and breeding.
 
 use std::fmt;
 
-use super::{Moment, Trace};
+use super::{Backend, BackendError, Group, GroupScores, Moment, Trace};
+use crate::config::Learning;
+use crate::evolve::{Breeding, Key, Purpose, UNCHANGED};
 use crate::model::sense;
 use crate::world::{INPUTS, World};
 
@@ -68,8 +70,73 @@ impl fmt::Display for Mismatch {
     }
 }
 
+/// Traces a group on two backends. Returns the first difference.
+pub(crate) fn compare_traces(
+    group: &Group<'_>,
+    reference: &mut dyn Backend,
+    backend: &mut dyn Backend,
+) -> Result<Option<Mismatch>, BackendError> {
+    let (expected, found) = (reference.trace(group)?, backend.trace(group)?);
+    Ok(first_mismatch(group.world, &expected, &found))
+}
+
+/// Returns the first group whose scores differ, and how.
+pub(crate) fn first_difference(
+    groups: &[Group<'_>],
+    expected: &[GroupScores],
+    found: &[GroupScores],
+) -> Option<(usize, String)> {
+    let differs = |(index, (expected, found)): (usize, (&GroupScores, &GroupScores))| {
+        let group = &groups[index];
+        let (per_team, fitnesses) = (group.fitnesses.len() * group.world.leaders(), group.fitnesses);
+        let of = |scores: &GroupScores, team: usize| {
+            let own = scores.scores[team * per_team..][..per_team].iter().map(|score| score.to_bits());
+            (scores.observed[team], own.collect::<Vec<u32>>())
+        };
+        let team = (0..group.team_count()).find(|&team| of(expected, team) != of(found, team))?;
+        let shown = |scores: &GroupScores| {
+            format!("{} POIs and {:?}", scores.observed[team], &scores.scores[team * per_team..][..per_team])
+        };
+        let (expected, found) = (shown(expected), shown(found));
+        Some((index, format!("team {team}, scores by {fitnesses:?}: expected {expected}, found {found}")))
+    };
+    expected.iter().zip(found).enumerate().find_map(differs)
+}
+
+/// Breeds policies, `[populations, slots, parameters]`, on the device of a backend, if that holds them. Returns the
+/// first weight that differs from the host's.
+pub(crate) fn compare_breeding(
+    weights: &[f32],
+    sizes: [usize; 3],
+    learning: &Learning,
+    backend: &mut dyn Backend,
+) -> Result<Option<String>, BackendError> {
+    let [populations, slots, parameters] = sizes;
+    let Some(mut held) = backend.hold(weights, sizes)? else { return Ok(None) };
+    // Each slot's parent is the next slot. Every fourth slot does not mutate.
+    let planned = |place: usize| ((place + 1) % slots) as u32 | if place % 4 == 3 { UNCHANGED } else { 0 };
+    let parents: Vec<u32> = (0..populations).flat_map(|_| (0..slots).map(planned)).collect();
+    let key = Key::new(learning.seed, 0, Purpose::Mutation);
+    let breeding = Breeding { parents: &parents, key, generation: 0, learning };
+    held.breed(&breeding)?;
+    let mut found = vec![0.0; weights.len()];
+    held.fetch(&mut found)?;
+    let expected = breeding.on_host(sizes, weights)?;
+    let differs = |index: &usize| expected[*index].to_bits() != found[*index].to_bits();
+    Ok((0..found.len()).find(differs).map(|index| {
+        let (leader, slot, weight) = (index / parameters / slots, index / parameters % slots, index % parameters);
+        let (expected, found) = (expected[index], found[index]);
+        format!(
+            "stage breed, leader {leader}, slot {slot}, weight {weight}: expected {:#010x} ({expected:?}), \
+             found {:#010x} ({found:?})",
+            expected.to_bits(),
+            found.to_bits()
+        )
+    }))
+}
+
 /// Returns the first difference of two traces of the same group: by step, then stage, then team.
-pub(crate) fn first_mismatch(world: &World, expected: &Trace, found: &Trace) -> Option<Mismatch> {
+fn first_mismatch(world: &World, expected: &Trace, found: &Trace) -> Option<Mismatch> {
     if expected == found && bits(expected) == bits(found) {
         return None;
     }

@@ -3,7 +3,7 @@
 
 use fearless_simd::{Simd, prelude::*};
 
-use super::{LONGEST, Lanes, motion::rotate};
+use super::{LONGEST, Lanes, TINY, motion::rotate};
 use crate::gpu_struct::gpu_struct;
 use crate::kernels::{
     larger,
@@ -83,9 +83,6 @@ impl FollowConstants {
         }
     }
 }
-
-/// Forces smaller than this (2^-30) are flushed to 0.
-pub(crate) const TINY: f32 = 1.0 / 1_073_741_824.0;
 
 /// Sums and counts of the offsets to agents within a follower's radii.
 #[derive(Clone, Copy)]

@@ -5,7 +5,7 @@
 
 use fearless_simd::Simd;
 
-use crate::gpu_struct::{Field, GpuStruct, gpu_struct};
+use crate::gpu_struct::{Field, GpuStruct, gpu_constants, gpu_struct};
 
 pub(crate) mod couple;
 pub(crate) mod follow;
@@ -17,14 +17,16 @@ pub mod start;
 
 use couple::{CoupleConstants, CoupleLanes};
 use follow::{FollowConstants, FollowLanes};
-use motion::{MotionConstants, MotionLanes};
-use policy::PolicyConstants;
-use sense::{Density, SenseConstants, SenseLanes};
+use motion::{GRID, INVERSE_GRID, MotionConstants, MotionLanes};
+use policy::{BEHAVIOURS, PolicyConstants};
+use sense::{Density, INPUTS, SenseConstants, SenseLanes};
 
 /// The maximum length of a map side, radius or range. Its square is far from f32's overflow.
 pub(crate) const LONGEST: f64 = 1e4;
 /// The minimum size of a length or speed other than 0. Its square is far from f32's denormals.
 pub(crate) const LEAST: f64 = 1e-6;
+/// Sums, forces and components of a heading smaller than this (2^-30) are flushed to 0, so that no denormal follows.
+pub(crate) const TINY: f32 = 1.0 / 1_073_741_824.0;
 
 gpu_struct! {
     /// The constants of a world. In the shaders the fields of all parts are fields of this struct.
@@ -103,9 +105,9 @@ impl<S: Simd> Lanes<S> {
 
 /// Returns the WGSL of the structs and constants that the parts' shaders use.
 pub(crate) fn declarations() -> String {
-    let inputs = format!("const INPUTS: u32 = {}u;\n", sense::INPUTS);
-    [Constants::wgsl(), Variant::wgsl(), Density::wgsl(), inputs].concat()
+    let constants = gpu_constants!(INPUTS, BEHAVIOURS, TINY, GRID, INVERSE_GRID);
+    [Constants::wgsl(), Variant::wgsl(), Density::wgsl(), constants].concat()
 }
 
-/// The parts' shaders, in the order of a step.
+/// The parts' shaders.
 pub(crate) const WGSL: [&str; 5] = [sense::WGSL, policy::WGSL, follow::WGSL, motion::WGSL, couple::WGSL];

@@ -4,7 +4,7 @@ use std::f64::consts::{FRAC_PI_2, PI};
 
 use fearless_simd::{Simd, prelude::*};
 
-use super::{LEAST, Lanes};
+use super::{LEAST, Lanes, TINY};
 use crate::gpu_struct::gpu_struct;
 use crate::kernels::{
     clamp_to,
@@ -127,9 +127,8 @@ impl MotionConstants {
 /// Positions are multiples of 1/GRID = 2^-18, or on a wall. Their differences are exact, and the squares of these far
 /// from denormal.
 pub const GRID: f32 = 262_144.0;
-
-/// Components of a heading smaller than this (2^-30) are flushed to 0.
-pub(crate) const TINY: f32 = 1.0 / 1_073_741_824.0;
+/// The size of a grid cell.
+pub(crate) const INVERSE_GRID: f32 = 1.0 / GRID;
 
 /// Rotates a heading to the left, by the angle of this cosine and sine.
 #[inline(always)]
@@ -169,5 +168,5 @@ pub fn advance<S: Simd>(at: S::f32s, step: S::f32s, heading: S::f32s, size: S::f
 /// Rounds a coordinate to the grid.
 #[inline(always)]
 pub(crate) fn snap<S: Simd>(at: S::f32s) -> S::f32s {
-    (at * GRID + 0.5).floor() * (1.0 / GRID)
+    (at * GRID + 0.5).floor() * INVERSE_GRID
 }

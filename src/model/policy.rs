@@ -3,7 +3,7 @@
 
 use fearless_simd::{Simd, prelude::*};
 
-use super::{Lanes, sense::INPUTS};
+use super::{Lanes, TINY, sense::INPUTS};
 use crate::config_enum::config_enum;
 use crate::gpu_struct::gpu_struct;
 use crate::kernels::{math, select, splat};
@@ -132,9 +132,6 @@ pub(crate) fn affine<S: Simd, const UNITS: usize>(inputs: &[S::f32s], weights: &
 pub(crate) fn clamp_preactivation<S: Simd>(sum: S::f32s) -> S::f32s {
     math::limit_tanh::<S>(math::flush::<S>(sum, TINY))
 }
-
-/// Sums smaller than this (2^-30) are flushed to 0.
-pub(crate) const TINY: f32 = 1.0 / 1_073_741_824.0;
 
 /// Returns the actions of the most wanted behaviour: the first of the largest `wanted`, each in -1..1.
 ///

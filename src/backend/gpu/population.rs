@@ -10,13 +10,13 @@ use super::device::{BINDING_ALIGNMENT, Binding, Bindings, DeviceError, Gpu, grid
 use super::exact;
 use crate::backend::{BackendError, DevicePopulation};
 use crate::config::Mutation;
-use crate::evolve::{self, Breeding};
-use crate::gpu_struct::{GpuStruct, gpu_struct};
+use crate::evolve::{self, Breeding, MAX_WEIGHT, MIN_WEIGHT, UNCHANGED};
+use crate::gpu_struct::{GpuStruct, gpu_constants, gpu_struct};
 use crate::parallel::*;
 
 /// Threads per workgroup.
 const WORKGROUP: usize = 256;
-/// Rows and columns of the tile that a workgroup of `gather` transposes (`TILE` in the shader).
+/// Rows and columns of the tile that a workgroup of `gather` transposes.
 const TILE: usize = 32;
 /// Leaders per gather dispatch. With three other storage buffers they stay below the 8 that every WebGPU device allows.
 pub(super) const LEADERS_PER_GATHER: usize = 4;
@@ -323,7 +323,7 @@ impl DevicePopulation for Population {
 /// Returns the whole shader.
 fn source() -> String {
     exact::assemble(&[
-        &format!("const WORKGROUP: u32 = {WORKGROUP}u;"),
+        &gpu_constants!(WORKGROUP, TILE, UNCHANGED, MIN_WEIGHT, MAX_WEIGHT),
         &[BreedJob::wgsl(), GatherJob::wgsl()].concat(),
         include_str!("../../../shaders/lib/math.wgsl"),
         include_str!("../../../shaders/population.wgsl"),

@@ -12,9 +12,9 @@ use crate::world::World;
 
 /// Maximum bytes of a buffer, because offsets are u32 words.
 pub(super) const MAX_OFFSET: u64 = 1 << 33;
-/// Threads of a warp on most GPUs. Leaders and followers start at multiples of it (`ROLE` in the shader), so that they
-/// rarely share a warp.
-const ROLE: usize = 32;
+/// Threads of a warp on most GPUs. Leaders and followers start at multiples of it, so that they rarely share a
+/// warp.
+pub(super) const ROLE: usize = 32;
 /// Workgroup sizes that the generic kernel may have. Every WebGPU device allows them.
 pub(super) const WORKGROUPS: [usize; 3] = [64, 128, 256];
 /// Teams per workgroup that a specialised kernel may have, best first: 32 teams fill a warp with one agent of each.

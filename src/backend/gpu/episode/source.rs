@@ -6,14 +6,14 @@ use std::fmt::Write;
 use crate::backend::gpu::exact;
 use crate::backend::{BackendError, FOUR, Group, Moment, Weights, fours};
 use crate::config::MAX_AGENTS;
-use crate::gpu_struct::GpuStruct;
+use crate::gpu_struct::{GpuStruct, gpu_constants};
 use crate::model::policy::Actions;
 use crate::model::{self, Constants, Variant};
 use crate::world::{INPUTS, OUTPUTS, World};
 
 use super::Records;
 use super::planner::{NOWHERE, PACK_WORKGROUP, PlannedTask, State, Task, gather, plan};
-use super::shape::{Capacity, Kernel, Recorded, Shape, Sizes, TEAMS, WIDTHS, WORKGROUPS, Workgroup};
+use super::shape::{Capacity, Kernel, ROLE, Recorded, Shape, Sizes, TEAMS, WIDTHS, WORKGROUPS, Workgroup};
 
 /// Maximum leaders whose sightings a follower counts in registers.
 const SIGHTS: usize = 8;
@@ -24,9 +24,7 @@ pub(super) fn packing() -> String {
     let structs = [model::declarations(), Task::wgsl(), State::wgsl(), Moment::wgsl()].concat();
     exact::assemble(&[
         &structs,
-        &format!(
-            "const WORKGROUP: u32 = {PACK_WORKGROUP}u;\nconst TEAMS: u32 = {most}u;\nconst NOWHERE: u32 = {NOWHERE}u;"
-        ),
+        &gpu_constants!(WORKGROUP = PACK_WORKGROUP, TEAMS = most, NOWHERE),
         include_str!("../../../../shaders/lib/layout.wgsl"),
         include_str!("../../../../shaders/pack.wgsl"),
     ])
@@ -43,17 +41,23 @@ pub(super) fn source(shape: Shape) -> String {
             (teams * agents as usize, tally, if tally { leaders } else { 1 })
         }
     };
-    let constants = format!(
-        "const WORKGROUP: u32 = {workgroup}u;\nconst SLOTS: u32 = {slots}u;\nconst SHARED: u32 = {shared}u;\n\
-         const TRACE: bool = {trace};\nconst SIGHTED: bool = {sighted};\nconst TALLY: bool = {tally};\nconst SIGHTS: u32 = {sights}u;"
+    let constants = gpu_constants!(
+        ROLE,
+        WORKGROUP = workgroup,
+        SLOTS = slots,
+        SHARED = shared,
+        TRACE = trace,
+        SIGHTED = sighted,
+        TALLY = tally,
+        SIGHTS = sights,
     );
     let front = match sizes {
         Sizes::Any { widest, chooses } => {
             let variant = Variant::copied_from("world");
             let generic = include_str!("../../../../shaders/generic.wgsl");
             format!(
-                "const WIDEST: u32 = {widest}u;\nconst CHOOSES: bool = {chooses};\n\
-                 fn world_variant() -> Variant {{ return {variant}; }}\n{generic}"
+                "{}fn world_variant() -> Variant {{ return {variant}; }}\n{generic}",
+                gpu_constants!(WIDEST = widest, CHOOSES = chooses)
             )
         }
         Sizes::Fixed { teams, leaders, agents, pois, widths, variant } => format!(
