@@ -60,17 +60,27 @@ def draw():
             curve = curves.setdefault((row["paradigm"], int(row["population"])), [])
             curve.append([float(row[key]) for key in ("teams", "champion_g", "standard_error")])
     figure, axes = plt.subplots(figsize=(7.2, 4.2), layout="constrained")
+    # Each line has its own shade, dashes and end label. A larger population is darker.
     styles = {50: ":", 500: "--", 5000: "-.", 50000: "-"}
+    shades = {
+        "leader-follower": {50: "#6baed6", 500: "#3182bd", 5000: "#08519c", 50000: "#08244f"},
+        "all-leaders": {50: "#fd8d3c", 500: "#e6550d", 5000: "#a63603", 50000: "#5b1a00"},
+    }
     for (paradigm, population), curve in sorted(curves.items(), key=lambda item: (item[0][0], item[0][1])):
-        colour = "#0072b2" if paradigm == "leader-follower" else "#d55e00"
+        colour = shades[paradigm][population]
         teams, mean, error = zip(*curve)
-        label = f"{paradigm}, {population} policies".replace("50000", "50 000")
-        axes.plot(teams, mean, styles[population], color=colour, label=label)
-        low = [m - e for m, e in zip(mean, error)]
-        high = [m + e for m, e in zip(mean, error)]
-        axes.fill_between(teams, low, high, color=colour, alpha=0.12, linewidth=0)
-    axes.set(xlabel="teams played", ylabel="G of the champion, mean over trials", xscale="log", ylim=(-0.02, 1.02))
-    axes.legend(loc="upper left", frameon=False, fontsize=10)
+        label = f"{population} policies".replace("50000", "50 000")
+        axes.plot(teams, mean, styles[population], color=colour, linewidth=1.8, label=label)
+        # All lines end near the same number of teams. Their standard errors stand beside each other there.
+        place = teams[-1] * (1.06 + 0.07 * list(styles).index(population))
+        axes.errorbar(place, mean[-1], error[-1], marker="o", markersize=3, color=colour, linewidth=1)
+    axes.set(xlabel="teams played (at the right: the last means with their standard errors)", ylabel="G of the champion, mean over trials", xscale="log", ylim=(-0.02, 1.02))
+    handles, labels = axes.get_legend_handles_labels()
+    for paradigm, first, place in (("all-leaders", 0, (0.22, 1.0)), ("leader-follower", 4, (0.0, 1.0))):
+        legend = axes.legend(handles[first:first + 4], labels[first:first + 4], title=paradigm, loc="upper left",
+                             bbox_to_anchor=place, frameon=False, fontsize=9, title_fontsize=9, alignment="left")
+        if first == 0:
+            axes.add_artist(legend)
     axes.spines[["top", "right"]].set_visible(False)
     text = io.StringIO()
     figure.savefig(text, format="svg", metadata={"Date": None})

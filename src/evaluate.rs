@@ -10,7 +10,7 @@ use crate::backend::{Backend, BackendError, Group, Moment};
 use crate::config::Fitness;
 use crate::evolve::{self, Key, Purpose};
 use crate::host::Instant;
-use crate::statistics::{self, Estimate};
+use crate::statistics::{self, Average, Estimate};
 use crate::world::World;
 
 pub use crate::evolve::aligned_teams;
@@ -99,7 +99,7 @@ pub struct Spread {
     /// Sample standard deviation over episodes. None for one episode.
     #[serde(rename = "standard_deviation")]
     pub deviation: Option<f64>,
-    /// The 95 % interval of the mean, see [`statistics::mean`]. None for one episode.
+    /// The 95 % interval of the mean, see [`statistics::bounded`]. None for one episode.
     #[serde(rename = "interval_95")]
     pub interval: Option<[f64; 2]>,
 }
@@ -126,10 +126,10 @@ impl Tally {
             let squares = u128::from(self.count) * self.squares - sum * sum;
             (squares as f64 / (count * (count - 1.0))).sqrt() / unit
         });
-        let interval = deviation.map(|deviation| {
-            let error = deviation / count.sqrt();
-            let Estimate { low, high, .. } = statistics::interval(mean, error, self.count as usize, 1.0 / unit);
-            [low.max(0.0), high.min(most as f64)]
+        let interval = deviation.and_then(|deviation| {
+            let average = Average::of(u32::try_from(self.count).ok()?, mean, deviation);
+            let Estimate { low, high, .. } = statistics::bounded(&average, [0.0, most as f64])?;
+            Some([low, high])
         });
         Spread { mean, deviation, interval }
     }

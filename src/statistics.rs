@@ -1,26 +1,21 @@
 //! Estimates from trials with their confidence intervals, and tests of differences.
 //!
-//! Trials of two arms with the same seed are pairs. They share their starts and, if sizes agree, their first
-//! populations. The differences of pairs are one sample: [`mean`] gives its interval.
+//! [`bounded`] gives the interval of a mean of scores, [`difference`] that of the difference of two arms, and [`paired`]
+//! that of pairs. They are used wherever G is shown with an interval. Trials of two arms with the same seed are pairs.
+//! They share their starts and, if sizes agree, their first populations. [`mean`] gives Student's interval, on which
+//! verdicts on claims are based. [`Average`] gives mean, deviation and standard error of any values.
 //!
-//! [`Average`] gives mean, deviation and standard error of any other values.
-//!
-//! Some functions make fewer assumptions about the distribution. [`bootstrap`] gives the interval of a mean or a
-//! difference, [`rank_sum`] tests two samples, and [`signed_rank`] tests pairs. [`holm`] corrects for multiple tests. G
-//! takes few values, so ranks have many ties, and both rank tests compute exact p-values for ties here.
+//! [`rank_sum`] tests two samples, and [`signed_rank`] tests pairs. [`holm`] corrects for multiple tests. G takes few
+//! values, so ranks have many ties, and both tests compute exact p-values for ties here.
 //!
 //! The special functions are those of `special`, which calls `libm` only: a table has the same digits on every system.
 //! Other crates of statistics call the system's functions as soon as any dependency asks for that.
 
-use rand::rngs::ChaCha8Rng;
-use rand::{RngExt, SeedableRng};
 use serde::Serialize;
 use special::{Beta, Error};
 
 /// Confidence level of all intervals.
 pub const CONFIDENCE: f64 = 0.95;
-/// Number of samples that [`bootstrap`] draws.
-pub const RESAMPLES: usize = 9999;
 /// Maximum number of values, counting both samples, for exact p-values. Larger samples use the normal distribution.
 pub(crate) const EXACT: usize = 100;
 
@@ -61,6 +56,12 @@ pub struct Average {
 }
 
 impl Average {
+    /// Returns the average of so many values with this mean and standard deviation.
+    pub(crate) fn of(count: u32, mean: f64, deviation: f64) -> Average {
+        let degrees = f64::from(count.saturating_sub(1));
+        Average { count, sum: mean * f64::from(count), mean, squares: deviation * deviation * degrees }
+    }
+
     /// Adds a value.
     pub fn add(&mut self, value: f64) {
         self.count += 1;
@@ -109,30 +110,14 @@ pub fn mean(values: &[f64], step: f64) -> Option<Estimate> {
 
 /// Returns the same as [`mean`], with an interval of any confidence level.
 pub fn mean_at(confidence: f64, values: &[f64], step: f64) -> Option<Estimate> {
-    let (value, error) = moments(values)?;
-    Some(interval_at(confidence, value, error, values.len(), step))
-}
-
-/// Returns the interval of [`mean`] from the mean, its standard error and the number of values, at least 2.
-pub fn interval(value: f64, error: f64, count: usize, step: f64) -> Estimate {
-    interval_at(CONFIDENCE, value, error, count, step)
-}
-
-fn interval_at(confidence: f64, value: f64, error: f64, count: usize, step: f64) -> Estimate {
-    let room = match error {
-        0.0 => step * share_at(confidence, 0, count).map_or(0.0, |share| share.high),
-        error => error * half_width_at(confidence, count),
+    let average: Average = values.iter().collect();
+    let value = average.mean();
+    let room = match average.error() {
+        _ if values.len() < 2 => return None,
+        0.0 => step * share_at(confidence, 0, values.len())?.high,
+        error => error * student((1.0 - confidence) / 2.0, (values.len() - 1) as f64),
     };
-    Estimate { value, low: value - room, high: value + room }
-}
-
-/// Returns the half-width of the 95 % interval of a mean of `count` values, in standard errors. 0 for fewer than two.
-pub fn half_width(count: usize) -> f64 {
-    half_width_at(CONFIDENCE, count)
-}
-
-fn half_width_at(confidence: f64, count: usize) -> f64 {
-    if count < 2 { 0.0 } else { student((1.0 - confidence) / 2.0, (count - 1) as f64) }
+    Some(Estimate { value, low: value - room, high: value + room })
 }
 
 /// Returns a share with the exact interval of Clopper and Pearson. None if `of` is 0.
@@ -177,17 +162,8 @@ pub fn smallest_alpha(holds: impl Fn(f64) -> bool) -> Option<f64> {
 /// The mean of the distances measures spread. Testing the paired differences of two arms' distances is the
 /// Brown-Forsythe test for pairs.
 pub fn distances(values: &[f64]) -> Vec<f64> {
-    let mut sorted = values.to_vec();
-    sorted.sort_by(f64::total_cmp);
-    let (low, high) = (values.len().saturating_sub(1) / 2, values.len() / 2);
-    let median = sorted.get(low).zip(sorted.get(high)).map_or(0.0, |(low, high)| (low + high) / 2.0);
+    let median = median(values).map_or(0.0, |median| median.value);
     values.iter().map(|value| (value - median).abs()).collect()
-}
-
-/// Returns mean and standard error. None for fewer than two values.
-fn moments(values: &[f64]) -> Option<(f64, f64)> {
-    let average: Average = values.iter().collect();
-    (average.count > 1).then(|| (average.mean(), average.error()))
 }
 
 /// Returns the value that Student's distribution exceeds with probability `tail`, at most 0.5.
@@ -206,59 +182,96 @@ fn normal_above(z: f64) -> f64 {
     (z * std::f64::consts::FRAC_1_SQRT_2).compl_error() / 2.0
 }
 
-/// Returns the value that a normal variable is below with probability `p`.
-fn normal_quantile(p: f64) -> f64 {
-    std::f64::consts::SQRT_2 * (2.0 * p - 1.0).inv_error()
+/// Returns the mean of values in `least..=most` with an interval that is right for few trials with few different
+/// outcomes. None for fewer than two values.
+///
+/// It is Student's interval of the sample with two more values, `least` and `most`, clamped to that range. So it has a
+/// width even if all values are equal. For proportions these are the intervals of Agresti and Caffo, *Simple and
+/// effective confidence intervals for proportions and differences of proportions result from adding two successes and
+/// two failures*, The American Statistician 54 (2000), with Student's quantile for few trials.
+///
+/// Student's interval of the sample alone and bootstrap intervals have no width for equal values. If one trial in ten
+/// fails, five trials are equal in most experiments, and such an interval misses the mean in each of these.
+pub fn bounded(average: &Average, range: [f64; 2]) -> Option<Estimate> {
+    bounded_by(bounded_factor(average.count as usize), average, range)
 }
 
-/// Returns the mean of the first sample, minus that of the second if given, with its bootstrap interval. None if a
-/// sample has fewer than two values.
-///
-/// The interval is bias-corrected and accelerated (BCa) over [`RESAMPLES`] samples. The seed is fixed, so equal values
-/// always have equal intervals. If all values of each sample are equal, the interval has no width.
-pub fn bootstrap(samples: &[&[f64]]) -> Option<Estimate> {
-    if samples.is_empty()
-        || samples.iter().any(|sample| sample.len() < 2 || !sample.iter().all(|value| value.is_finite()))
-    {
-        return None;
-    }
-    // Sums a function over the first sample with sign 1 and the second with sign -1.
-    let total = |of: &mut dyn FnMut(&[f64], f64) -> f64| -> f64 {
-        samples.iter().zip([1.0, -1.0]).map(|(sample, sign)| of(sample, sign)).sum()
-    };
-    let mean = |sample: &[f64]| moments(sample).map_or(f64::NAN, |(mean, _)| mean);
-    let value = total(&mut |sample, sign| sign * mean(sample));
-    let moment = |power: usize| {
-        total(&mut |sample, sign| {
-            let (mean, count) = (mean(sample), sample.len() as f64);
-            sample.iter().map(|value| power_of(sign * (value - mean) / count, power)).sum()
-        })
-    };
-    let spread = moment(2);
-    if spread == 0.0 {
-        return Some(Estimate::exact(value));
-    }
-    let acceleration = moment(3) / (spread * spread.sqrt()) / 6.0;
+/// Returns the half-width of the interval of [`bounded`] for so many values, in standard errors.
+pub fn bounded_factor(count: usize) -> f64 {
+    student((1.0 - CONFIDENCE) / 2.0, (count + 1) as f64)
+}
 
-    let mut random = ChaCha8Rng::seed_from_u64(0);
-    let mut draw = |sample: &[f64], sign: f64| {
-        let count = sample.len();
-        sign * (0..count).map(|_| sample[random.random_range(0..count)]).sum::<f64>() / count as f64
-    };
-    let mut drawn: Vec<f64> = (0..RESAMPLES).map(|_| total(&mut draw)).collect();
-    drawn.sort_by(f64::total_cmp);
-    // Means that differ only by rounding count as equal.
-    let grain = 1e-9 * spread.sqrt();
-    let [below, most] = [value - grain, value + grain].map(|at| drawn.partition_point(|&drawn| drawn < at));
-    let bias = normal_quantile((below + most) as f64 / 2.0 / RESAMPLES as f64);
-    let end = |tail: f64| {
-        let shifted = bias + normal_quantile(tail);
-        let place = normal_above(-bias - shifted / (1.0 - acceleration * shifted)) * (RESAMPLES - 1) as f64;
-        let (left, right) = (drawn[place.floor() as usize], drawn[place.ceil() as usize]);
-        left + (right - left) * place.fract()
-    };
-    let tail = (1.0 - CONFIDENCE) / 2.0;
-    Some(Estimate { value, low: end(tail), high: end(1.0 - tail) })
+/// Returns the same as [`bounded`], with a factor that is already known.
+pub fn bounded_by(factor: f64, average: &Average, [least, most]: [f64; 2]) -> Option<Estimate> {
+    let more = Extended::new(average, (least + most) / 2.0, (most - least) * (most - least) / 2.0)?;
+    Some(more.around(average.mean(), more.mean, factor * more.variance.sqrt()).within(least, most))
+}
+
+/// Returns the mean difference of two samples of values in a range, with the interval of Agresti and Caffo. None for
+/// fewer than two values in a sample.
+///
+/// Each sample gets two more values, as for [`bounded`]. The quantile is that of the normal distribution.
+pub fn difference(one: &Average, other: &Average, [least, most]: [f64; 2]) -> Option<Estimate> {
+    const NORMAL: f64 = 1.959_963_984_540_054;
+    let width = most - least;
+    let more = |average| Extended::new(average, (least + most) / 2.0, width * width / 2.0);
+    let (first, second) = (more(one)?, more(other)?);
+    let half = NORMAL * (first.variance + second.variance).sqrt();
+    Some(first.around(one.mean() - other.mean(), first.mean - second.mean, half).within(-width, width))
+}
+
+/// Returns the mean difference of pairs of values in a range of this width, with an interval like that of [`bounded`].
+/// None for fewer than two pairs.
+///
+/// The sample gets two more pairs. Half a pair has each combination of the smallest and the largest value, as in Agresti
+/// and Min, *Simple improved confidence intervals for comparing matched proportions*, Statistics in Medicine 24 (2005).
+pub fn paired(differences: &Average, width: f64) -> Option<Estimate> {
+    let more = Extended::new(differences, 0.0, width * width)?;
+    let half = bounded_factor(differences.count as usize) * more.variance.sqrt();
+    Some(more.around(differences.mean(), more.mean, half).within(-width, width))
+}
+
+/// A sample with two more values.
+struct Extended {
+    mean: f64,
+    /// The variance of the mean.
+    variance: f64,
+}
+
+impl Extended {
+    /// Adds two values with this mean. `squares` is the sum of their squared distances from it.
+    fn new(average: &Average, mean: f64, squares: f64) -> Option<Extended> {
+        let before = f64::from(average.count);
+        let count = before + 2.0;
+        let off = mean - average.mean();
+        let all = average.squares + squares + off * off * 2.0 * before / count;
+        let variance = all / (count - 1.0) / count;
+        (average.count > 1).then_some(Extended { mean: average.mean() + off * 2.0 / count, variance })
+    }
+
+    fn around(&self, value: f64, middle: f64, half: f64) -> Estimate {
+        Estimate { value, low: middle - half, high: middle + half }
+    }
+}
+
+/// Returns the median with its interval. None without values.
+///
+/// The interval needs no assumption about the distribution: its ends are two of the values, chosen by the binomial
+/// distribution (Conover, *Practical Nonparametric Statistics*, section 3.2). Values may be infinite. For fewer than six
+/// values no such interval covers 95 %, and its ends are infinite.
+pub fn median(values: &[f64]) -> Option<Estimate> {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    let (low, high) = (sorted.get(values.len().checked_sub(1)? / 2)?, sorted.get(values.len() / 2)?);
+    let count = values.len() as f64;
+    // The probability that at most so many of the values are below the median.
+    let tail = |below: &f64| 0.5.inc_beta(count - below, below + 1.0, (count - below).ln_beta(below + 1.0));
+    let below = (0..values.len()).map(|below| below as f64);
+    let outside = below.take_while(|below| tail(below) <= (1.0 - CONFIDENCE) / 2.0).count();
+    let ends = outside
+        .checked_sub(1)
+        .map_or([f64::NEG_INFINITY, f64::INFINITY], |place| [sorted[place], sorted[values.len() - 1 - place]]);
+    Some(Estimate { value: (low + high) / 2.0, low: ends[0], high: ends[1] })
 }
 
 /// The result of a test of two samples or of pairs.

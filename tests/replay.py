@@ -304,12 +304,14 @@ def main():
 
         # Pages with one and with two generations, in large and small windows, in light and dark mode.
         for page, name in [(run / "replay.html", "one"), (folder / "compare.html", "two")]:
-            for (width, height), dark in itertools.product([(1280, 900), (390, 844)], [False, True]):
+            for (width, height), dark in itertools.product([(1280, 900), (1000, 800), (390, 844)], [False, True]):
                 browser.window(width, height, dark)
                 browser.open(page.as_uri() + "#step=18")
                 browser.wait("document.readyState === 'complete' && replay.step === 18")
                 scroll_width = browser.evaluate("document.documentElement.scrollWidth")
                 assert scroll_width <= width, "the page is wider than the window"
+                tables = "[...document.querySelectorAll('.scores')].every(table => table.scrollWidth <= table.clientWidth)"
+                assert width < 1000 or browser.evaluate(tables), "a table scrolls sideways"
                 assert browser.evaluate("document.querySelectorAll('canvas').length") == (2 if name == "two" else 1)
                 assert not list(browser.complaints()), list(browser.complaints())
                 colours = browser.evaluate(COLOURS)

@@ -63,17 +63,32 @@ for size, grain, method in ((5, 1, None), (10, 2, None), (12, 4, None), (20, 0, 
         (less[less != 0],), lambda x: stats.rankdata(np.abs(x))[x > 0].sum(), vectorized=False,
         permutation_type="samples", n_resamples=np.inf).pvalue
     signs.append({"less": listed(less), "p": p})
-skewed = listed(random.exponential(2, size=20))
+
+
+def interval(mean, low, high, most):
+    return [float(mean), float(max(low, -most)), float(min(high, most))]
+
+
+# Intervals with two more values: the smallest and the largest. A pair of values gets half a pair of each combination.
 intervals = []
-for samples in ([skewed], [listed(random.normal(3, 1, size=8))],
-                [skewed, listed(random.normal(0, 1, size=9))],
-                [listed(random.exponential(1, size=30)), listed(random.exponential(3, size=12))]):
-    # With this many resamples, the interval hardly depends on the random numbers.
-    interval = stats.bootstrap(
-        samples, lambda one, other=np.zeros(1), axis=-1: one.mean(axis=axis) - other.mean(axis=axis),
-        n_resamples=200_000, batch=10_000, vectorized=True, method="BCa", rng=1).confidence_interval
-    intervals.append({"samples": samples, "low": interval.low, "high": interval.high})
+for n, least in ((3, 4), (5, 0), (5, 3), (10, 0), (10, 4), (30, 3)):
+    one, other = random.integers(least, 5, size=n) / 4, random.integers(0, 5, size=n) / 4
+    more, others = np.append(one, [0, 1]), np.append(other, [0, 1])
+    t = stats.t.interval(0.95, n + 1, more.mean(), stats.sem(more))
+    normal = stats.norm.interval(0.95, more.mean() - others.mean(), np.hypot(stats.sem(more), stats.sem(others)))
+    less = np.append(one - other, [-np.sqrt(0.5), np.sqrt(0.5)])
+    pairs = stats.t.interval(0.95, n + 1, less.mean(), stats.sem(less))
+    intervals.append({"one": one.tolist(), "other": other.tolist(),
+                      "mean": [float(one.mean()), float(max(t[0], 0)), float(min(t[1], 1))],
+                      "difference": interval((one - other).mean(), *normal, 1),
+                      "paired": interval((one - other).mean(), *pairs, 1)})
+medians = []
+for n in (1, 5, 6, 9, 25, 200):
+    values = random.integers(0, 100, size=n).astype(float)
+    found = stats.quantile_test(values, q=0, p=0.5).confidence_interval(0.95)
+    low, high = (None if not np.isfinite(end) else float(end) for end in found)
+    medians.append({"values": values.tolist(), "median": [float(np.median(values)), low, high]})
 several = [[0.01, 0.04, 0.03], [0.5, 0.2, 0.9, 0.001, 0.02, 0.02], [0.4]]
 corrected = [{"p": p, "holm": multipletests(p, method="holm")[1].tolist()} for p in several]
 print(json.dumps({"scipy": scipy.__version__, "means": means, "shares": shares, "spreads": spreads, "ranks": ranks,
-                  "signs": signs, "intervals": intervals, "corrected": corrected}, indent=1))
+                  "signs": signs, "intervals": intervals, "medians": medians, "corrected": corrected}, indent=1))

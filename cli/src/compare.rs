@@ -20,7 +20,7 @@ pub struct Args {
     /// Generations at which to compare G, as 0,50,last; last is the last one that all arms have reached
     #[arg(long, value_name = "N,…", value_delimiter = ',', default_value = "last", value_parser = generation)]
     at: Vec<String>,
-    /// Compare the generations that the best team needs to reach this G, in 0..1
+    /// Compare the generations that the champion needs to reach this G, in 0..1
     #[arg(long, value_name = "G", default_value_t = 0.75, value_parser = share)]
     reach: f64,
     /// Compare pair by pair; trials with the same seed and number are pairs

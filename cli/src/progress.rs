@@ -120,7 +120,7 @@ struct Terminal {
     generation: ProgressBar,
 }
 
-/// One arm's curve so far: for each part of the run, the sum of the best teams' G and the number of rows.
+/// One arm's curve so far: for each part of the run, the sum of the champions' G and the number of rows.
 struct GrowingBar {
     name: String,
     /// Number of POIs. None if stages differ in it.
@@ -129,11 +129,11 @@ struct GrowingBar {
     newest: Newest,
 }
 
-/// The newest generation: sums of the best and the mean teams' G over trials.
+/// The newest generation: sums of the champions' and the mean teams' G over trials.
 #[derive(Clone, Copy, Default)]
 struct Newest {
     generation: usize,
-    best: f64,
+    champion: f64,
     mean: f64,
     trials: u32,
 }
@@ -141,12 +141,12 @@ struct Newest {
 impl GrowingBar {
     fn add(&mut self, row: &Row, last: usize) {
         let part = (row.generation * self.parts.len() / (last + 1)).min(self.parts.len() - 1);
-        self.parts[part].0 += row.best_g;
+        self.parts[part].0 += row.champion_g;
         self.parts[part].1 += 1;
         if row.generation != self.newest.generation {
             self.newest = Newest { generation: row.generation, ..Newest::default() };
         }
-        self.newest.best += row.best_g;
+        self.newest.champion += row.champion_g;
         self.newest.mean += row.mean_g;
         self.newest.trials += 1;
     }
@@ -164,13 +164,13 @@ impl GrowingBar {
     /// Returns the newest generation's mean over trials, in POIs if their number is known. `in_words` adds the mean
     /// team and labels.
     fn value(&self, in_words: bool) -> String {
-        let Newest { best, mean, trials, .. } = self.newest;
+        let Newest { champion, mean, trials, .. } = self.newest;
         let pois = |sum: f64| sum / f64::from(trials.max(1)) * self.pois.unwrap_or(1) as f64;
         match (in_words, self.pois) {
-            (true, Some(all)) => format!("best {:.2}, mean {:.2} of {all} POIs", pois(best), pois(mean)),
-            (true, None) => format!("best {:.2}, mean {:.2} of the POIs", pois(best), pois(mean)),
-            (false, Some(all)) => format!("{:.2}/{all}", pois(best)),
-            (false, None) => format!("{:.2}", pois(best)),
+            (true, Some(all)) => format!("champion {:.2}, mean {:.2} of {all} POIs", pois(champion), pois(mean)),
+            (true, None) => format!("champion {:.2}, mean {:.2} of the POIs", pois(champion), pois(mean)),
+            (false, Some(all)) => format!("{:.2}/{all}", pois(champion)),
+            (false, None) => format!("{:.2}", pois(champion)),
         }
     }
 }

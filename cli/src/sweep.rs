@@ -86,8 +86,8 @@ pub struct Args {
     /// Also read files that differ from their digests in run.json, and mark the results as unverified
     #[arg(long, requires = "collect", help_heading = RESULTS)]
     unverified: bool,
-    /// Team whose G the pictures show: the best, the champion, or the mean over all teams
-    #[arg(long, value_name = "best|champion|mean", default_value = "best", help_heading = RESULTS)]
+    /// Team whose G is shown: the champion, the best of a generation, or the mean over all teams
+    #[arg(long, value_name = "champion|best|mean", default_value = "champion", help_heading = RESULTS)]
     measure: TeamKind,
     /// Range that pictures show around a mean: its 95 % interval, its standard error, or none
     #[arg(long, value_name = "interval|error|none", default_value = "interval", help_heading = RESULTS)]
@@ -182,7 +182,7 @@ impl Args {
             ("--every", self.every.to_string(), "1"),
             ("--reach", self.reach.to_string(), "0.75"),
             ("--axes", self.axes.join(","), ""),
-            ("--measure", self.measure.to_string(), "best"),
+            ("--measure", self.measure.to_string(), "champion"),
             ("--band", self.band.to_string(), "interval"),
         ];
         if shard.is_none() {

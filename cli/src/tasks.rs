@@ -80,8 +80,7 @@ fn in_words(found: &Outcome) -> String {
         let mut row = vec![task.name.clone()];
         row.extend(task.baselines.iter().map(|g| format!("{:.2}", mean(g))));
         row.extend(task.trained.iter().map(|found| {
-            let champion = statistics::mean(&found.champion_g, 1.0 / task.pois as f64);
-            let champion = champion.map(|mean| mean.within(0.0, 1.0));
+            let champion = statistics::bounded(&found.champion_g.iter().collect(), [0.0, 1.0]);
             let champion = champion.map_or(String::new(), |g| format!("{:.2} [{:.2}, {:.2}]", g.value, g.low, g.high));
             format!("{champion} ({:.2}; {} of {})", mean(&found.best_g), found.solved(), found.champion_g.len())
         }));

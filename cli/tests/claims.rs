@@ -13,6 +13,8 @@ use flotilla::statistics::{self, Average, Estimate, Tested};
 use flotilla::world::World;
 use flotilla_studies::paper::claims::{Claim, Verdict, claims};
 use flotilla_studies::paper::{self, Evidence, Experiment, LAYOUTS, SOURCES, Source, tables};
+use rand::rngs::ChaCha8Rng;
+use rand::{RngExt, SeedableRng};
 use serde_json::Value;
 
 /// Returns the paper's experiments with these numbers of trials and generations.
@@ -74,13 +76,25 @@ fn intervals_and_tests_equal_those_of_scipy() {
         let ahead = |difference: &f64| if *difference > 0.0 { 1.0 } else { f64::from(*difference == 0.0) / 2.0 };
         near(tested.a, &(differences.iter().map(ahead).sum::<f64>() / differences.len() as f64).into());
     }
+    let average = |values: &Value| -> Average { numbers(values).iter().collect() };
     for case in intervals {
-        let samples: Vec<_> = case["samples"].as_array().unwrap().iter().map(numbers).collect();
-        let ours = statistics::bootstrap(&samples.iter().map(Vec::as_slice).collect::<Vec<_>>()).unwrap();
-        let [low, high] = ["low", "high"].map(|end| case[end].as_f64().unwrap());
-        // Both resample with random numbers, which differ.
-        let off = 0.03 * (high - low);
-        assert!((ours.low - low).abs() < off && (ours.high - high).abs() < off, "{ours:?} is not {low} to {high}");
+        let [one, other] = ["one", "other"].map(|key| average(&case[key]));
+        let pairs = numbers(&case["one"]).into_iter().zip(numbers(&case["other"]));
+        let differences: Vec<f64> = pairs.map(|(one, other)| one - other).collect();
+        for (ours, key) in [
+            (statistics::bounded(&one, [0.0, 1.0]), "mean"),
+            (statistics::difference(&one, &other, [0.0, 1.0]), "difference"),
+            (statistics::paired(&differences.iter().collect(), 1.0), "paired"),
+        ] {
+            let ours = ours.unwrap();
+            let ends = case[key].as_array().unwrap();
+            [ours.value, ours.low, ours.high].into_iter().zip(ends).for_each(|(ours, theirs)| near(ours, theirs));
+        }
+    }
+    for case in list("medians") {
+        let median = statistics::median(&numbers(&case["values"])).unwrap();
+        let places = [median.low, median.high].map(|end| end.is_finite().then_some(end));
+        assert_eq!(Value::from(vec![Some(median.value), places[0], places[1]]), case["median"]);
     }
     for case in corrected {
         let holm = statistics::holm(&numbers(&case["p"]));
@@ -123,15 +137,72 @@ fn an_average_does_not_depend_on_the_order_of_its_values() {
     assert_eq!([[0.75, 1.0, 0.0, 0.0], [0.0, 0.75, 0.0, 1.0]].map(|values| average_of(&values).1), [0.4375; 2]);
 }
 
+/// Adds each way to draw `trials` scores from 0 to 1 in steps of 0.25, with the number of each score.
+fn draws(trials: usize, scores: usize) -> Vec<Vec<usize>> {
+    if scores == 1 {
+        return vec![vec![trials]];
+    }
+    let first =
+        |count: usize| draws(trials - count, scores - 1).into_iter().map(move |rest| [vec![count], rest].concat());
+    (0..=trials).flat_map(first).collect()
+}
+
+/// Five trials are equal in most experiments if few of all trials fail. So an interval needs a width even then. Coverage
+/// is exact here: every possible outcome counts with its probability.
 #[test]
-fn bootstrap_intervals_are_reproducible_and_have_no_width_without_spread() {
-    let (one, other) = ([0.25, 0.5, 1.0, 0.75], [0.5, 0.25, 0.0]);
-    let interval = statistics::bootstrap(&[&one, &other]).unwrap();
-    assert_eq!(statistics::bootstrap(&[&one, &other]), Some(interval));
-    assert!(interval.low < interval.value && interval.value == 0.375 && interval.value < interval.high);
-    let constant = statistics::bootstrap(&[&[0.5; 4], &[0.25; 3]]).unwrap();
-    assert_eq!((constant.low, constant.value, constant.high), (0.25, 0.25, 0.25));
-    assert_eq!((statistics::bootstrap(&[&one, &[1.0]]), statistics::bootstrap(&[])), (None, None));
+fn intervals_of_few_discrete_scores_cover_the_mean() {
+    const SCORES: [f64; 5] = [0.0, 0.25, 0.5, 0.75, 1.0];
+    let mut random = ChaCha8Rng::seed_from_u64(7);
+    let mut distributions: Vec<[f64; 5]> = Vec::new();
+    for share in [0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.95, 0.98] {
+        for other in 0..4 {
+            let mut chances = [0.0; 5];
+            (chances[other], chances[4]) = (1.0 - share, share);
+            distributions.push(chances);
+        }
+    }
+    for _ in 0..30 {
+        // Powers make most of them uneven.
+        let chances = [(); 5].map(|()| f64::from(random.random::<f32>()).powi(4));
+        distributions.push(chances.map(|chance| chance / chances.iter().sum::<f64>()));
+    }
+    for (trials, least) in [(3, 0.95), (5, 0.93), (10, 0.94), (20, 0.94)] {
+        let cases: Vec<(Vec<usize>, Average)> = draws(trials, 5)
+            .into_iter()
+            .map(|counts| {
+                let values = counts.iter().zip(&SCORES).flat_map(|(&count, score)| std::iter::repeat_n(score, count));
+                let average = values.collect();
+                (counts, average)
+            })
+            .collect();
+        let intervals: Vec<Estimate> =
+            cases.iter().map(|(_, average)| statistics::bounded(average, [0.0, 1.0]).unwrap()).collect();
+        assert!(intervals.iter().all(|interval| {
+            0.0 <= interval.low
+                && interval.low <= interval.value
+                && interval.value <= interval.high
+                && interval.high <= 1.0
+        }));
+        assert!(intervals.iter().all(|interval| interval.high - interval.low > 0.1), "{trials}");
+        for chances in &distributions {
+            let mean: f64 = chances.iter().zip(SCORES).map(|(chance, score)| chance * score).sum();
+            let covered =
+                cases.iter().zip(&intervals).filter(|(_, at)| at.low - 1e-9 <= mean && mean <= at.high + 1e-9);
+            let probability = |counts: &[usize]| {
+                let (mut left, mut product) = (trials, 1.0);
+                for (&count, chance) in counts.iter().zip(chances) {
+                    for place in 0..count {
+                        product *= chance * (left - place) as f64 / (place + 1) as f64;
+                    }
+                    left -= count;
+                }
+                product
+            };
+            let coverage: f64 = covered.map(|((counts, _), _)| probability(counts)).sum();
+            assert!(coverage >= least, "{coverage} of {trials} trials with chances {chances:?}");
+        }
+    }
+    assert_eq!(statistics::bounded(&[1.0].iter().collect(), [0.0, 1.0]), None);
 }
 
 #[test]

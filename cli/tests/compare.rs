@@ -11,7 +11,7 @@ use serde_json::Value;
 
 const WORLD: &str = "[world]\nleaders = [[10, 5], [20, 5]]\nfollowers = [[12, 2]]\npois = [[10, 15], [20, 15]]\n";
 
-/// Writes a run with the best team's G per trial and generation. The champion's G is half of it.
+/// Writes a run with the champion's G per trial and generation. The best team's G is halfway from there to 1.
 fn run(place: &Place, name: &str, keys: &[(&str, &str)], trials: &[&[f64]]) {
     let set = |(key, value): &(&str, &str)| Override { key: (*key).into(), text: (*value).into(), name: (*key).into() };
     let count = trials.len().to_string();
@@ -23,8 +23,8 @@ fn run(place: &Place, name: &str, keys: &[(&str, &str)], trials: &[&[f64]]) {
     let mut metrics = format!("{HEADER}\n");
     for generation in 0..trials.iter().map(|trial| trial.len()).max().unwrap() {
         for (number, trial) in trials.iter().enumerate().filter(|(_, trial)| trial.len() > generation) {
-            let best = trial[generation];
-            let _ = writeln!(metrics, "{number},{generation},{best},0,{},0.5", best / 2.0);
+            let champion = trial[generation];
+            let _ = writeln!(metrics, "{number},{generation},{},0,{champion},0.5", (champion + 1.0) / 2.0);
         }
     }
     fs::write(path.join("metrics.csv"), metrics).unwrap();
@@ -71,32 +71,35 @@ fn two_arms_are_reported_with_intervals_and_a_test() {
     let (text, stderr) = place.good("compare df g");
     assert_eq!(stderr, "");
     for words in [
-        "| arm                | trials | best team's G, generation 1 | champion's G, generation 1 | generations to G 0.75",
+        "| arm                | trials | champion's G, generation 1 | best team's G, generation 1 | generations to G 0.75",
         "| fitness Df, seed 0 | 5      | 0.950 [0.",
         "| fitness G, seed 1  | 5      | 0.500 [",
-        "| 1.0 [1.0, 1.0] (5 of 5)",
-        "(1 of 5)",
-        "| best team's G, generation 1 | fitness Df, seed 0 − fitness G, seed 1 | +0.450 [",
+        "| 1 (5 of 5)",
+        "| not reached (1 of 5)",
+        "| champion's G, generation 1  | fitness Df, seed 0 − fitness G, seed 1 | +0.450 [",
         "| 0.98 | 0.016 | 0.016    |",
-        "A trial that never reaches G 0.75 counts as if it reached it one generation after the last.",
+        "| –                      | 0.10",
+        "A median is not reached if half of the trials or more never reach G 0.75.",
     ] {
         assert!(text.contains(words), "{words:?} is missing from\n{text}");
     }
     let report = json(&place, "compare df g");
     let comparison = &report["comparisons"][0];
     assert_eq!((&report["test"], &comparison["generation"]), (&"mann-whitney".into(), &1.into()));
-    let [best, champion, reach] = [0, 1, 2].map(|measure| &comparison["measures"][measure]);
-    assert_eq!((&best["measure"], &best["generation"]), (&"best_g".into(), &1.into()));
+    let [champion, best, reach] = [0, 1, 2].map(|measure| &comparison["measures"][measure]);
+    assert_eq!((&champion["measure"], &champion["generation"]), (&"champion_g".into(), &1.into()));
     // The expected values are scipy's for the first case in tests/statistics.json.
-    let pair = &best["pairs"][0];
+    let pair = &champion["pairs"][0];
     assert!((number(&pair["a"]) - 0.98).abs() < 1e-12 && (number(&pair["p"]) - 4.0 / 252.0).abs() < 1e-12, "{pair}");
-    let difference = statistics::bootstrap(&[&df_ends, &g_ends]).unwrap();
+    let difference = statistics::difference(&df_ends.iter().collect(), &g_ends.iter().collect(), [0.0, 1.0]).unwrap();
     for (key, expected) in [("value", difference.value), ("low", difference.low), ("high", difference.high)] {
         assert!((number(&pair[key]) - expected).abs() < 1e-12, "{pair}");
     }
-    assert_eq!((number(&champion["arms"][0]["value"]), &champion["measure"]), (0.475, &"champion_g".into()));
-    // A trial that does not reach G 0.75 by generation 1 counts as 2.
-    assert_eq!([0, 1].map(|arm| number(&reach["arms"][arm]["value"])), [1.0, 1.8]);
+    assert_eq!((number(&best["arms"][0]["value"]), &best["measure"]), (0.975, &"best_g".into()));
+    // Most trials of the second arm do not reach G 0.75, so there is no median. Five trials are too few for its interval.
+    assert_eq!([0, 1].map(|arm| reach["arms"][arm]["value"].as_f64()), [Some(1.0), None]);
+    assert_eq!(["low", "high"].map(|end| reach["arms"][0][end].as_f64()), [None; 2]);
+    assert_eq!(["value", "low", "high"].map(|key| reach["pairs"][0][key].as_f64()), [None; 3]);
     assert_eq!([0, 1].map(|arm| number(&reach["arms"][arm]["reached"])), [5.0, 1.0]);
     // In reverse order the difference changes its sign.
     let reversed = &json(&place, "compare g df")["comparisons"][0]["measures"][0]["pairs"][0];
@@ -115,7 +118,7 @@ fn generations_to_reach_count_only_in_the_last_stage() {
     run(&place, "staged", &[five, ("stages", "[{ from = 3, set = { 'world.coupling' = 1 } }]")], &course);
     let report = json(&place, "compare plain staged");
     let reach = &report["comparisons"][0]["measures"][2];
-    assert_eq!([0, 1].map(|arm| number(&reach["arms"][arm]["value"])), [0.0, 5.0]);
+    assert_eq!([0, 1].map(|arm| reach["arms"][arm]["value"].as_f64()), [Some(0.0), None]);
     assert_eq!([0, 1].map(|arm| number(&reach["arms"][arm]["reached"])), [2.0, 1.0]);
     assert_eq!(
         [0, 1].map(|arm| report["comparisons"][0]["arms"][arm]["name"].as_str().unwrap()),
@@ -136,7 +139,11 @@ fn paired_trials_print_a_note_and_are_compared_with_paired() {
     let report = json(&place, "compare df g --paired");
     let pair = &report["comparisons"][0]["measures"][0]["pairs"][0];
     // In every pair the arms differ by 0.25, which gives the smallest p of five pairs.
-    assert_eq!(["value", "low", "high", "a", "p"].map(|key| number(&pair[key])), [0.25, 0.25, 0.25, 1.0, 2.0 / 32.0]);
+    assert_eq!(["value", "a", "p"].map(|key| number(&pair[key])), [0.25, 1.0, 2.0 / 32.0]);
+    let interval = statistics::paired(&[0.25; 5].iter().collect(), 1.0).unwrap();
+    for (key, end) in [("low", interval.low), ("high", interval.high)] {
+        assert!((number(&pair[key]) - end).abs() < 1e-12, "{pair}");
+    }
     let unpaired = &json(&place, "compare df g")["comparisons"][0]["measures"][0]["pairs"][0];
     assert!(number(&unpaired["p"]) > 0.3 && number(&unpaired["a"]) < 0.8, "{unpaired}");
 
@@ -157,14 +164,21 @@ fn equal_arms_do_not_differ() {
     let report = json(&place, "compare a b_50%");
     for measure in report["comparisons"][0]["measures"].as_array().unwrap() {
         let pair = &measure["pairs"][0];
-        let actual = ["value", "low", "high", "a", "p", "p_holm"].map(|key| number(&pair[key]));
-        assert_eq!(actual, [0.0, 0.0, 0.0, 0.5, 1.0, 1.0], "{measure}");
+        assert_eq!(["a", "p", "p_holm"].map(|key| number(&pair[key])), [0.5, 1.0, 1.0], "{measure}");
+        if measure["measure"] == "generations_to_reach" {
+            assert!(pair["value"].is_null(), "{measure}");
+        } else {
+            // Equal trials do not exclude a difference.
+            assert_eq!((number(&pair["value"]), number(&pair["low"])), (0.0, -number(&pair["high"])), "{measure}");
+            assert!(number(&pair["high"]) > 0.25, "{measure}");
+        }
     }
     // The arms have the same config, so they are named after their directories.
     let (text, _) = place.good("compare a b_50% --latex");
     assert!(
         text.starts_with("% Values are means over trials")
-            && text.contains(r"best team's G, generation 1 & a $-$ b\_50\% & +0.000")
+            && text.contains(r"& not reached (0 of 4) \\")
+            && text.contains(r"champion's G, generation 1 & a $-$ b\_50\% & +0.000")
     );
     for (open, close) in [(r"\begin{tabular}", r"\end{tabular}"), ("{", "}")] {
         assert_eq!(text.matches(open).count(), text.matches(close).count(), "{text}");
@@ -187,7 +201,7 @@ fn p_values_are_corrected_and_csv_equals_json() {
     let names: Vec<_> =
         measures.iter().map(|measure| (measure["measure"].as_str().unwrap(), number(&measure["generation"]))).collect();
     let expected =
-        [("best_g", 0.0), ("best_g", 1.0), ("champion_g", 0.0), ("champion_g", 1.0), ("generations_to_reach", 1.0)];
+        [("champion_g", 0.0), ("champion_g", 1.0), ("best_g", 0.0), ("best_g", 1.0), ("generations_to_reach", 1.0)];
     assert_eq!(names, expected);
     let pairs = measures[1]["pairs"].as_array().unwrap();
     let p: Vec<f64> =
@@ -200,14 +214,17 @@ fn p_values_are_corrected_and_csv_equals_json() {
     let mut table = csv::Reader::from_reader(text.as_bytes());
     let rows: Vec<std::collections::HashMap<String, String>> = table.deserialize().map(Result::unwrap).collect();
     assert_eq!(rows.len(), 5 * (3 + 3));
-    let row =
-        rows.iter().find(|row| row["measure"] == "best_g" && row["generation"] == "1" && row["other"] == "z").unwrap();
+    let is_last = |row: &std::collections::HashMap<String, String>| row["generation"] == "1" && row["other"] == "z";
+    let row = rows.iter().find(|row| row["measure"] == "champion_g" && is_last(row)).unwrap();
     assert_eq!((&*row["arm"], &*row["trials"], &*row["other_trials"]), ("x", "6", "6"));
     for key in ["value", "low", "high", "a", "p", "p_holm"] {
-        assert_eq!(row[key].parse::<f64>().unwrap(), number(&pairs[1][key]), "{key}");
+        assert!((row[key].parse::<f64>().unwrap() - number(&pairs[1][key])).abs() < 1e-12, "{key}");
     }
     let row = rows.iter().find(|row| row["reach"] == "1" && row["arm"] == "z" && row["other"].is_empty()).unwrap();
-    assert_eq!((&*row["reached"], &*row["value"]), ("4", &*(1.0 + 2.0 / 6.0).to_string()));
+    assert_eq!((&*row["reached"], &*row["value"]), ("4", "1"));
+    // Half of the trials never reach G 1, which is no number.
+    let row = rows.iter().find(|row| row["reach"] == "1" && row["arm"] == "x" && row["other"].is_empty()).unwrap();
+    assert_eq!((&*row["reached"], &*row["value"], &*row["high"]), ("0", "", ""));
 }
 
 #[test]
@@ -223,11 +240,11 @@ fn unfinished_runs_are_compared_up_to_the_last_common_generation() {
     let (text, stderr) = place.good("compare whole part");
     assert!(stderr.contains("note: fitness G has reached generation 2 of 10\n"), "{stderr}");
     assert!(stderr.contains("note: arms are compared up to generation 2, which all have reached\n"), "{stderr}");
-    assert!(text.contains("best team's G, generation 2"), "{text}");
+    assert!(text.contains("champion's G, generation 2"), "{text}");
     let report = json(&place, "compare whole part");
     let reach = &report["comparisons"][0]["measures"][2];
-    // Only generations 0 to 2 are known of all trials. The counted generations are 3, 3, 3, and 2, 3, 1.
-    assert_eq!([0, 1].map(|arm| number(&reach["arms"][arm]["value"])), [3.0, 2.0]);
+    // Only generations 0 to 2 are known of all trials. The second arm reaches G 0.75 at 2, never, and at 1.
+    assert_eq!([0, 1].map(|arm| reach["arms"][arm]["value"].as_f64()), [None, Some(2.0)]);
     assert_eq!([0, 1].map(|arm| number(&reach["arms"][arm]["reached"])), [0.0, 2.0]);
     assert_fails(&place, "compare whole part --at 3", 2, &["--at 3: ", "generation 2"]);
 
@@ -302,12 +319,12 @@ fn a_sweep_is_compared_along_an_axis_and_seeds_add_trials() {
         .flat_map(|point| {
             let text = fs::read_to_string(place.path("s/points").join(point).join("metrics.csv")).unwrap();
             let last = text.lines().filter(|line| line.split(',').nth(1) == Some("2"));
-            last.map(|line| line.split(',').nth(2).unwrap().parse().unwrap()).collect::<Vec<f64>>()
+            last.map(|line| line.split(',').nth(4).unwrap().parse().unwrap()).collect::<Vec<f64>>()
         })
         .collect();
     assert_eq!(ends.len(), 6);
     let value = &comparisons[1]["measures"][0]["arms"][1]["value"];
-    assert_eq!(number(value), statistics::bootstrap(&[&ends]).unwrap().value);
+    assert_eq!(number(value), ends.iter().sum::<f64>() / 6.0);
     let (text, _) = place.good("compare s --by learning.fitness --paired");
     assert!(text.starts_with("coupling 1\n\n| arm") && text.contains("\ncoupling 2\n\n"), "{text}");
     // `--by seed` compares the seeds of each coupling and fitness.

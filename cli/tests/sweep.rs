@@ -509,9 +509,10 @@ fn collected_shards_equal_the_unsharded_sweep() {
     );
     // Heat maps and curves have the same label for G, and explain their colours.
     for (picture, labels) in [
-        ("final.svg", &["G of the best team", "mean over trials; below: 95 % interval"][..]),
-        ("reach.svg", &["Median generation that reaches G 0.75", "below: trials that reach it"]),
-        ("curves.svg", &["G of the best team", "mean and 95 % interval over 2 trials"]),
+        ("final.svg", &["G of the champion", "mean over trials; below: 95 % interval"][..]),
+        // No trial reaches it, so there are no colours to explain.
+        ("reach.svg", &["Generations until G of the champion is 0.75, median over trials", "never"]),
+        ("curves.svg", &["G of the champion", "mean and 95 % interval over 2 trials"]),
     ] {
         let svg = fs::read_to_string(unsharded.join(picture)).unwrap();
         for label in labels {
@@ -524,9 +525,9 @@ fn collected_shards_equal_the_unsharded_sweep() {
     // Two trials each of 4 points with 3 generations and 4 points with 12, each plus generation 0.
     assert_eq!(text.lines().count(), 1 + 2 * (4 * 4 + 4 * 13));
 
-    succeed(flotilla(&sweep, &unsharded, &["--collect", "--measure", "champion", "--band", "error"]));
+    succeed(flotilla(&sweep, &unsharded, &["--collect", "--measure", "best", "--band", "error"]));
     let svg = fs::read_to_string(unsharded.join("final.svg")).unwrap();
-    assert!(svg.contains("G of the champion") && svg.contains("below: ± standard error"), "{svg}");
+    assert!(svg.contains("G of the best team") && svg.contains("below: ± standard error"), "{svg}");
 
     for count in [2, 3, 11] {
         let out = folder.path().join(format!("{count}"));
@@ -589,13 +590,17 @@ fn results_have_every_fifth_generation_and_the_last() {
         let rows: Vec<Vec<f64>> =
             metrics.lines().skip(1).map(|line| line.split(',').map(|field| field.parse().unwrap()).collect()).collect();
         let last = rows.iter().map(|row| row[1]).fold(0.0, f64::max);
-        let best: Vec<f64> = rows.iter().filter(|row| row[1] == last).map(|row| row[2]).collect();
-        assert_eq!(point[6].parse::<f64>().unwrap(), (best[0] + best[1]) / 2.0, "{point:?}");
-        let first = |trial: f64| rows.iter().find(|row| row[0] == trial && row[2] >= 0.5).map(|row| row[1]);
+        for (place, column) in [(6, 4), (9, 2)] {
+            let ends: Vec<f64> = rows.iter().filter(|row| row[1] == last).map(|row| row[column]).collect();
+            assert_eq!(point[place].parse::<f64>().unwrap(), (ends[0] + ends[1]) / 2.0, "{point:?}");
+        }
+        let [mean, low, high] = [6, 7, 8].map(|place| point[place].parse::<f64>().unwrap());
+        assert!(0.0 <= low && low <= mean && mean <= high && high <= 1.0 && low < high, "{point:?}");
+        let first = |trial: f64| rows.iter().find(|row| row[0] == trial && row[4] >= 0.5).map(|row| row[1]);
         let reached = [first(0.0), first(1.0)];
-        assert_eq!(point[10].parse::<usize>().unwrap(), reached.iter().flatten().count());
+        assert_eq!(point[11].parse::<usize>().unwrap(), reached.iter().flatten().count());
         let median = reached[0].zip(reached[1]).map(|(a, b)| (a + b) / 2.0);
-        assert_eq!(point[11].parse::<f64>().ok(), median, "{point:?}");
+        assert_eq!(point[12].parse::<f64>().ok(), median, "{point:?}");
     }
     let error = fail(flotilla(&sweep, &out, &["--collect", "--axes", "radius"]), 2);
     assert!(error.contains("it has world.coupling, world.steps, learning.generations"), "{error}");
@@ -613,14 +618,15 @@ fn a_large_sweep_prints_its_best_and_its_worst_points() {
         let out = folder.path().join("out");
         let text = succeed(flotilla(&sweep, &out, &["--quiet"]));
         let mut table = csv::Reader::from_path(out.join("points.csv")).unwrap();
-        let column = table.headers().unwrap().iter().position(|name| name == "best_g").unwrap();
+        let column = table.headers().unwrap().iter().position(|name| name == "champion_g").unwrap();
         let mut means: Vec<f64> = table.records().map(|row| row.unwrap()[column].parse().unwrap()).collect();
         means.sort_by(|a, b| b.total_cmp(a));
-        let mut expected: Vec<String> = means.iter().map(|mean| format!("  {mean:.3} ±")).collect();
+        let mut expected: Vec<String> = means.iter().map(|mean| format!("  {mean:.3}")).collect();
         if points == 15 {
             expected.splice(6..9, ["  … (3 more)".to_string()]);
         }
-        let listed: Vec<&str> = text.lines().filter(|line| line.contains('±') || line.contains('…')).skip(1).collect();
+        let is_listed = |line: &&str| line.contains("learning.seed = ") || line.contains('…');
+        let listed: Vec<&str> = text.lines().filter(is_listed).collect();
         assert_eq!(listed.len(), expected.len(), "{text}");
         assert!(listed.iter().zip(&expected).all(|(line, start)| line.starts_with(start)), "{expected:?}: {text}");
     }
@@ -915,8 +921,9 @@ fn json_summaries_agree_with_the_files() {
     for (row, point) in table.records().map(|row| row.unwrap()).zip(summary["points"].as_array().unwrap()) {
         assert_eq!(row[0], point["values"]["world.coupling"].to_string());
         assert_eq!(row[3], point["point"].to_string());
-        assert_eq!(row[6].parse::<f64>().unwrap(), point["best_g"].as_f64().unwrap());
-        assert_eq!(row[10], point["reached"].to_string());
+        assert_eq!(row[6].parse::<f64>().unwrap(), point["champion_g"].as_f64().unwrap());
+        assert_eq!(row[8].parse::<f64>().ok(), point["champion_g_interval_95"][1].as_f64());
+        assert_eq!(row[11], point["reached"].to_string());
         let run = fs::read_to_string(Path::new(point["folder"].as_str().unwrap()).join("run.json")).unwrap();
         assert!(run.contains(point["digest"].as_str().unwrap()));
     }

@@ -435,9 +435,12 @@ fn held_out_episodes_are_summarised_by_mean_deviation_and_interval() {
         let n = values.len() as f64;
         let mean = values.iter().sum::<f64>() / n;
         let deviation = (values.iter().map(|value| (value - mean).powi(2)).sum::<f64>() / (n - 1.0)).sqrt();
-        // Student's t with 11 degrees of freedom. For equal values, the bound of Clopper and Pearson for 0 of 12.
-        let half = if deviation == 0.0 { 1.0 - 0.025f64.powf(1.0 / n) } else { 2.200985 * deviation / n.sqrt() };
-        [mean, deviation, (mean - half).max(0.0), (mean + half).min(2.0)]
+        // Student's t with 13 degrees of freedom, for the values and the smallest and the largest possible one.
+        let more = [values, &[0.0, 2.0]].concat();
+        let middle = more.iter().sum::<f64>() / (n + 2.0);
+        let squares: f64 = more.iter().map(|value| (value - middle).powi(2)).sum();
+        let half = 2.160369 * (squares / (n + 1.0) / (n + 2.0)).sqrt();
+        [mean, deviation, (middle - half).max(0.0), (middle + half).min(2.0)]
     };
     let assert_close = |actual: &[f64], expected: &[f64]| {
         assert_eq!(actual.len(), expected.len());

@@ -209,7 +209,7 @@ class Run:
         return Replay(_native.replay(self.folder, *chosen, generations, self.unverified, word("backend", backend)))
 
     def plot(self, measure: str | None = None) -> Figure:
-        """The learning curves: best team, champion and mean team, each with its 95 % interval over trials.
+        """The learning curves: champion, best team and mean team, each with its 95 % interval over trials.
 
         Args:
             measure: draw only one of them: `"best"`, `"champion"` or `"mean"`.
@@ -261,8 +261,8 @@ def plot(runs: Runs, measure: str | None = None) -> Figure:
 
     Args:
         runs: runs or their directories, one or a list.
-        measure: the teams that are drawn: `"best"`, `"champion"` or `"mean"`. None draws all three of one run, and the best
-            of several.
+        measure: the teams that are drawn: `"best"`, `"champion"` or `"mean"`. None draws all three of one run, and the
+            champions of several.
 
     Raises:
         ValueError: there are no runs or too many, or there is no such measure.

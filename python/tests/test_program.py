@@ -65,8 +65,8 @@ def test_runs_are_compared(config):
     runs = [train(config.replace(learning={"fitness": fitness})) for fitness in ("G", "Df")]
     comparison = flotilla.compare(runs)
     assert comparison["test"] == "mann-whitney" and len(comparison["comparisons"][0]["arms"]) == 2
-    best = comparison["comparisons"][0]["measures"][0]["arms"][0]
-    assert best["value"] == pytest.approx(runs[0].metrics["best_g"][:, -1].mean())
+    champion = comparison["comparisons"][0]["measures"][0]["arms"][0]
+    assert champion["value"] == pytest.approx(runs[0].metrics["champion_g"][:, -1].mean())
     assert flotilla.compare(runs, paired=True)["test"] == "wilcoxon"
     with pytest.raises(ValueError, match="^at=99: "):
         flotilla.compare(runs, at=99)

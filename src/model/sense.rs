@@ -3,7 +3,7 @@
 use fearless_simd::{Simd, prelude::*};
 
 use super::{LONGEST, Lanes};
-use crate::config_enum::config_enum;
+use crate::config_enum::{Choice, config_enum};
 use crate::gpu_struct::gpu_struct;
 use crate::kernels::{
     math::{exact_sqrt, rsqrt},
@@ -13,6 +13,8 @@ use crate::reader::{Reader, between, section};
 
 /// The shader of this part.
 pub(crate) const WGSL: &str = include_str!("../../shaders/sense.wgsl");
+// The shader takes every density except the first for the second one.
+const _: () = assert!(Density::ALL.len() == 2, "add the new density to shaders/sense.wgsl, too, and raise this number");
 
 /// Inputs of a policy: POI and agent density in four quadrants each.
 pub const INPUTS: usize = 8;

@@ -43,7 +43,7 @@ pub fn compare(experiments: Vec<Experiment>, bytes: &[u8]) -> Result<Value, Refu
             let key = (config.learning.seed, trial);
             trials.push(Trial { key, scores: scores.to_vec(), from: config.last_from() });
         }
-        let (curve, _) = Curve::new(&best).thinned();
+        let (curve, _) = Curve::new(&best, 1.0).thinned();
         let band = curve.outline(Band::Interval, 1.0);
         curves.push(json!({ "generation": curve.generation, "mean": curve.mean, "band": band }));
         let folders = vec![PathBuf::from(&name)];

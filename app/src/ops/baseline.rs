@@ -101,7 +101,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     };
     let mean = |observed: &[f64]| observed.iter().sum::<f64>() / observed.len() as f64;
     let found = |seeds: Vec<f64>, differ: bool| {
-        let interval = statistics::mean(&seeds, 1.0).filter(|_| differ).map(|mean| mean.within(0.0, pois as f64));
+        let interval = statistics::bounded(&seeds.iter().collect(), [0.0, pois as f64]).filter(|_| differ);
         Found { mean: mean(&seeds), interval_95: interval.map(|mean| [mean.low, mean.high]), seeds }
     };
     let speed = |index: usize| (index + 1) as f64 / SPEEDS as f64;

@@ -65,8 +65,6 @@ pub fn at(text: &str) -> Result<At, String> {
 pub struct Outcome {
     /// The confidence of every interval.
     pub confidence: f64,
-    /// The number of bootstrap samples.
-    pub resamples: usize,
     /// The test: `mann-whitney` or `wilcoxon`.
     pub test: &'static str,
     /// The comparisons.
@@ -133,7 +131,6 @@ pub fn run(args: &Request, context: Context<'_>) -> Result<Outcome, Error> {
     report(&notes[reported..]);
     Ok(Outcome {
         confidence: statistics::CONFIDENCE,
-        resamples: statistics::RESAMPLES,
         test: if args.paired { "wilcoxon" } else { "mann-whitney" },
         comparisons: all,
         notes,

@@ -16,6 +16,7 @@ use crate::record::disk::{Disk, Place};
 use crate::record::folder::{self, CONFIG, RUN, Run, SWEEP, Start};
 use crate::record::ownership;
 use crate::record::runs;
+use crate::report::comparison;
 use crate::report::curves::Band;
 use crate::report::runs::TeamKind;
 use crate::run::{self as training, SessionEnd};
@@ -29,6 +30,7 @@ use flotilla::config::{self, ConfigError, Override, Problem, ValidConfig};
 use flotilla::escape::PathExt;
 use flotilla::memory;
 use flotilla::reach::{self, Unreachable};
+use flotilla::statistics;
 
 /// Request to train or collect a sweep.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -73,7 +75,7 @@ pub struct Results {
     pub unverified: bool,
     /// The axes of the pictures, across and down. The first two by default.
     pub axes: Vec<String>,
-    /// Team whose G the pictures show.
+    /// Team whose G the pictures show, and whose first generation with a G is reported.
     pub measure: TeamKind,
     /// Range that pictures show around a mean.
     pub band: Band,
@@ -121,12 +123,12 @@ pub struct PointOutcome {
 pub struct Found {
     /// The run's digest.
     pub digest: Option<String>,
+    /// G of the champion in the last generation, mean over trials.
+    pub champion_g: f64,
+    /// The 95 % interval of `champion_g`. None for one trial.
+    pub champion_g_interval_95: Option<[f64; 2]>,
     /// G of the best team in the last generation, mean over trials.
     pub best_g: f64,
-    /// Standard error of `best_g` over trials.
-    pub best_g_error: f64,
-    /// G of the champion, mean over trials.
-    pub champion_g: f64,
     /// The number of trials that reached the G.
     pub reached: usize,
     /// The median generation that reached it.
@@ -512,9 +514,10 @@ fn write_results(
         missing: outcome.as_ref().err().map(ToString::to_string),
         found: outcome.as_ref().ok().map(|outcome| Found {
             digest: Run::read(place.at(&folder.join(RUN))).ok().and_then(|run| run.digest),
-            best_g: outcome.best().mean(),
-            best_g_error: outcome.best().error(),
-            champion_g: outcome.champion().mean(),
+            champion_g: outcome.champion.mean(),
+            champion_g_interval_95: statistics::bounded(&outcome.champion, [0.0, 1.0])
+                .map(|mean| [mean.low, mean.high]),
+            best_g: outcome.best.mean(),
             reached: outcome.reached.iter().flatten().count(),
             median: outcome.median_reached(),
         }),
@@ -540,23 +543,27 @@ fn write_results(
 fn summary(sweep: &Sweep, outcomes: &[Result<results::Outcome, Missing>], options: &results::Detail) -> String {
     const LISTED: usize = 12;
     let done = sweep.points.iter().zip(outcomes).filter_map(|(point, outcome)| Some((point, outcome.as_ref().ok()?)));
-    let mut done: Vec<_> = done.map(|(point, outcome)| (outcome.best(), point, outcome)).collect();
+    let mut done: Vec<_> = done.map(|(point, outcome)| (outcome.measured(), point, outcome)).collect();
     done.sort_by(|(a, ..), (b, ..)| b.mean().total_cmp(&a.mean()));
     let mut text = format!(
-        "{} of {} points are done. G of the best team in the last generation, mean over trials ± standard error,\n\
+        "{} of {} points are done. {} in the last generation, mean over trials with its 95 % interval,\n\
          and the median generation that reached G = {}:\n",
         done.len(),
         sweep.points.len(),
+        options.measure.label(),
         options.reach
     );
-    for (at, (best, point, outcome)) in done.iter().enumerate() {
+    for (at, (measured, point, outcome)) in done.iter().enumerate() {
         if done.len() > LISTED && at == LISTED / 2 {
             let _ = writeln!(text, "  … ({} more)", done.len() - LISTED);
         }
         if done.len() <= LISTED || at < LISTED / 2 || at >= done.len() - LISTED / 2 {
-            let reached = outcome.median_reached().map_or("never".into(), |median| median.to_string());
-            let (mean, error) = (best.mean(), best.error());
-            let _ = writeln!(text, "  {mean:.3} ± {error:.3}  {reached:>6}  {}", sweep.describe(point));
+            let reached = outcome.median_reached().map_or("not reached".into(), |median| median.to_string());
+            let mean = match statistics::bounded(measured, [0.0, 1.0]) {
+                Some(mean) => comparison::estimate(mean, 3, false),
+                None => format!("{:.3}", measured.mean()),
+            };
+            let _ = writeln!(text, "  {mean}  {reached:>11}  {}", sweep.describe(point));
         }
     }
     text

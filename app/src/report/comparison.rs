@@ -90,12 +90,15 @@ pub enum At {
     Last,
 }
 
+/// The smallest and the largest G.
+const G: [f64; 2] = [0.0, 1.0];
+
 /// Options of a comparison.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Question {
     /// Generations at which G is compared.
     pub at: Vec<At>,
-    /// G of the best team, in 0..1. The first generation that reaches it is compared.
+    /// G of the champion, in 0..1. The first generation that reaches it is compared.
     pub reach: f64,
     /// Whether trials are compared pair by pair.
     pub paired: bool,
@@ -137,9 +140,9 @@ pub enum Measure {
         /// The generation, from 0.
         generation: usize,
     },
-    /// The first generation at which the best team's G is at least `reach`. With stages, only the last stage counts.
+    /// The first generation at which the champion's G is at least `reach`. With stages, only the last stage counts.
     ///
-    /// A trial that does not reach it by `generation` counts as one that reaches it at the next.
+    /// It is infinite for a trial that does not reach it by `generation`. Arms are described by their medians.
     GenerationsToReach {
         /// G to reach, in 0..1.
         reach: f64,
@@ -164,8 +167,8 @@ impl Measure {
             Measure::BestG { generation } => Some(trial.scores[generation][0]),
             Measure::ChampionG { generation } => Some(trial.scores[generation][1]),
             Measure::GenerationsToReach { reach, generation } => {
-                let reached = (trial.from..=generation).find(|&at| trial.scores[at][0] >= reach);
-                Some(reached.unwrap_or(generation + 1) as f64)
+                let reached = (trial.from..=generation).find(|&at| trial.scores[at][1] >= reach);
+                Some(reached.map_or(f64::INFINITY, |at| at as f64))
             }
             Measure::Played { .. } => None,
         }
@@ -174,16 +177,17 @@ impl Measure {
     /// Counts the trials that reached G, if this measures when they do.
     fn reached(self, values: &[f64]) -> Option<usize> {
         match self {
-            Measure::GenerationsToReach { generation, .. } => {
-                Some(values.iter().filter(|&&value| value <= generation as f64).count())
-            }
+            Measure::GenerationsToReach { .. } => Some(values.iter().filter(|value| value.is_finite()).count()),
             _ => None,
         }
     }
 
-    /// Returns the number of decimals to print.
-    pub fn digits(self) -> usize {
-        if let Measure::GenerationsToReach { .. } = self { 1 } else { 3 }
+    /// Returns a mean, a median or a difference as text, with its interval.
+    pub fn text(self, value: Estimate, signed: bool) -> String {
+        match self {
+            Measure::GenerationsToReach { .. } => generations(value, signed),
+            _ => estimate(value, 3, signed),
+        }
     }
 
     /// Returns the name of the measure in CSV.
@@ -243,16 +247,16 @@ pub struct Measured {
     /// The measure.
     #[serde(flatten)]
     pub measure: Measure,
-    /// Means of the arms, `[arms]`.
+    /// Means of the arms, or their medians of generations, `[arms]`.
     pub arms: Vec<Mean>,
     /// Differences between arms, one per pair of arms.
     pub pairs: Vec<Versus>,
 }
 
-/// The mean over an arm's trials.
+/// The mean over an arm's trials, or the median of generations.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Mean {
-    /// The mean with its 95 % interval.
+    /// The mean with its 95 % interval. A median or an end that is not reached is infinite, which is null in JSON.
     #[serde(flatten)]
     pub mean: Estimate,
     /// Number of trials that reached G, if that was measured.
@@ -265,7 +269,8 @@ pub struct Mean {
 pub struct Versus {
     /// Indices of the two arms.
     pub arms: [usize; 2],
-    /// The first arm's mean minus the second's.
+    /// The first arm's mean minus the second's. Differences of medians have no interval: its ends are NaN, and so is the
+    /// difference if a median is infinite. NaN is null in JSON.
     #[serde(flatten)]
     pub difference: Estimate,
     /// The test of the difference.
@@ -300,10 +305,10 @@ pub fn compare(place: &str, arms: &[Cohort], options: &Question) -> Result<Compa
             generations.push(at);
         }
     }
-    let best = generations.iter().map(|&generation| Measure::BestG { generation });
     let champion = generations.iter().map(|&generation| Measure::ChampionG { generation });
+    let best = generations.iter().map(|&generation| Measure::BestG { generation });
     let reach = Measure::GenerationsToReach { reach: options.reach, generation: last };
-    let measures = best.chain(champion).chain([reach]).map(|measure| {
+    let measures = champion.chain(best).chain([reach]).map(|measure| {
         let values = |arm: &Cohort| arm.trials.iter().filter_map(|trial| measure.of(trial)).collect();
         measured(measure, &arms.iter().map(values).collect::<Vec<_>>(), options.paired)
     });
@@ -344,26 +349,46 @@ pub fn of_values(
 
 /// Evaluates one measure of values `[arms][trials]` with at least two trials per arm.
 fn measured(measure: Measure, values: &[Vec<f64>], paired: bool) -> Measured {
-    let two = "arms of two trials or more";
-    let means = values
-        .iter()
-        .map(|values| Mean { mean: statistics::bootstrap(&[values]).expect(two), reached: measure.reached(values) });
+    const TWO: &str = "arms of two trials or more";
+    let means = values.iter().map(|values| {
+        let mean = match measure {
+            Measure::GenerationsToReach { .. } => statistics::median(values),
+            _ => statistics::bounded(&values.iter().collect(), G),
+        };
+        Mean { mean: mean.expect(TWO), reached: measure.reached(values) }
+    });
+    let means: Vec<Mean> = means.collect();
+    // Trials that never reach G are ties for the tests, after all others.
+    let ranked = |values: &Vec<f64>| -> Vec<f64> {
+        match measure {
+            Measure::GenerationsToReach { generation, .. } => {
+                values.iter().map(|value| value.min(generation as f64 + 1.0)).collect()
+            }
+            _ => values.clone(),
+        }
+    };
+    let values: Vec<Vec<f64>> = values.iter().map(ranked).collect();
     let mut pairs = Vec::new();
     for (first, one) in values.iter().enumerate() {
         for (second, other) in values.iter().enumerate().skip(first + 1) {
-            let (difference, test) = if paired {
-                let less: Vec<f64> = one.iter().zip(other).map(|(one, other)| one - other).collect();
-                (statistics::bootstrap(&[&less]), statistics::signed_rank(&less))
-            } else {
-                (statistics::bootstrap(&[one, other]), statistics::rank_sum(one, other))
+            let less: Vec<f64> = one.iter().zip(other).map(|(one, other)| one - other).collect();
+            let difference = match measure {
+                Measure::GenerationsToReach { .. } => {
+                    let [one, other] = [first, second].map(|arm| means[arm].mean.value);
+                    let value = if one.is_finite() && other.is_finite() { one - other } else { f64::NAN };
+                    Some(Estimate { value, low: f64::NAN, high: f64::NAN })
+                }
+                _ if paired => statistics::paired(&less.iter().collect(), G[1] - G[0]),
+                _ => statistics::difference(&one.iter().collect(), &other.iter().collect(), G),
             };
-            let (difference, test) = (difference.expect(two), test.expect(two));
+            let test = if paired { statistics::signed_rank(&less) } else { statistics::rank_sum(one, other) };
+            let (difference, test) = (difference.expect(TWO), test.expect(TWO));
             pairs.push(Versus { arms: [first, second], difference, test, p_holm: 0.0 });
         }
     }
     let corrected = statistics::holm(&pairs.iter().map(|pair| pair.test.p).collect::<Vec<_>>());
     pairs.iter_mut().zip(corrected).for_each(|(pair, p)| pair.p_holm = p);
-    Measured { measure, arms: means.collect(), pairs }
+    Measured { measure, arms: means, pairs }
 }
 
 impl Comparison {
@@ -374,7 +399,7 @@ impl Comparison {
         let rows = self.arms.iter().enumerate().map(|(at, arm)| {
             let cell = |Measured { measure, arms, .. }: &Measured| {
                 let reached = arms[at].reached.map_or(String::new(), |count| format!(" ({count} of {})", arm.trials));
-                estimate(arms[at].mean, measure.digits(), false) + &reached
+                measure.text(arms[at].mean, false) + &reached
             };
             [arm.name.clone(), arm.trials.to_string()].into_iter().chain(self.measures.iter().map(cell)).collect()
         });
@@ -386,7 +411,7 @@ impl Comparison {
         let head = ["measure", "pair", "difference", "A", "p", "p (Holm)"].map(String::from).to_vec();
         let row = |measure: Measure, pair: &Versus| {
             let names = pair.arms.map(|arm| &*self.arms[arm].name);
-            let difference = estimate(pair.difference, measure.digits(), true);
+            let difference = measure.text(pair.difference, true);
             let (a, p) = (format!("{:.2}", pair.test.a), [pair.test.p, pair.p_holm].map(probability));
             [vec![measure.to_string(), names.join(" − "), difference, a], p.to_vec()].concat()
         };
@@ -396,6 +421,18 @@ impl Comparison {
             .flat_map(|Measured { measure, pairs, .. }| pairs.iter().map(|pair| row(*measure, pair)));
         [head].into_iter().chain(rows).collect()
     }
+}
+
+/// Formats a median of generations as "3.5 [3, 12]", with the interval if there is one.
+fn generations(Estimate { value, low, high }: Estimate, signed: bool) -> String {
+    let word = |generation: f64| match generation {
+        _ if generation.is_nan() => "–".to_string(),
+        f64::INFINITY => "not reached".into(),
+        _ if signed => format!("{generation:+}").replace('-', "−"),
+        _ => generation.to_string(),
+    };
+    let interval = if low.is_finite() { format!(" [{}, {}]", word(low), word(high)) } else { String::new() };
+    word(value) + &interval
 }
 
 /// Formats an estimate as "0.92 [0.86, 0.97]", with typographic minus signs.
@@ -421,7 +458,8 @@ pub fn legend(all: &[Comparison], options: &Question) -> String {
         false => ("the Mann-Whitney test", "a random trial of the first arm"),
     };
     let mut text = format!(
-        "Values are means over trials, with 95 % bootstrap intervals.\n\
+        "Values are means over trials, with 95 % intervals for few trials of bounded scores.\n\
+         Generations are medians over trials. The interval of a median takes six trials.\n\
          Differences are the first arm minus the second.\n\
          A is the probability that {a} has the larger value; 0.5 means no difference.\n\
          p is two-sided, by {test}. Holm's correction is for the number of pairs.\n"
@@ -432,7 +470,7 @@ pub fn legend(all: &[Comparison], options: &Question) -> String {
     if all.iter().any(|all| all.measures.iter().any(|measured| never(measured, all))) {
         let _ = writeln!(
             text,
-            "A trial that never reaches G {} counts as if it reached it one generation after the last.",
+            "A median is not reached if half of the trials or more never reach G {}. They are ties for the test, after the others.",
             options.reach
         );
     }
@@ -494,7 +532,9 @@ pub fn csv(all: &[Comparison], output: impl io::Write) -> io::Result<()> {
             };
             let place =
                 || [escape::csv_cell(place).into_owned(), measure.key().into(), generation.to_string(), reach.clone()];
-            let numbers = |Estimate { value, low, high }| [value, low, high].map(|number: f64| number.to_string());
+            // Like JSON, CSV has no infinite numbers.
+            let finite = |number: f64| if number.is_finite() { number.to_string() } else { String::new() };
+            let numbers = |Estimate { value, low, high }| [value, low, high].map(finite);
             for (arm, Mean { mean, reached }) in named.iter().zip(arms) {
                 let name = escape::csv_cell(&arm.name).into_owned();
                 let whose = [name, String::new(), arm.trials.to_string(), String::new()];

@@ -17,6 +17,8 @@ const MAX_POINTS: usize = 300;
 /// Font size of 7 points, in millimetres. The next one is 8 points.
 pub(crate) const SMALL: f64 = 2.47;
 pub(super) const NORMAL: f64 = 2.82;
+/// Maximum number of bands in one panel. More than these cannot be told apart.
+const MAX_BANDS: usize = 3;
 const REFERENCES: [&[f64]; 2] = [&[2.6, 1.0], &[0.7, 0.7]];
 const DASHES: [&[f64]; 5] = [&[], &[1.6, 0.7], &[1.8, 0.6, 0.4, 0.6], &[0.5, 0.5], &[3.0, 0.8]];
 
@@ -24,7 +26,7 @@ const DASHES: [&[f64]; 5] = [&[], &[1.6, 0.7], &[1.8, 0.6, 0.4, 0.6], &[0.5, 0.5
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Band {
-    /// The 95 % interval of the mean, by Student's t.
+    /// The 95 % interval of the mean, see [`statistics::bounded`].
     #[default]
     Interval,
     /// One standard error on both sides.
@@ -49,20 +51,6 @@ impl std::str::FromStr for Band {
 }
 
 impl Band {
-    /// Returns lower end, mean and upper end of a share's band, within 0..1.
-    pub fn around(self, average: &Average) -> [f64; 3] {
-        let (mean, half) = (average.mean(), self.half_width(average));
-        [(mean - half).max(0.0), mean, (mean + half).min(1.0)]
-    }
-
-    fn half_width(self, average: &Average) -> f64 {
-        match self {
-            Band::Interval => average.error() * statistics::half_width(average.count() as usize),
-            Band::Error => average.error(),
-            Band::None => 0.0,
-        }
-    }
-
     /// Describes the band, for captions: "mean and 95 % interval".
     pub fn describe(self) -> &'static str {
         match self {
@@ -82,52 +70,69 @@ pub struct Curve {
     pub mean: Vec<f64>,
     /// Standard error of the mean, `[points]`.
     pub error: Vec<f64>,
-    /// Half-width of the 95 % interval of the mean, `[points]`.
+    /// Lower and upper end of the 95 % interval of the mean, `[points]`. A single trial has no interval: both are the
+    /// mean.
     #[serde(skip)]
-    pub interval: Vec<f64>,
+    pub interval: Vec<[f64; 2]>,
     /// The largest number of trials of a point.
     #[serde(skip)]
     pub trials: u32,
 }
 
 impl Curve {
-    /// Makes a curve from one average per generation, from generation 0. Generations without values are left out.
-    pub fn new(tallies: &[Average]) -> Curve {
-        Curve::at(tallies.iter().enumerate())
+    /// Makes a curve of values in `0..=most` from one average per generation, from generation 0. Generations without
+    /// values are left out.
+    pub fn new(tallies: &[Average], most: f64) -> Curve {
+        Curve::at(tallies.iter().enumerate(), most)
     }
 
-    /// Makes a curve from generations, each with its average. Generations without values are left out.
-    pub fn at<'a>(averages: impl IntoIterator<Item = (usize, &'a Average)>) -> Curve {
+    /// Makes a curve like [`Curve::new`] from generations, each with its average.
+    pub fn at<'a>(averages: impl IntoIterator<Item = (usize, &'a Average)>, most: f64) -> Curve {
         let mut curve = Curve::default();
         // The factor takes time and rarely changes.
         let (mut count, mut factor) = (0, 0.0);
         for (generation, average) in averages.into_iter().filter(|(_, average)| average.count() > 0) {
             if average.count() != count {
-                (count, factor) = (average.count(), statistics::half_width(average.count() as usize));
+                (count, factor) = (average.count(), statistics::bounded_factor(average.count() as usize));
             }
+            let mean = average.mean();
+            let interval = statistics::bounded_by(factor, average, [0.0, most]);
             curve.generation.push(generation as f64);
-            curve.mean.push(average.mean());
+            curve.mean.push(mean);
             curve.error.push(average.error());
-            curve.interval.push(average.error() * factor);
+            curve.interval.push(interval.map_or([mean; 2], |interval| [interval.low, interval.high]));
             curve.trials = curve.trials.max(average.count());
         }
         curve
     }
 
+    /// Returns the ends of the band at a point, clamped to `0..=most`.
+    pub fn ends(&self, band: Band, point: usize, most: f64) -> [f64; 2] {
+        let (mean, error) = (self.mean[point], self.error[point]);
+        let ends = match band {
+            Band::Interval => self.interval[point],
+            Band::Error => [mean - error, mean + error],
+            Band::None => [mean; 2],
+        };
+        ends.map(|end| end.clamp(0.0, most))
+    }
+
+    /// Describes the band at a point: " ± 0.03" or " [0.86, 0.97]". Empty if it has no width.
+    pub(super) fn describe(&self, band: Band, point: usize) -> String {
+        match (band, self.ends(band, point, f64::INFINITY)) {
+            (_, [low, high]) if low >= high => String::new(),
+            (Band::Interval, ends) => format!(" [{}]", ends.map(number).join(", ")),
+            _ => format!(" ± {}", number(self.error[point])),
+        }
+    }
+
     /// Returns the outline of a band around the mean, clamped to `0..=most`: the upper side by generation, then the
     /// lower side backwards. None if the band has no width.
     pub fn outline(&self, band: Band, most: f64) -> Option<Vec<(f64, f64)>> {
-        let half = match band {
-            Band::Interval => &self.interval,
-            Band::Error => &self.error,
-            Band::None => return None,
-        };
-        half.iter().any(|&half| half > 0.0).then_some(())?;
-        let side = |sign: f64| {
-            let values = self.mean.iter().zip(half).map(move |(mean, half)| (mean + sign * half).clamp(0.0, most));
-            self.generation.iter().copied().zip(values)
-        };
-        Some(side(1.0).chain(side(-1.0).rev()).collect())
+        let ends: Vec<[f64; 2]> = (0..self.mean.len()).map(|point| self.ends(band, point, most)).collect();
+        ends.iter().any(|[low, high]| low < high).then_some(())?;
+        let side = |end: usize| self.generation.iter().copied().zip(ends.iter().map(move |ends| ends[end]));
+        Some(side(1).chain(side(0).rev()).collect())
     }
 
     /// Returns a curve with few enough points to draw, and the number of generations that each point averages.
@@ -136,8 +141,9 @@ impl Curve {
         let average = |values: &[f64]| -> Vec<f64> {
             values.chunks(each).map(|values| values.iter().sum::<f64>() / values.len() as f64).collect()
         };
-        let [generation, mean, error, interval] =
-            [&self.generation, &self.mean, &self.error, &self.interval].map(|values| average(values));
+        let [generation, mean, error] = [&self.generation, &self.mean, &self.error].map(|values| average(values));
+        let [low, high] = [0, 1].map(|end| average(&self.interval.iter().map(|ends| ends[end]).collect::<Vec<_>>()));
+        let interval = low.into_iter().zip(high).map(|(low, high)| [low, high]).collect();
         (Curve { generation, mean, error, interval, trials: self.trials }, each)
     }
 }
@@ -191,8 +197,10 @@ impl Figure {
         let columns = self.panels.len().max(1) as f64;
         let height = if columns > 1.0 { 36.0 } else { 46.0 };
         let width = (COLUMN - edge - RIGHT - GAP * (columns - 1.0)) / columns;
-        let banded =
-            band_caption(self.band, self.panels.iter().flat_map(|panel| &panel.curves).map(|(_, curve)| curve));
+        let of_panels =
+            || self.panels.iter().map(|panel| panel.curves.iter().filter(|(at, _)| *at < self.legend.len()));
+        let bars = needs_bars(of_panels().map(Iterator::count));
+        let banded = band_caption(self.band, bars, of_panels().flatten().map(|(_, curve)| curve));
         let caption = if banded.is_some() { 4.0 } else { 0.0 };
         let mut scene = Scene::new(COLUMN, above + height + BELOW + caption);
         (scene.title, scene.description) = (self.title(), self.description());
@@ -221,7 +229,7 @@ impl Figure {
         let x_max = self.panels.iter().map(last).fold(1.0, f64::max);
         for (column, (panel, curves)) in self.panels.iter().zip(&thinned).enumerate() {
             let left = edge + (width + GAP) * column as f64;
-            let axes = Axes { left, above, width, height, x_max, y_max: self.y_max * 1.04 };
+            let axes = Axes { left, above, width, height, x_max, most: self.y_max };
             scene.bold([left + width / 2.0, above - 1.3], &*panel.title, NORMAL, Anchor::Middle, BLACK);
             axes.draw(&mut scene, column == 0, self.y_max, self.shares);
             axes.stages(&mut scene, &panel.stages);
@@ -234,20 +242,17 @@ impl Figure {
                 scene.text([middle, above + height + 7.4], label, NORMAL, Anchor::Middle, BLACK);
             }
             if let Some(caption) = banded.as_ref().filter(|_| column == 0) {
-                draw_caption(&mut scene, [edge, above + height + 11.4], caption);
+                draw_caption(&mut scene, [edge, above + height + 11.4], caption, bars);
             }
             scene.clipped([left - 0.8, above - 0.8, width + 1.6, height + 1.6], |scene| {
                 let (curves, references): (Vec<_>, Vec<_>) =
                     curves.iter().partition(|(index, _)| *index < self.legend.len());
-                for (index, (curve, _)) in &curves {
-                    axes.band(scene, curve.outline(self.band, self.y_max), Look::of(*index).color);
-                }
+                let curves: Vec<_> = curves.into_iter().map(|(index, (curve, _))| (*index, curve)).collect();
+                axes.bands(scene, &curves, self.band, bars);
                 for (index, (curve, _)) in references {
                     scene.line(axes.points(curve), self.pen(*index));
                 }
-                for (index, (curve, _)) in curves {
-                    axes.curve(scene, curve, *index, self.legend.len());
-                }
+                axes.curves(scene, &curves, self.band, bars, self.legend.len());
             });
         }
         self.warning.iter().for_each(|warning| scene.warn(warning));
@@ -276,12 +281,7 @@ impl Figure {
                 let label = self.legend.iter().chain(&self.references).nth(*index)?;
                 let last = curve.mean.len().checked_sub(1)?;
                 let [from, to] = [0, last].map(|at| (curve.generation[at], number(curve.mean[at])));
-                let room = match self.band {
-                    Band::Interval => curve.interval[last],
-                    Band::Error => curve.error[last],
-                    Band::None => 0.0,
-                };
-                let room = if room > 0.0 { format!(" ± {}", number(room)) } else { String::new() };
+                let room = curve.describe(self.band, last);
                 Some(format!(
                     "{label} from {} at generation {} to {}{room} at generation {}",
                     from.1, from.0, to.1, to.0
@@ -294,27 +294,38 @@ impl Figure {
             text.extend(stages.map(|(index, from)| format!(" Stage {} begins at generation {from}.", index + 1)));
         }
         let curves = self.panels.iter().flat_map(|panel| &panel.curves).map(|(_, curve)| curve);
-        if let Some(caption) = band_caption(self.band, curves) {
+        if let Some(caption) = band_caption(self.band, false, curves) {
             text += &format!(" Band: {caption}.");
         }
         text
     }
 }
 
-/// Returns the caption of the bands, if any curve has one.
-pub(crate) fn band_caption<'a>(band: Band, curves: impl Iterator<Item = &'a Curve>) -> Option<String> {
+/// Reports whether bars at the last generation replace bands, given the number of curves of each panel.
+pub(super) fn needs_bars(mut curves: impl Iterator<Item = usize>) -> bool {
+    curves.any(|count| count > MAX_BANDS)
+}
+
+/// Returns the caption of the bands or bars, if any curve has one.
+pub(super) fn band_caption<'a>(band: Band, bars: bool, curves: impl Iterator<Item = &'a Curve>) -> Option<String> {
     let curves: Vec<&Curve> = curves.collect();
     curves.iter().any(|curve| curve.outline(band, f64::INFINITY).is_some()).then_some(())?;
     let trials: BTreeSet<u32> = curves.iter().map(|curve| curve.trials).collect();
     let (least, most) = (trials.first()?, trials.last()?);
     let trials = if least == most { most.to_string() } else { format!("{least} to {most}") };
-    Some(format!("{} over {trials} trials", band.describe()))
+    let place = if bars { " at the end" } else { "" };
+    Some(format!("{} over {trials} trials{place}", band.describe()))
 }
 
-/// Draws the caption of the bands from a place on the baseline.
-pub(crate) fn draw_caption(scene: &mut Scene, [x, y]: [f64; 2], caption: &str) {
-    scene.rectangle([x, y - 1.9, 6.0, 2.2], Some(Fill { color: GREY, opacity: 0.3 }), None);
-    scene.line(vec![[x, y - 0.8], [x + 6.0, y - 0.8]], Pen::new(GREY, 0.4));
+/// Draws the caption of the bands or bars from a place on the baseline.
+pub(super) fn draw_caption(scene: &mut Scene, [x, y]: [f64; 2], caption: &str, bars: bool) {
+    if bars {
+        scene.line(vec![[x + 3.0, y - 2.1], [x + 3.0, y + 0.5]], Pen::new(GREY, 0.4));
+        scene.circle([x + 3.0, y - 0.8], 0.7, Some(GREY.into()), None);
+    } else {
+        scene.rectangle([x, y - 1.9, 6.0, 2.2], Some(Fill { color: GREY, opacity: 0.3 }), None);
+        scene.line(vec![[x, y - 0.8], [x + 6.0, y - 0.8]], Pen::new(GREY, 0.4));
+    }
     scene.text([x + 7.0, y], caption, SMALL, Anchor::Start, BLACK);
 }
 
@@ -336,18 +347,21 @@ fn legend_rows(labels: &[String]) -> Vec<Vec<(usize, f64)>> {
 }
 
 /// Position and ranges of one panel, in millimetres and data units.
-struct Axes {
-    left: f64,
-    above: f64,
-    width: f64,
-    height: f64,
-    x_max: f64,
-    y_max: f64,
+pub(super) struct Axes {
+    pub left: f64,
+    pub above: f64,
+    pub width: f64,
+    pub height: f64,
+    /// The last generation.
+    pub x_max: f64,
+    /// The largest value.
+    pub most: f64,
 }
 
 impl Axes {
-    fn at(&self, generation: f64, value: f64) -> [f64; 2] {
-        let y = (value / self.y_max).clamp(0.0, 1.0);
+    pub fn at(&self, generation: f64, value: f64) -> [f64; 2] {
+        // Curves at the largest value stay below the edge.
+        let y = (value / (self.most * 1.04)).clamp(0.0, 1.0);
         [self.left + self.width * generation / self.x_max, self.above + self.height * (1.0 - y)]
     }
 
@@ -389,11 +403,33 @@ impl Axes {
         }
     }
 
-    /// Draws the band around a mean, if it has one.
-    fn band(&self, scene: &mut Scene, outline: Option<Vec<(f64, f64)>>, color: Color) {
-        let Some(outline) = outline else { return };
-        let outline = outline.into_iter().map(|(generation, value)| self.at(generation, value)).collect();
-        scene.polygon(outline, Some(Fill { color, opacity: 0.2 }), None);
+    /// Draws the bands of curves, unless bars replace them.
+    pub fn bands(&self, scene: &mut Scene, curves: &[(usize, &Curve)], band: Band, bars: bool) {
+        for (index, curve) in curves.iter().filter(|_| !bars) {
+            if let Some(outline) = curve.outline(band, self.most) {
+                let outline = outline.into_iter().map(|(generation, value)| self.at(generation, value)).collect();
+                scene.polygon(outline, Some(Fill { color: Look::of(*index).color, opacity: 0.2 }), None);
+            }
+        }
+    }
+
+    /// Draws curves, each with its index in the legend of `of` curves, and the bars of their last generation, side by
+    /// side.
+    pub fn curves(&self, scene: &mut Scene, curves: &[(usize, &Curve)], band: Band, bars: bool, of: usize) {
+        for (index, curve) in curves {
+            self.curve(scene, curve, *index, of);
+        }
+        for (place, (index, curve)) in curves.iter().rev().enumerate().filter(|_| bars) {
+            let Some(last) = curve.mean.len().checked_sub(1) else { continue };
+            let ends = curve.ends(band, last, self.most);
+            let [x, y] = self.at(curve.generation[last], curve.mean[last]);
+            let (x, look) = (x - 0.8 - 2.0 * place as f64, Look::of(*index));
+            if ends[0] < ends[1] {
+                let [low, high] = ends.map(|end| [x, self.at(0.0, end)[1]]);
+                scene.line(vec![low, high], Pen::new(look.color, 0.4));
+                look.mark(scene, [x, y]);
+            }
+        }
     }
 
     fn points(&self, curve: &Curve) -> Vec<[f64; 2]> {
@@ -419,22 +455,22 @@ impl Axes {
 
 /// Style of a curve: colour, dashes and mark. The first five curves differ in both colour and dashes.
 #[derive(Clone, Copy)]
-struct Look {
+pub(super) struct Look {
     color: Color,
     dash: &'static [f64],
     shape: usize,
 }
 
 impl Look {
-    fn of(index: usize) -> Look {
+    pub fn of(index: usize) -> Look {
         Look { color: COLORS[index % COLORS.len()], dash: DASHES[index % DASHES.len()], shape: index % 4 }
     }
 
-    fn pen(&self) -> Pen {
+    pub fn pen(&self) -> Pen {
         Pen { dash: self.dash, ..Pen::new(self.color, 0.4) }
     }
 
-    fn mark(&self, scene: &mut Scene, [x, y]: [f64; 2]) {
+    pub fn mark(&self, scene: &mut Scene, [x, y]: [f64; 2]) {
         let (fill, pen) = (Some(Fill::from(self.color)), Some(Pen::new(WHITE, 0.15)));
         let corners = |offsets: &[[f64; 2]]| offsets.iter().map(|[dx, dy]| [x + dx, y + dy]).collect::<Vec<_>>();
         match self.shape {

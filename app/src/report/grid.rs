@@ -1,7 +1,7 @@
 //! Figures of a sweep: heat maps over two axes, curves by the values of an axis, and dots for keys that are varied one
 //! at a time.
 
-use super::curves::{Band, Curve, NORMAL, SMALL, band_caption, distinct, draw_caption};
+use super::curves::{Axes, Band, Curve, Look, NORMAL, SMALL, band_caption, distinct, draw_caption, needs_bars};
 use super::scene::{Anchor, BLACK, Color, Fill, GREY, LIGHT, Pen, Scene, WHITE, text_width};
 
 /// Maximum width of a figure in millimetres. Further panels go to the next row.
@@ -99,7 +99,9 @@ impl HeatMap {
         panels.above -= if titles > 0.0 { 0.0 } else { 4.0 };
         let (width, height, wide) = (panels.width, panels.height, panels.width / columns as f64);
         let (key_width, key_above) = (KEY, panels.above + panels.height() + 3.0);
-        let mut scene = Scene::new(panels.width().max(least), key_above + 9.5);
+        // Without values there are no colours to explain.
+        let coloured = self.panels.iter().flat_map(|(_, cells)| cells).any(|cell| matches!(cell, Cell::Value(..)));
+        let mut scene = Scene::new(panels.width().max(least), key_above + if coloured { 9.5 } else { -1.5 });
         scene.bold([3.0, 5.0], &*self.title, 3.2, Anchor::Start, BLACK);
         (scene.title, scene.description) = (self.title.clone(), self.description());
 
@@ -139,6 +141,9 @@ impl HeatMap {
                     scene.upright([3.8, y + height / 2.0], &*self.y.label, NORMAL, BLACK);
                 }
             }
+        }
+        if !coloured {
+            return scene;
         }
         let steps = 64;
         for step in 0..steps {
@@ -239,29 +244,30 @@ impl Curves {
             x += entry + 1.5;
         }
         panels.above = y + if titles > 0.0 { 9.0 } else { 5.0 };
-        let banded = band_caption(self.band, self.panels.iter().flat_map(|(_, curves)| curves).map(|(_, curve)| curve));
+        let bars = needs_bars(self.panels.iter().map(|(_, curves)| curves.len()));
+        let all = self.panels.iter().flat_map(|(_, curves)| curves).map(|(_, curve)| curve);
+        let banded = band_caption(self.band, bars, all);
         let caption = if banded.is_some() { 4.5 } else { 0.0 };
         let mut scene = Scene::new(whole, panels.above + panels.height() - 2.0 + caption);
         (scene.title, scene.description) = (self.title.clone(), self.description());
         if let Some(caption) = banded {
             let place = [3.0, scene.height - 2.0];
-            draw_caption(&mut scene, place, &caption);
+            draw_caption(&mut scene, place, &caption, bars);
         }
         scene.bold([3.0, 5.0], &*self.title, 3.2, Anchor::Start, BLACK);
         scene.text([3.0, 10.9], &*self.by.label, NORMAL, Anchor::Start, BLACK);
         for (at, (label, [x, y])) in labels.iter().zip(places).enumerate() {
-            scene.line(vec![[x, y], [x + 6.0, y]], self.pen(at));
+            scene.line(vec![[x, y], [x + 6.0, y]], Look::of(at).pen());
+            Look::of(at).mark(&mut scene, [x + 3.0, y]);
             scene.text([x + 7.0, y + 0.9], &**label, SMALL, Anchor::Start, BLACK);
         }
         let generations = self.panels.iter().flat_map(|(_, curves)| curves).filter_map(|(_, c)| c.generation.last());
         let last = generations.fold(1.0, |a: f64, &b| a.max(b));
         for (index, (title, curves)) in self.panels.iter().enumerate() {
             let [left, above] = panels.place(index);
-            let at = |generation: f64, g: f64| {
-                [left + width * generation / last, above + HEIGHT * (1.0 - g / 1.04).clamp(0.0, 1.0)]
-            };
+            let axes = Axes { left, above, width, height: HEIGHT, x_max: last, most: 1.0 };
             for (tick, label) in [(0.0, "0"), (0.5, "0.5"), (1.0, "1")] {
-                let [_, y] = at(0.0, tick);
+                let [_, y] = axes.at(0.0, tick);
                 scene.line(vec![[left, y], [left + width, y]], Pen::new(LIGHT, 0.15));
                 if panels.is_first(index) {
                     scene.text([left - 1.3, y + 0.9], label, SMALL, Anchor::End, BLACK);
@@ -272,7 +278,7 @@ impl Curves {
                 Pen::new(BLACK, 0.2),
             );
             for (generation, anchor) in [(0.0, Anchor::Middle), (last, Anchor::End)] {
-                let [x, y] = at(generation, 0.0);
+                let [x, y] = axes.at(generation, 0.0);
                 scene.text([x, y + 3.4], generation.to_string(), SMALL, anchor, BLACK);
             }
             scene.text([left + width / 2.0, above + HEIGHT + 3.4], "Generation", SMALL, Anchor::Middle, BLACK);
@@ -282,16 +288,9 @@ impl Curves {
             }
             scene.clipped([left - 0.4, above - 0.4, width + 0.8, HEIGHT + 0.8], |scene| {
                 let curves: Vec<_> = curves.iter().map(|(value, curve)| (*value, curve.thinned().0)).collect();
-                for (value, curve) in &curves {
-                    if let Some(outline) = curve.outline(self.band, 1.0) {
-                        let fill = Fill { color: self.pen(*value).color, opacity: 0.15 };
-                        scene.polygon(outline.into_iter().map(|(x, y)| at(x, y)).collect(), Some(fill), None);
-                    }
-                }
-                for (value, curve) in &curves {
-                    let points = curve.generation.iter().zip(&curve.mean).map(|(&x, &y)| at(x, y)).collect();
-                    scene.line(points, self.pen(*value));
-                }
+                let curves: Vec<_> = curves.iter().map(|(value, curve)| (*value, curve)).collect();
+                axes.bands(scene, &curves, self.band, bars);
+                axes.curves(scene, &curves, self.band, bars, labels.len());
             });
         }
         scene
@@ -303,24 +302,12 @@ impl Curves {
         for (title, curves) in &self.panels {
             let end = |(value, curve): &(usize, Curve)| {
                 let (mean, value) = (curve.mean.last()?, self.by.values.get(*value)?);
-                let half = match self.band {
-                    Band::Interval => curve.interval.last(),
-                    Band::Error => curve.error.last(),
-                    Band::None => None,
-                };
-                Some(format!("{value}: {mean:.2}{}", half.map_or(String::new(), |half| format!(" ± {half:.2}"))))
+                Some(format!("{value}: {mean:.2}{}", curve.describe(self.band, curve.mean.len() - 1)))
             };
             let ends: Vec<_> = curves.iter().filter_map(end).collect();
             text += &format!(" {title}{}{}.", if title.is_empty() { "" } else { ": " }, ends.join(", "));
         }
         text
-    }
-
-    /// Returns the pen for the value of an axis: darker for later values, with alternating dashes.
-    fn pen(&self, value: usize) -> Pen {
-        const DASHES: [&[f64]; 3] = [&[], &[1.8, 0.7], &[0.7, 0.6]];
-        let last = self.by.values.len().saturating_sub(1).max(1) as f64;
-        Pen { dash: DASHES[value % 3], ..Pen::new(shade(0.35 + 0.65 * value as f64 / last), 0.45) }
     }
 }
 
@@ -466,5 +453,22 @@ impl Panels {
 
     fn height(&self) -> f64 {
         (self.height + self.below) * self.count.div_ceil(self.columns) as f64 - self.below + 9.0
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_map_without_values_has_no_colour_bar() {
+        let [some, none] =
+            [Cell::Value(1.0, "1.00".into(), String::new()), Cell::Word("not reached".into())].map(|cell| {
+                let x = Scale { label: "coupling".into(), values: vec!["1".into()] };
+                let key = vec![(0.0, "first".to_string()), (1.0, "last".into())];
+                HeatMap { x, panels: vec![(String::new(), vec![cell])], key, ..HeatMap::default() }.scene().svg()
+            });
+        let labelled = |svg: &str| ["first", "last"].map(|label| svg.contains(&format!("aria-label=\"{label}\"")));
+        assert_eq!((labelled(&some), labelled(&none)), ([true; 2], [false; 2]));
     }
 }

@@ -22,18 +22,18 @@ pub(crate) const MAX_RUNS: usize = 24;
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum TeamKind {
-    /// The team with the largest G.
-    #[default]
-    Best,
     /// The team of the best policy of each population.
+    #[default]
     Champion,
+    /// The team with the largest G, a maximum that grows with the population.
+    Best,
     /// The mean over all teams.
     Mean,
 }
 
 impl TeamKind {
     /// All kinds.
-    pub const ALL: [TeamKind; 3] = [TeamKind::Best, TeamKind::Champion, TeamKind::Mean];
+    pub const ALL: [TeamKind; 3] = [TeamKind::Champion, TeamKind::Best, TeamKind::Mean];
 
     /// Returns the kind's name in pictures.
     pub fn name(self) -> &'static str {
@@ -70,7 +70,7 @@ impl std::str::FromStr for TeamKind {
 
     fn from_str(text: &str) -> Result<TeamKind, String> {
         let read = TeamKind::deserialize(text.into_deserializer());
-        read.map_err(|_: serde::de::value::Error| "allowed best, champion or mean".into())
+        read.map_err(|_: serde::de::value::Error| "allowed champion, best or mean".into())
     }
 }
 
@@ -138,7 +138,7 @@ pub fn trials(folder: &Path, config: &Config, verification: Verification) -> Res
 
 /// Returns the figure of G by generation: of one kind of team in each run, or of all kinds in a single run.
 ///
-/// By default, one run shows all kinds of teams, and several runs show their best teams. Several runs are labelled by
+/// By default, one run shows all kinds of teams, and several runs show their champions. Several runs are labelled by
 /// the config keys that differ.
 ///
 /// # Errors
@@ -185,11 +185,11 @@ fn figure_of_runs(
 ) -> Figure {
     let (legend, curves): (Vec<String>, Vec<Curve>) = match (all, measure) {
         ([run], None) => {
-            TeamKind::ALL.into_iter().map(|kind| (kind.name().to_string(), Curve::new(run.of(kind)))).unzip()
+            TeamKind::ALL.into_iter().map(|kind| (kind.name().to_string(), Curve::new(run.of(kind), 1.0))).unzip()
         }
-        ([run], Some(kind)) => (vec![kind.name().to_string()], vec![Curve::new(run.of(kind))]),
+        ([run], Some(kind)) => (vec![kind.name().to_string()], vec![Curve::new(run.of(kind), 1.0)]),
         (all, kind) => {
-            let curves = all.iter().map(|run| Curve::new(run.of(kind.unwrap_or_default())));
+            let curves = all.iter().map(|run| Curve::new(run.of(kind.unwrap_or_default()), 1.0));
             labels().into_iter().zip(curves).unzip()
         }
     };

@@ -9,8 +9,8 @@ use crate::record::RecordError;
 use crate::record::digests::UNVERIFIED;
 use crate::record::disk::Disk;
 use crate::record::ownership;
-use crate::report::curves::{Band, Curve, PRINT, SMALL, distinct};
-use crate::report::grid::{Cell, Curves, Dots, HeatMap, Interval, Scale};
+use crate::report::curves::{Band, PRINT, SMALL, distinct};
+use crate::report::grid::{Cell, Curves, Dots, HeatMap, Scale};
 use crate::report::scene::Format;
 
 /// Maximum number of values of an axis, and of panels, in a figure.
@@ -109,8 +109,7 @@ fn dots(sweep: &Sweep, outcomes: &[Result<Outcome, Missing>], options: &Detail) 
             *title = words.collect::<Vec<_>>().join(", ");
         }
         let Ok(outcome) = outcome else { continue };
-        let [low, mean, high] = options.band.around(&outcome.measured());
-        let spread: Interval = [mean, low, high];
+        let spread = outcome.interval(options);
         let mut row = 0;
         let changed = varied.iter().find_map(|&axis| {
             let value = point.values[axis];
@@ -208,31 +207,33 @@ impl<'a> PanelGrid<'a> {
         };
         let title = format!("{what}, last generation, {} over trials", options.band.describe());
         self.heat_map(title, (key, [what, cells.into()]), |_, outcome| {
-            let measured = outcome.measured();
-            let [low, mean, high] = options.band.around(&measured);
+            let [mean, low, high] = outcome.interval(options);
             let note = match options.band {
+                // A single trial has no interval.
+                _ if outcome.reached.len() < 2 => String::new(),
                 Band::Interval => format!("{low:.2}–{high:.2}"),
-                Band::Error => format!("±{:.2}", measured.error()),
+                Band::Error => format!("±{:.2}", outcome.measured().error()),
                 Band::None => String::new(),
             };
-            // A single trial has no interval.
-            let note = if measured.count() > 1 { note } else { String::new() };
             Cell::Value(mean, format!("{mean:.2}"), note)
         })
     }
 
-    /// Draws the generations to reach a G, shaded by their logarithm.
+    /// Draws the generations to reach a G, shaded by their logarithm. As for G, dark is good: early.
     fn reach(&self, options: &Detail) -> HeatMap {
         let all = self.panels.iter().flat_map(|(_, points)| points).flatten();
         let last = all.map(|(point, _)| point.config.learning.generations).max().unwrap_or(0).max(1) as f64;
-        let place = |generation: f64| libm::log1p(generation) / libm::log1p(last);
+        let place = |generation: f64| 1.0 - libm::log1p(generation) / libm::log1p(last);
         let mut ticks = vec![0.0];
         ticks.extend([1.0, 3.0, 10.0, 30.0, 100.0, 1e3, 1e4, 1e5].into_iter().filter(|&tick| tick < last * 0.75));
         ticks.push(last);
         let key = ticks.into_iter().map(|tick| (place(tick), tick.to_string())).collect();
-        let title = format!("Generations until the best team's G is {}, median over trials", options.reach);
-        let label =
-            [format!("Median generation that reaches G {}", options.reach), "below: trials that reach it".into()];
+        let title =
+            format!("Generations until G of the {} is {}, median over trials", options.measure.name(), options.reach);
+        let label = [
+            format!("Median generation that reaches G {}", options.reach),
+            "dark: early; below: trials that reach it".into(),
+        ];
         self.heat_map(title, (key, label), |_, outcome| {
             let reached = outcome.reached.iter().flatten().count();
             let note = format!("{reached} of {}", outcome.reached.len());
@@ -252,7 +253,7 @@ impl<'a> PanelGrid<'a> {
             for (title, points) in &self.panels {
                 let curve = |(value, at): (usize, &PointResult<'_>)| {
                     let outcome = (*at)?.1;
-                    Some((value, Curve::at(outcome.curve.iter().map(|(generation, average)| (*generation, average)))))
+                    Some((value, outcome.curve()))
                 };
                 let curves = points[row * width..(row + 1) * width].iter().enumerate().filter_map(curve).collect();
                 let row = self.y.map(|y| format!("{} = {}", y.leaf(), y.label(row)));

@@ -10,10 +10,11 @@ use crate::record::disk::{Disk, Place};
 use crate::record::folder::{CONFIG, METRICS, POINTS, RESULTS};
 use crate::record::{RecordError, load_config, without_checkpoint};
 use crate::record::{metrics, ownership};
-use crate::report::curves::Band;
+use crate::report::curves::{Band, Curve};
+use crate::report::grid::Interval;
 use crate::report::runs::TeamKind;
 use flotilla::escape::{self, PathExt};
-use flotilla::statistics::Average;
+use flotilla::statistics::{self, Average};
 use flotilla::trainer::Row;
 
 /// The options of [`write()`].
@@ -25,7 +26,7 @@ pub struct Detail {
     pub reach: f64,
     /// Whether points' files are compared with their digests.
     pub verification: Verification,
-    /// The team whose G the pictures show.
+    /// The team whose G the pictures show, and whose first generation with a G is reported.
     pub measure: TeamKind,
     /// Meaning of the pictures' bands.
     pub band: Band,
@@ -34,11 +35,11 @@ pub struct Detail {
 /// The results of a point's trials.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Outcome {
-    /// The best team's G in the last generation of every trial.
-    pub best: Vec<f64>,
-    /// The champion's G in the last generation of every trial.
-    pub champion: Vec<f64>,
-    /// The first generation of every trial whose best G is at least [`Detail::reach`].
+    /// The best team's G in the last generation, averaged over trials.
+    pub best: Average,
+    /// The champion's G in the last generation, averaged over trials.
+    pub champion: Average,
+    /// The first generation of every trial at which [`Detail::measure`]'s G is at least [`Detail::reach`].
     pub reached: Vec<Option<usize>>,
     /// [`Detail::measure`]'s G by generation, averaged over the trials, for each row of `results.csv`. The last
     /// generation is the last entry.
@@ -46,28 +47,30 @@ pub struct Outcome {
 }
 
 impl Outcome {
-    /// Returns the average over trials of the best team's G in the last generation.
-    pub fn best(&self) -> Average {
-        self.best.iter().collect()
-    }
-
-    /// Returns the average over trials of the champion's G in the last generation.
-    pub fn champion(&self) -> Average {
-        self.champion.iter().collect()
-    }
-
     /// Returns the average over trials of [`Detail::measure`]'s G in the last generation.
     pub fn measured(&self) -> Average {
         self.curve.last().map_or(Average::default(), |(_, average)| *average)
     }
 
+    /// Returns the curve of [`Detail::measure`]'s G.
+    pub(super) fn curve(&self) -> Curve {
+        Curve::at(self.curve.iter().map(|(generation, average)| (*generation, average)), 1.0)
+    }
+
+    /// Returns the mean and the ends of the band of [`Detail::measure`]'s G in the last generation.
+    pub(super) fn interval(&self, options: &Detail) -> Interval {
+        let last = &self.curve[self.curve.len() - 1..];
+        let curve = Curve::at(last.iter().map(|(generation, average)| (*generation, average)), 1.0);
+        let [low, high] = curve.ends(options.band, 0, 1.0);
+        [curve.mean[0], low, high]
+    }
+
     /// Returns the median over trials of the first generation that reaches G. Trials that never reach it count as
     /// infinite. None if the median is infinite.
     pub(crate) fn median_reached(&self) -> Option<f64> {
-        let mut reached: Vec<usize> = self.reached.iter().map(|reached| reached.unwrap_or(usize::MAX)).collect();
-        reached.sort_unstable();
-        let middle = [reached[(reached.len() - 1) / 2], reached[reached.len() / 2]];
-        (middle[1] < usize::MAX).then(|| (middle[0] + middle[1]) as f64 / 2.0)
+        let reached = |reached: &Option<usize>| reached.map_or(f64::INFINITY, |generation| generation as f64);
+        let reached: Vec<f64> = self.reached.iter().map(reached).collect();
+        statistics::median(&reached).map(|median| median.value).filter(|median| median.is_finite())
     }
 }
 
@@ -145,19 +148,33 @@ fn summary(
     output: &mut dyn Write,
 ) -> io::Result<()> {
     let mut table = csv::Writer::from_writer(output);
-    let columns =
-        ["point", "trials", "generations", "best_g", "best_g_error", "champion_g", "reach", "reached", "median"];
+    let columns = [
+        "point",
+        "trials",
+        "generations",
+        "champion_g",
+        "champion_g_low",
+        "champion_g_high",
+        "best_g",
+        "reach",
+        "reached",
+        "median",
+    ];
     table.write_record(sweep.axes.iter().map(|axis| &*axis.key).chain(columns))?;
     for (point, outcome) in sweep.points.iter().zip(outcomes) {
         let Ok(outcome) = outcome else { continue };
-        let best = outcome.best();
+        // A single trial has no interval.
+        let interval = statistics::bounded(&outcome.champion, [0.0, 1.0]);
+        let ends = interval.map(|interval| [interval.low, interval.high].map(|end| end.to_string()));
+        let [low, high] = ends.unwrap_or_default();
         let fields = [
             point.index.to_string(),
-            outcome.best.len().to_string(),
+            outcome.reached.len().to_string(),
             point.config.learning.generations.to_string(),
-            best.mean().to_string(),
-            best.error().to_string(),
-            outcome.champion().mean().to_string(),
+            outcome.champion.mean().to_string(),
+            low,
+            high,
+            outcome.best.mean().to_string(),
             options.reach.to_string(),
             outcome.reached.iter().flatten().count().to_string(),
             outcome.median_reached().map_or(String::new(), |median| median.to_string()),
@@ -189,7 +206,7 @@ fn read(point: &Point, place: Place<'_>, options: &Detail) -> Result<(Vec<Row>, 
     let mut source = metrics::open(place.at(&path)).map_err(|error| damaged(&error))?;
     for row in &mut source {
         let (row, _) = row.map_err(|error| damaged(&format!("{}: {error}", path.escaped())))?;
-        let Row { trial, generation, best_g, .. } = row;
+        let Row { trial, generation, .. } = row;
         if (generation, trial) != (next / trials, next % trials) || generation > last {
             return Err(Missing::Damaged(format!(
                 "{}: trial {trial} of generation {generation} is out of order",
@@ -198,7 +215,7 @@ fn read(point: &Point, place: Place<'_>, options: &Detail) -> Result<(Vec<Row>, 
         }
         next += 1;
         // G of an easier stage is not comparable.
-        if best_g >= options.reach && reached[trial].is_none() && generation >= config.last_from() {
+        if options.measure.of(&row) >= options.reach && reached[trial].is_none() && generation >= config.last_from() {
             reached[trial] = Some(generation);
         }
         if generation % options.every == 0 || generation == last {
@@ -216,8 +233,8 @@ fn read(point: &Point, place: Place<'_>, options: &Detail) -> Result<(Vec<Row>, 
         (rows[0][at].generation, average)
     });
     let outcome = Outcome {
-        best: ends().map(|row| row.best_g).collect(),
-        champion: ends().map(|row| row.champion_g).collect(),
+        best: ends().map(|row| &row.best_g).collect(),
+        champion: ends().map(|row| &row.champion_g).collect(),
         reached,
         curve: curve.collect(),
     };

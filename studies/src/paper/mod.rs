@@ -266,7 +266,7 @@ impl TrialCurves<'_> {
     }
 
     fn curve(&self) -> Curve {
-        Curve::new(&self.tallies())
+        Curve::new(&self.tallies(), self.pois as f64)
     }
 }
 

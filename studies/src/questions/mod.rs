@@ -346,7 +346,7 @@ impl Answer {
                         (None, Some(count)) => format!(" ({count} of {})", named.trials),
                         (None, None) => String::new(),
                     };
-                    comparison::estimate(mean.mean, measure.digits(), false) + &note
+                    measure.text(mean.mean, false) + &note
                 };
                 let mut row = vec![place.join(", ")];
                 row.extend(arms.iter().zip(&comparison.arms).enumerate().map(mean));
@@ -354,7 +354,7 @@ impl Answer {
                     pairs.iter().find(|versus| versus.arms == *pair).map_or(String::new(), |versus| {
                         let p = comparison::probability(versus.p_holm);
                         let sign = if p.starts_with('<') { "" } else { "= " };
-                        format!("{}, p {sign}{p}", comparison::estimate(versus.difference, measure.digits(), true))
+                        format!("{}, p {sign}{p}", measure.text(versus.difference, true))
                     })
                 }));
                 row
@@ -371,7 +371,11 @@ impl Answer {
 
     /// Draws the means with their intervals.
     pub fn scene(&self) -> Scene {
-        let reported: Vec<_> = self.reported().into_iter().filter(|(_, measure)| measure.digits() > 1).collect();
+        let reported: Vec<_> = self
+            .reported()
+            .into_iter()
+            .filter(|(_, measure)| !matches!(measure, Measure::GenerationsToReach { .. }))
+            .collect();
         let mut groups: Vec<(String, Vec<String>)> = Vec::new();
         for AnswerRow { name, comparison, .. } in &self.rows {
             if !groups.iter().any(|(other, _)| other == name) {

@@ -103,7 +103,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let answers = compare(&parts, request, &disk, backend, context)?;
     let first = &parts[0].1.points[0].config.learning;
     let heading = format!(
-        "Means over {} trials of seed {} with 95 % bootstrap intervals. In parentheses beside a champion's G is that of the\n\
+        "Means over {} trials of seed {} with 95 % intervals; generations are medians. In parentheses beside a champion's G is that of the\n\
          best of {} teams. p is from Mann and Whitney's test, two-sided, with Holm's correction for all pairs of arms at\n\
          one place.\n",
         first.trials,

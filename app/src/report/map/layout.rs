@@ -8,12 +8,8 @@ use flotilla::config::{Observers, StageConfig};
 use flotilla::model::rule::Rule;
 use flotilla::world::World;
 
-/// Draws the layout of a config before training: start positions, headings and the coupling of each POI.
-pub fn layout(name: &str, config: &StageConfig) -> Scene {
-    const LEFT: f64 = 11.0;
-    const EDGE: f64 = 3.0;
-    const HEAD: f64 = 6.5;
-    let world = World::new(config);
+/// Returns the team of a config before training.
+fn team(config: &StageConfig, world: &World) -> Team {
     let leaders = world.leaders();
     let agent = |(index, start): (usize, &glam::Vec2)| Marker {
         place: start.as_dvec2(),
@@ -30,11 +26,20 @@ pub fn layout(name: &str, config: &StageConfig) -> Scene {
         observed: false,
         open: world.rule.is_open(poi, 1, &none),
     };
-    let team = Team {
+    Team {
         leaders,
         agents: world.starts.iter().enumerate().map(agent).collect(),
         pois: config.world.pois.iter().zip(&world.coupling).enumerate().map(poi).collect(),
-    };
+    }
+}
+
+/// Draws the layout of a config before training: start positions, headings and the coupling of each POI.
+pub fn layout(name: &str, config: &StageConfig) -> Scene {
+    const LEFT: f64 = 11.0;
+    const EDGE: f64 = 3.0;
+    const HEAD: f64 = 6.5;
+    let world = World::new(config);
+    let (leaders, team) = (world.leaders(), team(config, &world));
     let map = DVec2::from(config.world.map);
     let view = Viewport::new(config, [DVec2::ZERO, map], 80.0).moved_to([LEFT, HEAD]);
     let [width, height] = view.size();
@@ -106,4 +111,29 @@ pub fn layout(name: &str, config: &StageConfig) -> Scene {
 fn pois_in_words(rule: &Rule, pois: usize) -> String {
     let list: Vec<_> = (0..pois.min(12)).map(|poi| poi_label(rule, poi, "any time".into())).collect();
     format!(" POIs can be observed: {}{}.", list.join("; "), if pois > 12 { "; …" } else { "" })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::report::map::{around, label_area, overlap};
+
+    #[test]
+    fn labels_of_windows_and_couplings_avoid_agents() {
+        for text in [
+            include_str!("../../../../configs/tasks/decoy.toml"),
+            include_str!("../../../../configs/tasks/merge.toml"),
+            include_str!("../../../../configs/tasks/shuttle.toml"),
+        ] {
+            let config = flotilla::Config::parse(text, "task.toml").unwrap().validate().unwrap();
+            let team = team(config.as_ref(), &World::new(&config));
+            let view = Viewport::new(&config, [DVec2::ZERO, config.world.map.into()], 80.0);
+            let arm = view.agent_size(&team);
+            for (poi, (place, size)) in team.pois.iter().zip(view.poi_labels(&team).unwrap()) {
+                let label = label_area(place, &poi.label, size);
+                let crosses = |agent: &&Marker| overlap(label, around(view.at(agent.place), arm));
+                assert!(!team.agents.iter().any(|agent| crosses(&agent)), "{}", poi.label);
+            }
+        }
+    }
 }

@@ -103,17 +103,27 @@ impl Legend {
         self.entries.push((Symbol::None, text.into()));
     }
 
-    /// Returns the position of each entry in rows of a given width, and the height of all rows, in millimetres.
-    fn places(&self, width: f64) -> (Vec<[f64; 2]>, f64) {
+    /// Returns the entries in rows of a given width, each with its position, and the height of all rows, in millimetres.
+    /// An entry that is longer than a row is broken between words.
+    fn places(&self, width: f64) -> (Vec<(&Symbol, String, [f64; 2])>, f64) {
         let (mut x, mut y) = (0.0, 0.0);
         let mut places = Vec::new();
         for (symbol, text) in &self.entries {
-            let length = symbol.width() + text_width(text, LABEL);
-            if x > 0.0 && x + length > width {
+            let length = |text: &str| symbol.width() + text_width(text, LABEL);
+            if x > 0.0 && x + length(text) > width {
                 (x, y) = (0.0, y + Self::ROW);
             }
-            places.push([x, y]);
-            x += length + 3.5;
+            let mut row = String::new();
+            for word in text.split_inclusive(' ') {
+                if !row.is_empty() && length(&(row.clone() + word)) > width {
+                    places.push((symbol, std::mem::take(&mut row), [x, y]));
+                    y += Self::ROW;
+                }
+                row += word;
+            }
+            let end = length(&row) + 3.5;
+            places.push((symbol, row, [x, y]));
+            x += end;
         }
         (places, y + Self::ROW)
     }
@@ -125,10 +135,27 @@ impl Legend {
 
     /// Draws the legend from a place on the first row's baseline.
     pub fn draw(&self, scene: &mut Scene, [left, first]: [f64; 2], width: f64) {
-        for ((symbol, text), [x, y]) in self.entries.iter().zip(self.places(width).0) {
+        for (symbol, text, [x, y]) in self.places(width).0 {
             symbol.draw(scene, [left + x, first + y]);
             let color = if symbol.width() > 0.0 { BLACK } else { FAINT };
-            scene.text([left + x + symbol.width(), first + y], &**text, LABEL, Anchor::Start, color);
+            scene.text([left + x + symbol.width(), first + y], text, LABEL, Anchor::Start, color);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_note_longer_than_a_row_is_broken() {
+        let mut legend = Legend::default();
+        legend.note("a short one");
+        legend.note("2 × as fast as it was; motion between steps is drawn straight");
+        let (places, height) = legend.places(40.0);
+        assert!(places.len() >= 3 && height >= 3.0 * Legend::ROW, "{} rows", places.len());
+        for (_, text, [x, y]) in places {
+            assert!(x + text_width(text.trim_end(), LABEL) <= 40.0 && y < height, "{text:?} at {x}, {y}");
         }
     }
 }

@@ -253,8 +253,10 @@ impl Viewport {
         (nearest * self.scale * 0.4).clamp(0.5, 1.3)
     }
 
-    /// Returns each POI label's position and font size, or none if labels would overlap.
+    /// Returns each POI label's position and font size, or none if labels would overlap. Labels avoid agents if they can.
     fn poi_labels(&self, team: &Team) -> Option<Vec<([f64; 2], f64)>> {
+        let arm = self.agent_size(team) * 1.35;
+        let agents: Vec<_> = team.agents.iter().map(|agent| around(self.at(agent.place), arm)).collect();
         [LABEL, MIN_LABEL].into_iter().find_map(|size| {
             let crosses: Vec<_> = team.pois.iter().map(|poi| around(self.at(poi.place), 0.8)).collect();
             let mut taken: Vec<[f64; 4]> = Vec::new();
@@ -264,18 +266,27 @@ impl Viewport {
                 let half = text_width(&poi.label, size) / 2.0;
                 // Labels of large circles are at the top, because agents gather in the middle.
                 let top = y - self.radius * self.scale + size + 0.8;
+                let bottom = y + self.radius * self.scale - 0.8;
                 let places = [
                     [x, if top < y - 2.5 { top } else { y - 1.6 }],
                     [x, y - 1.6],
                     [x, y + 1.5 + size],
                     [x + 1.6 + half, y + 0.35 * size],
                     [x - 1.6 - half, y + 0.35 * size],
+                    [x, if bottom > y + 2.5 + size { bottom } else { y + 1.5 + size }],
                 ];
+                // Labels at an edge of the map are moved inside.
+                let [from, to] = [whole[0] + half + 0.3, whole[2] - half - 0.3];
+                let places = places.map(|[x, y]| [x.min(to).max(from), y]);
                 let free = |place: &[f64; 2]| {
                     let area = label_area(*place, &poi.label, size);
                     within(area, whole) && !taken.iter().chain(&crosses).any(|other| overlap(area, *other))
                 };
-                let found = places.into_iter().find(free)?;
+                let apart = |place: &&[f64; 2]| {
+                    let area = label_area(**place, &poi.label, size);
+                    free(place) && !agents.iter().any(|other| overlap(area, *other))
+                };
+                let found = *places.iter().find(apart).or_else(|| places.iter().find(|place| free(place)))?;
                 taken.push(label_area(found, &poi.label, size));
                 Some((found, size))
             };
@@ -289,7 +300,7 @@ impl Viewport {
         const MAX_NUMBERS: usize = 256;
         let arrow = self.agent_size(team) * 1.35;
         let leaders = &team.agents[..team.leaders.min(MAX_NUMBERS)];
-        let arrows: Vec<_> = leaders.iter().map(|leader| around(self.at(leader.place), arrow * 0.6)).collect();
+        let arrows: Vec<_> = team.agents.iter().map(|agent| around(self.at(agent.place), arrow * 0.6)).collect();
         let size = if team.leaders > 20 { MIN_LABEL } else { LABEL };
         for (number, leader) in leaders.iter().enumerate() {
             let [x, y] = self.at(leader.place);
@@ -300,13 +311,18 @@ impl Viewport {
                 [[x + aside, low + 1.2], [x - aside, low + 1.2], [x + aside, low - 1.2], [x - aside, low - 1.2]];
             let whole = self.whole();
             let inside = |place: &&[f64; 2]| within(label_area(**place, &text, size), whole);
-            let free = |place: &&[f64; 2]| {
-                let area = label_area(**place, &text, size);
+            // Followers may be covered if there is no other place.
+            let free = |place: &[f64; 2], agents: usize| {
+                let area = label_area(*place, &text, size);
+                let mut arrows = arrows[..agents].iter().enumerate();
                 within(area, whole)
                     && !taken.iter().any(|other| overlap(area, *other))
-                    && !arrows.iter().enumerate().any(|(at, other)| at != number && overlap(area, *other))
+                    && !arrows.any(|(at, other)| at != number && overlap(area, *other))
             };
-            let place = match places.iter().find(free) {
+            let found = [arrows.len(), leaders.len()]
+                .into_iter()
+                .find_map(|agents| places.iter().find(|place| free(place, agents)));
+            let place = match found {
                 Some(place) => *place,
                 None if team.leaders <= 12 => *places.iter().find(inside).unwrap_or(&places[0]),
                 None => continue,
