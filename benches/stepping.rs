@@ -55,8 +55,9 @@ fn measure(config: &Config, level: Level, teams: usize, rounds: usize) -> Result
     let mut rollout = |group| cpu.play(&[group]).map(|scores| _ = std::hint::black_box(scores));
 
     // A trace of one step gives the constant outputs, which the stepper gets as actions.
-    let mut one_step = world.clone();
-    one_step.constants.steps = 1;
+    let mut one_step = config.clone();
+    one_step.world.steps = 1;
+    let one_step = World::new(&one_step.validate()?);
     let trace = Cpu::default().trace(&Group { world: &one_step, starts: &world.starts, ..groups[0] })?;
     let actions: Vec<f32> = (0..teams)
         .flat_map(|team| (0..leaders).map(move |leader| (team, leader)))

@@ -214,6 +214,9 @@ pub struct Batch<'a> {
 
 /// [`evaluate`], which calls `each` several times per second, from this thread and in the order of episodes. If that
 /// breaks, the evaluation ends after the episodes reported so far.
+///
+/// # Errors
+/// The backend fails.
 pub fn evaluate_until(
     backend: &mut dyn Backend,
     group: &Group<'_>,

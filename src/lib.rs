@@ -122,8 +122,9 @@
 //! |---|---|---|
 //! | (none) | training, evaluation and verification on the CPU; on WebAssembly with one thread | 35 |
 //! | `gpu` (default) | any GPU, using wgpu | 85 |
+//! | `scalar` | episodes without vector instructions, for tests | 35 |
 
-#![deny(missing_docs)]
+#![deny(missing_docs, clippy::missing_errors_doc)]
 #![allow(rustdoc::private_intra_doc_links, reason = "tables of modules name the internal ones, too")]
 
 pub mod backend;

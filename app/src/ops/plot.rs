@@ -64,7 +64,7 @@ pub fn run(request: &Request, context: Context<'_>) -> Result<Outcome, Error> {
     };
     let out = place.path();
     let kind = kind_of(out)?;
-    let scene = runs::figure(&runs, request.measure, request.band, verification)?.scene();
+    let scene = runs::figure(runs, request.measure, request.band, verification)?.scene();
     place.check()?;
     place.write(&content(&scene, kind, out)?)?;
     if runs::paired(runs, verification)? {

@@ -159,7 +159,7 @@ pub fn trained(folder: &Path, verification: Verification) -> Result<Trained, Rea
     let (found, expected) = (rows.len(), config.learning.trials * (config.learning.generations + 1));
     if found != expected {
         let reason = format!("its {} has {found} rows of {expected}", METRICS);
-        return Err(ReadError::Unfinished { folder: folder.into(), reason }.into());
+        return Err(ReadError::Unfinished { folder: folder.into(), reason });
     }
     let path = folder.join(POLICIES);
     let policies = policies::read_all(&path, &config)?;

@@ -60,10 +60,14 @@ impl Cpu {
         Cpu { level, workspaces: None }
     }
 
-    /// Returns every instruction set of this CPU, narrowest first.
+    /// Returns every instruction set of this CPU, narrowest first. With the feature `scalar` the first uses no vectors.
     pub fn levels() -> Vec<Level> {
         let best = Level::new();
         let mut levels = vec![Level::baseline()];
+        #[cfg(feature = "scalar")]
+        if !levels[0].is_fallback() {
+            levels.insert(0, Level::fallback());
+        }
         #[cfg(target_arch = "x86_64")]
         {
             levels.extend(best.as_sse4_2().map(Level::Sse4_2));

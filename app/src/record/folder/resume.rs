@@ -24,6 +24,9 @@ pub struct FirstAndLastRows {
     pub last: Vec<Row>,
 }
 
+/// A checkpoint, and the metrics truncated to match it.
+type ResumePoint = (Checkpoint, metrics::Writer);
+
 impl Folder {
     /// Finds the checkpoint from which the run resumes. Unusable checkpoints are renamed or removed.
     pub(super) fn find(&self, config: &Config, from: StartFrom<'_>, found: &mut Resumed) -> Result<(), RecordError> {
@@ -61,7 +64,7 @@ impl Folder {
     pub(crate) fn last_checkpoint(
         &self,
         config: &Config,
-    ) -> Result<(Option<(Checkpoint, metrics::Writer)>, Vec<usize>), RecordError> {
+    ) -> Result<(Option<ResumePoint>, Vec<usize>), RecordError> {
         let mut kept = checkpoint::list(&self.file(CHECKPOINTS))?;
         let newest = self.find_checkpoint(config, Some(config), false, None, &mut kept, &mut Vec::new())?;
         Ok((newest, kept))

@@ -58,6 +58,9 @@ pub(crate) struct Legend {
     entries: Vec<(Symbol, String)>,
 }
 
+/// A symbol, its text and their position.
+type Placed<'a> = (&'a Symbol, String, [f64; 2]);
+
 impl Legend {
     const ROW: f64 = 4.2;
 
@@ -105,7 +108,7 @@ impl Legend {
 
     /// Returns the entries in rows of a given width, each with its position, and the height of all rows, in millimetres.
     /// An entry that is longer than a row is broken between words.
-    fn places(&self, width: f64) -> (Vec<(&Symbol, String, [f64; 2])>, f64) {
+    fn places(&self, width: f64) -> (Vec<Placed<'_>>, f64) {
         let (mut x, mut y) = (0.0, 0.0);
         let mut places = Vec::new();
         for (symbol, text) in &self.entries {

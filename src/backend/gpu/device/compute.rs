@@ -89,7 +89,10 @@ impl Gpu {
         }
     }
 
-    /// Compiles one of the crate's own shaders, see [`Gpu::pipeline`].
+    /// Compiles one of the crate's own shaders.
+    ///
+    /// # Errors
+    /// See [`Gpu::pipeline`].
     pub fn own_pipeline(
         &self,
         label: &str,
