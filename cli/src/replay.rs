@@ -21,9 +21,9 @@ pub struct Args {
     /// Generation whose team plays [default: the newest]
     #[arg(long, value_name = "N", value_parser = whole)]
     generation: Option<usize>,
-    /// Team to look at: the best of its generation, the champion (the team of every population's best policy), or a
+    /// Team to look at: the champion (the team of every population's best policy), the best of its generation, or a
     /// number from 0
-    #[arg(long, value_name = "best|champion|N", default_value = "best")]
+    #[arg(long, value_name = "best|champion|N", default_value = "champion")]
     team: Which,
     /// Another generation of the trial, side by side
     #[arg(long, value_name = "N", value_parser = whole)]

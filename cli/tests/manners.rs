@@ -401,7 +401,7 @@ fn plot_and_replay_report_as_json() {
     };
     let object = json("plot run --json -o curves.svg");
     assert_eq!((&object["out"], &object["runs"][0]), (&"curves.svg".into(), &"run".into()));
-    let object = json("replay run --json -q --backend cpu --compare 0 -o replay.svg");
+    let object = json("replay run --team best --json -q --backend cpu --compare 0 -o replay.svg");
     let bytes = fs::metadata(place.path("replay.svg")).unwrap().len();
     assert_eq!((&object["out"], &object["bytes"]), (&"replay.svg".into(), &bytes.into()));
     let metrics = place.read("run/metrics.csv");

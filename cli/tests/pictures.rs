@@ -13,7 +13,7 @@ const PICTURES: [(&str, &str); 4] = [
     ("layout", "check small.toml"),
     ("curves", "plot run"),
     ("comparison", "plot run other"),
-    ("still", "replay run --quiet"),
+    ("still", "replay run --team best --quiet"),
 ];
 /// References are smaller than the pictures by this factor, and grey.
 const SHRINK: usize = 4;

@@ -256,7 +256,7 @@ fn every_generation_replays_with_its_recorded_score() {
     for ((trial, generation), best) in run.best() {
         let (trial_text, generation_text) = (trial.to_string(), generation.to_string());
         let arguments = ["replay", &run.text(), "--trial", &trial_text, "--generation", &generation_text];
-        let stdout = succeed(&[&arguments[..], &["--backend", "cpu"]].concat());
+        let stdout = succeed(&[&arguments[..], &["--team", "best", "--backend", "cpu"]].concat());
         assert!(stdout.contains(&format!(": observed {} of 2 POIs, as", 2.0 * best)), "{stdout}");
         let page = data(&run.file("replay.html"));
         let episode = &page["episodes"][0];
@@ -368,7 +368,7 @@ fn a_replay_that_contradicts_the_metrics_is_refused() {
         .map(|line| {
             let mut fields: Vec<&str> = line.split(',').collect();
             if fields[0] == "0" && fields[1] == "6" {
-                fields[2] = if fields[2] == "1" { "0.5" } else { "1" };
+                fields[4] = if fields[4] == "1" { "0.5" } else { "1" };
             }
             fields.join(",") + "\n"
         })

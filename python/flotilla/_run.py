@@ -175,7 +175,7 @@ class Run:
         compare: int | None = None,
         backend: str | int = "auto",
         *,
-        team: int | str = "best",
+        team: int | str = "champion",
     ) -> Replay:
         """The episode of one team of a trial and generation, as it was scored.
 
@@ -184,7 +184,7 @@ class Run:
             generation: None is the last.
             compare: another generation, side by side.
             backend: as of `train`.
-            team: `"best"`, `"champion"`, or the number of a team, from 0.
+            team: `"champion"`, `"best"`, or the number of a team, from 0.
 
         Raises:
             ValueError: there is no such trial, generation or team, or the worlds of the two generations differ: they are of
@@ -196,7 +196,7 @@ class Run:
             >>> run = flotilla.train(flotilla.Config.paper().replace(learning={"generations": 5}))
             >>> [episode.generation for episode in run.replay(compare=0).episodes]
             [0, 5]
-            >>> champion = run.replay(trial="best", team="champion").episodes[0]
+            >>> champion = run.replay(trial="best").episodes[0]
             >>> bool(champion.best_g == run.metrics["champion_g"][:, -1].max())
             True
         """

@@ -31,7 +31,7 @@ pub struct Request {
     /// The generation. The newest by default.
     #[serde(default)]
     pub generation: Option<usize>,
-    /// The team. The best of the generation by default.
+    /// The team. The champion by default.
     #[serde(default)]
     pub team: Which,
     /// Another generation of the trial, side by side.

@@ -61,10 +61,7 @@ impl Folder {
     }
 
     /// Returns the newest usable checkpoint of a run that trains in this folder, and the generations of all.
-    pub(crate) fn last_checkpoint(
-        &self,
-        config: &Config,
-    ) -> Result<(Option<ResumePoint>, Vec<usize>), RecordError> {
+    pub(crate) fn last_checkpoint(&self, config: &Config) -> Result<(Option<ResumePoint>, Vec<usize>), RecordError> {
         let mut kept = checkpoint::list(&self.file(CHECKPOINTS))?;
         let newest = self.find_checkpoint(config, Some(config), false, None, &mut kept, &mut Vec::new())?;
         Ok((newest, kept))

@@ -135,9 +135,9 @@ fn places(count: usize) -> String {
 #[serde(rename_all = "snake_case")]
 pub enum Which {
     /// The team with the largest G; the first one if several are equal.
-    #[default]
     Best,
     /// The team of the best policy of each population after the generation is scored.
+    #[default]
     Champion,
     /// The team with this index in its generation.
     Number(usize),
