@@ -1,4 +1,15 @@
-//! All use cases of the program as data.
+//! All use cases of the program as data, from any source.
+//!
+//! ```
+//! use flotilla_app::ops::Context;
+//! use flotilla_cli::request;
+//!
+//! let request = r#"{"use_case": "check", "name": "mine", "config": {"text": "[world]", "name": "mine.toml"}}"#;
+//! let request = serde_json::from_str(request)?;
+//! let error = request::answer(&request, &mut &mut flotilla::front::cpu(), Context::new(&|_| ()));
+//! assert_eq!(error.unwrap_err().code(), "config_invalid");
+//! # Ok::<(), serde_json::Error>(())
+//! ```
 
 use flotilla_app::ops::{
     BackendSource, Context, Error, baseline, check, compare, plot, replay, rollout, sweep, train, verify,

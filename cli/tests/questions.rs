@@ -120,7 +120,7 @@ fn the_page_equals_a_new_study() {
         assert_eq!(
             block(&page, part),
             block(&out, part),
-            "docs/results/questions-tables.md; see the head of tests/questions.rs"
+            "docs/results/questions-tables.md; see the head of cli/tests/questions.rs"
         );
         for ending in ["svg", "csv"] {
             let [expected, actual] = [

@@ -139,7 +139,7 @@ fn check_or_write_page(page: &str, text: &str) {
     } else if expected != actual {
         let difference = expected.lines().zip(actual.lines()).find(|(expected, actual)| expected != actual);
         panic!(
-            "{page} differs from the results; on the page and now: {difference:#?}\n(see the head of tests/stories.rs)"
+            "{page} differs from the results; on the page and now: {difference:#?}\n(see the head of cli/tests/stories.rs)"
         );
     }
 }

@@ -88,7 +88,7 @@ def compare(
         runs: at least two runs or their directories, or the directory of one sweep.
         at: generations to compare at: `[0, 50, "last"]`.
         paired: compare pair by pair: trials with one seed and number are pairs.
-        reach: also compare the first generation whose best team has this G, 0 to 1.
+        reach: also compare the first generation whose champion has this G, 0 to 1.
         by: the axis of a sweep whose values are compared. None is the only axis.
 
     Raises:

@@ -1,7 +1,7 @@
 //! Tests that a killed training process resumes to the same bytes.
 //!
 //! This uses only the core and the recording of runs, not the program, which takes long to build for some machines.
-//! `tests/recovery.rs` has the other tests of kills.
+//! `cli/tests/recovery.rs` has the other tests of kills.
 
 use std::path::Path;
 use std::process::{Child, Command, ExitStatus};

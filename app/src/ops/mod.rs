@@ -1,30 +1,19 @@
 //! The use cases of the program, below the command line, Python and the page.
 //!
 //! Each use case takes a request and reports its progress to a [`Context`]. It returns an outcome, or an [`Error`] with a
-//! stable code. Requests and outcomes can be serialised, and [`answer`] takes any request as data.
+//! stable code. Requests and outcomes can be serialised.
 //!
 //! # Example
 //!
 //! ```
 //! use flotilla_app::ops::{self, ConfigText, Context, check};
 //!
-//! let text = include_str!("../../configs/chaotic.toml").into();
+//! let text = flotilla::config::LAYOUTS[2].1.into();
 //! let config = ConfigText { text, name: "chaotic.toml".into(), set: vec![] };
 //! let request = check::Request { config, name: "chaotic".into(), out: None };
 //! let found = check::run(&request, Context::new(&|_| ()))?;
 //! println!("{} teams play {} steps", found.cost.teams, found.cost.team_steps);
 //! # Ok::<(), ops::Error>(())
-//! ```
-//!
-//! The same as data, from any source, with a processor:
-//!
-//! ```
-//! use flotilla_app::ops::{self, Context};
-//!
-//! let request = r#"{"use_case": "check", "name": "mine", "config": {"text": "[world]", "name": "mine.toml"}}"#;
-//! let error = ops::answer(&serde_json::from_str(request)?, &mut &mut flotilla::front::cpu(), Context::new(&|_| ()));
-//! assert_eq!(error.unwrap_err().code(), "config_invalid");
-//! # Ok::<(), serde_json::Error>(())
 //! ```
 //!
 //! | module | use case |
