@@ -15,6 +15,7 @@
 //! | [`ops`] | the use cases of the program, and their errors |
 
 #![deny(missing_docs)]
+#![allow(rustdoc::private_intra_doc_links, reason = "tables of modules name the internal ones, too")]
 
 pub mod choice;
 pub mod ops;

@@ -3,6 +3,8 @@
 //! A command's file contains `Args` (its flags) and `run(Args) -> Result<(), Error>`. The list `commands!` below names
 //! it.
 
+#![allow(rustdoc::private_intra_doc_links, reason = "tables of modules name the internal ones, too")]
+
 use std::ffi::OsString;
 use std::fmt::Display;
 use std::io::{self, Write};

@@ -1343,6 +1343,22 @@ mod unix {
     }
 
     #[test]
+    fn a_stopped_run_whose_folder_was_moved_is_not_resumed_at_its_old_path() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = config_file(folder.path(), HEAVY);
+        let (out, moved) = (folder.path().join("run"), folder.path().join("moved"));
+        let child = flotilla_train(&file, &out, &["--quiet"]).spawn().unwrap();
+        wait_until("the run starts", || out.join(CONFIG).exists());
+        fs::rename(&out, &moved).unwrap();
+        signal(&child, "TERM");
+        let (status, message) = wait_for_end(child);
+        assert_eq!(status.code(), Some(75), "{message}");
+        assert!(message.contains("was moved: continue with --resume and its new path"), "{message}");
+        let resumed = flotilla_train(&file, &moved, &["--resume", "--quiet"]).output().unwrap();
+        assert_eq!(resumed.status.code(), Some(0), "{}", stderr(&resumed));
+    }
+
+    #[test]
     fn an_interrupt_after_another_signal_stops_a_run_at_once() {
         let folder = tempfile::tempdir().unwrap();
         let text = HEAVY.replace("population = 60", "population = 2000").replace("steps = 4", "steps = 10000");

@@ -38,7 +38,7 @@ class Comparison(list[dict[str, Any]]):
         >>> runs = [flotilla.train(config.replace(learning={"fitness": fitness})) for fitness in ("G", "Df")]
         >>> comparison = flotilla.compare(runs)
         >>> [(row["measure"], row["arm"]) for row in comparison[:2]]
-        [('best_g', 'fitness G'), ('best_g', 'fitness Df')]
+        [('champion_g', 'fitness G'), ('champion_g', 'fitness Df')]
         >>> comparison.pairs[0]["arm"], comparison.pairs[0]["other"], comparison["test"]
         ('fitness G', 'fitness Df', 'mann-whitney')
     """

@@ -106,7 +106,7 @@ def test_a_run_says_that_its_fitness_is_not_the_config_s(config, program):
         page = run.replay(generation=generation, team=team).page()
         assert '"fitness":"own"' in page and '"fitness":"Df"' not in page
     with pytest.raises(flotilla.Error, match="fitness that is not the config's, so generation 6 cannot be trained again"):
-        run.replay()
+        run.replay(team="best")
     with pytest.raises(flotilla.Error, match="cannot be extended"):
         train(config.replace(learning={"seed": 3, "generations": 8}), out="ours", resume=True)
     error = program("train", "ours/config.toml", "--out", "ours", "--resume", "--generations", "8", status=1)
@@ -124,7 +124,7 @@ def test_a_run_from_given_policies_says_so(config):
     kept, trained = (json.loads(Path(folder, "run.json").read_text()) for folder in ("kept", "trained"))
     assert kept["init"] == trained["init"] and kept["digest"] == trained["digest"]
     with pytest.raises(flotilla.Error, match="started from given policies"):
-        flotilla.Run.open("kept").replay()
+        flotilla.Run.open("kept").replay(team="best")
 
 
 def test_pickles_and_states_resume_with_the_same_bits(config):

@@ -97,7 +97,7 @@ def test_comparisons_are_tables(config):
     # What was an object is still read like one, and survives a pickle.
     again = pickle.loads(pickle.dumps(comparison))
     assert again == comparison and again.pairs == comparison.pairs and again["comparisons"][0]["generation"] == 6
-    assert comparison[0]["measure"] == "best_g" and len(comparison[:2]) == 2
+    assert comparison[0]["measure"] == "champion_g" and len(comparison[:2]) == 2
 
 
 def test_a_sweep_is_compared_by_its_folder(config):

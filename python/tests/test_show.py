@@ -13,7 +13,7 @@ from flotilla import Run, rollout, train
 
 def test_replays_are_shown_and_saved_in_each_format(config):
     for run in (train(config), train(config, out="run")):
-        replay = run.replay(trial=1, compare=0)
+        replay = run.replay(trial=1, compare=0, team="best")
         assert [(episode.trial, episode.generation) for episode in replay.episodes] == [(1, 0), (1, 6)]
         assert [episode.best_g for episode in replay.episodes] == [run.metrics["best_g"][1, g] for g in (0, 6)]
         assert replay._repr_html_().startswith("<iframe srcdoc=") and "<script" in replay.page()
@@ -100,7 +100,7 @@ def test_curves_are_drawn(config):
     runs[1].save("kept")
     assert flotilla.plot([runs[0], "kept"]).svg()[:4] == "<svg"
     assert flotilla.plot("kept").svg() == flotilla.plot(runs[1]).svg() == flotilla.plot([Path("kept")]).svg()
-    assert "G of the champion" in flotilla.plot(runs, measure="champion").svg() != flotilla.plot(runs).svg()
+    assert "G of the champion" in flotilla.plot(runs, measure="champion").svg() != flotilla.plot(runs, measure="best").svg()
     assert runs[0].plot("mean").svg() != runs[0].plot("best").svg()
     with pytest.raises(ValueError, match='measure "worst": allowed best, champion or mean'):
         flotilla.plot(runs, measure="worst")

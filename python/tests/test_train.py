@@ -211,7 +211,7 @@ def test_init_starts_from_the_policies_of_another_run(config, program):
     # It has the times of the original.
     assert filecmp.cmp("copy/metrics.csv", "warm/metrics.csv", shallow=False)
     with pytest.raises(flotilla.Error, match="started from given policies"):
-        Run.open("copy").replay()
+        Run.open("copy").replay(team="best")
     # It has the last checkpoint, so it can be extended without the initial policies.
     longer = second.replace(learning={"generations": 9})
     assert train(longer, out="copy", resume=True).digest == train(longer, init=first).digest

@@ -288,10 +288,12 @@ fn train(
         }
         if !context.ends() {
             let next = session.generations()[0];
-            return Err(Error::Stopped(with_remedy(
-                format!("before generation {next} of {last}, with everything saved"),
-                format!("continue with\n  {}", request.command_to_resume(folder, context)),
-            )));
+            let remedy = match session.disk(0).has_moved() {
+                true => format!("{} was moved: continue with --resume and its new path", folder.escaped()),
+                false => format!("continue with\n  {}", request.command_to_resume(folder, context)),
+            };
+            let stopped = format!("before generation {next} of {last}, with everything saved");
+            return Err(Error::Stopped(with_remedy(stopped, remedy)));
         }
         last = session.end()?;
     }

@@ -131,6 +131,11 @@ impl Disk {
         self.root.as_deref()
     }
 
+    /// Reports whether the path of the folder that the disk is limited to no longer leads there.
+    pub fn has_moved(&self) -> bool {
+        self.root().is_some_and(RootedFolder::has_moved)
+    }
+
     /// Returns the place of a path on this disk.
     pub fn at<'a>(&'a self, path: &'a Path) -> Place<'a> {
         Place { disk: Some(self).filter(|disk| disk.root.is_some()), path }

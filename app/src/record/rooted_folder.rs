@@ -45,6 +45,11 @@ impl RootedFolder {
         &self.path
     }
 
+    /// Reports whether the path no longer leads to the folder. Always false on systems without handles.
+    pub fn has_moved(&self) -> bool {
+        system::has_moved(&self.handle, &self.path)
+    }
+
     /// Returns the user ids `[owner, current user]`, or `None` on systems without user ids.
     pub fn owners(&self) -> io::Result<Option<[u32; 2]>> {
         system::owners(&self.handle)
@@ -269,6 +274,11 @@ mod system {
         Ok(Handle(handle.0.try_clone()?))
     }
 
+    pub fn has_moved(handle: &Handle, path: &Path) -> bool {
+        let id = |found: fs::Stat| (found.st_dev, found.st_ino);
+        fs::fstat(&handle.0).is_ok_and(|own| fs::stat(path).map_or(true, |there| id(there) != id(own)))
+    }
+
     pub fn owners(handle: &Handle) -> io::Result<Option<[u32; 2]>> {
         Ok(Some([fs::fstat(&handle.0)?.st_uid, rustix::process::geteuid().as_raw()]))
     }
@@ -383,6 +393,10 @@ mod system {
 
     pub fn copy(_: &Handle) -> io::Result<Handle> {
         Ok(Handle())
+    }
+
+    pub fn has_moved(_: &Handle, _: &Path) -> bool {
+        false
     }
 
     pub fn owners(_: &Handle) -> io::Result<Option<[u32; 2]>> {

@@ -45,7 +45,7 @@ pub struct Request {
     /// Config keys to set in all experiments.
     #[serde(default)]
     pub set: Vec<Override>,
-    /// Letters of the open questions. Only [`super::questions`] uses them.
+    /// Letters of the open questions. Only [`crate::questions`] uses them.
     #[serde(default)]
     pub questions: Vec<char>,
 }
