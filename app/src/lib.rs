@@ -1,5 +1,5 @@
-//! What flotilla's command, its Python package, its page and its studies share, on top of the engine
-//! ([`flotilla`]).
+//! Runs on disk, sweeps, pictures and use cases, which the command, the Python package, the page and the studies share,
+//! on top of the engine ([`flotilla`]).
 //!
 //! Each module imports only modules above it.
 //!
