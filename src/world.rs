@@ -19,8 +19,8 @@ pub use crate::model::{Constants, Variant};
 
 /// One world: constants, start positions (leaders first), POIs, their coupling, and the rule of observation.
 ///
-/// Its [parts](WorldParts) can be read, but not changed. Only a valid config makes a world, so that its parts agree with
-/// each other. Shaders run without bounds checks and rely on this.
+/// Only a valid config makes a world, and its [parts](WorldParts) can be read but not changed, so that they agree with each
+/// other. Shaders run without bounds checks and rely on this.
 #[derive(Clone, Debug, PartialEq)]
 pub struct World(WorldParts);
 
