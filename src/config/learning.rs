@@ -1,11 +1,9 @@
 //! The sections `[learning]` and `[checkpoint]`: their data and keys.
 
-use serde::{Serialize, Serializer};
-
 use super::MAX_STEPS;
 use crate::config_enum::config_enum;
 use crate::model::{LEAST, LONGEST};
-use crate::reader::{NumberOrPercentage, Reader, between, section};
+use crate::reader::{CountOrPercentage, Reader, between, section};
 
 /// Maximum number of teams in one generation, and of policies in a population.
 pub const MAX_POPULATION: usize = 1 << 20;
@@ -151,13 +149,7 @@ config_enum! {
 }
 
 /// The number of policies in a population that survive unchanged.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Elites {
-    /// A number of policies.
-    Count(usize),
-    /// A percentage of the population.
-    Percentage(f64),
-}
+pub type Elites = CountOrPercentage;
 
 impl Elites {
     /// Returns the number of elites in a population. A percentage is rounded to the nearest whole number, and gives at
@@ -168,21 +160,6 @@ impl Elites {
             Elites::Percentage(percentage) => ((population as f64 * percentage / 100.0).round() as usize).max(1),
         };
         count.min(population)
-    }
-}
-
-impl From<usize> for Elites {
-    fn from(count: usize) -> Elites {
-        Elites::Count(count)
-    }
-}
-
-impl Serialize for Elites {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        match self {
-            Elites::Count(count) => count.serialize(serializer),
-            Elites::Percentage(percentage) => serializer.collect_str(&format_args!("{percentage}%")),
-        }
     }
 }
 
@@ -255,11 +232,7 @@ impl Learning {
             let text = format!("found {hall_of_fame}, allowed 0 unless learning.method is \"tournament\"");
             r.report_key("learning.hall_of_fame", text);
         }
-        let elites = Learning::elites(r).number_or_percentage(between(0, population).because("learning.population"), 1);
-        let elites = match elites {
-            NumberOrPercentage::Number(count) => Elites::Count(count),
-            NumberOrPercentage::Percentage(percentage) => Elites::Percentage(percentage),
-        };
+        let elites = Learning::elites(r).count_or_percentage(between(0, population).because("learning.population"), 1);
         let parents = Learning::parents(r).choice(Parents::All);
         if parents == Parents::Elites && elites == Elites::Count(0) {
             r.report_key(

@@ -117,53 +117,12 @@ impl Config {
         ignored: &[&str],
         overrides: &[Override],
     ) -> Result<(ValidConfig, Vec<String>), ConfigError> {
-        let (staging, overrides): (Vec<_>, Vec<_>) =
-            overrides.iter().cloned().partition(|set| set.key == stages::STAGES);
-        let invalid = |problems, unlisted| ConfigError::Invalid { name: name.to_string(), problems, unlisted };
-        let (own, mut notes) = Config::without_stages(document, ignored, &overrides)
-            .map_err(|reader::Problems { listed, unlisted }| invalid(listed, unlisted))?;
-        let shortened = overrides.iter().any(|set| set.key == stages::GENERATIONS);
-        let stages = match staging.last() {
-            Some(set) => {
-                let text = format!("{} = {}", stages::STAGES, set.text);
-                stages::read(&Document::parse(&text), true, &own, shortened)
-            }
-            None => stages::read(document, false, &own, shortened).map_err(|problems| {
-                let is_valid = |overrides: &[Override]| {
-                    Config::without_stages(document, ignored, overrides)
-                        .is_ok_and(|(own, _)| stages::read(document, false, &own, shortened).is_ok())
-                };
-                stages::attribute(problems, &overrides, is_valid)
-            }),
-        };
-        let stages = stages.map_err(|mut problems| {
-            let unlisted = problems.len().saturating_sub(reader::MAX_LISTED);
-            problems.truncate(reader::MAX_LISTED);
-            invalid(problems, unlisted)
-        })?;
-        let last = own.learning.generations;
-        let (stages, later): (Vec<_>, Vec<_>) = stages.into_iter().partition(|(stage, _)| stage.from <= last);
-        notes.extend(later.iter().map(|(Stage { from, .. }, _)| {
-            format!("the stage from generation {from} on is left out, because this run ends with generation {last}")
-        }));
-        let (stages, configs) = stages.into_iter().unzip();
-        let config = ValidConfig::new(Config { stages, ..own }, configs);
-        notes.extend(config.notes());
-        Ok((config, notes))
-    }
-
-    /// Reads all keys except the stages, which change the config that these keys make.
-    fn without_stages(
-        document: &Document<'_>,
-        ignored: &[&str],
-        overrides: &[Override],
-    ) -> Result<(Config, Vec<String>), reader::Problems> {
         let others = reader::OtherSections {
             ignored: &[ignored, &[stages::STAGES]].concat(),
             refused: if ignored.contains(&GRID) { &[] } else { &[GRID, VARY] },
             message: "this makes the file a sweep, of many configs; use `flotilla sweep`",
         };
-        reader::read(document, others, overrides, Config::ask)
+        resolve(name, overrides, || Reader::of_text(document, others), || stages::unresolved(document, false))
     }
 
     /// Returns this config with some keys changed.
@@ -171,7 +130,7 @@ impl Config {
     /// # Errors
     /// Fails if an override is invalid. The error lists the problems.
     pub fn with(&self, overrides: &[Override]) -> Result<Config, ConfigError> {
-        Config::read(&self.serialised()?, OWN_NAME, &[], overrides)
+        Ok(self.resolved(overrides)?.into_config())
     }
 
     /// Validates a config whose fields a program has set, as if it had been read from a file.
@@ -179,7 +138,19 @@ impl Config {
     /// # Errors
     /// Fails if the config is invalid. The error lists its problems.
     pub fn validate(&self) -> Result<ValidConfig, ConfigError> {
-        Ok(Config::read_noted(&Document::parse(&self.serialised()?), OWN_NAME, &[], &[])?.0)
+        self.resolved(&[])
+    }
+
+    fn resolved(&self, overrides: &[Override]) -> Result<ValidConfig, ConfigError> {
+        let stages = || (self.stages.iter().enumerate().map(stages::UnresolvedStage::of).collect(), vec![]);
+        Ok(resolve(OWN_NAME, overrides, || Ok(Reader::of_values(self.values())), stages)?.0)
+    }
+
+    /// Returns the value of each dotted key, without the stages.
+    fn values(&self) -> impl Iterator<Item = (&'static str, reader::Value<'static>)> {
+        let Config { world, motion, follow, sense, policy, learning, checkpoint, stages: _ } = self;
+        let sections = [world.values(), motion.values(), follow.values(), sense.values(), policy.values()];
+        sections.into_iter().chain([learning.values(), checkpoint.values()]).flatten()
     }
 
     /// Returns the text of a config file for this config, with every key written out.
@@ -188,14 +159,7 @@ impl Config {
     /// Panics if a program has set a whole number that TOML cannot represent, which is one above 2⁶³ − 1. Such a config
     /// is invalid, see [`Config::validate`].
     pub fn to_toml(&self) -> String {
-        self.serialised().expect("numbers, words and lists of them under plain keys are TOML")
-    }
-
-    fn serialised(&self) -> Result<String, ConfigError> {
-        toml::to_string(self).map_err(|error| {
-            let problem = Problem { line: None, key: String::new(), message: error.to_string() };
-            ConfigError::Invalid { name: OWN_NAME.into(), problems: vec![problem], unlisted: 0 }
-        })
+        toml::to_string(self).expect("numbers, words and lists of them under plain keys are TOML")
     }
 
     /// Returns the number of agents that learn: the leaders, and in the all-leaders paradigm also the followers.
@@ -272,6 +236,52 @@ impl Config {
         }
         config
     }
+}
+
+/// Reads a config from its values and stages, with some keys set by overrides. Also returns notes for its author, see
+/// [`Config::read_noted`].
+fn resolve<'a>(
+    name: &str,
+    overrides: &[Override],
+    values: impl Fn() -> Result<Reader<'a>, reader::Problems>,
+    stages: impl Fn() -> (Vec<stages::UnresolvedStage<'a>>, Vec<Problem>),
+) -> Result<(ValidConfig, Vec<String>), ConfigError> {
+    let (staging, overrides): (Vec<_>, Vec<_>) = overrides.iter().cloned().partition(|set| set.key == stages::STAGES);
+    let invalid = |problems, unlisted| ConfigError::Invalid { name: name.to_string(), problems, unlisted };
+    let without_stages = |overrides: &[Override]| {
+        let mut reader: Reader<'_> = values()?;
+        reader.set_all(overrides);
+        reader.read(Config::ask)
+    };
+    let (own, mut notes) =
+        without_stages(&overrides).map_err(|reader::Problems { listed, unlisted }| invalid(listed, unlisted))?;
+    let shortened = overrides.iter().any(|set| set.key == stages::GENERATIONS);
+    let resolved = match staging.last() {
+        Some(set) => {
+            let text = format!("{} = {}", stages::STAGES, set.text);
+            stages::resolve(stages::unresolved(&Document::parse(&text), true), &own, shortened)
+        }
+        None => stages::resolve(stages(), &own, shortened).map_err(|problems| {
+            let is_valid = |overrides: &[Override]| {
+                without_stages(overrides).is_ok_and(|(own, _)| stages::resolve(stages(), &own, shortened).is_ok())
+            };
+            stages::attribute(problems, &overrides, is_valid)
+        }),
+    };
+    let resolved = resolved.map_err(|mut problems| {
+        let unlisted = problems.len().saturating_sub(reader::MAX_LISTED);
+        problems.truncate(reader::MAX_LISTED);
+        invalid(problems, unlisted)
+    })?;
+    let last = own.learning.generations;
+    let (stages, later): (Vec<_>, Vec<_>) = resolved.into_iter().partition(|(stage, _)| stage.from <= last);
+    notes.extend(later.iter().map(|(Stage { from, .. }, _)| {
+        format!("the stage from generation {from} on is left out, because this run ends with generation {last}")
+    }));
+    let (stages, configs) = stages.into_iter().unzip();
+    let config = ValidConfig::new(Config { stages, ..own }, configs);
+    notes.extend(config.notes());
+    Ok((config, notes))
 }
 
 /// An error in reading or validating a config.

@@ -4,14 +4,12 @@
 //! run as a whole are the same in all stages.
 
 use std::collections::BTreeMap;
-use std::ops::RangeInclusive;
 
 use serde::Serialize;
-use toml::Spanned;
-use toml::de::{DeTable, DeValue};
+use toml::de::DeValue;
 
 use super::{Config, MAX_GENERATIONS, Override, Problem};
-use crate::reader::{Document, LineNumbers, Number};
+use crate::reader::{Document, Number, Reader, Value};
 
 /// The list of stages in a config.
 pub const STAGES: &str = "stages";
@@ -52,187 +50,175 @@ impl Config {
     }
 }
 
-/// The keys that a stage sets, dotted, each as written.
-type Written<'a> = BTreeMap<String, WrittenValue<'a>>;
-
-/// The line and the text of a value.
-struct WrittenValue<'a> {
+/// A stage before its values are checked.
+#[derive(Default)]
+pub(super) struct UnresolvedStage<'a> {
+    /// The name in problems: `stages[0]`.
+    name: String,
+    /// The line of the stage, and of its `from`; none if it is from outside the file.
     line: Option<usize>,
-    text: &'a str,
+    from_line: Option<usize>,
+    /// The first generation.
+    from: Option<Value<'a>>,
+    /// The dotted keys that it sets, each with its line.
+    set: BTreeMap<String, (Option<usize>, Value<'a>)>,
 }
 
-/// The problems of a document's stages.
-struct Problems<'a> {
-    /// The document's lines, or `None` if the document comes from outside the file.
-    lines: Option<&'a LineNumbers>,
-    listed: Vec<Problem>,
-}
-
-impl Problems<'_> {
-    /// Returns the line of an offset in the document.
-    fn line(&self, offset: usize) -> Option<usize> {
-        self.lines.map(|lines| lines.line(offset))
-    }
-
-    fn report(&mut self, line: Option<usize>, key: String, message: String) {
-        self.listed.push(Problem { line, key, message });
-    }
-
-    fn report_at(&mut self, offset: usize, key: String, message: String) {
-        self.report(self.line(offset), key, message);
+impl UnresolvedStage<'_> {
+    /// Returns a stage that a program has set.
+    pub fn of((index, stage): (usize, &Stage)) -> Self {
+        let set = stage.set.iter().map(|(key, value)| (key.clone(), (None, value.clone().into()))).collect();
+        UnresolvedStage { name: name_of(index), from: Some(Value::of(&stage.from)), set, ..UnresolvedStage::default() }
     }
 }
 
-/// Reads the stages of a document, each with its resolved config. The document's other keys make the valid config `own`.
+/// Returns the name of a stage in problems.
+fn name_of(index: usize) -> String {
+    format!("{STAGES}[{index}]")
+}
+
+/// Returns the stages of a document, and the problems of their form. Problems have no lines if the document comes from
+/// `outside` the file.
+pub(super) fn unresolved<'a>(document: &'a Document<'_>, outside: bool) -> (Vec<UnresolvedStage<'a>>, Vec<Problem>) {
+    let line = |offset: usize| (!outside).then(|| document.lines().line(offset));
+    let mut problems = Vec::new();
+    let mut report = |offset, key: String, message: String| problems.push(Problem { line: line(offset), key, message });
+    let Some(list) = document.table().get(STAGES) else { return (vec![], vec![]) };
+    let Some(tables) = list.get_ref().as_array().filter(|tables| tables.len() <= MAX_STAGES) else {
+        let message = format!("allowed a list of up to {MAX_STAGES} tables [[{STAGES}]], each with `from` and `set`");
+        report(list.span().start, STAGES.into(), message);
+        return (vec![], problems);
+    };
+    let mut unresolved = Vec::new();
+    for (index, table) in tables.iter().enumerate() {
+        let (name, start) = (name_of(index), table.span().start);
+        let mut stage = UnresolvedStage { name: name.clone(), line: line(start), ..UnresolvedStage::default() };
+        let Some(keys) = table.get_ref().as_table() else {
+            report(start, name, "allowed a table with `from` and `set`".into());
+            continue;
+        };
+        for (key, value) in keys {
+            let (place, offset) = (format!("{name}.{}", key.get_ref()), key.span().start);
+            match (key.get_ref().as_ref(), value.get_ref()) {
+                ("from", _) => {
+                    stage.from_line = line(offset);
+                    stage.from = Some(document.value(value));
+                }
+                ("set", DeValue::Table(set)) => {
+                    for (key, value) in set {
+                        let (line, key) = (line(key.span().start), key.get_ref());
+                        match value.get_ref() {
+                            // `set = { world.coupling = 1 }` is the same key without quotes.
+                            DeValue::Table(leaves) => stage.set.extend(leaves.iter().map(|(leaf, value)| {
+                                (format!("{key}.{}", leaf.get_ref()), (line, document.value(value)))
+                            })),
+                            _ => drop(stage.set.insert(key.to_string(), (line, document.value(value)))),
+                        }
+                    }
+                }
+                ("set", _) => report(offset, place, "allowed a table of dotted keys in quotes".into()),
+                _ => report(offset, place, "unknown key; a stage has from, set".into()),
+            }
+        }
+        unresolved.push(stage);
+    }
+    (unresolved, problems)
+}
+
+/// Checks stages, and returns each with its resolved config. The config's other keys make the valid config `own`.
 ///
-/// Problems have lines unless the document comes from outside the file. `shortened` means that the run's length was set
-/// from outside, in which case stages may begin after its end.
+/// `problems` are those of the form of the stages. `shortened` means that the run's length was set from outside, in which
+/// case stages may begin after its end.
 ///
 /// # Errors
 /// Fails if a stage is invalid. The error lists all problems by line.
-pub(super) fn read(
-    document: &Document<'_>,
-    outside: bool,
+pub(super) fn resolve(
+    (unresolved, mut problems): (Vec<UnresolvedStage<'_>>, Vec<Problem>),
     own: &Config,
     shortened: bool,
 ) -> Result<Vec<(Stage, Config)>, Vec<Problem>> {
-    let Some(list) = document.table().get(STAGES) else { return Ok(vec![]) };
-    let mut problems = Problems { lines: (!outside).then(|| document.lines()), listed: vec![] };
-    let Some(tables) = list.get_ref().as_array().filter(|tables| tables.len() <= MAX_STAGES) else {
-        let message = format!("allowed a list of up to {MAX_STAGES} tables [[{STAGES}]], each with `from` and `set`");
-        problems.report_at(list.span().start, STAGES.into(), message);
-        return Err(problems.listed);
-    };
-    // A stage changes the values of `own`, so defaults that depend on other keys stay as they are there.
-    let own_text = own.to_toml();
-    let own_document = Document::parse(&own_text);
+    if unresolved.len() > MAX_STAGES {
+        let message = format!("found {}, allowed up to {MAX_STAGES}", unresolved.len());
+        return Err(vec![Problem { line: None, key: STAGES.into(), message }]);
+    }
     let mut stages: Vec<(Stage, Config)> = Vec::new();
-    for (index, table) in tables.iter().enumerate() {
-        let (name, start) = (format!("{STAGES}[{index}]"), table.span().start);
-        let Some(keys) = table.get_ref().as_table() else {
-            problems.report_at(start, name, "allowed a table with `from` and `set`".into());
-            continue;
-        };
-        let least = stages.last().map_or(0, |(before, _)| before.from + 1);
-        let most = if shortened { MAX_GENERATIONS } else { own.learning.generations };
-        let (from, written) = read_table(keys, &name, document.text(), least..=most, &mut problems);
-        if from.is_none() {
-            problems.report_at(start, name.clone(), "missing `from`, the first of its generations".into());
-        }
-        let line = problems.line(start);
-        let config = resolve(&written, &name, line, own, &own_document, &mut problems);
-        let value = |text: &str| {
-            let table: Option<toml::Table> = format!("value = {text}").parse().ok();
-            table.and_then(|mut table| table.remove("value"))
-        };
-        let set = written.iter().filter_map(|(key, written)| Some((key.clone(), value(written.text)?))).collect();
-        stages.push((Stage { from: from.unwrap_or(0), set }, config));
+    for stage in unresolved {
+        let min = stages.last().map_or(0, |(before, _)| before.from + 1);
+        let max = if shortened { MAX_GENERATIONS } else { own.learning.generations };
+        let from = stage.first_generation([min, max], &mut problems);
+        let config = stage.config(own, &mut problems);
+        let set = stage.set.iter().filter_map(|(key, (_, value))| Some((key.clone(), value.to_toml()?))).collect();
+        stages.push((Stage { from, set }, config));
     }
-    if problems.listed.is_empty() { Ok(stages) } else { Err(problems.listed) }
+    problems.sort_by_key(|problem| problem.line);
+    if problems.is_empty() { Ok(stages) } else { Err(problems) }
 }
 
-/// Reads one stage's table, which is called `name` in problems: its first generation and the keys that it sets. If the
-/// generation is not in `allowed`, returns the least that is.
-fn read_table<'a>(
-    keys: &DeTable<'_>,
-    name: &str,
-    text: &'a str,
-    allowed: RangeInclusive<usize>,
-    problems: &mut Problems<'_>,
-) -> (Option<usize>, Written<'a>) {
-    let (mut from, mut written) = (None, Written::new());
-    for (key, value) in keys {
-        let (place, offset) = (format!("{name}.{}", key.get_ref()), key.span().start);
-        match (key.get_ref().as_ref(), value.get_ref()) {
-            ("from", number) => {
-                let (least, most) = allowed.clone().into_inner();
-                match <usize as Number>::read(number).flatten() {
-                    Some(number) if allowed.contains(&number) => from = Some(number),
-                    _ if allowed.is_empty() => {
-                        let message = format!("the stage before begins in the last generation, {most} ({GENERATIONS})");
-                        problems.report_at(offset, place, message);
-                        from = Some(least);
-                    }
-                    found => {
-                        let found = found.map_or("something else".into(), |found| found.to_string());
-                        let after = if least > 0 { ", after the stage before" } else { "" };
-                        let message =
-                            format!("found {found}, allowed a whole number, {least} to {most} ({GENERATIONS}){after}");
-                        problems.report_at(offset, place, message);
-                        from = Some(least);
-                    }
-                }
-            }
-            ("set", DeValue::Table(set)) => written = read_set(set, text, problems),
-            ("set", _) => problems.report_at(offset, place, "allowed a table of dotted keys in quotes".into()),
-            _ => problems.report_at(offset, place, "unknown key; a stage has from, set".into()),
-        }
-    }
-    (from, written)
-}
-
-/// Reads the keys that a stage sets.
-fn read_set<'a>(set: &DeTable<'_>, text: &'a str, problems: &Problems<'_>) -> Written<'a> {
-    let mut written = Written::new();
-    for (key, value) in set {
-        let line = problems.line(key.span().start);
-        let mut add = |key: String, value: &Spanned<DeValue<'_>>| {
-            written.insert(key, WrittenValue { line, text: text.get(value.span()).unwrap_or_default() });
+impl UnresolvedStage<'_> {
+    /// Returns the first generation, or the smallest allowed one if it is wrong.
+    fn first_generation(&self, [min, max]: [usize; 2], problems: &mut Vec<Problem>) -> usize {
+        let Some(from) = &self.from else {
+            let message = "missing `from`, the first of its generations".into();
+            problems.push(Problem { line: self.line, key: self.name.clone(), message });
+            return min;
         };
-        match value.get_ref() {
-            // `set = { world.coupling = 1 }` is the same key without quotes.
-            DeValue::Table(leaves) => {
-                leaves.iter().for_each(|(leaf, value)| add(format!("{}.{}", key.get_ref(), leaf.get_ref()), value));
+        let message = match usize::read(from).flatten() {
+            Some(from) if (min..=max).contains(&from) => return from,
+            _ if min > max => format!("the stage before begins in the last generation, {max} ({GENERATIONS})"),
+            found => {
+                let found = found.map_or("something else".into(), |found| found.to_string());
+                let after = if min > 0 { ", after the stage before" } else { "" };
+                format!("found {found}, allowed a whole number, {min} to {max} ({GENERATIONS}){after}")
             }
-            _ => add(key.get_ref().to_string(), value),
-        }
+        };
+        problems.push(Problem { line: self.from_line, key: format!("{}.from", self.name), message });
+        min
     }
-    written
-}
 
-/// Returns the config of a stage. If a key is invalid, this is `own`. Problems without a line of their own get `line`,
-/// that of the stage.
-fn resolve(
-    written: &Written<'_>,
-    name: &str,
-    line: Option<usize>,
-    own: &Config,
-    own_document: &Document<'_>,
-    problems: &mut Problems<'_>,
-) -> Config {
-    let mut overrides = Vec::new();
-    for (key, value) in written {
-        let name = format!("{name}.set.{key}");
-        if FIXED.iter().any(|fixed| key == fixed || fixed.ends_with('.') && key.starts_with(fixed)) {
-            problems.report(value.line, name, "this key cannot change between stages".into());
-        } else {
-            overrides.push(Override { key: key.clone(), text: value.text.to_string(), name });
-        }
-    }
-    let line = |key: &str| {
-        let within = |(written, _): &(&String, &WrittenValue)| key.starts_with(&format!("{name}.set.{written}"));
-        written.iter().find(within).map_or(line, |(_, value)| value.line)
-    };
-    let config = match Config::without_stages(own_document, &[], &overrides) {
-        Ok((config, _)) => config,
-        Err(found) => {
-            for Problem { key, message, .. } in found.listed {
-                let line = line(&key);
-                let key = if key.starts_with(STAGES) { key } else { format!("{name}: {key}") };
-                problems.report(line, key, message);
+    /// Returns the config of the stage. If a key is invalid, this is `own`. Problems without a line of their own get
+    /// that of the stage.
+    fn config(&self, own: &Config, problems: &mut Vec<Problem>) -> Config {
+        let name = &self.name;
+        // A stage changes the values of `own`, so defaults that depend on other keys stay as they are there.
+        let mut reader = Reader::of_values(own.values());
+        for (key, (line, value)) in &self.set {
+            let name = format!("{name}.set.{key}");
+            if FIXED.iter().any(|fixed| key == fixed || fixed.ends_with('.') && key.starts_with(fixed)) {
+                problems.push(Problem {
+                    line: *line,
+                    key: name,
+                    message: "this key cannot change between stages".into(),
+                });
+            } else {
+                reader.set(key, value.clone(), name);
             }
-            own.clone()
         }
-    };
-    let counts = |config: &Config| [config.learners(), config.world.leaders.len()];
-    if counts(&config) != counts(own) {
-        let key = if written.contains_key("world.leaders") { "world.leaders" } else { "world.followers" };
-        let [found, expected] = [&config, own].map(Config::learners);
-        let key = format!("{name}.set.{key}");
-        let message = format!("{found} leaders learn in this stage, {expected} in all others");
-        problems.report(line(&key), key, message);
+        let line = |key: &str| {
+            let within =
+                |(set, _): &(&String, &(Option<usize>, Value<'_>))| key.starts_with(&format!("{name}.set.{set}"));
+            self.set.iter().find(within).map_or(self.line, |(_, (line, _))| *line)
+        };
+        let config = match reader.read(Config::ask) {
+            Ok((config, _)) => config,
+            Err(found) => {
+                problems.extend(found.listed.into_iter().map(|Problem { key, message, .. }| Problem {
+                    line: line(&key),
+                    key: if key.starts_with(STAGES) { key } else { format!("{name}: {key}") },
+                    message,
+                }));
+                own.clone()
+            }
+        };
+        let counts = |config: &Config| [config.learners(), config.world.leaders.len()];
+        if counts(&config) != counts(own) {
+            let leaders = self.set.contains_key("world.leaders");
+            let key = format!("{name}.set.world.{}", if leaders { "leaders" } else { "followers" });
+            let [found, expected] = [&config, own].map(Config::learners);
+            let message = format!("{found} leaders learn in this stage, {expected} in all others");
+            problems.push(Problem { line: line(&key), key, message });
+        }
+        config
     }
-    config
 }
 
 /// Attributes the problems of stages to the flags that cause them, if the file is valid without flags. A flag causes

@@ -37,9 +37,9 @@ impl Motion {
         let slowest = between(LEAST, max_speed).or_zero().because("motion.max_speed");
         let before = r.error_count();
         let min_speed = Motion::min_speed(r).number(slowest, 0.0);
-        let least = if r.error_count() > before { 0.0 } else { min_speed };
-        let start_speed = between(least.max(LEAST), max_speed).because("motion.min_speed to motion.max_speed");
-        let start_speed = if least == 0.0 { start_speed.or_zero() } else { start_speed };
+        let min = if r.error_count() > before { 0.0 } else { min_speed };
+        let start_speed = between(min.max(LEAST), max_speed).because("motion.min_speed to motion.max_speed");
+        let start_speed = if min == 0.0 { start_speed.or_zero() } else { start_speed };
         let motion = Motion {
             min_speed,
             max_speed,
@@ -59,7 +59,7 @@ impl Motion {
             format!(
                 "motion.max_speed times world.dt is {step:.2e} units, and positions on this map are {resolution:.2e} units \
                  apart: agents stand still or get too far or not far enough; set a larger world.dt or a smaller world.map, \
-                 so that a step is at least {:.2e} units",
+                 so that a step is at min {:.2e} units",
                 SHORTEST * resolution
             )
         })

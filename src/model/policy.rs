@@ -15,7 +15,7 @@ pub(crate) const WGSL: &str = include_str!("../../shaders/policy.wgsl");
 /// Actions of a leader: a wanted turn and a wanted speed.
 pub const OUTPUTS: usize = 2;
 /// Behaviours to choose among: hold, towards or away from POIs, towards or away from agents.
-pub const BEHAVIOURS: usize = 5;
+pub(crate) const BEHAVIOURS: usize = 5;
 /// Maximum number of hidden layers.
 pub const MAX_HIDDEN_LAYERS: usize = 3;
 /// Maximum units per hidden layer.

@@ -2,37 +2,23 @@
 
 use std::ops::{Range, RangeInclusive};
 
-use serde::Serialize;
-
 use crate::config_enum::config_enum;
-use crate::reader::{OneOrList, Reader, between};
+use crate::reader::{OneOrEach, Reader, between};
 
 /// Agents needed at a POI at the same step: one number for all POIs, or one per POI.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-#[serde(untagged)]
-pub enum Coupling {
-    /// The same number for every POI.
-    Same(usize),
-    /// One number per POI, `[pois]`.
-    Each(Vec<usize>),
-}
+pub type Coupling = OneOrEach<usize>;
 
 impl Coupling {
     /// Reads the coupling. Errors name the number of agents by `because`. `pois` is `None` if their list is invalid.
     pub(crate) fn read(r: &mut Reader<'_>, agents: usize, because: &'static str, pois: Option<usize>) -> Coupling {
-        let coupling = r
-            .key(
-                "world.coupling",
-                "agents",
-                "C: number of agents that a POI needs at the same step to be observed; one number for all POIs, or one \
-                 per POI",
-                "3.2, Eq. 2",
-            )
-            .one_or_list(between(1, agents).because(because), pois.map_or(0..=usize::MAX, |pois| pois..=pois), 3);
-        match coupling {
-            OneOrList::One(coupling) => Coupling::Same(coupling),
-            OneOrList::List(couplings) => Coupling::Each(couplings),
-        }
+        r.key(
+            "world.coupling",
+            "agents",
+            "C: number of agents that a POI needs at the same step to be observed; one number for all POIs, or one per \
+             POI",
+            "3.2, Eq. 2",
+        )
+        .one_or_each(between(1, agents).because(because), pois.map_or(0..=usize::MAX, |pois| pois..=pois), 3)
     }
 
     /// Returns the coupling of each POI, `[pois]`.

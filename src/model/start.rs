@@ -2,19 +2,11 @@
 
 use std::f64::consts::{FRAC_PI_2, TAU};
 
-use serde::Serialize;
+use crate::reader::{OneOrEach, Reader, between};
 
-use crate::reader::{OneOrList, Reader, between};
-
-/// The agents' headings at the start, in radians from the x axis towards the y axis.
-#[derive(Clone, Debug, PartialEq, Serialize)]
-#[serde(untagged)]
-pub enum Heading {
-    /// One heading for all agents.
-    Same(f64),
-    /// One per leader, which its followers share; or one per agent, leaders first.
-    Each(Vec<f64>),
-}
+/// The agents' headings at the start, in radians from the x axis towards the y axis: one heading for all agents; one per
+/// leader, which its followers share; or one per agent, leaders first.
+pub type Heading = OneOrEach<f64>;
 
 impl Heading {
     /// Reads the key. `counts` are the numbers of leaders and followers, `None` if they are unknown.
@@ -29,27 +21,22 @@ impl Heading {
                  per agent",
                 "3.1, Fig. 3",
             )
-            .one_or_list(between(-1e3, 1e3), 0..=usize::MAX, FRAC_PI_2);
-        match heading {
-            OneOrList::One(heading) => Heading::Same(heading),
-            OneOrList::List(headings) => {
-                if let (Some([leaders, followers]), true) = (counts, r.error_count() == errors_before)
-                    && headings.len() != leaders
-                    && headings.len() != leaders + followers
-                {
-                    let found = headings.len();
-                    let allowed = match followers {
-                        0 => format!("{leaders} (one per leader)"),
-                        _ => format!("{leaders} (one per leader) or {} (one per agent)", leaders + followers),
-                    };
-                    r.report_key(
-                        "world.heading",
-                        format!("found a list of {found}, allowed one number or a list of {allowed}"),
-                    );
-                }
-                Heading::Each(headings)
-            }
+            .one_or_each(between(-1e3, 1e3), 0..=usize::MAX, FRAC_PI_2);
+        if let (Heading::Each(headings), Some([leaders, followers])) = (&heading, counts)
+            && r.error_count() == errors_before
+            && ![leaders, leaders + followers].contains(&headings.len())
+        {
+            let per_agent = match followers {
+                0 => String::new(),
+                _ => format!(" or {} (one per agent)", leaders + followers),
+            };
+            let found = headings.len();
+            let message = format!(
+                "found a list of {found}, allowed one number or a list of {leaders} (one per leader){per_agent}"
+            );
+            r.report_key("world.heading", message);
         }
+        heading
     }
 
     /// Returns a note if a heading is larger than a full turn: it was likely meant in degrees.

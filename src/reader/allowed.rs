@@ -3,11 +3,12 @@
 use std::fmt::{self, Display};
 
 use serde::Serialize;
-use toml::de::DeValue;
+
+use super::value::{Kind, Value};
 
 /// The allowed values of a number.
 #[derive(Clone, Copy, Debug)]
-pub struct Allowed<T> {
+pub(crate) struct Allowed<T> {
     low: T,
     pub(super) high: T,
     zero: bool,
@@ -17,7 +18,7 @@ pub struct Allowed<T> {
 }
 
 /// Returns the range from `low` to `high`, both included.
-pub fn between<T>(low: T, high: T) -> Allowed<T> {
+pub(crate) fn between<T>(low: T, high: T) -> Allowed<T> {
     Allowed { low, high, zero: false, unlimited: false, because: "" }
 }
 
@@ -98,14 +99,14 @@ impl<T: Number> Display for Allowed<T> {
 }
 
 /// A type of numbers in a config.
-pub trait Number: Copy + PartialOrd + Display + Serialize {
+pub(crate) trait Number: Copy + PartialOrd + Display + Serialize {
     /// The number 0.
     const ZERO: Self;
     /// The name of the type with its article: "a number".
     const KIND: &'static str;
 
     /// Returns the number of a value: `None` for another kind of value, `Some(None)` for a number outside the type.
-    fn read(value: &DeValue<'_>) -> Option<Option<Self>>;
+    fn read(value: &Value<'_>) -> Option<Option<Self>>;
 
     /// Reports whether the number is infinity.
     fn is_infinite(self) -> bool {
@@ -117,15 +118,11 @@ impl Number for f64 {
     const ZERO: f64 = 0.0;
     const KIND: &'static str = "a number";
 
-    fn read(value: &DeValue<'_>) -> Option<Option<f64>> {
-        match value {
-            DeValue::Integer(_) => Some(i64::read(value)?.map(|integer| integer as f64)),
-            DeValue::Float(float) => {
-                let value: Option<f64> = float.as_str().parse().ok();
-                let written = |value: &f64| value.is_finite() || float.as_str().contains("inf");
-                // Adding 0 turns -0 into 0.
-                Some(value.filter(written).map(|value| value + 0.0))
-            }
+    fn read(value: &Value<'_>) -> Option<Option<f64>> {
+        match value.kind {
+            Kind::Integer(_) => i64::read(value).map(|integer| integer.map(|integer| integer as f64)),
+            // Adding 0 turns -0 into 0.
+            Kind::Float(number) => Some(number.map(|number| number + 0.0)),
             _ => None,
         }
     }
@@ -141,8 +138,11 @@ macro_rules! whole_number {
             const ZERO: $type = 0;
             const KIND: &'static str = "a whole number";
 
-            fn read(value: &DeValue<'_>) -> Option<Option<$type>> {
-                value.as_integer().map(|integer| <$type>::from_str_radix(integer.as_str(), integer.radix()).ok())
+            fn read(value: &Value<'_>) -> Option<Option<$type>> {
+                match value.kind {
+                    Kind::Integer(number) => Some(number.and_then(|number| number.try_into().ok())),
+                    _ => None,
+                }
             }
         }
     )*};

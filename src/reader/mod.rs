@@ -1,4 +1,4 @@
-//! A reader of TOML texts, key by key. Each request for a key states its allowed values, and one pass finds all
+//! A reader of configs, from TOML texts or from programs, key by key. Each request for a key states its allowed values, and one pass finds all
 //! problems of the text with their lines.
 //!
 //! The requests also define the table of keys, see [`keys`]. The keys themselves are defined elsewhere.
@@ -13,10 +13,13 @@ use toml::de::{DeTable, DeValue, Error};
 
 mod allowed;
 mod request;
+mod value;
 
-pub(crate) use allowed::Allowed;
-pub use allowed::{Number, between};
-pub(crate) use request::{KeyRequest, NumberOrPercentage, OneOrList};
+pub(crate) use allowed::{Allowed, Number, between};
+pub(crate) use request::KeyRequest;
+pub use request::{CountOrPercentage, OneOrEach};
+pub(crate) use value::Value;
+use value::{Kind, shorten};
 
 /// Maximum number of problems listed per text.
 pub(crate) const MAX_LISTED: usize = 50;
@@ -88,7 +91,7 @@ pub struct Problems {
 
 /// Sections of a text that its reader does not read.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct OtherSections<'a> {
+pub(crate) struct OtherSections<'a> {
     /// Sections that are ignored.
     pub ignored: &'a [&'a str],
     /// Sections that make the text something else. They are reported alone.
@@ -102,15 +105,17 @@ pub struct OtherSections<'a> {
 pub struct Document<'a> {
     text: &'a str,
     table: DeTable<'a>,
+    /// The syntax errors in the text, by offset.
     errors: Vec<Error>,
     lines: LineNumbers,
 }
 
 impl<'a> Document<'a> {
-    /// Parses a text. [`read`] reports its syntax errors.
+    /// Parses a text. [`Config::read_noted`](crate::Config::read_noted) reports its syntax errors.
     pub fn parse(text: &'a str) -> Document<'a> {
         work::add(text.len());
-        let (table, errors) = DeTable::parse_recoverable(text);
+        let (table, mut errors) = DeTable::parse_recoverable(text);
+        errors.sort_by_key(start_of);
         Document { text, table: table.into_inner(), errors, lines: LineNumbers::of(text) }
     }
 
@@ -120,14 +125,14 @@ impl<'a> Document<'a> {
         self
     }
 
-    /// Returns the text that was parsed.
-    pub fn text(&self) -> &'a str {
-        self.text
-    }
-
     /// Returns the top-level table.
     pub fn table(&self) -> &DeTable<'a> {
         &self.table
+    }
+
+    /// Returns a value of the table.
+    pub(crate) fn value<'d>(&'d self, value: &Spanned<DeValue<'d>>) -> Value<'d> {
+        Value::of_text(value.clone(), self.text)
     }
 
     /// Returns the line numbers of the text.
@@ -155,93 +160,11 @@ impl LineNumbers {
     }
 }
 
-/// Reads a text, with some keys set by overrides: `ask` requests every key. Also returns a note about each omitted
-/// key whose default other keys do not allow.
-///
-/// # Errors
-/// All problems of the text and the overrides.
-pub(crate) fn read<T>(
-    document: &Document<'_>,
-    others: OtherSections<'_>,
-    overrides: &[Override],
-    ask: impl FnOnce(&mut Reader<'_>) -> T,
-) -> Result<(T, Vec<String>), Problems> {
-    let Document { text, table, errors, lines } = document;
-    let mut reader = Reader::default();
-    let other = if errors.is_empty() { None } else { other_language(text) };
-    if let Some((start, language)) = other {
-        let message = format!(
-            "found {language}, allowed TOML: `key = value` below a [section]; `flotilla init` writes an example"
-        );
-        reader.report(Place::Offset(start), "", message);
-    }
-    for error in first_errors(errors, lines).filter(|_| other.is_none()) {
-        let span = error.span().unwrap_or(0..0);
-        let at = text.get(span.clone()).filter(|at| !at.trim().is_empty());
-        // A missing comma is the usual mistake in a list of positions. The parser takes it for a word without quotes.
-        let numbers = |at: &str| at.contains(' ') && at.split(' ').all(|word| word.parse::<f64>().is_ok());
-        let message = match at {
-            Some(at) if numbers(at) => format!("found `{}`, allowed numbers with a comma between them", shorten(at)),
-            Some(at) => format!("{} (at `{}`)", error.message().trim().replace('\n', ", "), shorten(at)),
-            None => error.message().trim().replace('\n', ", "),
-        };
-        reader.report(Place::Offset(span.start), "", message);
-    }
-    if reader.problems.is_empty() {
-        let mut refused = table.keys().filter(|key| others.refused.contains(&key.get_ref().as_ref()));
-        if let Some(section) = refused.next() {
-            reader.report(Place::Offset(section.span().start), section.get_ref(), others.message.into());
-        }
-    }
-    if reader.problems.is_empty() {
-        reader.fill(table.clone(), text, others.ignored, overrides);
-        let read = ask(&mut reader);
-        reader.report_unknown();
-        if reader.problems.is_empty() {
-            return Ok((read, reader.notes));
-        }
-    }
-    Err(reader.into_problems(lines))
-}
-
 /// Returns the result for an empty text, and the keys that `ask` requests, in order.
-pub fn keys<T>(ask: impl FnOnce(&mut Reader<'_>) -> T) -> (T, Vec<Definition>) {
+pub(crate) fn keys<T>(ask: impl FnOnce(&mut Reader<'_>) -> T) -> (T, Vec<Definition>) {
     let mut reader = Reader { table: Some(vec![]), ..Reader::default() };
     let read = ask(&mut reader);
     (read, reader.table.unwrap_or_default())
-}
-
-/// Returns the language of a text that is not TOML, with the offset of the first line that is not a comment.
-fn other_language(text: &str) -> Option<(usize, &'static str)> {
-    let mut start = 0;
-    let lines = text.split_inclusive('\n').map(|line| {
-        let at = start;
-        start += line.len();
-        (at, line.trim())
-    });
-    let (start, first) = lines.into_iter().find(|(_, line)| !line.is_empty() && !line.starts_with('#'))?;
-    let is_name = |name: &str| name.bytes().all(|byte| byte.is_ascii_alphanumeric() || b"_-.".contains(&byte));
-    let yaml = first == "---" || first.split_once(':').is_some_and(|(name, _)| !name.is_empty() && is_name(name));
-    match first {
-        _ if first.starts_with('{') => Some((start, "JSON")),
-        _ if yaml => Some((start, "YAML")),
-        _ => None,
-    }
-}
-
-/// Returns the syntax errors that are not consequences of an earlier one: an error can invalidate the rest of its line,
-/// and an unclosed list the rest of the file.
-fn first_errors<'e>(errors: &'e [Error], lines: &'e LineNumbers) -> impl Iterator<Item = &'e Error> {
-    let unclosed = errors.iter().any(|error| error.message().contains("unclosed array"));
-    let in_list = |error: &Error| unclosed && error.message().contains("array");
-    let end = errors.iter().position(in_list).map_or(errors.len(), |first| first + 1);
-    let mut last = 0;
-    errors[..end].iter().filter(move |error| {
-        let line = lines.line(error.span().map_or(0, |span| span.start));
-        let is_new = line > last;
-        last = last.max(line);
-        is_new
-    })
 }
 
 /// The place of a value. The order of the variants is the order of problems.
@@ -249,15 +172,14 @@ fn first_errors<'e>(errors: &'e [Error], lines: &'e LineNumbers) -> impl Iterato
 enum Place {
     /// The offset in the file, in bytes.
     Offset(usize),
-    /// An override.
+    /// An override, or a config that was not written.
     Outside,
 }
 
-/// A value with its name and place for errors.
+/// A value with its name for errors.
 struct Entry<'a> {
-    value: Spanned<DeValue<'a>>,
-    /// The text that contains the value's span.
-    text: &'a str,
+    value: Value<'a>,
+    /// Whether it is an override.
     outside: bool,
     /// The key with its index in a list, or the override's name.
     name: String,
@@ -265,29 +187,15 @@ struct Entry<'a> {
 
 impl Entry<'_> {
     fn place(&self) -> Place {
-        if self.outside { Place::Outside } else { Place::Offset(self.value.span().start) }
-    }
-
-    fn found(&self) -> String {
-        match self.value.get_ref() {
-            DeValue::Array(items) => format!("a list of {}", items.len()),
-            DeValue::Table(_) => "a table".into(),
-            _ => shorten(self.text.get(self.value.span()).unwrap_or_default()),
-        }
+        self.value.written.filter(|_| !self.outside).map_or(Place::Outside, |(offset, _)| Place::Offset(offset))
     }
 }
 
-/// Shortens a text from the file to a part of one line.
-fn shorten(text: &str) -> String {
-    let line = text.lines().next().unwrap_or_default();
-    let end = line.char_indices().nth(40).map_or(line.len(), |(end, _)| end);
-    let more = if end < text.len() { "…" } else { "" };
-    line[..end].chars().map(|c| if c.is_control() { ' ' } else { c }).chain(more.chars()).collect()
-}
-
-/// The values of a file that were not requested yet, and the problems of those that were.
+/// The values of a config that were not requested yet, and the problems of those that were.
 #[derive(Default)]
-pub struct Reader<'a> {
+pub(crate) struct Reader<'a> {
+    /// The lines of the text, if the config was written.
+    lines: Option<&'a LineNumbers>,
     /// The values by dotted key.
     entries: BTreeMap<String, Entry<'a>>,
     /// The values outside any section.
@@ -325,6 +233,11 @@ macro_rules! section {
 
         impl $name {
             $(section! { @key $section, $field { $($words),+ } $($unit, $paper)? })+
+
+            /// Returns the value of each dotted key.
+            pub(crate) fn values(&self) -> Vec<(&'static str, $crate::reader::Value<'static>)> {
+                vec![$((concat!($section, ".", stringify!($field)), $crate::reader::Value::of(&self.$field))),+]
+            }
         }
     };
     (@key $section:tt, $field:ident { $($words:tt)+ }) => {};
@@ -342,35 +255,75 @@ macro_rules! section {
 pub(crate) use section;
 
 impl<'a> Reader<'a> {
-    fn fill(&mut self, document: DeTable<'a>, text: &'a str, ignored: &[&str], overrides: &'a [Override]) {
-        for (section, value) in document {
-            let start = section.span().start;
-            let section = section.into_inner().into_owned();
-            if ignored.contains(&section.as_str()) {
-                continue;
-            }
-            let span = value.span();
-            match value.into_inner() {
-                DeValue::Table(table) => {
-                    for (key, value) in table {
-                        let name = format!("{section}.{}", key.into_inner());
-                        self.entries.insert(name.clone(), Entry { value, text, outside: false, name });
-                    }
-                    self.sections.insert(section, start);
+    /// Reads a text.
+    ///
+    /// # Errors
+    /// The text is not TOML, or has a section that makes it something else.
+    pub fn of_text(document: &'a Document<'a>, others: OtherSections<'_>) -> Result<Reader<'a>, Problems> {
+        let Document { text, table, errors, lines } = document;
+        let mut reader = Reader { lines: Some(lines), ..Reader::default() };
+        // Other errors follow from these: one can invalidate the rest of its line, and an unclosed list the rest of the
+        // file.
+        let unclosed = errors.iter().any(|error| error.message().contains("unclosed array"));
+        let in_list = |error: &Error| unclosed && error.message().contains("array");
+        let end = errors.iter().position(in_list).map_or(errors.len(), |at| at + 1);
+        for errors in errors[..end].chunk_by(|a, b| lines.line(start_of(a)) == lines.line(start_of(b))) {
+            reader.report(Place::Offset(start_of(&errors[0])), "", syntax_problem(&errors[0], text));
+        }
+        let mut refused = table.keys().filter(|key| others.refused.contains(&key.get_ref().as_ref()));
+        if let (true, Some(section)) = (errors.is_empty(), refused.next()) {
+            reader.report(Place::Offset(section.span().start), section.get_ref(), others.message.into());
+        }
+        if !reader.problems.is_empty() {
+            return Err(reader.into_problems());
+        }
+        for (section, value) in
+            table.iter().filter(|(section, _)| !others.ignored.contains(&section.get_ref().as_ref()))
+        {
+            let (name, start) = (section.get_ref().to_string(), section.span().start);
+            if let DeValue::Table(table) = value.get_ref() {
+                for (key, value) in table {
+                    let (name, value) = (format!("{name}.{}", key.get_ref()), Value::of_text(value.clone(), text));
+                    reader.entries.insert(name.clone(), Entry { value, outside: false, name });
                 }
-                other => {
-                    let value = Spanned::new(span, other);
-                    self.strays.push(Entry { value, text, outside: false, name: section });
-                }
+                reader.sections.insert(name, start);
+            } else {
+                reader.strays.push(Entry { value: Value::of_text(value.clone(), text), outside: false, name });
             }
         }
+        Ok(reader)
+    }
+
+    /// Reads values by dotted key.
+    pub fn of_values(values: impl IntoIterator<Item = (&'static str, Value<'a>)>) -> Reader<'a> {
+        let entry = |(key, value): (&str, _)| (key.into(), Entry { value, outside: false, name: key.into() });
+        Reader { entries: values.into_iter().map(entry).collect(), ..Reader::default() }
+    }
+
+    /// Sets a key. Errors call it `name`.
+    pub fn set(&mut self, key: &str, value: Value<'a>, name: String) {
+        self.entries.insert(key.into(), Entry { value, outside: true, name });
+    }
+
+    /// Sets some keys.
+    pub fn set_all(&mut self, overrides: &'a [Override]) {
         for Override { key, text, name } in overrides {
             let (value, errors) = DeValue::parse_recoverable(text);
-            for error in errors {
+            if let Some(error) = errors.first() {
                 self.report(Place::Outside, name, format!("found {}: {}", shorten(text), error.message().trim()));
             }
-            self.entries.insert(key.clone(), Entry { value, text, outside: true, name: name.clone() });
+            self.set(key, Value::of_text(value, text), name.clone());
         }
+    }
+
+    /// Requests every key with `ask`. Also returns a note about each omitted key whose default other keys do not allow.
+    ///
+    /// # Errors
+    /// All problems of the values.
+    pub fn read<T>(mut self, ask: impl FnOnce(&mut Reader<'_>) -> T) -> Result<(T, Vec<String>), Problems> {
+        let read = ask(&mut self);
+        self.report_unknown();
+        if self.problems.is_empty() { Ok((read, self.notes)) } else { Err(self.into_problems()) }
     }
 
     fn take(&mut self, key: &'static str) -> Option<Entry<'a>> {
@@ -385,7 +338,7 @@ impl<'a> Reader<'a> {
     }
 
     /// Requests a key.
-    pub fn key<'r>(
+    pub(crate) fn key<'r>(
         &'r mut self,
         name: &'static str,
         unit: &'static str,
@@ -411,23 +364,23 @@ impl<'a> Reader<'a> {
     }
 
     fn check<T: Number>(&mut self, entry: &Entry<'_>, allowed: Allowed<T>) -> T {
-        let allows = match T::read(entry.value.get_ref()) {
+        let allows = match T::read(&entry.value) {
             Some(Some(value)) if allowed.holds(value) => return value,
             Some(Some(value)) if allowed.is_too_small(value) => allowed.in_detail(),
             Some(_) => allowed.to_string(),
             None => format!("{}, {allowed}", T::KIND),
         };
-        self.report(entry.place(), &entry.name, format!("found {}, allowed {allows}", entry.found()));
+        self.report(entry.place(), &entry.name, format!("found {}, allowed {allows}", entry.value.found()));
         allowed.high
     }
 
     /// Returns the items of a list. Reports another kind of value or another length.
     fn items(&mut self, entry: Entry<'a>, lengths: RangeInclusive<usize>, what: &str) -> Option<Vec<Entry<'a>>> {
-        let found = entry.found();
-        let (place, Entry { value, text, outside, name }) = (entry.place(), entry);
-        match value.into_inner() {
-            DeValue::Array(items) if lengths.contains(&items.len()) => {
-                let named = |(index, value)| Entry { value, text, outside, name: format!("{name}[{index}]") };
+        let found = entry.value.found();
+        let (place, Entry { value, outside, name }) = (entry.place(), entry);
+        match value.kind {
+            Kind::List(items) if lengths.contains(&items.len()) => {
+                let named = |(index, value)| Entry { value, outside, name: format!("{name}[{index}]") };
                 Some(items.into_iter().enumerate().map(named).collect())
             }
             _ => {
@@ -478,7 +431,7 @@ impl<'a> Reader<'a> {
         for entry in std::mem::take(&mut self.strays) {
             let name = &entry.name;
             let message = if sections.contains(&name.as_str()) {
-                format!("found {}, allowed a section [{name}]", entry.found())
+                format!("found {}, allowed a section [{name}]", entry.value.found())
             } else {
                 format!("unknown key{}", hint_for(name, &known))
             };
@@ -498,17 +451,35 @@ impl<'a> Reader<'a> {
         }
     }
 
-    fn into_problems(mut self, lines: &LineNumbers) -> Problems {
+    fn into_problems(mut self) -> Problems {
         self.problems.sort_by_key(|problem| problem.0);
         let unlisted = self.problems.len().saturating_sub(MAX_LISTED);
         let listed = self.problems.into_iter().take(MAX_LISTED).map(|(place, key, message)| {
             let line = match place {
-                Place::Offset(offset) => Some(lines.line(offset)),
+                Place::Offset(offset) => self.lines.map(|lines| lines.line(offset)),
                 Place::Outside => None,
             };
             Problem { line, key, message }
         });
         Problems { listed: listed.collect(), unlisted }
+    }
+}
+
+/// Returns the offset of a syntax error.
+fn start_of(error: &Error) -> usize {
+    error.span().map_or(0, |span| span.start)
+}
+
+/// Returns the message of a syntax error in one line.
+fn syntax_problem(error: &Error, text: &str) -> String {
+    let message = error.message().trim().replace('\n', ", ");
+    let at = text.get(error.span().unwrap_or(0..0)).filter(|at| !at.trim().is_empty());
+    // A missing comma is the usual mistake in a list of positions. The parser takes it for a word without quotes.
+    let is_numbers = |at: &str| at.contains(' ') && at.split(' ').all(|word| word.parse::<f64>().is_ok());
+    match at {
+        Some(at) if is_numbers(at) => format!("found `{}`, allowed numbers with a comma between them", shorten(at)),
+        Some(at) => format!("{message} (at `{}`)", shorten(at)),
+        None => message,
     }
 }
 

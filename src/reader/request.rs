@@ -2,13 +2,13 @@
 
 use std::ops::RangeInclusive;
 
-use serde::Serialize;
+use serde::{Serialize, Serializer};
 
 use super::{Allowed, Definition, Entry, Number, Reader, between};
 use crate::config_enum::Choice;
 
 /// A requested key, before its allowed values and its default are given.
-pub struct KeyRequest<'r, 'a> {
+pub(crate) struct KeyRequest<'r, 'a> {
     pub(super) reader: &'r mut Reader<'a>,
     pub(super) name: &'static str,
     pub(super) unit: &'static str,
@@ -33,49 +33,47 @@ impl<'a> KeyRequest<'_, 'a> {
         self.reader.number(self.name, entry, allowed, default)
     }
 
-    /// Returns a number, or a percentage of the number that bounds it, written as a word such as `"10%"`.
-    pub(crate) fn number_or_percentage<T: Number>(mut self, allowed: Allowed<T>, default: T) -> NumberOrPercentage<T> {
+    /// Returns a count, or a percentage of the number that bounds it, written as a word such as `"10%"`.
+    pub fn count_or_percentage(mut self, allowed: Allowed<usize>, default: usize) -> CountOrPercentage {
         const PERCENTAGES: &str = "above \"0%\", up to \"100%\"";
-        let kind = || format!("{}, or a percentage such as \"10%\"", kind::<T>());
+        let kind = || format!("{}, or a percentage such as \"10%\"", kind::<usize>());
         let range = || format!("{}, or {PERCENTAGES}", allowed.in_general());
         let entry = self.take(|| (kind(), range(), Some(written(&default))));
-        let Some((entry, word)) = entry.as_ref().and_then(|entry| Some((entry, entry.value.get_ref().as_str()?)))
-        else {
-            if let Some(entry) = entry.as_ref().filter(|entry| T::read(entry.value.get_ref()).is_none()) {
+        let message = match entry.as_ref().map(|entry| (&entry.value, entry.value.word())) {
+            Some((value, Some(word))) => {
+                let percentage = word.strip_suffix('%').and_then(|number| number.parse().ok());
+                match percentage.filter(|&percentage: &f64| 0.0 < percentage && percentage <= 100.0) {
+                    Some(percentage) => return CountOrPercentage::Percentage(percentage),
+                    None => format!("found {}, allowed {allowed}, or {PERCENTAGES}", value.found()),
+                }
+            }
+            Some((value, None)) if usize::read(value).is_none() => {
                 // A share is the usual mistake.
-                let share = f64::read(entry.value.get_ref()).flatten().filter(|share| (1e-6..=1.0).contains(share));
+                let share = f64::read(value).flatten().filter(|share| (1e-6..=1.0).contains(share));
                 let percentage = (share.unwrap_or(0.1) * 1e6).round() / 1e4;
-                let (found, kind) = (entry.found(), T::KIND);
-                let message =
-                    format!("found {found}, allowed {kind}, {allowed}, or a percentage such as \"{percentage}%\"");
-                self.reader.report(entry.place(), &entry.name, message);
-                return NumberOrPercentage::Number(allowed.nearest(default));
+                let (found, kind) = (value.found(), usize::KIND);
+                format!("found {found}, allowed {kind}, {allowed}, or a percentage such as \"{percentage}%\"")
             }
-            return NumberOrPercentage::Number(self.reader.number(self.name, entry, allowed, default));
+            _ => return CountOrPercentage::Count(self.reader.number(self.name, entry, allowed, default)),
         };
-        let percentage = word.strip_suffix('%').and_then(|number| number.parse().ok());
-        match percentage.filter(|&percentage: &f64| 0.0 < percentage && percentage <= 100.0) {
-            Some(percentage) => NumberOrPercentage::Percentage(percentage),
-            None => {
-                let message = format!("found {}, allowed {allowed}, or {PERCENTAGES}", entry.found());
-                self.reader.report(entry.place(), &entry.name, message);
-                NumberOrPercentage::Number(allowed.nearest(default))
-            }
+        if let Some(entry) = entry {
+            self.reader.report(entry.place(), &entry.name, message);
         }
+        CountOrPercentage::Count(allowed.nearest(default))
     }
 
     /// Returns the value of a word, or the default without the key.
     pub fn choice<T: Choice>(mut self, default: T) -> T {
         let words = || T::names().map(|word| format!("{word:?}")).collect::<Vec<_>>().join(" or ");
         let Some(entry) = self.take(|| ("word".into(), words(), Some(written(&default)))) else { return default };
-        let word = entry.value.get_ref().as_str();
+        let word = entry.value.word();
         T::ALL.iter().find(|choice| Some(choice.0) == word).map_or_else(
             || {
                 let typed = word.unwrap_or_default().to_lowercase();
                 let distance = |name: &&str| strsim::damerau_levenshtein(&name.to_lowercase(), &typed);
                 let nearest = T::names().min_by_key(distance).filter(|name| distance(name) <= typed.len() / 3);
                 let hint = nearest.map_or(String::new(), |name| format!("; did you mean {name:?}?"));
-                let message = format!("found {}, allowed {}{hint}", entry.found(), words());
+                let message = format!("found {}, allowed {}{hint}", entry.value.found(), words());
                 self.reader.report(entry.place(), &entry.name, message);
                 default
             },
@@ -84,7 +82,7 @@ impl<'a> KeyRequest<'_, 'a> {
     }
 
     /// Returns two numbers, or the default without the key.
-    pub(crate) fn pair(mut self, allowed: Allowed<f64>, default: [f64; 2]) -> [f64; 2] {
+    pub fn pair(mut self, allowed: Allowed<f64>, default: [f64; 2]) -> [f64; 2] {
         let about = || ("two numbers".into(), format!("each {}", allowed.in_general()), Some(written(&default)));
         let Some(entry) = self.take(about) else { return default };
         self.reader.two(entry, [allowed; 2])
@@ -133,7 +131,7 @@ impl<'a> KeyRequest<'_, 'a> {
     ) -> Vec<Vec<T>> {
         let range = || format!("none, or as many as {of}, of numbers each {}", allowed.in_general());
         let Some(entry) = self.take(|| (format!("list of {what}"), range(), Some("[]".into()))) else { return vec![] };
-        if entry.value.get_ref().as_array().is_some_and(|items| items.is_empty()) {
+        if entry.value.list().is_some_and(|items| items.is_empty()) {
             return vec![];
         }
         let reader = self.reader;
@@ -152,36 +150,52 @@ impl<'a> KeyRequest<'_, 'a> {
     }
 
     /// Returns one number or a list of numbers. The default is one number.
-    pub(crate) fn one_or_list<T: Number>(
+    pub fn one_or_each<T: Number>(
         mut self,
         allowed: Allowed<T>,
         counts: RangeInclusive<usize>,
         default: T,
-    ) -> OneOrList<T> {
+    ) -> OneOrEach<T> {
         let kind = || format!("{}, or a list of them", kind::<T>());
         match self.take(|| (kind(), allowed.in_general(), Some(written(&default)))) {
-            Some(entry) if entry.value.get_ref().is_array() => {
-                OneOrList::List(self.reader.numbers(entry, counts, allowed))
-            }
-            entry => OneOrList::One(self.reader.number(self.name, entry, allowed, default)),
+            Some(entry) if entry.value.list().is_some() => OneOrEach::Each(self.reader.numbers(entry, counts, allowed)),
+            entry => OneOrEach::Same(self.reader.number(self.name, entry, allowed, default)),
         }
     }
 }
 
-/// The value of a key that takes a number or a percentage.
-pub(crate) enum NumberOrPercentage<T> {
-    /// A number.
-    Number(T),
+/// The value of a key that takes a count, or a percentage of the number that bounds it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum CountOrPercentage {
+    /// A count.
+    Count(usize),
     /// A percentage, above 0 and up to 100.
     Percentage(f64),
 }
 
-/// The value of a key that allows a number or a list.
-pub(crate) enum OneOrList<T> {
-    /// One value for all.
-    One(T),
-    /// One value for each.
-    List(Vec<T>),
+impl From<usize> for CountOrPercentage {
+    fn from(count: usize) -> CountOrPercentage {
+        CountOrPercentage::Count(count)
+    }
+}
+
+impl Serialize for CountOrPercentage {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        match self {
+            CountOrPercentage::Count(count) => count.serialize(serializer),
+            CountOrPercentage::Percentage(percentage) => serializer.collect_str(&format_args!("{percentage}%")),
+        }
+    }
+}
+
+/// The value of a key that takes one number for all, or a list with a number for each.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+#[serde(untagged)]
+pub enum OneOrEach<T> {
+    /// The same number for all.
+    Same(T),
+    /// One number for each.
+    Each(Vec<T>),
 }
 
 /// Returns the name of a type without its article.

@@ -1,0 +1,113 @@
+//! Values of configs, as written in a text or set by a program.
+
+use std::borrow::Cow;
+
+use toml::Spanned;
+use toml::de::DeValue;
+
+/// A value of a config.
+#[derive(Clone)]
+pub(crate) struct Value<'a> {
+    pub(super) kind: Kind<'a>,
+    /// The offset and the text of a value that was written.
+    pub(super) written: Option<(usize, &'a str)>,
+}
+
+/// The content of a [`Value`].
+#[derive(Clone)]
+pub(super) enum Kind<'a> {
+    /// A whole number. `None` is one that TOML cannot represent.
+    Integer(Option<i128>),
+    /// Another number. `None` is NaN, or a number that is too large for `f64`.
+    Float(Option<f64>),
+    Word(Cow<'a, str>),
+    List(Vec<Value<'a>>),
+    Table,
+    /// A value of a type that no key has. The text describes it in errors if it was not written.
+    Other(String),
+}
+
+impl<'a> Value<'a> {
+    /// Returns a value of a parsed text.
+    pub(super) fn of_text(value: Spanned<DeValue<'a>>, text: &'a str) -> Value<'a> {
+        let span = value.span();
+        let written = Some((span.start, text.get(span).unwrap_or_default()));
+        let kind = match value.into_inner() {
+            DeValue::Integer(integer) => Kind::Integer(i128::from_str_radix(integer.as_str(), integer.radix()).ok()),
+            DeValue::Float(float) => {
+                let is_exact = |value: &f64| value.is_finite() || float.as_str().contains("inf");
+                Kind::Float(float.as_str().parse().ok().filter(is_exact))
+            }
+            DeValue::String(word) => Kind::Word(word),
+            DeValue::Array(items) => Kind::List(items.into_iter().map(|item| Value::of_text(item, text)).collect()),
+            DeValue::Table(_) => Kind::Table,
+            DeValue::Boolean(_) | DeValue::Datetime(_) => Kind::Other(String::new()),
+        };
+        Value { kind, written }
+    }
+
+    /// Returns the value of a field. Whole numbers above the range of TOML are kept as such.
+    pub(crate) fn of(field: &impl serde::Serialize) -> Value<'a> {
+        let kind = match toml::Value::try_from(field) {
+            Ok(value) => return value.into(),
+            Err(_) => Kind::Integer(None),
+        };
+        Value { kind, written: None }
+    }
+
+    /// Returns the items of a list.
+    pub(crate) fn list(&self) -> Option<&[Value<'a>]> {
+        if let Kind::List(items) = &self.kind { Some(items) } else { None }
+    }
+
+    /// Returns a word.
+    pub(super) fn word(&self) -> Option<&str> {
+        if let Kind::Word(word) = &self.kind { Some(word) } else { None }
+    }
+
+    /// Describes the value in errors.
+    pub(super) fn found(&self) -> String {
+        match (&self.kind, self.written) {
+            (Kind::List(items), _) => format!("a list of {}", items.len()),
+            (Kind::Table, _) => "a table".into(),
+            (_, Some((_, text))) => shorten(text),
+            (Kind::Integer(None), None) => format!("a number above {}", i64::MAX),
+            (Kind::Float(None), None) => "nan".into(),
+            (Kind::Other(text), None) => text.clone(),
+            (_, None) => self.to_toml().map_or(String::new(), |value| shorten(&value.to_string())),
+        }
+    }
+
+    /// Returns the value as TOML, if a key can have it.
+    pub(crate) fn to_toml(&self) -> Option<toml::Value> {
+        match &self.kind {
+            Kind::Integer(number) => i64::try_from((*number)?).ok().map(toml::Value::Integer),
+            Kind::Float(number) => number.map(toml::Value::Float),
+            Kind::Word(word) => Some(word.clone().into_owned().into()),
+            Kind::List(items) => items.iter().map(Value::to_toml).collect::<Option<Vec<_>>>().map(toml::Value::Array),
+            Kind::Table | Kind::Other(_) => None,
+        }
+    }
+}
+
+impl From<toml::Value> for Value<'_> {
+    fn from(value: toml::Value) -> Self {
+        let kind = match value {
+            toml::Value::Integer(number) => Kind::Integer(Some(number.into())),
+            toml::Value::Float(number) => Kind::Float(Some(number).filter(|number| !number.is_nan())),
+            toml::Value::String(word) => Kind::Word(word.into()),
+            toml::Value::Array(items) => Kind::List(items.into_iter().map(Value::from).collect()),
+            toml::Value::Table(_) => Kind::Table,
+            other => Kind::Other(other.to_string()),
+        };
+        Value { kind, written: None }
+    }
+}
+
+/// Shortens a text from the file to a part of one line.
+pub(super) fn shorten(text: &str) -> String {
+    let line = text.lines().next().unwrap_or_default();
+    let end = line.char_indices().nth(40).map_or(line.len(), |(end, _)| end);
+    let more = if end < text.len() { "…" } else { "" };
+    line[..end].chars().map(|c| if c.is_control() { ' ' } else { c }).chain(more.chars()).collect()
+}
