@@ -89,14 +89,14 @@ impl Display for Unreachable {
 /// The agent accelerates as fast as it can and never turns. Walls can only shorten its path.
 pub fn travel(world: &World, steps: usize) -> Vec<f64> {
     let motion = &world.constants.motion;
-    let [change, least, most, dt] =
+    let [change, min, max, dt] =
         [motion.max_speed_change, motion.min_speed, motion.max_speed, motion.dt].map(f64::from);
     // Positions are rounded to f32 and then to the grid, on both axes.
     let largest = f64::from(motion.map_x.max(motion.map_y));
     let rounding = 2f64.sqrt() * (1.0 / f64::from(GRID) + largest * f64::from(f32::EPSILON));
     let (mut speed, mut far) = (f64::from(world.constants.speed), 0.0);
     let step = |_| {
-        speed = (speed + change).max(least).min(most);
+        speed = (speed + change).max(min).min(max);
         far += speed * dt * (1.0 + ROUNDING) + rounding;
         far
     };

@@ -5,6 +5,7 @@ use rand::rngs::ChaCha8Rng;
 use rand::{RngExt, SeedableRng};
 
 use crate::config::*;
+use crate::evolve::MIN_WEIGHT;
 use crate::world::World;
 
 /// The layout of a world's agents and POIs.
@@ -302,11 +303,9 @@ pub fn weights(world: &World, policies: usize, seed: u64) -> Vec<f32> {
             // differently.
             let normal = (0..12).map(|_| rng.random::<f32>()).sum::<f32>() - 6.0;
             let weight = if rng.random_bool(zeros) { 0.0 } else { scale * normal };
-            if weight.abs() < LEAST_WEIGHT { 0.0 } else { weight }
+            // Smaller weights become 0, so that no product in the kernels is denormal.
+            if weight.abs() < MIN_WEIGHT { 0.0 } else { weight }
         }));
     }
     weights
 }
-
-/// Smaller weights become 0, so that no product in the kernels is denormal.
-const LEAST_WEIGHT: f32 = 1.0 / (1 << 30) as f32;

@@ -36,9 +36,9 @@ impl Estimate {
         Estimate { value, low: value, high: value }
     }
 
-    /// Returns the estimate with its interval clamped to `least..=most`.
-    pub fn within(self, least: f64, most: f64) -> Estimate {
-        Estimate { low: self.low.max(least), high: self.high.min(most), ..self }
+    /// Returns the estimate with its interval clamped to `min..=max`.
+    pub fn within(self, min: f64, max: f64) -> Estimate {
+        Estimate { low: self.low.max(min), high: self.high.min(max), ..self }
     }
 }
 
@@ -182,10 +182,10 @@ fn normal_above(z: f64) -> f64 {
     (z * std::f64::consts::FRAC_1_SQRT_2).compl_error() / 2.0
 }
 
-/// Returns the mean of values in `least..=most` with an interval that is right for few trials with few different
+/// Returns the mean of values in `min..=max` with an interval that is right for few trials with few different
 /// outcomes. None for fewer than two values.
 ///
-/// It is Student's interval of the sample with two more values, `least` and `most`, clamped to that range. So it has a
+/// It is Student's interval of the sample with two more values, `min` and `max`, clamped to that range. So it has a
 /// width even if all values are equal. For proportions these are the intervals of Agresti and Caffo, *Simple and
 /// effective confidence intervals for proportions and differences of proportions result from adding two successes and
 /// two failures*, The American Statistician 54 (2000), with Student's quantile for few trials.
@@ -202,19 +202,19 @@ pub fn bounded_factor(count: usize) -> f64 {
 }
 
 /// Returns the same as [`bounded`], with a factor that is already known.
-pub fn bounded_by(factor: f64, average: &Average, [least, most]: [f64; 2]) -> Option<Estimate> {
-    let more = Extended::new(average, (least + most) / 2.0, (most - least) * (most - least) / 2.0)?;
-    Some(more.around(average.mean(), more.mean, factor * more.variance.sqrt()).within(least, most))
+pub fn bounded_by(factor: f64, average: &Average, [min, max]: [f64; 2]) -> Option<Estimate> {
+    let more = Extended::new(average, (min + max) / 2.0, (max - min) * (max - min) / 2.0)?;
+    Some(more.around(average.mean(), more.mean, factor * more.variance.sqrt()).within(min, max))
 }
 
 /// Returns the mean difference of two samples of values in a range, with the interval of Agresti and Caffo. None for
 /// fewer than two values in a sample.
 ///
 /// Each sample gets two more values, as for [`bounded`]. The quantile is that of the normal distribution.
-pub fn difference(one: &Average, other: &Average, [least, most]: [f64; 2]) -> Option<Estimate> {
+pub fn difference(one: &Average, other: &Average, [min, max]: [f64; 2]) -> Option<Estimate> {
     const NORMAL: f64 = 1.959_963_984_540_054;
-    let width = most - least;
-    let more = |average| Extended::new(average, (least + most) / 2.0, width * width / 2.0);
+    let width = max - min;
+    let more = |average| Extended::new(average, (min + max) / 2.0, width * width / 2.0);
     let (first, second) = (more(one)?, more(other)?);
     let half = NORMAL * (first.variance + second.variance).sqrt();
     Some(first.around(one.mean() - other.mean(), first.mean - second.mean, half).within(-width, width))

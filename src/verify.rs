@@ -9,12 +9,12 @@ use glam::Vec2;
 
 use crate::backend::compare::{compare_breeding, compare_traces, first_difference};
 use crate::backend::{Backend, BackendError, Group};
-use crate::config::{Config, Fitness, LAYOUTS, Paradigm, Sharing, StageConfig, ValidConfig};
+use crate::config::{Config, Fitness, Sharing, StageConfig, ValidConfig};
 use crate::credit::RecordRequest;
 use crate::evaluate::{SCORES, SCORES_AND_DT};
 use crate::evolve::{self, Key, Purpose};
 use crate::sample;
-use crate::trainer::{Row, Trainer};
+use crate::trainer::Trainer;
 use crate::world::World;
 
 /// The input of a comparison.
@@ -40,21 +40,6 @@ impl Plan {
         let worlds = seeds.map(|seed| (format!("random world {seed}"), sample::world(seed))).collect();
         Plan { worlds, teams, seed, generations: 3 }
     }
-}
-
-/// Returns short trainings of the paper's six experiments, each with its name. Their results are the same on every
-/// machine, so machines can be compared by digests.
-pub fn short_trainings() -> Vec<(String, Config)> {
-    let mut trainings = Vec::new();
-    for (name, text) in LAYOUTS {
-        for paradigm in [Paradigm::LeaderFollower, Paradigm::AllLeaders] {
-            let mut config = Config::parse(text, name).expect("the paper's own config");
-            config.learning.paradigm = paradigm;
-            (config.learning.trials, config.learning.generations) = (2, 10);
-            trainings.push((format!("{name}, {paradigm}"), config));
-        }
-    }
-    trainings
 }
 
 /// The amount that was compared, and the first difference, if any.
@@ -210,10 +195,7 @@ fn compare_training(
         .collect::<Result<Vec<ValidConfig>, BackendError>>()?;
     let train = |backend: &mut dyn Backend| {
         let mut trainer = Trainer::new(configs.clone());
-        let mut rows: Vec<Row> = Vec::new();
-        while !trainer.is_done() {
-            rows.extend(trainer.advance(backend)?);
-        }
+        let rows = trainer.finish(backend)?;
         let weights: Vec<Vec<u32>> = (0..configs.len())
             .map(|arm| trainer.policies(arm).concat().iter().map(|weight| weight.to_bits()).collect())
             .collect();

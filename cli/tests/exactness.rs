@@ -10,8 +10,6 @@ use flotilla::backend::gpu::device::{self, AdapterChoice, AdapterInfo, Binding, 
 use flotilla::backend::gpu::episode::{self, Kernel};
 use flotilla::backend::gpu::exact::{self, Pass, ShaderError};
 use flotilla::backend::gpu::{self, shaders};
-use flotilla::verify::short_trainings;
-use flotilla::world::World;
 use naga::back::{hlsl, msl};
 use naga::proc::{BoundsCheckPolicies, BoundsCheckPolicy};
 use naga::valid::{Capabilities, FunctionInfo, ValidationFlags, Validator};
@@ -262,8 +260,7 @@ fn only_results_compared_as_integers_need_no_guard() {
 
 /// Returns every shader, and the specialised episode kernels of the paper's six experiments.
 fn kernels() -> Vec<(String, String)> {
-    let specialised = short_trainings().into_iter().flat_map(|(name, config)| {
-        let world = World::new(&config.validate().unwrap());
+    let specialised = support::papers_worlds().into_iter().flat_map(|(name, world)| {
         [64, 256, 1024].map(|threads| {
             let text = episode::shader_of(&world, Kernel::Specialised, threads);
             (format!("{name}, {threads} threads"), text)

@@ -141,48 +141,38 @@ fn first_mismatch(world: &World, expected: &Trace, found: &Trace) -> Option<Mism
         return None;
     }
     let mut first: Option<Mismatch> = None;
-    let mut note = |mismatch: Mismatch| {
-        let key = |m: &Mismatch| (m.step, m.stage, m.team);
-        if first.as_ref().is_none_or(|earlier| key(&mismatch) < key(earlier)) {
-            first = Some(mismatch);
-        }
-    };
-    for (index, (a, b)) in expected.moments.iter().zip(&found.moments).enumerate() {
-        let (agent, team) = (index % expected.agents, index / expected.agents % expected.teams);
-        let step = index / expected.agents / expected.teams;
-        for (word, (&a, &b)) in words(a).iter().zip(words(b)).enumerate() {
-            if a != b {
-                let (stage, name) = field(word);
-                note(Mismatch { step, team, stage, place: format!("agent {agent}, {name}"), expected: a, found: b });
+    // Compares two arrays. `locate` returns step, quantity, team and place of a number.
+    let mut compare = |a: &[u32], b: &[u32], locate: &dyn Fn(usize) -> (usize, Quantity, usize, String)| {
+        for (index, (&expected, &found)) in a.iter().zip(b).enumerate().filter(|(_, (a, b))| a != b) {
+            let (step, stage, team, place) = locate(index);
+            if first.as_ref().is_none_or(|earlier| (step, stage, team) < (earlier.step, earlier.stage, earlier.team)) {
+                first = Some(Mismatch { step, team, stage, place, expected, found });
             }
         }
-    }
-    let (pois, set_words) = (world.pois.len(), world.constants.words as usize);
-    for (index, (&a, &b)) in expected.sets.iter().zip(&found.sets).enumerate() {
-        if a != b {
-            let (team, row) = (index / world.set_words(), index % world.set_words());
-            let (step, poi, word) = (row / pois / set_words, row / set_words % pois, row % set_words);
-            let place = format!("POI {poi}, agents from {}", word * 32);
-            note(Mismatch { step: step + 1, team, stage: Quantity::Couple, place, expected: a, found: b });
-        }
-    }
-    let (words, of_team) = (world.leader_words(), world.sight_words());
-    for (index, (&a, &b)) in expected.sights.iter().zip(&found.sights).enumerate() {
-        if a != b {
-            let (team, row) = (index / of_team, index % of_team / words);
-            let (step, follower) = (row / world.followers(), row % world.followers());
-            let place = format!("follower {follower}, leaders from {}", index % words * 32);
-            note(Mismatch { step: step + 1, team, stage: Quantity::Sight, place, expected: a, found: b });
-        }
-    }
-    let pairs = world.leaders() * world.followers();
-    for (index, (&a, &b)) in expected.seen.iter().zip(&found.seen).enumerate() {
-        if a != b {
-            let (team, pair) = (index / pairs, index % pairs);
-            let place = format!("follower {}, leader {}", pair / world.leaders(), pair % world.leaders());
-            note(Mismatch { step: world.steps(), team, stage: Quantity::Influence, place, expected: a, found: b });
-        }
-    }
+    };
+    compare(bits(expected), bits(found), &|index| {
+        let (moment, (stage, name)) = (index / WORDS, field(index % WORDS));
+        let (agent, team) = (moment % expected.agents, moment / expected.agents % expected.teams);
+        (moment / expected.agents / expected.teams, stage, team, format!("agent {agent}, {name}"))
+    });
+    let (pois, words) = (world.pois.len(), world.constants.words as usize);
+    compare(&expected.sets, &found.sets, &|index| {
+        let (team, row) = (index / world.set_words(), index % world.set_words());
+        let place = format!("POI {}, agents from {}", row / words % pois, row % words * 32);
+        (row / words / pois + 1, Quantity::Couple, team, place)
+    });
+    let (followers, words, of_team) = (world.followers(), world.leader_words(), world.sight_words());
+    compare(&expected.sights, &found.sights, &|index| {
+        let row = index % of_team / words;
+        let place = format!("follower {}, leaders from {}", row % followers, index % words * 32);
+        (row / followers + 1, Quantity::Sight, index / of_team, place)
+    });
+    let leaders = world.leaders();
+    compare(&expected.seen, &found.seen, &|index| {
+        let (team, pair) = (index / (leaders * followers), index % (leaders * followers));
+        let place = format!("follower {}, leader {}", pair / leaders, pair % leaders);
+        (world.steps(), Quantity::Influence, team, place)
+    });
     first
 }
 
@@ -206,10 +196,6 @@ fn field(word: usize) -> (Quantity, &'static str) {
 }
 
 const WORDS: usize = size_of::<Moment>() / size_of::<u32>();
-
-fn words(moment: &Moment) -> &[u32; WORDS] {
-    bytemuck::cast_ref(moment)
-}
 
 fn bits(trace: &Trace) -> &[u32] {
     bytemuck::cast_slice(&trace.moments)

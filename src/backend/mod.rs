@@ -17,7 +17,7 @@ use crate::evolve::Breeding;
 use crate::parallel::current_num_threads;
 
 mod batch;
-pub mod compare;
+pub(crate) mod compare;
 pub mod cpu;
 mod error;
 #[cfg(feature = "gpu")]
@@ -29,10 +29,10 @@ mod trace;
 pub use batch::{Group, Weights};
 pub use error::BackendError;
 pub use scores::GroupScores;
-pub use size::HELD_FROM;
-pub use size::{BATCH_BYTES, PACKED_FROM, held_bytes, record_bytes, state_bytes, weight_bytes};
+pub(crate) use size::{BATCH_BYTES, PACKED_FROM, held_bytes, state_bytes, weight_bytes};
 #[cfg(feature = "gpu")]
 use size::{FOUR, check_sizes, fours, record_words};
+pub use size::{HELD_FROM, record_bytes};
 pub use trace::{Moment, Trace};
 
 /// Plays episodes and scores them. Every implementation returns the same bits.

@@ -1,9 +1,11 @@
-//! Training by ask and tell, in which the caller scores the policies.
+//! The driver of a training. Its caller may score the policies (ask and tell).
 
-use super::train::{new_trainer, previous_champions, start_from};
 use super::{Failure, Generation, Trained};
-use crate::backend::Backend;
-use crate::config::Config;
+use crate::backend::{Backend, BackendError};
+use crate::config::{Config, ValidConfig};
+use crate::evolve;
+use crate::memory::{self, Peaks};
+use crate::parallel::current_num_threads;
 use crate::trainer::{Candidates, Row, Snapshot, Trainer};
 use crate::world::World;
 
@@ -46,11 +48,19 @@ pub struct Progress {
 }
 
 impl Coevolution {
-    /// Creates random populations for every trial.
+    /// Creates random populations for every trial. They stay on the host.
     ///
     /// # Errors
     /// The config is invalid, or its memory does not fit this machine.
     pub fn new(config: &Config) -> Result<Coevolution, Failure> {
+        let mut coevolution = Coevolution::on_any_processor(config)?;
+        coevolution.trainer.keep_on_host();
+        Ok(coevolution)
+    }
+
+    /// Creates a training like [`Coevolution::new`], whose populations a backend may hold. [`Coevolution::ask`] cannot
+    /// return them then.
+    pub(super) fn on_any_processor(config: &Config) -> Result<Coevolution, Failure> {
         let valid = config.validate()?;
         let config = Config::clone(&valid);
         Ok(Coevolution { config, trainer: new_trainer(valid)?, rows: Vec::new(), played: false, own_fitness: false })
@@ -64,7 +74,25 @@ impl Coevolution {
         if self.generation() > 0 || self.played {
             return Err(Failure::State);
         }
-        start_from(&mut self.trainer, &self.config, policies, first)
+        let (leaders, parameters) = (self.config.populations(), self.config.parameters());
+        let trials = self.config.learning.trials;
+        if first.len() > 1 && first.len() != trials {
+            return Err(Failure::Trials { found: first.len(), trials });
+        }
+        for (trial, weights) in (0..trials).zip(first.iter().cycle()) {
+            let mut weights = weights.clone();
+            if weights.is_empty() || Some(weights.len()) != (leaders * parameters).checked_mul(policies) {
+                return Err(Failure::Weights { found: weights.len(), leaders, teams: policies, parameters });
+            }
+            if let Some(place) = evolve::flush_and_validate(&mut weights) {
+                let (policy, parameter, value) = (place / parameters, place % parameters, weights[place]);
+                return Err(Failure::Weight { leader: policy / policies, team: policy % policies, parameter, value });
+            }
+            if !self.trainer.start_from(0, trial, policies, &weights) {
+                unreachable!("the weights are as many as the config takes");
+            }
+        }
+        Ok(())
     }
 
     /// Returns the config.
@@ -98,12 +126,12 @@ impl Coevolution {
     /// # Errors
     /// All generations were played.
     pub fn ask(&mut self) -> Result<Vec<Candidates<'_>>, Failure> {
-        if self.is_done() { Err(Failure::Done) } else { Ok(self.trainer.ask(0)) }
+        if self.is_done() { Err(Failure::Done) } else { Ok(self.trainer.candidates()) }
     }
 
     /// Returns the world of the generation, and its teams per trial, without the champions'.
     pub fn world(&self) -> (&World, usize) {
-        self.trainer.candidates_world(0)
+        self.trainer.world_and_teams()
     }
 
     /// Plays the generation. Returns G, `[trials][teams]`, and the config's fitness of each leader,
@@ -115,11 +143,16 @@ impl Coevolution {
         if self.is_done() {
             return Err(Failure::Done);
         }
+        self.play_once(backend)?;
+        Ok(self.trainer.scores())
+    }
+
+    fn play_once(&mut self, backend: &mut dyn Backend) -> Result<(), Failure> {
         if !self.played {
-            self.trainer.play_candidates(0, backend)?;
+            self.trainer.play(backend)?;
             self.played = true;
         }
-        Ok(self.trainer.played(0))
+        Ok(())
     }
 
     /// Breeds the next generation from what each leader of each team was worth, `[trials][teams][leaders]`, or `None`
@@ -147,29 +180,33 @@ impl Coevolution {
                 return Err(Failure::Fitness(format!("number {place} is {}, allowed are finite ones", told[place])));
             }
         }
-        if !self.played {
-            self.trainer.play_candidates(0, backend)?;
-        }
-        if let Some(told) = fitness.filter(|_| !self.own_fitness) {
-            let bits = |scores: &[f32]| scores.iter().map(|score| score.to_bits()).collect::<Vec<_>>();
-            self.own_fitness = bits(told) != bits(&self.trainer.played(0).1);
-        }
         let first = self.rows.len();
-        self.rows.extend(self.trainer.tell(0, fitness));
-        self.played = false;
+        self.advance(backend, fitness)?;
         if self.generation() > self.config.learning.generations && !self.is_done() {
-            self.end(backend)?;
+            self.advance(backend, None)?;
         }
         let rows = &self.rows[first..];
         let generation = rows.last().map_or(0, |row| row.generation);
         Ok(Generation { generation, last: self.config.learning.generations, rows, champions: None })
     }
 
-    /// Plays the champions of the last generation, which completes its rows.
-    fn end(&mut self, backend: &mut dyn Backend) -> Result<(), Failure> {
-        self.trainer.play_candidates(0, backend)?;
-        self.rows.extend(self.trainer.tell(0, None));
-        Ok(())
+    /// Plays a generation, unless it was played, and breeds the next one. Returns the rows that became complete.
+    pub(super) fn advance(&mut self, backend: &mut dyn Backend, fitness: Option<&[f32]>) -> Result<&[Row], Failure> {
+        self.play_once(backend)?;
+        if let Some(told) = fitness.filter(|_| !self.own_fitness) {
+            let bits = |scores: &[f32]| scores.iter().map(|score| score.to_bits()).collect::<Vec<_>>();
+            self.own_fitness = bits(told) != bits(&self.trainer.scores().1);
+        }
+        let first = self.rows.len();
+        self.rows.extend(self.trainer.breed(fitness));
+        self.played = false;
+        Ok(&self.rows[first..])
+    }
+
+    /// Makes the next generation the last, unless an earlier one is.
+    pub(super) fn end(&mut self) {
+        self.config.learning.generations = self.trainer.end(0);
+        self.config.stages.retain(|stage| stage.from <= self.config.learning.generations);
     }
 
     /// Returns the champions of the generation that was told last, `[trials][populations][parameters]`.
@@ -180,7 +217,21 @@ impl Coevolution {
         if self.generation() == 0 {
             return Err(Failure::State);
         }
-        Ok(previous_champions(&mut self.trainer, &self.config)?)
+        Ok(self.previous_champions()?)
+    }
+
+    /// Returns the champions of the previous generation, `[trials][populations][parameters]`.
+    pub(super) fn previous_champions(&mut self) -> Result<Vec<f32>, BackendError> {
+        let (parameters, population) = (self.config.parameters(), self.config.learning.population);
+        let champion = population * parameters..(population + 1) * parameters;
+        let mut best = Vec::new();
+        for trial in 0..self.config.learning.trials {
+            let weights = self.trainer.weights(0, trial)?;
+            for policies in weights.chunks_exact(self.config.learning.slots() * parameters) {
+                best.extend_from_slice(&policies[champion.clone()]);
+            }
+        }
+        Ok(best)
     }
 
     /// Returns the state, for [`Coevolution::restore`].
@@ -212,7 +263,7 @@ impl Coevolution {
             && *generation <= last + 2
             && in_turn
             && state.rows.len() == complete
-            && weights.iter().flatten().all(|&weight| crate::evolve::is_weight(weight))
+            && weights.iter().flatten().all(|&weight| evolve::is_weight(weight))
             && fitness.iter().all(|fitness| whole(fitness))
             && pending.iter().all(|row| row.is_some() == (*generation > 0));
         if !fits || !self.trainer.restore(0, state.snapshot) {
@@ -232,4 +283,17 @@ impl Coevolution {
         }
         Trained::of(&mut self.trainer, self.config.clone(), &self.rows)
     }
+}
+
+/// Checks that a training fits this machine's memory, and returns its trainer.
+fn new_trainer(config: ValidConfig) -> Result<Trainer, Failure> {
+    let plan = Peaks::of([&config], current_num_threads());
+    // Nothing is saved during training, but the results stay in memory: every row twice, and the policies.
+    let rows = config.learning.trials as u64 * (config.learning.generations as u64 + 1);
+    // The last slots stay too, if they are needed to extend the run.
+    let slots = if config.learning.extends_from_policies() { 0 } else { memory::snapshot_bytes(&config) };
+    let kept = rows * (size_of::<Row>() + 3 * size_of::<f64>()) as u64 + config.policy_bytes() + slots;
+    let needed = (plan.host.min(plan.gpu_host) - plan.checkpoint).saturating_add(kept);
+    memory::check(needed, 0)?;
+    Ok(Trainer::new([config]))
 }

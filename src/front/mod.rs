@@ -10,20 +10,23 @@
 //! |---|---|
 //! | `error` | what all functions return if they fail |
 //! | `open` | the processor that plays, and its backend |
-//! | `train` | training with a callback, and its results |
-//! | `coevolution` | training by ask and tell, in which the caller scores the policies |
+//! | `results` | the results of a training |
+//! | `coevolution` | the driver of a training, whose caller may score the policies (ask and tell) |
+//! | `train` | training with a callback |
 //! | `play` | playing, tracing and stepping of given policies |
 
 mod coevolution;
 mod error;
 mod open;
 mod play;
+mod results;
 mod train;
 
 pub use coevolution::{Coevolution, Progress};
 pub use error::Failure;
 pub use open::cpu;
 #[cfg(feature = "gpu")]
-pub use open::{Found, Processor, find_gpu, on_gpu, open};
+pub use open::{GpuSearch, Processor, find_gpu, on_gpu, open};
 pub use play::{ActionNoise, Played, Traced, play, play_until, record, stepper, trace, with_team};
-pub use train::{Generation, Trained, train, train_from, train_with_champions};
+pub use results::{Generation, Trained};
+pub use train::{train, train_from, train_with_champions};

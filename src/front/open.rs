@@ -29,11 +29,11 @@ pub enum Processor {
 /// The result of the search for a GPU.
 #[cfg(feature = "gpu")]
 #[non_exhaustive]
-pub struct Found {
+pub struct GpuSearch {
     /// The opened GPU, if one is used.
     pub gpu: Option<GpuBackend>,
     /// The reason why an existing GPU is not used.
-    pub passed_over: Option<DeviceError>,
+    pub rejection: Option<DeviceError>,
 }
 
 /// Opens the GPU that the processor asks for, if any. `holding` selects the populations that the GPU keeps between
@@ -44,9 +44,9 @@ pub struct Found {
 /// # Errors
 /// The requested GPU does not exist or cannot be used.
 #[cfg(feature = "gpu")]
-pub fn find_gpu(processor: &Processor, holding: Option<ResidencyPolicy>) -> Result<Found, DeviceError> {
+pub fn find_gpu(processor: &Processor, holding: Option<ResidencyPolicy>) -> Result<GpuSearch, DeviceError> {
     let choice = match processor {
-        Processor::Cpu => return Ok(Found { gpu: None, passed_over: None }),
+        Processor::Cpu => return Ok(GpuSearch { gpu: None, rejection: None }),
         Processor::Auto | Processor::Gpu => AdapterChoice::Real,
         Processor::Adapter(name) => AdapterChoice::Named(name.clone()),
     };
@@ -57,12 +57,12 @@ pub fn find_gpu(processor: &Processor, holding: Option<ResidencyPolicy>) -> Resu
                 Some(holding) => gpu.with_residency(holding),
                 None => gpu,
             };
-            Ok(Found { gpu: Some(gpu), passed_over: None })
+            Ok(GpuSearch { gpu: Some(gpu), rejection: None })
         }
         Err(DeviceError::NoAdapter | DeviceError::NoRealAdapter { .. }) if optional => {
-            Ok(Found { gpu: None, passed_over: None })
+            Ok(GpuSearch { gpu: None, rejection: None })
         }
-        Err(error) if optional => Ok(Found { gpu: None, passed_over: Some(error) }),
+        Err(error) if optional => Ok(GpuSearch { gpu: None, rejection: Some(error) }),
         Err(error) => Err(error),
     }
 }
@@ -73,8 +73,8 @@ pub fn find_gpu(processor: &Processor, holding: Option<ResidencyPolicy>) -> Resu
 /// The requested GPU does not exist or cannot be used.
 #[cfg(feature = "gpu")]
 pub fn open(processor: &Processor) -> Result<(OpenBackend, Option<DeviceError>), DeviceError> {
-    let Found { gpu, passed_over } = find_gpu(processor, None)?;
-    Ok((gpu.map_or_else(cpu, on_gpu), passed_over))
+    let GpuSearch { gpu, rejection } = find_gpu(processor, None)?;
+    Ok((gpu.map_or_else(cpu, on_gpu), rejection))
 }
 
 /// Returns the CPU backend, which is always available.

@@ -1,14 +1,12 @@
 //! Estimate of a run's peak memory, made before the run starts.
 //!
-//! Every array that grows with the run is counted in the module that owns it. [`trainer`] counts what every run needs,
-//! and [`backend`] counts what episodes need. [`PROGRAM`] covers everything that does not grow.
+//! [`StageBytes`] lists every array that grows with the run. [`PROGRAM`] covers everything that does not grow.
 //!
 //! Nothing else is as large. Checkpoints and policies are written directly from the populations or from a single copy,
 //! see [`copies_checkpoint`]. A sweep limits its batches to half of the available memory.
 
 use crate::backend::{self, BATCH_BYTES, PACKED_FROM, cpu};
-use crate::config::{Config, Method, ValidConfig};
-use crate::trainer;
+use crate::config::{Config, Method, StageConfig, ValidConfig};
 use crate::world::World;
 
 #[cfg(any(test, not(any(target_os = "macos", windows))))]
@@ -23,6 +21,79 @@ const COPIED: u64 = 64 << 20;
 /// Bytes per generation for a run's learning curves, drawn at its end: for each of three curves the average over trials
 /// and a point. The arrays double as they grow.
 const DRAWN: u64 = 3 * (32 + 32);
+
+/// Words of 4 bytes per episode of a batch, on any backend.
+const EPISODE_WORDS: u64 = 40;
+
+/// Bytes of the arrays of all trials of a config in one stage.
+#[derive(Clone, Copy, Default)]
+struct StageBytes {
+    /// This generation and the next, its schedules and its scores.
+    training: u64,
+    /// The team schedules alone. If a GPU holds the populations, those of the next generation are drawn early.
+    schedules: u64,
+    /// The start positions of agents, and the positions of POIs if they move.
+    starts: u64,
+    /// On the CPU: the queue of all vectors of teams.
+    queue: u64,
+    /// On the CPU: a thread's vector of teams.
+    block: u64,
+    /// On a GPU: the weights, the records and the states of all teams.
+    on_gpu: [u64; 3],
+}
+
+impl StageBytes {
+    fn of(config: &StageConfig) -> StageBytes {
+        let (world, learning) = (World::new(config), &config.learning);
+        let (sizes, fitness) = ([learning.trials, config.populations(), learning.population], learning.fitness);
+        let [trials, populations, policies] = sizes.map(|size| size as u64);
+        let [leaders, teams, episodes] = [config.learners(), config.max_teams(), learning.episodes_per_team];
+        let [leaders, teams, episodes] = [leaders, teams, episodes].map(|size| size as u64);
+        let (slots, parameters) = (learning.slots() as u64, config.parameters() as u64);
+        let moved = if learning.poi_jitter > 0.0 { world.pois.len() } else { 0 };
+        let starts = 4 * trials * episodes * 2 * (world.agents() + moved) as u64;
+        let schedules = 4 * trials * (populations * learning.teams() as u64 + leaders * teams) + starts;
+        // Fitness is summed in 64 bits if a policy plays in several teams.
+        let is_summed = learning.partners > 1 || learning.hall_of_fame > 0;
+        let words_of_trial = 2 * populations * slots * parameters // this generation and the next
+            + populations * (policies + slots) // fitness and parents
+            + episodes * teams * (1 + leaders) // POIs observed and scores
+            + if is_summed { 2 * populations * policies } else { 0 }
+            + episodes * EPISODE_WORDS;
+        let played = trials * episodes * teams;
+        let of_team = [
+            backend::weight_bytes(&world),
+            backend::record_bytes(&world, fitness),
+            backend::state_bytes(&world, fitness),
+        ];
+        StageBytes {
+            training: 4 * trials * words_of_trial + schedules,
+            schedules,
+            starts,
+            queue: played.div_ceil(cpu::lanes()) * 16,
+            block: cpu::block_bytes(&world, fitness),
+            on_gpu: of_team.map(|bytes| played.saturating_mul(bytes)),
+        }
+    }
+
+    /// Returns the largest size of each array in any stage. In the generation that begins a stage, the starts of the
+    /// stage before are kept too.
+    fn most(config: &ValidConfig) -> StageBytes {
+        let most = config.stages().iter().fold(StageBytes::default(), |most, (_, stage)| {
+            let stage = StageBytes::of(stage);
+            StageBytes {
+                training: most.training.max(stage.training),
+                schedules: most.schedules.max(stage.schedules),
+                starts: most.starts.max(stage.starts),
+                queue: most.queue.max(stage.queue),
+                block: most.block.max(stage.block),
+                on_gpu: std::array::from_fn(|array| most.on_gpu[array].max(stage.on_gpu[array])),
+            }
+        });
+        let before = if config.stages.is_empty() { 0 } else { most.starts };
+        StageBytes { training: most.training + before, schedules: most.schedules + before, ..most }
+    }
+}
 
 /// Peaks of memory use, in bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -57,42 +128,30 @@ pub struct TooLittle {
 impl Peaks {
     /// Returns the peaks for training these configs together on `threads` threads.
     pub fn of<'a>(configs: impl IntoIterator<Item = &'a ValidConfig>, threads: usize) -> Peaks {
-        let lanes = cpu::lanes();
         let [mut training, mut next, mut checkpoint, mut queue, mut drawing] = [0_u64; 5];
-        let [mut weights, mut record, mut states] = [0_u64; 3];
         let [mut block, mut order, mut populations, mut held] = [0_u64; 4];
+        let mut on_gpu = [0_u64; 3];
         for config in configs {
-            let staged: Vec<(&Config, World)> =
-                config.stages().iter().map(|(_, config)| (&**config, World::new(config))).collect();
-            // The largest stage determines each size.
-            let most = |size: &dyn Fn(&Config, &World) -> u64| {
-                staged.iter().map(|(config, world)| size(config, world)).max().unwrap_or(0)
-            };
-            let (trials, policies) = (config.learning.trials as u64, config.learning.population);
-            let teams = |config: &Config| trials * config.learning.episodes_per_team as u64 * config.max_teams() as u64;
-            training += trainer::bytes(config);
-            next += trainer::next_schedule_bytes(config);
+            let most = StageBytes::most(config);
+            let trials = config.learning.trials as u64;
+            training += most.training;
+            next += most.schedules;
             checkpoint += checkpoint_bytes(config);
             drawing = drawing.max(DRAWN * (config.learning.generations as u64 + 1).next_power_of_two());
-            queue += most(&|config, _| teams(config).div_ceil(lanes) * 16);
-            block = block.max(most(&|config, world| cpu::block_bytes(world, config.learning.fitness)));
+            queue += most.queue;
+            block = block.max(most.block);
             // An evolution strategy also needs the utilities.
             let strategy = config.learning.method != Method::Tournament;
             let ranked = size_of::<usize>() + if strategy { size_of::<f64>() } else { 0 };
-            order = order.max((policies * ranked) as u64);
+            order = order.max((config.learning.population * ranked) as u64);
             populations += trials * config.populations() as u64;
             if !strategy {
                 held +=
                     trials * backend::held_bytes([config.populations(), config.learning.slots(), config.parameters()]);
             }
-            weights = weights.saturating_add(most(&|config, world| teams(config) * backend::weight_bytes(world)));
-            record = record.saturating_add(most(&|config, world| {
-                teams(config).saturating_mul(backend::record_bytes(world, config.learning.fitness))
-            }));
-            states = states.saturating_add(most(&|config, world| {
-                teams(config).saturating_mul(backend::state_bytes(world, config.learning.fitness))
-            }));
+            on_gpu.iter_mut().zip(most.on_gpu).for_each(|(sum, bytes)| *sum = sum.saturating_add(bytes));
         }
+        let [weights, record, states] = on_gpu;
         // Episodes, the final sorting of each population and the picture do not happen at the same time.
         let playing = threads as u64 * block + queue;
         let ending = (populations.min(threads as u64) * order).max(drawing);
@@ -138,13 +197,20 @@ pub fn check(needed: u64, checkpoint: u64) -> Result<(), TooLittle> {
 /// Reports whether a checkpoint of these configs is copied and written while training continues. Larger checkpoints are
 /// written directly from the populations, and training waits.
 pub fn copies_checkpoint<'a>(configs: impl IntoIterator<Item = &'a Config>) -> bool {
-    configs.into_iter().map(trainer::snapshot_bytes).sum::<u64>() <= COPIED
+    configs.into_iter().map(snapshot_bytes).sum::<u64>() <= COPIED
+}
+
+/// Returns the bytes of the weights and scores in a [`Snapshot`](crate::trainer::Snapshot).
+pub(crate) fn snapshot_bytes(config: &Config) -> u64 {
+    let (learning, populations) = (&config.learning, config.populations() as u64);
+    let numbers = learning.slots() as u64 * config.parameters() as u64 + learning.population as u64;
+    4 * learning.trials as u64 * populations * numbers
 }
 
 /// Returns the bytes that a checkpoint copies.
 fn checkpoint_bytes(config: &Config) -> u64 {
     let due = config.checkpoint.generations > 0 || config.checkpoint.seconds > 0.0;
-    if due && copies_checkpoint([config]) { trainer::snapshot_bytes(config) } else { 0 }
+    if due && copies_checkpoint([config]) { snapshot_bytes(config) } else { 0 }
 }
 
 /// Returns the bytes that this process may still use, or `None` if the system does not report them.

@@ -5,7 +5,7 @@ use sha2::{Digest, Sha256};
 use super::Row;
 
 /// Columns of a row that have the same bits on every backend.
-pub const COLUMNS: &str = "trial,generation,best_g,mean_g,champion_g";
+const COLUMNS: &str = "trial,generation,best_g,mean_g,champion_g";
 
 /// Returns a row as text, in the order of [`COLUMNS`].
 pub fn line(row: &Row) -> String {

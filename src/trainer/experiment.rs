@@ -14,7 +14,7 @@ use crate::evolve::{self, Key, Purpose};
 use crate::parallel::*;
 
 /// One experiment and its trials.
-pub(super) struct Experiment {
+pub(super) struct ExperimentState {
     pub stages: Stages,
     pub trials: Vec<TrialState>,
     /// The schedules of the generation that plays, one per trial.
@@ -48,15 +48,15 @@ pub(super) struct TrialState {
     pub pending: Option<Row>,
 }
 
-impl Experiment {
-    pub fn new(config: &ValidConfig, trials: Range<usize>, level: Level) -> Experiment {
+impl ExperimentState {
+    pub fn new(config: &ValidConfig, trials: Range<usize>, level: Level) -> ExperimentState {
         let stages = Stages::new(config);
         let leaders = stages.of(0).world.leaders();
         let schedule = || TeamSchedule::new(config.learning.population, config.populations(), leaders);
         let schedules = std::iter::repeat_with(schedule).take(trials.len()).collect();
         let trials = trials.into_par_iter().map(|index| TrialState::new(&stages, index, level)).collect();
         let residency = Residency::on_host(0);
-        Experiment { stages, trials, schedules, next_schedules: vec![], residency }
+        ExperimentState { stages, trials, schedules, next_schedules: vec![], residency }
     }
 
     /// The stage that the populations are about to play in.
@@ -97,7 +97,7 @@ impl Experiment {
         if self.next_schedules.first().is_some_and(|next| next.is_of(generation, &self.stages)) {
             std::mem::swap(&mut self.schedules, &mut self.next_schedules);
         }
-        let Experiment { stages, schedules, trials, .. } = self;
+        let ExperimentState { stages, schedules, trials, .. } = self;
         let pairs = schedules.par_iter_mut().zip(trials);
         pairs.for_each(|(schedule, trial)| schedule.draw(level, stages, trial.index, generation));
     }

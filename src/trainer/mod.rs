@@ -10,8 +10,10 @@
 //! | `residency` | where populations are: on the host or on a device |
 //! | `populations` | moving populations between the two, and breeding them |
 //! | `results` | playing a generation, and its rows and fitness |
-//! | `ask_tell` | training in which the caller scores the policies |
-//! | `size` | estimates of the memory that a trainer needs |
+//! | `ask_tell` | the teams of a generation and their scores, for callers that score policies |
+//!
+//! [`Trainer::advance`] is the only loop body of every training. It has two halves: [`Trainer::play`] and
+//! [`Trainer::breed`]. Between them, a caller may replace the scores.
 
 use std::collections::TryReserveError;
 use std::time::Duration;
@@ -31,20 +33,20 @@ mod populations;
 mod residency;
 mod results;
 mod schedule;
-mod size;
 mod stages;
 
 pub use ask_tell::Candidates;
-pub use size::{bytes, next_schedule_bytes, snapshot_bytes};
 
-use experiment::Experiment;
+use experiment::ExperimentState;
 use schedule::TeamSchedule;
 
 /// Trains any number of experiments side by side. Each is at a generation of its own.
 pub struct Trainer {
-    experiments: Vec<Experiment>,
+    experiments: Vec<ExperimentState>,
     level: Level,
     times: GenerationTimes,
+    /// Whether no backend may hold the populations.
+    on_host: bool,
 }
 
 /// The results of one generation of one trial. Every G is in 0..1.
@@ -145,16 +147,16 @@ impl Trainer {
     /// Creates random populations for every trial of every config.
     pub fn new(configs: impl IntoIterator<Item = ValidConfig>) -> Trainer {
         let level = Level::new();
-        let experiment = |config: ValidConfig| Experiment::new(&config, 0..config.learning.trials, level);
+        let experiment = |config: ValidConfig| ExperimentState::new(&config, 0..config.learning.trials, level);
         let experiments = configs.into_iter().map(experiment).collect();
-        Trainer { experiments, level, times: GenerationTimes::default() }
+        Trainer { experiments, level, times: GenerationTimes::default(), on_host: false }
     }
 
     /// Creates random populations for one trial of a config. Its rows are the same as among the other trials.
     pub fn of_trial(config: &ValidConfig, trial: usize) -> Trainer {
         let level = Level::new();
-        let experiments = vec![Experiment::new(config, trial..trial + 1, level)];
-        Trainer { experiments, level, times: GenerationTimes::default() }
+        let experiments = vec![ExperimentState::new(config, trial..trial + 1, level)];
+        Trainer { experiments, level, times: GenerationTimes::default(), on_host: false }
     }
 
     /// Returns the generation that an experiment plays next: two past its last when it is done.
@@ -166,7 +168,7 @@ impl Trainer {
     ///
     /// The results are those of a config with that number of generations.
     pub fn end(&mut self, experiment: usize) -> usize {
-        let Experiment { stages, residency, .. } = &mut self.experiments[experiment];
+        let ExperimentState { stages, residency, .. } = &mut self.experiments[experiment];
         stages.last_generation = stages.last_generation.min(residency.generation());
         stages.last_generation
     }
@@ -178,20 +180,26 @@ impl Trainer {
 
     /// Reports whether every experiment has played its last generation, and that generation's champions.
     pub fn is_done(&self) -> bool {
-        self.experiments.iter().all(Experiment::is_done)
+        self.experiments.iter().all(ExperimentState::is_done)
     }
 
-    /// Plays, scores and breeds one generation of every experiment that has one left.
-    ///
-    /// Returns the rows that became complete, by experiment, trial and generation. A generation's champion plays with
-    /// the next generation. The last champion plays alone.
+    /// Keeps all populations on the host from now on, so that they can be read at any time.
+    pub(crate) fn keep_on_host(&mut self) {
+        self.on_host = true;
+    }
+
+    /// Plays, scores and breeds one generation of every experiment that has one left. Returns the rows that became
+    /// complete, see [`Trainer::breed`].
     ///
     /// # Errors
     /// The backend failed. The trainer is then still before this generation, and another backend can play it, unless
     /// the one that failed holds the populations. Then a new trainer continues from a [`Trainer::snapshot`].
     pub fn advance(&mut self, backend: &mut dyn Backend) -> Result<Vec<Row>, BackendError> {
         // Enters the thread pool once, because waking a thread takes longer than a small generation.
-        scope(|_| self.play_generation(backend))
+        scope(|_| {
+            self.play(backend)?;
+            Ok(self.breed(None))
+        })
     }
 
     /// Plays every generation that is left, and returns all rows.
@@ -206,33 +214,51 @@ impl Trainer {
         Ok(rows)
     }
 
-    fn play_generation(&mut self, backend: &mut dyn Backend) -> Result<Vec<Row>, BackendError> {
-        let level = self.level;
-        let playing = self.experiments.iter_mut().enumerate().filter(|(_, experiment)| !experiment.is_done());
-        let mut playing: Vec<(usize, &mut Experiment)> = playing.collect();
+    /// Plays the teams of one generation of every experiment that has one left, and keeps their scores.
+    ///
+    /// # Errors
+    /// See [`Trainer::advance`].
+    pub(crate) fn play(&mut self, backend: &mut dyn Backend) -> Result<(), BackendError> {
+        scope(|_| {
+            let (level, start) = (self.level, Instant::now());
+            if !self.on_host {
+                unfinished(&mut self.experiments).try_for_each(|(_, experiment)| experiment.offer(backend))?;
+            }
+            let mut playing: Vec<_> = unfinished(&mut self.experiments).collect();
+            playing.par_iter_mut().for_each(|(_, experiment)| experiment.prepare(level));
+            let prepared = Instant::now();
+            play_and_draw_next(&mut playing, level, backend)?;
+            let mut over = playing.iter_mut().filter(|(_, experiment)| experiment.only_champions_left());
+            over.try_for_each(|(_, experiment)| experiment.fetch())?;
+            self.times.prepare += prepared - start;
+            self.times.play += prepared.elapsed();
+            Ok(())
+        })
+    }
 
-        let start = Instant::now();
-        playing.iter_mut().try_for_each(|(_, experiment)| experiment.offer(backend))?;
-        playing.par_iter_mut().for_each(|(_, experiment)| experiment.prepare(level));
-        let prepared = Instant::now();
-        play_and_draw_next(&mut playing, level, backend)?;
-        let mut over = playing.iter_mut().filter(|(_, experiment)| experiment.only_champions_left());
-        over.try_for_each(|(_, experiment)| experiment.fetch())?;
-        let played = Instant::now();
-        let collect = |(index, experiment): &mut (usize, &mut Experiment)| match experiment.only_champions_left() {
-            true => experiment.collect_last_rows(),
-            false => experiment.collect_results(*index, None),
-        };
-        let mut rows = playing.par_iter_mut().flat_map_iter(collect).collect::<Vec<_>>();
-        let collected = Instant::now();
-        playing.retain(|(_, experiment)| !experiment.only_champions_left());
-        playing.par_iter_mut().for_each(|(_, experiment)| experiment.breed(level));
-        rows.sort_by_key(|row| (row.experiment, row.trial, row.generation));
-        self.times.prepare += prepared - start;
-        self.times.play += played - prepared;
-        self.times.collect += collected - played;
-        self.times.breed += collected.elapsed();
-        Ok(rows)
+    /// Breeds the next generation of every experiment that [`Trainer::play`] played. `fitness` is what each leader of
+    /// each team of the first experiment was worth, `[trials][teams][leaders]`; `None` takes the config's fitness.
+    ///
+    /// Returns the rows that became complete, by experiment, trial and generation. A generation's champions play with
+    /// the next generation. The last champions play alone.
+    pub(crate) fn breed(&mut self, fitness: Option<&[f32]>) -> Vec<Row> {
+        scope(|_| {
+            let (level, start) = (self.level, Instant::now());
+            let mut playing: Vec<_> = unfinished(&mut self.experiments).collect();
+            let collect =
+                |(index, experiment): &mut (usize, &mut ExperimentState)| match experiment.only_champions_left() {
+                    true => experiment.collect_last_rows(),
+                    false => experiment.collect_results(*index, fitness.filter(|_| *index == 0)),
+                };
+            let mut rows = playing.par_iter_mut().flat_map_iter(collect).collect::<Vec<_>>();
+            let collected = Instant::now();
+            playing.retain(|(_, experiment)| !experiment.only_champions_left());
+            playing.par_iter_mut().for_each(|(_, experiment)| experiment.breed(level));
+            rows.sort_by_key(|row| (row.experiment, row.trial, row.generation));
+            self.times.collect += collected - start;
+            self.times.breed += collected.elapsed();
+            rows
+        })
     }
 
     /// Returns the policies of an experiment's last generation, which it has played: best first in each population, one
@@ -340,13 +366,18 @@ impl Trainer {
     }
 }
 
+/// Returns the experiments that have a generation left, with their indices.
+fn unfinished(experiments: &mut [ExperimentState]) -> impl Iterator<Item = (usize, &mut ExperimentState)> {
+    experiments.iter_mut().enumerate().filter(|(_, experiment)| !experiment.is_done())
+}
+
 /// Plays the teams of some experiments. Meanwhile, draws the next schedules of those whose populations are on a device.
 fn play_and_draw_next(
-    playing: &mut [(usize, &mut Experiment)],
+    playing: &mut [(usize, &mut ExperimentState)],
     level: Level,
     backend: &mut dyn Backend,
 ) -> Result<(), BackendError> {
-    let take = |(_, experiment): &mut (usize, &mut Experiment)| std::mem::take(&mut experiment.next_schedules);
+    let take = |(_, experiment): &mut (usize, &mut ExperimentState)| std::mem::take(&mut experiment.next_schedules);
     let mut next: Vec<Vec<TeamSchedule>> = playing.iter_mut().map(take).collect();
     let (played, ()) = join(
         || results::play(backend, playing),

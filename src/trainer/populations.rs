@@ -4,7 +4,7 @@ use std::cell::RefCell;
 
 use fearless_simd::Level;
 
-use super::experiment::{Experiment, TrialState};
+use super::experiment::{ExperimentState, TrialState};
 use super::residency::Residency;
 use super::stages::Stage;
 use crate::backend::{Backend, BackendError};
@@ -15,7 +15,7 @@ use crate::parallel::*;
 /// Slots that one thread fills at a time.
 const SLOTS_PER_TASK: usize = 64;
 
-impl Experiment {
+impl ExperimentState {
     /// Asks a backend once to hold the populations. It takes those of all trials or none.
     ///
     /// # Errors
@@ -74,22 +74,33 @@ impl Experiment {
 
     /// Plans the next generation, and lets the device breed it.
     fn breed_on_device(&mut self, level: Level) -> Result<(), BackendError> {
+        self.plan(level);
         let generation = self.residency.generation();
-        let Experiment { stages, trials, residency, .. } = self;
+        let ExperimentState { stages, trials, residency, .. } = self;
         let Residency::Device { populations, .. } = residency else { return Ok(()) };
-        let (learning, last) = (&stages.of(generation).config.learning, stages.last_generation);
-        let Learning { seed, population, .. } = *learning;
-        trials.par_iter_mut().for_each(|trial| {
-            let key = Key::new(seed, trial.index, Purpose::Tournament);
-            let plans = trial.parents.par_chunks_exact_mut(learning.slots());
-            plans.zip(trial.fitness.par_chunks_exact(population)).enumerate().for_each(
-                |(leader, (parents, fitness))| plan(level, learning, key, (generation, last), leader, fitness, parents),
-            );
-        });
+        let learning = &stages.of(generation).config.learning;
         populations.iter_mut().zip(trials).try_for_each(|(held, trial)| {
-            let key = Key::new(seed, trial.index, Purpose::Mutation);
+            let key = Key::new(learning.seed, trial.index, Purpose::Mutation);
             held.breed(&Breeding { parents: &trial.parents, key, generation, learning })
         })
+    }
+
+    /// Plans the next generation of all populations. After the last generation, every policy is kept.
+    fn plan(&mut self, level: Level) {
+        let (generation, last) = (self.residency.generation(), self.last());
+        let ExperimentState { stages, trials, .. } = self;
+        let learning = &stages.of(generation).config.learning;
+        trials.par_iter_mut().for_each(|trial| {
+            let key = Key::new(learning.seed, trial.index, Purpose::Tournament);
+            let plans = trial.parents.par_chunks_exact_mut(learning.slots());
+            let plans = plans.zip(trial.fitness.par_chunks_exact(learning.population)).enumerate();
+            plans.for_each(|(leader, (parents, fitness))| match generation == last {
+                true => evolve::keep_parents(fitness, parents),
+                false => {
+                    evolve::draw_parents(level, key, generation, leader, Selection::of(learning), fitness, parents);
+                }
+            });
+        });
     }
 
     /// Breeds populations that the host holds. This cannot fail.
@@ -166,22 +177,17 @@ impl Experiment {
     /// Selects parents and mutates them.
     fn select(&mut self, level: Level) {
         thread_local! { static SCRATCH: RefCell<Vec<u32>> = const { RefCell::new(Vec::new()) }; }
-        let generation = self.residency.generation();
-        let Experiment { stages, trials, .. } = self;
+        self.plan(level);
+        let (generation, stride) = (self.residency.generation(), self.stride());
+        let ExperimentState { stages, trials, .. } = self;
         let Stage { config, world, .. } = stages.of(generation);
-        let (learning, last) = (&config.learning, stages.last_generation);
-        let Learning { seed, population, .. } = *learning;
-        let parameters = world.parameters();
-        let slots = learning.slots();
-        let stride = slots * parameters;
+        let (learning, parameters) = (&config.learning, world.parameters());
         trials.par_iter_mut().for_each(|trial| {
-            let tournaments = Key::new(seed, trial.index, Purpose::Tournament);
-            let key = Key::new(seed, trial.index, Purpose::Mutation);
-            let TrialState { weights, children, parents, fitness, .. } = trial;
-            let plans = fitness.par_chunks_exact(population).zip(parents.par_chunks_exact_mut(slots));
+            let key = Key::new(learning.seed, trial.index, Purpose::Mutation);
+            let TrialState { weights, children, parents, .. } = trial;
             let populations = weights.par_chunks_exact(stride).zip(children.par_chunks_exact_mut(stride));
-            plans.zip(populations).enumerate().for_each(|(leader, ((fitness, parents), (policies, children)))| {
-                plan(level, learning, tournaments, (generation, last), leader, fitness, parents);
+            let populations = populations.zip(parents.par_chunks_exact(learning.slots())).enumerate();
+            populations.for_each(|(leader, ((policies, children), parents))| {
                 let tasks = children.par_chunks_mut(SLOTS_PER_TASK * parameters);
                 // Small tasks end at about the same time on all threads.
                 tasks.with_max_len(4).enumerate().for_each(|(index, children)| {
@@ -208,21 +214,5 @@ impl Experiment {
                 policy.copy_from_slice(&weights[index * parameters..(index + 1) * parameters]);
             }
         });
-    }
-}
-
-/// Plans one population's next generation; after the last generation, keeps every policy.
-fn plan(
-    level: Level,
-    learning: &Learning,
-    key: Key,
-    (generation, last): (usize, usize),
-    leader: usize,
-    fitness: &[f32],
-    parents: &mut [u32],
-) {
-    match generation == last {
-        true => evolve::keep_parents(fitness, parents),
-        false => evolve::draw_parents(level, key, generation, leader, Selection::of(learning), fitness, parents),
     }
 }

@@ -5,7 +5,7 @@ use std::ops::Range;
 use glam::Vec2;
 
 use super::Row;
-use super::experiment::{Experiment, TrialState};
+use super::experiment::{ExperimentState, TrialState};
 use super::schedule::{MIN_POLICIES_PER_TASK, TeamSchedule, min_populations_per_task};
 use super::stages::Stage;
 use crate::backend::{Backend, BackendError, Group, GroupScores, Weights};
@@ -19,7 +19,7 @@ const TEAMS_TOGETHER: usize = 1 << 16;
 /// that is over plays its champions only.
 pub(super) fn play<'a>(
     backend: &mut dyn Backend,
-    experiments: &'a [(usize, &'a mut Experiment)],
+    experiments: &'a [(usize, &'a mut ExperimentState)],
 ) -> Result<Vec<GroupScores>, BackendError> {
     let mut groups = Vec::new();
     for (_, experiment) in experiments {
@@ -53,9 +53,9 @@ pub(super) fn play<'a>(
 }
 
 /// Gives each trial its scores, in the order in which [`play`] plays.
-pub(super) fn keep(scores: Vec<GroupScores>, experiments: &mut [(usize, &mut Experiment)]) {
+pub(super) fn keep(scores: Vec<GroupScores>, experiments: &mut [(usize, &mut ExperimentState)]) {
     let mut scores = scores.into_iter();
-    for (_, Experiment { trials, schedules, .. }) in experiments {
+    for (_, ExperimentState { trials, schedules, .. }) in experiments {
         for (trial, schedule) in trials.iter_mut().zip(schedules) {
             trial.scores = scores.by_ref().take(schedule.starts.len()).collect();
             trial.previous_stage_scores = scores.by_ref().take(schedule.previous_stage_starts.len()).collect();
@@ -63,7 +63,7 @@ pub(super) fn keep(scores: Vec<GroupScores>, experiments: &mut [(usize, &mut Exp
     }
 }
 
-impl Experiment {
+impl ExperimentState {
     /// Returns the range of teams to play. The last is the champions' team: it does not play in the first generation,
     /// and plays alone after the last one.
     fn playing(&self) -> Range<usize> {
@@ -76,7 +76,7 @@ impl Experiment {
     /// experiment's in its trainer. `given_scores` replaces the scores, `[trials][teams][leaders]`.
     pub fn collect_results(&mut self, index: usize, given_scores: Option<&[f32]>) -> Vec<Row> {
         let (generation, size) = (self.residency.generation(), self.teams() * self.stage().world.leaders());
-        let Experiment { stages, trials, schedules, .. } = self;
+        let ExperimentState { stages, trials, schedules, .. } = self;
         let Stage { config, world, .. } = stages.of(generation);
         let (teams, hall) = (config.learning.teams(), config.hall_teams(generation) > 0);
         let pois_before = stages.ending_before(generation).map_or(world.pois.len(), |stage| stage.world.pois.len());
