@@ -17,7 +17,7 @@ use flotilla::backend::cpu::{Cpu, level_name};
 use flotilla::backend::{Backend, Group};
 use flotilla::config::{Config, Sharing};
 use flotilla::evolve::{Key, Purpose, random_policy};
-use flotilla::stepping::Stepper;
+use flotilla::stepping::{Recording, Stepper};
 use flotilla::world::{OUTPUTS, World};
 
 /// Minimum time per measurement.
@@ -63,7 +63,7 @@ fn measure(config: &Config, level: Level, teams: usize, rounds: usize) -> Result
         .flat_map(|team| (0..leaders).map(move |leader| (team, leader)))
         .flat_map(|(team, leader)| trace.moment(1, team, leader).outputs)
         .collect();
-    let mut stepper = Stepper::at_level(level, world.clone(), teams, false)?;
+    let mut stepper = Stepper::at_level(level, world.clone(), teams, Recording::None)?;
     let mut states = 0.0;
     let mut steps = |with_states: bool| -> Result<(), Box<dyn Error>> {
         stepper.reset();

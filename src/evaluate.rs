@@ -184,25 +184,11 @@ impl Evaluation {
     }
 }
 
-/// Plays every team of a group from every start and computes every fitness. Dt is computed only if the group needs
-/// sights.
-///
-/// Memory limits the number of episodes per batch. `watch` receives the finished share, in 0..1, after each batch.
-///
-/// # Errors
-/// The backend fails.
-pub fn evaluate(
-    backend: &mut dyn Backend,
-    group: &Group<'_>,
-    starts: &Starts,
-    watch: &mut dyn FnMut(f64),
-) -> Result<Evaluation, BackendError> {
-    evaluate_until(backend, group, starts, watch, &mut |_| ControlFlow::Continue(()))
-}
-
-/// Some episodes of all teams, as [`evaluate_until`] reports them.
+/// Some episodes of all teams, as [`evaluate`] reports them.
 #[derive(Clone, Copy, Debug)]
 pub struct Batch<'a> {
+    /// The share of all episodes that were played so far, in 0..1.
+    pub share: f64,
     /// The first episode, and POIs observed in it and the following ones, `[episodes][teams]`. Empty while episodes are
     /// incomplete.
     pub first: usize,
@@ -212,16 +198,18 @@ pub struct Batch<'a> {
     pub credits: &'a [[f32; 4]],
 }
 
-/// [`evaluate`], which calls `each` several times per second, from this thread and in the order of episodes. If that
-/// breaks, the evaluation ends after the episodes reported so far.
+/// Plays every team of a group from every start and computes every fitness. Dt is computed only if the group needs
+/// sights.
+///
+/// Memory limits the number of episodes per batch. `each` is called several times per second, from this thread and in
+/// the order of episodes. If it breaks, the evaluation ends after the episodes reported so far.
 ///
 /// # Errors
 /// The backend fails.
-pub fn evaluate_until(
+pub fn evaluate(
     backend: &mut dyn Backend,
     group: &Group<'_>,
     starts: &Starts,
-    watch: &mut dyn FnMut(f64),
     each: &mut dyn FnMut(Batch<'_>) -> ControlFlow<()>,
 ) -> Result<Evaluation, BackendError> {
     let world = group.world;
@@ -239,7 +227,7 @@ pub fn evaluate_until(
         credits: vec![[0.0; 4]; teams * leaders],
         timed,
     };
-    let mut done = 0;
+    let (mut done, all) = (0, (teams * episodes) as f64);
     // Episodes of teams that are played at once, so that this takes a fraction of a second.
     let mut limit = (FIRST_STEPS / world.steps()).max(1);
     let mut first = 0;
@@ -265,7 +253,6 @@ pub fn evaluate_until(
                 }
             }
             done += groups.len() * count;
-            watch(done as f64 / (teams * episodes) as f64);
             let took = started.elapsed();
             if took < SHORT_BATCH {
                 limit = limit.saturating_mul(2);
@@ -273,7 +260,8 @@ pub fn evaluate_until(
                 limit = (limit / 2).max(1);
             }
             first_team += count;
-            if first_team < teams && each(Batch { first, observed: &[], credits: &[] }).is_break() {
+            let share = done as f64 / all;
+            if first_team < teams && each(Batch { share, first, observed: &[], credits: &[] }).is_break() {
                 return Ok(evaluation);
             }
         }
@@ -287,7 +275,8 @@ pub fn evaluate_until(
                 sums.iter_mut().zip(scores).for_each(|(sum, &score)| *sum += f64::from(score));
             }
         }
-        if each(Batch { first, observed: &observed, credits: &credits }).is_break() {
+        let share = done as f64 / all;
+        if each(Batch { share, first, observed: &observed, credits: &credits }).is_break() {
             break;
         }
         first += at_once;
@@ -295,7 +284,7 @@ pub fn evaluate_until(
     Ok(evaluation)
 }
 
-/// Number of team-steps in the first batch of [`evaluate_until`].
+/// Number of team-steps in the first batch of [`evaluate`].
 const FIRST_STEPS: usize = 1 << 16;
 /// Range of time that each later batch should take.
 const SHORT_BATCH: Duration = Duration::from_millis(100);

@@ -152,7 +152,12 @@ impl World {
 
     /// Returns the words of one team's record of sets: steps × POIs × words per set.
     pub fn set_words(&self) -> usize {
-        self.steps() * self.pois.len() * self.constants.words as usize
+        self.steps() * self.words_per_step()
+    }
+
+    /// Returns the words of one step of such a record.
+    pub(crate) fn words_per_step(&self) -> usize {
+        self.pois.len() * self.constants.words as usize
     }
 }
 

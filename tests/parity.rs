@@ -247,17 +247,21 @@ fn held_out_episodes_give_the_same_results_on_every_backend() {
     let teams: Vec<u32> = (0..policies as u32).flat_map(|policy| std::iter::repeat_n(policy, leaders)).collect();
     let group = group_of_teams(&world, &weights, policies, &teams);
     let starts = Starts::Drawn { episodes: 300, seed: 5, jitter: 6.0, poi_jitter: 4.0 };
-    let expected = evaluate(&mut Cpu::default(), &group, &starts, &mut |_| ()).unwrap();
+    let expected =
+        evaluate(&mut Cpu::default(), &group, &starts, &mut |_| std::ops::ControlFlow::Continue(())).unwrap();
     let others = Starts::Drawn { episodes: 300, seed: 5, jitter: 6.0, poi_jitter: 0.0 };
     assert_ne!(
-        evaluate(&mut Cpu::default(), &group, &others, &mut |_| ()).unwrap(),
+        evaluate(&mut Cpu::default(), &group, &others, &mut |_| std::ops::ControlFlow::Continue(())).unwrap(),
         expected,
         "moved POIs changed nothing"
     );
     let spreads: Vec<_> = (0..policies).map(|team| expected.team(team)).collect();
     assert!(spreads.iter().any(|spread| spread.deviation > Some(0.0)), "no team observes a POI: {spreads:?}");
     for (request, info) in support::adapters("held_out_episodes_give_the_same_results_on_every_backend") {
-        let found = evaluate(&mut open(&request, Pass::Guarded, Kernel::Best), &group, &starts, &mut |_| ()).unwrap();
+        let found = evaluate(&mut open(&request, Pass::Guarded, Kernel::Best), &group, &starts, &mut |_| {
+            std::ops::ControlFlow::Continue(())
+        })
+        .unwrap();
         assert_eq!(found, expected, "{info}");
     }
 }

@@ -11,7 +11,7 @@ use flotilla::config::{Fitness, MAX_POPULATION, Sharing};
 use flotilla::credit::{self, Credit, Scores};
 use flotilla::evaluate::Starts;
 use flotilla::sample;
-use flotilla::stepping::{StepError, Stepper};
+use flotilla::stepping::{Recording, StepError, Stepper};
 use flotilla::world::World;
 use glam::Vec2;
 
@@ -104,7 +104,7 @@ fn stepping_with_traced_actions_gives_the_bits_of_the_trace() {
         for (seed, teams) in (0..40).zip([1, 3, 16, 17, 37, 150].into_iter().cycle()) {
             let played = Played::new(seed, teams);
             let case = format!("seed {seed}, {teams} teams, {}", level_name(level));
-            let stepper = Stepper::at_level(level, played.world.clone(), teams, true).and_then(Stepper::with_sights);
+            let stepper = Stepper::at_level(level, played.world.clone(), teams, Recording::SetsAndSights);
             let mut stepper = stepper.unwrap_or_else(|error| panic!("{case}: {error}"));
             stepper.reset_to(&played.starts_of(teams)).expect("the starts are on the map");
             let mut observed = vec![0; teams];
@@ -141,7 +141,7 @@ fn each_team_can_be_reset_at_any_step() {
         let teams = 21;
         let played = Played::new(seed, teams);
         let (last, starts) = (played.world.steps(), played.starts_of(teams));
-        let stepper = Stepper::at_level(level, played.world.clone(), teams, true).and_then(Stepper::with_sights);
+        let stepper = Stepper::at_level(level, played.world.clone(), teams, Recording::SetsAndSights);
         let mut stepper = stepper.unwrap_or_else(|error| panic!("{error}"));
         stepper.reset_to(&starts).expect("the starts are on the map");
         let mut steps = vec![0; teams];
@@ -178,10 +178,10 @@ fn world() -> World {
 #[test]
 fn invalid_input_is_refused_and_changes_nothing() {
     let world = world();
-    assert!(matches!(Stepper::new(world.clone(), 0), Err(StepError::Teams(0))));
-    assert!(matches!(Stepper::new(world.clone(), MAX_POPULATION + 1), Err(StepError::Teams(_))));
-    assert!(matches!(Stepper::new(world.clone(), usize::MAX), Err(StepError::Teams(_))));
-    let mut stepper = Stepper::new(world.clone(), 3).expect("three teams are allowed");
+    assert!(matches!(Stepper::new(world.clone(), 0, Recording::None), Err(StepError::Teams(0))));
+    assert!(matches!(Stepper::new(world.clone(), MAX_POPULATION + 1, Recording::None), Err(StepError::Teams(_))));
+    assert!(matches!(Stepper::new(world.clone(), usize::MAX, Recording::None), Err(StepError::Teams(_))));
+    let mut stepper = Stepper::new(world.clone(), 3, Recording::None).expect("three teams are allowed");
     let (good, leaders) = ([0.25; 24], world.leaders());
     stepper.step(&good).expect("the actions are valid");
     let before = (stepper.inputs().to_vec(), stepper.states().positions.to_vec(), stepper.steps().to_vec());
@@ -207,7 +207,7 @@ fn invalid_input_is_refused_and_changes_nothing() {
         starts[2 * 24 + 2 * 5 + 1] = at;
         messages.push(message(stepper.reset_to(&starts)));
         // Starts of teams that are not reset are not validated.
-        let mut other = Stepper::new(world.clone(), 3).expect("three teams are allowed");
+        let mut other = Stepper::new(world.clone(), 3, Recording::None).expect("three teams are allowed");
         other.reset_some(&[true, true, false], Some(&starts)).expect("the starts of the chosen teams are on the map");
     }
     let expected = [
@@ -217,8 +217,8 @@ fn invalid_input_is_refused_and_changes_nothing() {
         "2 choices, but [teams] are 3",
         "agent 0 of team 0 would start at (NaN, NaN), which is not on the map",
         "11 scores, but [teams][leaders] are 12",
-        "no record to score; create the stepper with `Stepper::recording`",
-        "no record to score; create the stepper with `Stepper::recording`",
+        "no record to score; create the stepper with `Recording::Sets`",
+        "no record to score; create the stepper with `Recording::Sets`",
         "team 3 does not exist: there are 3, counted from 0",
         "the speed of leader 2 in team 1 is NaN, which is no finite number",
         "the speed of leader 2 in team 1 is inf, which is no finite number",
@@ -236,7 +236,7 @@ fn invalid_input_is_refused_and_changes_nothing() {
 fn actions_are_clamped_and_starts_are_rounded_to_the_grid() {
     let world = world();
     let positions = |action: [f32; 2], starts: Option<&[f32]>| {
-        let mut stepper = Stepper::new(world.clone(), 5).expect("five teams are allowed");
+        let mut stepper = Stepper::new(world.clone(), 5, Recording::None).expect("five teams are allowed");
         starts.into_iter().for_each(|starts| stepper.reset_to(starts).expect("the starts are on the map"));
         (0..10).for_each(|_| stepper.step(&action.repeat(5 * world.leaders())).expect("the actions are valid"));
         stepper.states().positions.to_vec()
@@ -250,7 +250,8 @@ fn actions_are_clamped_and_starts_are_rounded_to_the_grid() {
     (config.motion.max_speed, config.motion.max_acceleration) = (f64::from(3f32.next_up()), 100.0);
     config.world.speed = 0.5 + f64::from(f32::EPSILON);
     let speed = |wanted: f32| {
-        let mut stepper = Stepper::new(World::new(&config.validate().unwrap()), 1).expect("one team is allowed");
+        let mut stepper =
+            Stepper::new(World::new(&config.validate().unwrap()), 1, Recording::None).expect("one team is allowed");
         stepper.step(&[0.0, wanted].repeat(stepper.world().leaders())).expect("the actions are valid");
         stepper.states().speeds[0]
     };
@@ -262,7 +263,7 @@ fn actions_are_clamped_and_starts_are_rounded_to_the_grid() {
     let off_grid: Vec<f32> =
         on_grid.iter().map(|at| at + if *at < 16.0 { 1.0 / (1 << 20) as f32 } else { 0.0 }).collect();
     assert_ne!(off_grid, on_grid);
-    let mut stepper = Stepper::new(world.clone(), 5).expect("five teams are allowed");
+    let mut stepper = Stepper::new(world.clone(), 5, Recording::None).expect("five teams are allowed");
     stepper.reset_to(&off_grid).expect("the starts are on the map");
     assert_eq!(stepper.states().positions, on_grid);
     assert_eq!(positions([0.1, 0.2], Some(&off_grid)), positions([0.1, 0.2], None));
@@ -275,8 +276,8 @@ fn a_restored_stepper_continues_with_the_same_bits() {
         let world = World::new(&config.validate().unwrap());
         let (teams, leaders, agents, pois) = (13, world.leaders(), world.agents(), world.pois.len());
         let make = |level| {
-            let stepper = Stepper::at_level(level, world.clone(), teams, true).unwrap();
-            if seed % 2 == 0 { stepper.with_sights().unwrap() } else { stepper }
+            let recording = if seed % 2 == 0 { Recording::SetsAndSights } else { Recording::Sets };
+            Stepper::at_level(level, world.clone(), teams, recording).unwrap()
         };
         let mut original = make(Level::new());
         // In every third world, each team has its own POIs.
@@ -335,7 +336,7 @@ fn a_restored_stepper_continues_with_the_same_bits() {
 #[test]
 fn an_invalid_saved_state_is_refused_and_changes_nothing() {
     let world = World::new(&sample::world(1).validate().unwrap());
-    let make = |teams| Stepper::recording(world.clone(), teams).and_then(Stepper::with_sights).unwrap();
+    let make = |teams| Stepper::new(world.clone(), teams, Recording::SetsAndSights).unwrap();
     let mut stepper = make(3);
     stepper.step(&vec![0.5; 3 * world.leaders() * 2]).unwrap();
     let state = stepper.save();
@@ -348,8 +349,8 @@ fn an_invalid_saved_state_is_refused_and_changes_nothing() {
         refused(&mut stepper, &state[..length]);
     }
     refused(&mut stepper, &[&state[..], &[0; 4]].concat());
-    refused(&mut Stepper::new(world.clone(), 3).unwrap(), &state);
-    refused(&mut Stepper::recording(world.clone(), 3).unwrap(), &state);
+    refused(&mut Stepper::new(world.clone(), 3, Recording::None).unwrap(), &state);
+    refused(&mut Stepper::new(world.clone(), 3, Recording::Sets).unwrap(), &state);
     refused(&mut make(4), &state);
     let mut scores = vec![0.0; 3 * world.leaders()];
     for (word, bits) in (0..state.len() / 4).flat_map(|word| [f32::NAN.to_bits(), u32::MAX].map(|bits| (word, bits))) {
@@ -377,13 +378,13 @@ fn each_team_can_have_its_own_pois() {
     let starts = Starts::Drawn { episodes: teams as u32, seed: 5, jitter: 1.0, poi_jitter: 3.0 };
     let drawn: Vec<Vec<Vec2>> = (0..teams).map(|team| starts.of(team, &world)).collect();
     let flat: Vec<f32> = drawn.iter().flatten().flat_map(|place| place.to_array()).collect();
-    let mut together = Stepper::new(world.clone(), teams).unwrap();
+    let mut together = Stepper::new(world.clone(), teams, Recording::None).unwrap();
     together.reset_to(&flat).unwrap();
     let actions = vec![0.75; world.leaders() * 2];
     for (team, places) in drawn.iter().enumerate() {
         // The same world with the POIs of this team.
         config.world.pois = places[agents..].iter().map(|place| place.as_dvec2().to_array()).collect();
-        let mut alone = Stepper::new(World::new(&config.validate().unwrap()), 1).unwrap();
+        let mut alone = Stepper::new(World::new(&config.validate().unwrap()), 1, Recording::None).unwrap();
         let start: Vec<f32> = places[..agents].iter().flat_map(|place| place.to_array()).collect();
         alone.reset_to(&start).unwrap();
         together.reset_to(&flat).unwrap();

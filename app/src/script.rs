@@ -8,7 +8,7 @@ use std::f32::consts::PI;
 use serde::{Deserialize, Serialize};
 
 use flotilla::config::{Config, StageConfig};
-use flotilla::stepping::{StepError, Stepper};
+use flotilla::stepping::{Recording, StepError, Stepper};
 use flotilla::world::World;
 
 /// The places that a team's leaders drive to.
@@ -69,7 +69,7 @@ impl Script {
     /// # Errors
     /// There is too little memory, or a target is not finite, see [`Script::check`].
     pub fn play(&self, config: &StageConfig) -> Result<Vec<Option<u32>>, StepError> {
-        let mut stepper = Stepper::new(World::new(config), 1)?;
+        let mut stepper = Stepper::new(World::new(config), 1, Recording::None)?;
         let (leaders, max_speed) = (config.learners(), config.motion.max_speed as f32);
         let mut first = vec![None; config.world.pois.len()];
         while !stepper.is_over(0) {

@@ -308,7 +308,9 @@ fn baselines_with_moved_pois_are_measured_from_held_out_starts() {
     let (weights, starts, sharing) = (weights[..].into(), &world.starts, Sharing::PerLeader);
     let group = Group { world: &world, starts, weights, policies, sharing, teams: &teams, fitnesses: &[] };
     let held_out = Starts::Drawn { episodes: 30, seed: 0, jitter: 0.0, poi_jitter: 5.0 };
-    let played = evaluate::evaluate(&mut Cpu::default(), &group, &held_out, &mut |_| ()).unwrap();
+    let played =
+        evaluate::evaluate(&mut Cpu::default(), &group, &held_out, &mut |_| std::ops::ControlFlow::Continue(()))
+            .unwrap();
     let g: Vec<f64> = played.observed.iter().map(|tally| tally.mean() / world.pois.len() as f64).collect();
     for (found, g) in outcome.constants.iter().zip(&g) {
         assert!((found - g).abs() < 1e-12, "{:?} is not {g:?}", outcome.constants);

@@ -9,7 +9,7 @@ use crate::backend::{Backend, Group, GroupScores};
 use crate::config::{Config, Fitness, MAX_POPULATION, Sharing};
 use crate::evaluate::{self, Evaluation, MAX_EPISODES, Starts};
 use crate::evolve::{self, Key, Purpose};
-use crate::stepping::Stepper;
+use crate::stepping::{Recording, Stepper};
 use crate::world::{INPUTS, OUTPUTS, World};
 
 /// The scores of teams, averaged over episodes.
@@ -51,7 +51,7 @@ pub fn play(
     Ok(Played::from(&play_until(config, backend, teams, weights, starts, each)?))
 }
 
-/// Plays teams as [`play`] does, and calls `each` several times per second, see [`evaluate::evaluate_until`].
+/// Plays teams as [`play`] does, and calls `each` several times per second, see [`evaluate::evaluate`].
 ///
 /// # Errors
 /// As for [`play`].
@@ -65,7 +65,7 @@ pub fn play_until(
 ) -> Result<Evaluation, Failure> {
     let checked = CheckedTeams::new(config, teams, weights, starts)?;
     let group = Group { fitnesses: scores_of(config), ..checked.group(&checked.world.starts) };
-    Ok(evaluate::evaluate_until(backend, &group, starts, &mut |_| (), each)?)
+    Ok(evaluate::evaluate(backend, &group, starts, each)?)
 }
 
 /// Returns the fitnesses that teams of a config are scored by: Dt only if it is the config's fitness.
@@ -201,11 +201,12 @@ pub fn trace(
 /// The config is invalid, the number of teams is not allowed, or memory is insufficient.
 pub fn stepper(config: &Config, teams: usize, recording: bool) -> Result<Stepper, Failure> {
     let world = World::new(&config.validate()?);
-    Ok(match (recording, config.learning.fitness) {
-        (false, _) => Stepper::new(world, teams)?,
-        (true, Fitness::Dt) => Stepper::recording(world, teams)?.with_sights()?,
-        (true, _) => Stepper::recording(world, teams)?,
-    })
+    let recording = match (recording, config.learning.fitness) {
+        (false, _) => Recording::None,
+        (true, Fitness::Dt) => Recording::SetsAndSights,
+        (true, _) => Recording::Sets,
+    };
+    Ok(Stepper::new(world, teams, recording)?)
 }
 
 /// Teams of given policies after all checks.

@@ -5,11 +5,11 @@ use std::sync::Mutex;
 use fearless_simd::{Simd, prelude::*};
 use glam::Vec2;
 
-use crate::backend::cpu::{Agent, Block, BlockState, load_pois, to_rows, transpose_rows, with_pois};
+use crate::backend::cpu::{Agent, Block, BlockState, StepArrays, load_pois, step_sizes, transpose_rows, with_pois};
 use crate::credit::Episode;
 use crate::kernels::{clamp_to, splat};
 use crate::parallel::*;
-use crate::world::{INPUTS, OUTPUTS, World};
+use crate::world::{OUTPUTS, World};
 
 use super::state::Saved;
 
@@ -33,26 +33,23 @@ pub(super) struct Observations {
     pub(super) speeds: Vec<f32>,
 }
 
+/// A command to all vectors of teams.
+#[derive(Clone, Copy)]
+pub(super) enum Command<'a> {
+    /// Resets the `chosen` teams, `[teams]`, or all, to `starts`, `[teams][agents]`, or to the world's.
+    Reset { chosen: Option<&'a [bool]>, starts: Option<&'a [Vec2]> },
+    /// Plays a step with actions, `[teams][leaders][2]`.
+    Step(&'a [f32]),
+    /// Puts all teams into a saved state. Of the observations, only the inputs change.
+    Restore(&'a Saved<'a>),
+    /// Writes the positions, headings and speeds.
+    Show,
+}
+
 /// Vectors of teams of any instruction set.
 pub(super) trait Vectors: Send + Sync {
-    /// Resets the `chosen` teams, `[teams]`, or all, to `starts`, `[teams][agents]`, or to the world's. `moved` are
-    /// POI positions, as for [`Vectors::step`].
-    fn reset(
-        &mut self,
-        world: &World,
-        chosen: Option<&[bool]>,
-        starts: Option<&[Vec2]>,
-        moved: &[Vec2],
-        observations: &mut Observations,
-    );
-    /// Plays a step. `moved` are the POI positions, `[teams][pois]`; empty if all teams have the world's.
-    fn step(&mut self, world: &World, moved: &[Vec2], actions: &[f32], observations: &mut Observations);
-    /// Puts all teams into a saved state. Of the observations, it sets only the inputs.
-    fn restore(&mut self, world: &World, saved: &Saved<'_>, moved: &[Vec2], observations: &mut Observations);
-    /// Writes the positions, headings and speeds of all teams.
-    fn states(&mut self, world: &World, observations: &mut Observations);
-    /// Allocates a record of sightings for all steps.
-    fn keep_sights(&mut self, world: &World);
+    /// Executes a command. `moved` are the POI positions, `[teams][pois]`; empty if all teams have the world's.
+    fn run(&mut self, world: &World, moved: &[Vec2], command: Command<'_>, observations: &mut Observations);
     /// Returns the record of a team, if one is kept. `seen` is scratch memory that holds a part of it.
     fn episode<'a>(&'a self, team: usize, world: &World, seen: &'a mut Vec<u32>) -> Option<Episode<'a>>;
 }
@@ -91,11 +88,12 @@ struct TeamBlocks<S: Simd> {
     idle: Mutex<Vec<Box<Workspace<S>>>>,
 }
 
-pub(super) fn vectors<S: Simd>(simd: S, world: &World, teams: usize, record: usize) -> Box<dyn Vectors> {
+/// Returns vectors of teams that record so many words of sets and of sightings per team.
+pub(super) fn vectors<S: Simd>(simd: S, world: &World, teams: usize, [sets, sights]: [usize; 2]) -> Box<dyn Vectors> {
     let block = |first: usize| {
         let teams = S::f32s::LEN.min(teams - first);
-        let state = Block::new(simd, world).into_state(record > 0);
-        TeamBlock { first, teams, state, record: vec![0; teams * record], sights: vec![] }
+        let state = Block::new(simd, world).into_state(sets > 0);
+        TeamBlock { first, teams, state, record: vec![0; teams * sets], sights: vec![0; teams * sights] }
     };
     let blocks = (0..teams).step_by(S::f32s::LEN).map(block).collect();
     Box::new(TeamBlocks { simd, blocks, idle: Mutex::default() })
@@ -105,65 +103,34 @@ pub(super) fn vectors<S: Simd>(simd: S, world: &World, teams: usize, record: usi
 pub(super) const VECTORS_PER_TASK: usize = 8;
 
 impl<S: Simd> Vectors for TeamBlocks<S> {
-    fn reset(
-        &mut self,
-        world: &World,
-        chosen: Option<&[bool]>,
-        starts: Option<&[Vec2]>,
-        moved: &[Vec2],
-        observations: &mut Observations,
-    ) {
-        let simd = self.simd;
-        self.each(world, observations, &|workspace, block, observations| {
-            simd.vectorize(
-                #[inline(always)]
-                || {
-                    workspace.move_pois(simd, world, moved, block.first, block.teams);
-                    workspace.reset(simd, world, block, chosen, starts, observations);
-                },
-            );
-        });
-    }
-
-    fn step(&mut self, world: &World, moved: &[Vec2], actions: &[f32], observations: &mut Observations) {
-        let simd = self.simd;
-        self.each(world, observations, &|workspace, block, observations| {
-            simd.vectorize(
-                #[inline(always)]
-                || {
-                    workspace.move_pois(simd, world, moved, block.first, block.teams);
-                    workspace.step(simd, world, block, actions, observations);
-                },
-            );
-        });
-    }
-
-    fn restore(&mut self, world: &World, saved: &Saved<'_>, moved: &[Vec2], observations: &mut Observations) {
-        let simd = self.simd;
-        self.each(world, observations, &|workspace, block, observations| {
-            simd.vectorize(
-                #[inline(always)]
-                || {
-                    workspace.move_pois(simd, world, moved, block.first, block.teams);
-                    workspace.restore(simd, world, block, saved, observations.inputs);
-                },
-            );
-        });
-    }
-
-    fn states(&mut self, world: &World, observations: &mut Observations) {
-        let simd = self.simd;
-        self.each(world, observations, &|_, block, observations| {
-            simd.vectorize(
-                #[inline(always)]
-                || show(simd, &block.state.agents, observations),
-            );
-        });
-    }
-
-    fn keep_sights(&mut self, world: &World) {
-        for block in &mut self.blocks {
-            block.sights = vec![0; block.teams * world.sight_words()];
+    fn run(&mut self, world: &World, moved: &[Vec2], command: Command<'_>, observations: &mut Observations) {
+        let (simd, idle) = (self.simd, &self.idle);
+        let Observations { inputs, agents_at_poi, newly, observed, steps, positions, headings, speeds } = observations;
+        let mut all = StepArrays { positions, headings, speeds, inputs, agents_at_poi, ..StepArrays::default() };
+        let (sizes, pois) = (step_sizes(world, 1, 1), world.pois.len());
+        let flags = newly.chunks_mut(pois * S::f32s::LEN).zip(observed.chunks_mut(pois * S::f32s::LEN));
+        let flags = flags.zip(steps.chunks_mut(S::f32s::LEN));
+        let mut parts: Vec<_> = (self.blocks.iter_mut().zip(flags))
+            .map(|(block, ((newly, observed), steps))| {
+                let arrays = all.split(sizes, block.teams);
+                (block, Slices { arrays, newly, observed, steps })
+            })
+            .collect();
+        let run = |parts: &mut [(&mut TeamBlock<S>, Slices<'_>)]| {
+            let workspace = lock(idle).pop();
+            let mut workspace = workspace.unwrap_or_else(|| Box::new(Workspace::new(simd, world)));
+            for (block, slices) in parts {
+                simd.vectorize(
+                    #[inline(always)]
+                    || workspace.run(simd, world, moved, block, command, slices),
+                );
+            }
+            lock(idle).push(workspace);
+        };
+        match parts.len() {
+            // Waking other threads would take longer.
+            ..=VECTORS_PER_TASK => run(&mut parts),
+            _ => parts.par_chunks_mut(VECTORS_PER_TASK).for_each(run),
         }
     }
 
@@ -178,86 +145,12 @@ impl<S: Simd> Vectors for TeamBlocks<S> {
     }
 }
 
-impl<S: Simd> TeamBlocks<S> {
-    /// Calls `act` with every vector, on all threads.
-    fn each(
-        &mut self,
-        world: &World,
-        observations: &mut Observations,
-        act: &(impl Fn(&mut Workspace<S>, &mut TeamBlock<S>, Slices<'_>) + Sync),
-    ) {
-        let (simd, blocks, idle) = (self.simd, &mut self.blocks, &self.idle);
-        View::new(blocks, observations).each(world, &|blocks, mut observations| {
-            let workspace = lock(idle).pop();
-            let mut workspace = workspace.unwrap_or_else(|| Box::new(Workspace::new(simd, world)));
-            for block in blocks {
-                let own = observations.split(block.teams, world);
-                act(&mut workspace, block, own);
-            }
-            lock(idle).push(workspace);
-        });
-    }
-}
-
-/// Some vectors of teams, and what is shown of them.
-struct View<'a, S: Simd> {
-    blocks: &'a mut [TeamBlock<S>],
-    observations: Slices<'a>,
-}
-
-/// The [`Observations`] of some teams.
+/// The [`Observations`] of one vector of teams.
 struct Slices<'a> {
-    inputs: &'a mut [f32],
-    agents_at_poi: &'a mut [u32],
+    arrays: StepArrays<'a>,
     newly: &'a mut [bool],
     observed: &'a mut [bool],
     steps: &'a mut [u32],
-    positions: &'a mut [f32],
-    headings: &'a mut [f32],
-    speeds: &'a mut [f32],
-}
-
-impl<'a, S: Simd> View<'a, S> {
-    fn new(blocks: &'a mut [TeamBlock<S>], observations: &'a mut Observations) -> View<'a, S> {
-        let Observations { inputs, agents_at_poi, newly, observed, steps, positions, headings, speeds } = observations;
-        View {
-            blocks,
-            observations: Slices { inputs, agents_at_poi, newly, observed, steps, positions, headings, speeds },
-        }
-    }
-
-    /// Calls `act` with a few vectors at a time, on all threads.
-    fn each(self, world: &World, act: &(impl Fn(&'a mut [TeamBlock<S>], Slices<'a>) + Sync)) {
-        let View { blocks, mut observations } = self;
-        if blocks.len() > VECTORS_PER_TASK {
-            let (low, high) = blocks.split_at_mut(blocks.len() / 2);
-            let first = observations.split(low.len() * S::f32s::LEN, world);
-            let (low, high) = (View { blocks: low, observations: first }, View { blocks: high, observations });
-            join(|| low.each(world, act), || high.each(world, act));
-        } else {
-            act(blocks, observations);
-        }
-    }
-}
-
-impl<'a> Slices<'a> {
-    /// Splits off the first teams.
-    fn split(&mut self, teams: usize, world: &World) -> Slices<'a> {
-        let (agents, pois) = (world.agents(), world.pois.len());
-        Slices {
-            inputs: self.inputs.split_off_mut(..teams * world.leaders() * INPUTS).unwrap_or_default(),
-            agents_at_poi: self
-                .agents_at_poi
-                .split_off_mut(..teams * pois * world.constants.words as usize)
-                .unwrap_or_default(),
-            newly: self.newly.split_off_mut(..teams * pois).unwrap_or_default(),
-            observed: self.observed.split_off_mut(..teams * pois).unwrap_or_default(),
-            steps: self.steps.split_off_mut(..teams).unwrap_or_default(),
-            positions: self.positions.split_off_mut(..teams * agents * 2).unwrap_or_default(),
-            headings: self.headings.split_off_mut(..teams * agents * 2).unwrap_or_default(),
-            speeds: self.speeds.split_off_mut(..teams * agents).unwrap_or_default(),
-        }
-    }
 }
 
 /// Returns the team in a lane. Unused lanes repeat the first team.
@@ -274,7 +167,7 @@ fn lanes<S: Simd>(teams: usize) -> impl Iterator<Item = (usize, usize)> {
 
 impl<S: Simd> Workspace<S> {
     fn new(simd: S, world: &World) -> Workspace<S> {
-        let sets = vec![0; world.pois.len() * world.constants.words as usize * S::f32s::LEN];
+        let sets = vec![0; world.words_per_step() * S::f32s::LEN];
         let sights = vec![0; world.followers() * world.leader_words() * S::f32s::LEN];
         Workspace { block: Block::new(simd, world), sets, sights, kept: Default::default(), moved: vec![] }
     }
@@ -292,11 +185,39 @@ impl<S: Simd> Workspace<S> {
         );
     }
 
+    /// Executes a command for one vector of teams.
     #[inline(always)]
-    fn restore(&mut self, simd: S, world: &World, block: &mut TeamBlock<S>, saved: &Saved<'_>, inputs: &mut [f32]) {
-        let TeamBlock { first, teams, ref mut state, ref mut record, ref mut sights } = *block;
+    fn run(
+        &mut self,
+        simd: S,
+        world: &World,
+        moved: &[Vec2],
+        block: &mut TeamBlock<S>,
+        command: Command<'_>,
+        slices: &mut Slices<'_>,
+    ) {
+        self.move_pois(simd, world, moved, block.first, block.teams);
+        self.block.swap(&mut block.state);
+        let has_changed = match command {
+            Command::Reset { chosen, starts } => self.reset(world, block, chosen, starts, slices),
+            Command::Step(actions) => self.step(simd, world, block, actions, slices),
+            Command::Restore(saved) => self.restore(world, block, saved),
+            Command::Show => {
+                slices.arrays.write_states(simd, &self.block.agents, (0, 1));
+                false
+            }
+        };
+        if has_changed {
+            with_pois!(self.moved, world, pois => self.block.sense(pois));
+            slices.arrays.write_inputs(&self.block, (0, 1));
+        }
+        self.block.swap(&mut block.state);
+    }
+
+    #[inline(always)]
+    fn restore(&mut self, world: &World, block: &mut TeamBlock<S>, saved: &Saved<'_>) -> bool {
+        let TeamBlock { first, teams, ref mut record, ref mut sights, .. } = *block;
         let (agents, pairs) = (world.agents(), world.followers() * world.leaders());
-        self.block.swap(state);
         for (lane, team) in lanes::<S>(teams) {
             let at = (first + team) * agents;
             for (agent, index) in self.block.agents.iter_mut().zip(at..) {
@@ -312,28 +233,25 @@ impl<S: Simd> Workspace<S> {
         let (size, seen) = (record.len() / teams, sights.len() / teams);
         record.copy_from_slice(&saved.record[first * size..][..teams * size]);
         sights.copy_from_slice(&saved.sights[first * seen..][..teams * seen]);
-        self.sense(simd, world, inputs);
-        self.block.swap(state);
+        true
     }
 
+    /// Returns whether any team is chosen.
     #[inline(always)]
     fn reset(
         &mut self,
-        simd: S,
         world: &World,
         block: &mut TeamBlock<S>,
         chosen: Option<&[bool]>,
         starts: Option<&[Vec2]>,
-        observations: Slices<'_>,
-    ) {
-        let Slices { inputs, agents_at_poi, newly, observed, steps, .. } = observations;
-        let (agents, pois, words) = (world.agents(), world.pois.len(), world.constants.words as usize);
-        let TeamBlock { first, teams, ref mut state, ref mut record, ref mut sights } = *block;
+        Slices { arrays, newly, observed, steps }: &mut Slices<'_>,
+    ) -> bool {
+        let (agents, pois, words) = (world.agents(), world.pois.len(), world.words_per_step());
+        let TeamBlock { first, teams, ref mut record, ref mut sights, .. } = *block;
         let is_chosen = |team: usize| chosen.is_none_or(|chosen| chosen[team]);
         if !(first..first + teams).any(is_chosen) {
-            return;
+            return false;
         }
-        self.block.swap(state);
         let all = (first..first + teams).all(is_chosen);
         if all {
             self.block.start();
@@ -348,53 +266,55 @@ impl<S: Simd> Workspace<S> {
         }
         let (size, seen) = (record.len() / teams, sights.len() / teams);
         for team in (0..teams).filter(|team| is_chosen(first + team)) {
-            agents_at_poi[team * pois * words..][..pois * words].fill(0);
+            arrays.agents_at_poi[team * words..][..words].fill(0);
             newly[team * pois..][..pois].fill(false);
             observed[team * pois..][..pois].fill(false);
             steps[team] = 0;
             record[team * size..][..size].fill(0);
             sights[team * seen..][..seen].fill(0);
         }
-        self.sense(simd, world, inputs);
-        self.block.swap(state);
+        true
     }
 
+    /// Returns whether any team still plays.
     #[inline(always)]
-    fn step(&mut self, simd: S, world: &World, block: &mut TeamBlock<S>, actions: &[f32], observations: Slices<'_>) {
-        let Slices { inputs, agents_at_poi, newly, observed, steps, .. } = observations;
+    fn step(
+        &mut self,
+        simd: S,
+        world: &World,
+        block: &mut TeamBlock<S>,
+        actions: &[f32],
+        Slices { arrays, newly, observed, steps }: &mut Slices<'_>,
+    ) -> bool {
         let last = world.constants.steps;
-        let playing = (0..).zip(&*steps).map(|(team, &step)| u64::from(step < last) << team).sum::<u64>();
+        let playing = (0..).zip(&**steps).map(|(team, &step)| u64::from(step < last) << team).sum::<u64>();
         newly.fill(false);
-        let TeamBlock { first, teams, ref mut state, ref mut record, ref mut sights } = *block;
+        let TeamBlock { first, teams, ref mut record, ref mut sights, .. } = *block;
         if playing == 0 {
-            return;
+            return false;
         }
-        self.block.swap(state);
         self.take(simd, world, &actions[first * world.leaders() * OUTPUTS..], teams);
-        if !sights.is_empty() {
-            self.record_sightings(world, steps, sights);
-        }
-        if playing.count_ones() as usize == teams {
-            self.block.advance();
-        } else {
+        let is_partial = (playing.count_ones() as usize) < teams;
+        if is_partial {
             let (agents, counts) = &mut self.kept;
             agents.clone_from(&self.block.agents);
             counts.clone_from(&self.block.counts);
-            self.block.advance();
-            lanes::<S>(teams).filter(|&(_, team)| steps[team] >= last).for_each(|(lane, _)| self.keep(lane));
         }
-        with_pois!(self.moved, world, pois => self.block.record_poi_sets(pois, &mut self.sets));
-        let (pois, words) = (world.pois.len(), world.constants.words as usize);
-        let width = S::f32s::LEN;
-        let sets = bytemuck::cast_slice::<u32, f32>(&self.sets);
-        to_rows(
-            simd,
-            pois * words,
-            (0, 1),
-            bytemuck::cast_slice_mut(agents_at_poi),
-            #[inline(always)]
-            |column| &sets[column * width..][..width],
-        );
+        let seen = if sights.is_empty() { &mut [][..] } else { &mut self.sights };
+        with_pois!(self.moved, world, pois => {
+            self.block.step(pois, seen, &mut self.sets);
+            if is_partial {
+                for (lane, _) in lanes::<S>(teams).filter(|&(_, team)| steps[team] >= last) {
+                    keep(&mut self.block, &self.kept, lane);
+                }
+                self.block.record_poi_sets(pois, &mut self.sets);
+            }
+        });
+        arrays.write_sets(simd, &self.sets, (0, 1));
+        if !sights.is_empty() {
+            self.record_sightings(world, steps, sights);
+        }
+        let (pois, words, width) = (world.pois.len(), world.constants.words as usize, S::f32s::LEN);
         // A POI that this step observes opens another one from the next step on.
         let rule = &world.rule;
         for (poi, (sets, &coupling)) in self.sets.chunks_exact(words * width).zip(&world.coupling).enumerate() {
@@ -409,23 +329,21 @@ impl<S: Simd> Workspace<S> {
                 enough &= enough - 1;
             }
         }
-        observed.iter_mut().zip(newly).for_each(|(observed, newly)| *observed |= *newly);
+        observed.iter_mut().zip(&**newly).for_each(|(observed, newly)| *observed |= *newly);
         if !record.is_empty() {
             let size = pois * words;
             for (team, &step) in steps.iter().enumerate().filter(|(_, step)| **step < last) {
                 let at = team * world.set_words() + step as usize * size;
-                record[at..at + size].copy_from_slice(&agents_at_poi[team * size..][..size]);
+                record[at..at + size].copy_from_slice(&arrays.agents_at_poi[team * size..][..size]);
             }
         }
         steps.iter_mut().for_each(|step| *step = last.min(*step + 1));
-        self.sense(simd, world, inputs);
-        self.block.swap(state);
+        true
     }
 
-    /// Records which leaders each follower sees before this step, for teams whose episode is not over.
+    /// Records which leaders each follower saw before this step, for teams whose episode is not over.
     #[inline(always)]
-    fn record_sightings(&mut self, world: &World, steps: &[u32], sights: &mut [u32]) {
-        self.block.record_sightings(&mut self.sights);
+    fn record_sightings(&self, world: &World, steps: &[u32], sights: &mut [u32]) {
         let size = world.followers() * world.leader_words();
         for (team, &step) in steps.iter().enumerate().filter(|(_, step)| **step < world.constants.steps) {
             let to = &mut sights[team * world.sight_words() + step as usize * size..][..size];
@@ -452,65 +370,21 @@ impl<S: Simd> Workspace<S> {
             *output = clamp_to::<S>(*output, splat(simd, -1.0), splat(simd, 1.0));
         }
     }
-
-    /// Restores a lane's state from before the step.
-    #[inline(always)]
-    fn keep(&mut self, lane: usize) {
-        let (agents, counts) = &self.kept;
-        for (agent, kept) in self.block.agents.iter_mut().zip(agents) {
-            agent.x[lane] = kept.x[lane];
-            agent.y[lane] = kept.y[lane];
-            agent.hx[lane] = kept.hx[lane];
-            agent.hy[lane] = kept.hy[lane];
-            agent.speed[lane] = kept.speed[lane];
-        }
-        for (count, kept) in self.block.counts.iter_mut().zip(counts) {
-            count[lane] = kept[lane];
-        }
-    }
-
-    #[inline(always)]
-    fn sense(&mut self, simd: S, world: &World, inputs: &mut [f32]) {
-        with_pois!(self.moved, world, pois => self.block.sense(pois));
-        let columns = self.block.inputs.as_flattened();
-        to_rows(
-            simd,
-            columns.len(),
-            (0, 1),
-            inputs,
-            #[inline(always)]
-            |column| columns[column].as_slice(),
-        );
-    }
 }
 
-/// Writes all positions, headings and speeds.
+/// Restores a lane's agents and counts from before the step.
 #[inline(always)]
-fn show<S: Simd>(simd: S, agents: &[Agent<S>], observations: Slices<'_>) {
-    to_rows(
-        simd,
-        2 * agents.len(),
-        (0, 1),
-        observations.positions,
-        #[inline(always)]
-        |column| if column % 2 == 0 { agents[column / 2].x.as_slice() } else { agents[column / 2].y.as_slice() },
-    );
-    to_rows(
-        simd,
-        2 * agents.len(),
-        (0, 1),
-        observations.headings,
-        #[inline(always)]
-        |column| if column % 2 == 0 { agents[column / 2].hx.as_slice() } else { agents[column / 2].hy.as_slice() },
-    );
-    to_rows(
-        simd,
-        agents.len(),
-        (0, 1),
-        observations.speeds,
-        #[inline(always)]
-        |column| agents[column].speed.as_slice(),
-    );
+fn keep<S: Simd>(block: &mut Block<S>, (agents, counts): &(Vec<Agent<S>>, Vec<S::u32s>), lane: usize) {
+    for (agent, kept) in block.agents.iter_mut().zip(agents) {
+        agent.x[lane] = kept.x[lane];
+        agent.y[lane] = kept.y[lane];
+        agent.hx[lane] = kept.hx[lane];
+        agent.hy[lane] = kept.hy[lane];
+        agent.speed[lane] = kept.speed[lane];
+    }
+    for (count, kept) in block.counts.iter_mut().zip(counts) {
+        count[lane] = kept[lane];
+    }
 }
 
 /// Counts the set bits of each lane.

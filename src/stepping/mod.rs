@@ -4,10 +4,10 @@
 //! Given a policy's own outputs, it returns the bits of [`Backend::trace`](crate::backend::Backend::trace).
 //!
 //! ```
-//! use flotilla::{config::Config, stepping::Stepper, world::World};
+//! use flotilla::{config::Config, stepping::{Recording, Stepper}, world::World};
 //!
 //! let config = Config::parse(include_str!("../../configs/generally_forward.toml"), "generally_forward.toml")?;
-//! let mut stepper = Stepper::new(World::new(&config.validate()?), 64)?;
+//! let mut stepper = Stepper::new(World::new(&config.validate()?), 64, Recording::None)?;
 //! // Every leader of every team straight ahead at full speed: [teams][leaders][2].
 //! let ahead = [0.0, 1.0].repeat(64 * stepper.world().leaders());
 //! while !stepper.is_over(0) {
@@ -31,7 +31,7 @@ use crate::world::{GRID, INPUTS, OUTPUTS, World, on_grid};
 mod engine;
 mod state;
 
-use engine::{Observations, VECTORS_PER_TASK, Vectors, vectors};
+use engine::{Command, Observations, VECTORS_PER_TASK, Vectors, vectors};
 
 /// Teams of one world, each at its own step.
 ///
@@ -43,6 +43,17 @@ pub struct Stepper {
     observations: Observations,
     /// Each team's POI positions, `[teams][pois]`; empty if all teams have the world's.
     moved: Vec<Vec2>,
+}
+
+/// What a stepper records of every step.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Recording {
+    /// Nothing.
+    None,
+    /// Who is at which POI, for [`Stepper::scores`] and [`Stepper::fitness`].
+    Sets,
+    /// Also which leaders each follower sees, for Dt.
+    SetsAndSights,
 }
 
 /// The state of all agents.
@@ -125,37 +136,30 @@ pub enum StepError {
         /// The number of teams.
         teams: usize,
     },
-    /// Scores need a record, see [`Stepper::recording`].
-    #[error("no record to score; create the stepper with `Stepper::recording`")]
+    /// Scores need a record, see [`Recording`].
+    #[error("no record to score; create the stepper with `Recording::Sets`")]
     NotRecorded,
-    /// Dt needs a record of sightings, see [`Stepper::with_sights`].
-    #[error("no record of who saw whom at which step, which Dt needs; create the stepper with `with_sights`")]
+    /// Dt needs a record of sightings, see [`Recording`].
+    #[error(
+        "no record of who saw whom at which step, which Dt needs; create the stepper with `Recording::SetsAndSights`"
+    )]
     NotSeen,
 }
 
 impl Stepper {
-    /// Creates teams at the world's start, without a record.
+    /// Creates teams at the world's start.
     ///
     /// # Errors
     /// The number of teams is 0 or above [`MAX_POPULATION`], or there is too little memory.
-    pub fn new(world: World, teams: usize) -> Result<Stepper, StepError> {
-        Stepper::at_level(Level::new(), world, teams, false)
+    pub fn new(world: World, teams: usize, recording: Recording) -> Result<Stepper, StepError> {
+        Stepper::at_level(Level::new(), world, teams, recording)
     }
 
-    /// Creates teams at the world's start that record who is at which POI at which step. [`Stepper::scores`] and
-    /// [`Stepper::fitness`] need that.
+    /// [`Stepper::new`] with a given instruction set, for tests and benchmarks.
     ///
     /// # Errors
-    /// The number of teams is 0 or above [`MAX_POPULATION`], or there is too little memory.
-    pub fn recording(world: World, teams: usize) -> Result<Stepper, StepError> {
-        Stepper::at_level(Level::new(), world, teams, true)
-    }
-
-    /// [`Stepper::new`] or [`Stepper::recording`] with a given instruction set, for tests and benchmarks.
-    ///
-    /// # Errors
-    /// The number of teams is 0 or above [`MAX_POPULATION`], or there is too little memory.
-    pub fn at_level(level: Level, world: World, teams: usize, recording: bool) -> Result<Stepper, StepError> {
+    /// See [`Stepper::new`].
+    pub fn at_level(level: Level, world: World, teams: usize, recording: Recording) -> Result<Stepper, StepError> {
         if !(1..=MAX_POPULATION).contains(&teams) {
             return Err(StepError::Teams(teams));
         }
@@ -163,15 +167,17 @@ impl Stepper {
         let words = world.constants.words as usize;
         // Probed first, because a failing allocation below would abort. Counts a team's numbers, both in the vectors and
         // as shown.
-        let record = if recording { world.set_words() } else { 0 };
+        let [sets, sights] = match recording {
+            Recording::None => [0, 0],
+            Recording::Sets => [world.set_words(), 0],
+            Recording::SetsAndSights => [world.set_words(), world.sight_words()],
+        };
         let in_vectors = agents * 6 + leaders * (INPUTS + OUTPUTS) + world.followers() * (11 + leaders) + pois * words;
-        let numbers = in_vectors + record + leaders * INPUTS + agents * 5 + pois * (words + 1) + 1;
+        let numbers = in_vectors + sets + sights + leaders * INPUTS + agents * 5 + pois * (words + 1) + 1;
         let bytes = numbers as u128 * 4 * teams as u128;
-        usize::try_from(bytes)
-            .ok()
-            .and_then(|bytes| Vec::<u8>::new().try_reserve_exact(bytes).ok())
-            .ok_or(StepError::Memory { teams, bytes })?;
-        let vectors = dispatch!(level, simd => vectors(simd, &world, teams, record));
+        let probe = usize::try_from(bytes).ok().and_then(|bytes| Vec::<u8>::new().try_reserve_exact(bytes).ok());
+        probe.ok_or(StepError::Memory { teams, bytes })?;
+        let vectors = dispatch!(level, simd => vectors(simd, &world, teams, [sets, sights]));
         let observations = Observations {
             inputs: vec![0.0; teams * leaders * INPUTS],
             agents_at_poi: vec![0; teams * pois * words],
@@ -187,22 +193,6 @@ impl Stepper {
         Ok(stepper)
     }
 
-    /// Resets all teams, and records which leaders each follower sees at each step, which Dt needs.
-    ///
-    /// # Errors
-    /// There is too little memory.
-    pub fn with_sights(mut self) -> Result<Stepper, StepError> {
-        let teams = self.teams();
-        let bytes = self.world.sight_words() as u128 * 4 * teams as u128;
-        usize::try_from(bytes)
-            .ok()
-            .and_then(|bytes| Vec::<u8>::new().try_reserve_exact(bytes).ok())
-            .ok_or(StepError::Memory { teams, bytes })?;
-        self.vectors.keep_sights(&self.world);
-        self.reset();
-        Ok(self)
-    }
-
     /// Returns the world.
     pub fn world(&self) -> &World {
         &self.world
@@ -216,7 +206,7 @@ impl Stepper {
     /// Resets all teams to the world's start.
     pub fn reset(&mut self) {
         self.moved.clear();
-        self.vectors.reset(&self.world, None, None, &self.moved, &mut self.observations);
+        self.run(Command::Reset { chosen: None, starts: None });
     }
 
     /// Resets all teams to given start positions, `[teams][agents][2]`, or `[teams][agents + pois][2]` with POI
@@ -228,7 +218,7 @@ impl Stepper {
     pub fn reset_to(&mut self, starts: &[f32]) -> Result<(), StepError> {
         let (starts, pois) = self.checked(starts, None)?;
         self.moved = pois;
-        self.vectors.reset(&self.world, None, Some(&starts), &self.moved, &mut self.observations);
+        self.run(Command::Reset { chosen: None, starts: Some(&starts) });
         Ok(())
     }
 
@@ -249,7 +239,7 @@ impl Stepper {
             moved.copy_from_slice(given.get(team * pois..(team + 1) * pois).unwrap_or(&self.world.pois));
         }
         let starts = starts.as_ref().map(|(starts, _)| &starts[..]);
-        self.vectors.reset(&self.world, Some(chosen), starts, &self.moved, &mut self.observations);
+        self.run(Command::Reset { chosen: Some(chosen), starts });
         Ok(())
     }
 
@@ -278,7 +268,7 @@ impl Stepper {
                 value: actions[index],
             });
         }
-        self.vectors.step(&self.world, &self.moved, actions, &mut self.observations);
+        self.run(Command::Step(actions));
         Ok(())
     }
 
@@ -323,12 +313,12 @@ impl Stepper {
 
     /// Computes the state of all agents.
     pub fn states(&mut self) -> States<'_> {
-        self.vectors.states(&self.world, &mut self.observations);
+        self.run(Command::Show);
         let Observations { positions, headings, speeds, .. } = &self.observations;
         States { positions, headings, speeds }
     }
 
-    /// Returns every fitness of a team's episode so far. Dt needs a [record of sightings](Stepper::with_sights), unless
+    /// Returns every fitness of a team's episode so far. Dt needs a [record of sightings](Recording::SetsAndSights), unless
     /// there are no followers.
     ///
     /// # Errors
@@ -362,6 +352,10 @@ impl Stepper {
                 })
             },
         )
+    }
+
+    fn run(&mut self, command: Command<'_>) {
+        self.vectors.run(&self.world, &self.moved, command, &mut self.observations);
     }
 
     fn check_length(

@@ -2,7 +2,7 @@
 
 use glam::Vec2;
 
-use super::{StepError, Stepper};
+use super::{Command, StepError, Stepper};
 use crate::world::World;
 
 /// The first word of a saved state, which names the format and its version.
@@ -44,7 +44,7 @@ impl<'a> Words<'a> {
 impl Stepper {
     /// Returns the state of all teams, for [`Stepper::restore`]. It is the same on every instruction set.
     pub fn save(&mut self) -> Vec<u8> {
-        self.vectors.states(&self.world, &mut self.observations);
+        self.run(Command::Show);
         let (header, observations) = (self.header(self.moved.len() / self.teams()), &self.observations);
         let mut words = header.to_vec();
         for numbers in [&observations.positions, &observations.headings, &observations.speeds] {
@@ -113,7 +113,7 @@ impl Stepper {
         self.observations.newly.iter_mut().zip(newly).for_each(|(to, &flag)| *to = flag == 1);
         self.observations.observed.iter_mut().zip(observed).for_each(|(to, &flag)| *to = flag == 1);
         self.observations.steps.copy_from_slice(steps);
-        self.vectors.restore(&self.world, &saved, &self.moved, &mut self.observations);
+        self.run(Command::Restore(&saved));
         Ok(())
     }
 

@@ -168,9 +168,11 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         fitnesses: if request.scores.is_some() { evaluate::SCORES_AND_DT } else { evaluate::SCORES },
     };
     let playing = format!("playing {}", counted(policies.policies, starts.episodes()));
-    let share = &mut |part| context.fraction(part, &playing);
-    let until = &mut |_: Batch<'_>| if context.is_stopped() { Break(()) } else { Continue(()) };
-    let evaluation = evaluate::evaluate_until(&mut **backend, &group, &starts, share, until);
+    let each = &mut |batch: Batch<'_>| {
+        context.fraction(batch.share, &playing);
+        if context.is_stopped() { Break(()) } else { Continue(()) }
+    };
+    let evaluation = evaluate::evaluate(&mut **backend, &group, &starts, each);
     context.pause();
     let evaluation = evaluation?;
     context.check_not_stopped()?;

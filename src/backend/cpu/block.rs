@@ -16,7 +16,7 @@ use crate::world::{INPUTS, OUTPUTS, World};
 /// The state of one vector of teams, one team per lane, with scratch memory for a step. A step reads only the
 /// previous state.
 pub(crate) struct Block<S: Simd> {
-    pub(super) simd: S,
+    pub simd: S,
     pub(super) world: Lanes<S>,
     /// `[agents]`, leaders first.
     pub agents: Vec<Agent<S>>,
@@ -125,12 +125,17 @@ impl<S: Simd> Block<S> {
         self.world.constants.variant.density().dispatch(Sensing { block: self, pois });
     }
 
-    /// Moves all agents: leaders by their policies' outputs, followers by the agents near them.
+    /// Plays a step by the leaders' outputs. Writes which leaders each follower sees before it moves, unless `sights` is
+    /// empty, and the agents at each POI after it, see [`Block::record_sightings`] and [`Block::record_poi_sets`].
     #[inline(always)]
-    pub fn advance(&mut self) {
+    pub fn step(&mut self, pois: &[impl PoiPosition<S>], sights: &mut [u32], sets: &mut [u32]) {
+        if !sights.is_empty() {
+            self.record_sightings(sights);
+        }
         self.lead();
         self.follow();
         self.move_agents();
+        self.record_poi_sets(pois, sets);
     }
 
     #[inline(always)]

@@ -95,12 +95,8 @@ impl<S: Simd> EpisodeBlock<S> {
             block.sense(pois);
             network.decide(&block.inputs, &mut block.outputs);
             observer.decided(block, step);
-            if sights_per_step > 0 {
-                block.record_sightings(&mut sights[step * sights_per_step..]);
-            }
-            block.advance();
             let sets = &mut sets[step * sets_per_step..][..sets_per_step];
-            block.record_poi_sets(pois, sets);
+            block.step(pois, &mut sights[step * sights_per_step..][..sights_per_step], sets);
             observer.moved(block, sets, step);
         });
         for (words, count) in seen.chunks_exact_mut(S::f32s::LEN).zip(&block.counts) {

@@ -28,12 +28,12 @@ mod steps;
 mod transpose;
 
 pub(crate) use agent::Agent;
-pub use forward::forward;
-pub use steps::{Noise, StepArrays};
-
 pub(crate) use block::{Block, BlockState};
+pub use forward::forward;
 pub(crate) use pois::{load_pois, with_pois};
-pub(crate) use transpose::{to_rows, transpose_rows};
+pub(crate) use steps::step_sizes;
+pub use steps::{Noise, StepArrays};
+pub(crate) use transpose::transpose_rows;
 
 use batch::{WorldBatch, world_batches};
 use episode::{EpisodeBlock, Observer, sight_words};

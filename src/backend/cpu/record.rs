@@ -11,7 +11,7 @@ use crate::model::{Lanes, couple, follow};
 impl<S: Simd> Block<S> {
     /// Writes which leaders each follower sees, one bit per leader, `[followers][words of leaders][lanes]`.
     #[inline(always)]
-    pub fn record_sightings(&self, sights: &mut [u32]) {
+    pub(super) fn record_sightings(&self, sights: &mut [u32]) {
         let Block { simd, world, agents, .. } = self;
         let (leaders, followers) = agents.split_at(world.constants.leaders as usize);
         let pairs = followers.iter().flat_map(|follower| leaders.chunks(32).map(move |leaders| (follower, leaders)));

@@ -2,6 +2,7 @@
 
 use fearless_simd::{Simd, dispatch, prelude::*};
 
+use super::agent::Agent;
 use super::batch::{WorldBatch, world_batches};
 use super::block::Block;
 use super::episode::{EpisodeBlock, Observer};
@@ -37,13 +38,11 @@ pub struct StepArrays<'a> {
     pub observed_at: &'a mut [u32],
 }
 
-/// Numbers that one team has in each of [`StepArrays`], in their order.
-fn step_sizes(world: &World) -> [usize; 8] {
-    let (agents, steps) = (world.agents(), world.steps());
-    let leaders = steps * world.leaders();
-    let states = (steps + 1) * agents;
-    let (inputs, outputs) = (leaders * INPUTS, leaders * OUTPUTS);
-    [states * 2, states * 2, states, inputs, outputs, outputs, world.set_words(), world.pois.len()]
+/// Numbers that one team has in each of [`StepArrays`], in their order, with so many states and steps.
+pub(crate) fn step_sizes(world: &World, states: usize, steps: usize) -> [usize; 8] {
+    let (states, leaders) = (states * world.agents(), steps * world.leaders());
+    let (inputs, outputs, sets) = (leaders * INPUTS, leaders * OUTPUTS, steps * world.words_per_step());
+    [states * 2, states * 2, states, inputs, outputs, outputs, sets, world.pois.len()]
 }
 
 /// Normal noise on the actions of leaders.
@@ -67,7 +66,7 @@ impl<'a> StepArrays<'a> {
     }
 
     /// Splits off the first teams. Empty arrays stay empty.
-    fn split(&mut self, sizes: [usize; 8], teams: usize) -> StepArrays<'a> {
+    pub(crate) fn split(&mut self, sizes: [usize; 8], teams: usize) -> StepArrays<'a> {
         let [positions, headings, speeds, inputs, outputs, actions, agents_at_poi, observed_at] =
             sizes.map(|size| size * teams);
         StepArrays {
@@ -81,6 +80,71 @@ impl<'a> StepArrays<'a> {
             observed_at: self.observed_at.split_off_mut(..observed_at).unwrap_or_default(),
         }
     }
+}
+
+/// Writes the quantities of one vector of teams to row `row` of each team's `rows` rows.
+impl StepArrays<'_> {
+    /// Writes positions, headings and speeds.
+    #[inline(always)]
+    pub(crate) fn write_states<S: Simd>(&mut self, simd: S, all: &[Agent<S>], row: (usize, usize)) {
+        let agents = all.len();
+        to_rows(
+            simd,
+            agents * 2,
+            row,
+            self.positions,
+            #[inline(always)]
+            |column| if column % 2 == 0 { all[column / 2].x.as_slice() } else { all[column / 2].y.as_slice() },
+        );
+        to_rows(
+            simd,
+            agents * 2,
+            row,
+            self.headings,
+            #[inline(always)]
+            |column| if column % 2 == 0 { all[column / 2].hx.as_slice() } else { all[column / 2].hy.as_slice() },
+        );
+        to_rows(
+            simd,
+            agents,
+            row,
+            self.speeds,
+            #[inline(always)]
+            |column| all[column].speed.as_slice(),
+        );
+    }
+
+    /// Writes what the leaders sense.
+    #[inline(always)]
+    pub(crate) fn write_inputs<S: Simd>(&mut self, block: &Block<S>, row: (usize, usize)) {
+        write_columns(block.simd, block.inputs.as_flattened(), row, self.inputs);
+    }
+
+    /// Writes the agents at each POI, `[pois][words][lanes]`.
+    #[inline(always)]
+    pub(crate) fn write_sets<S: Simd>(&mut self, simd: S, sets: &[u32], row: (usize, usize)) {
+        let (sets, to) = (bytemuck::cast_slice(sets), bytemuck::cast_slice_mut(self.agents_at_poi));
+        to_rows(
+            simd,
+            sets.len() / S::f32s::LEN,
+            row,
+            to,
+            #[inline(always)]
+            |column| &sets[column * S::f32s::LEN..][..S::f32s::LEN],
+        );
+    }
+}
+
+#[inline(always)]
+fn write_columns<S: Simd>(simd: S, columns: &[S::f32s], row: (usize, usize), to: &mut [f32]) {
+    to_rows(
+        simd,
+        columns.len(),
+        row,
+        to,
+        #[inline(always)]
+        |column| columns[column].as_slice(),
+    );
 }
 
 impl Cpu {
@@ -101,7 +165,9 @@ impl Cpu {
         let [batch] = &batches[..] else {
             return Err(BackendError::InvalidInput("steps are recorded of groups of one world".into()));
         };
-        if let Some(index) = arrays.wrong_length(step_sizes(batch.world), batch.teams) {
+        if let Some(index) =
+            arrays.wrong_length(step_sizes(batch.world, batch.world.steps() + 1, batch.world.steps()), batch.teams)
+        {
             return Err(BackendError::InvalidInput(format!("array {index} of the steps has the wrong length")));
         }
         if noise.is_some_and(|noise| noise.deviations.len() != batch.world.leaders()) {
@@ -121,7 +187,8 @@ fn record<S: Simd>(
     mut arrays: StepArrays<'_>,
     scores: &ScoreTable<'_>,
 ) {
-    let (width, sizes) = (S::f32s::LEN, step_sizes(batch.world));
+    let (width, steps) = (S::f32s::LEN, batch.world.steps());
+    let sizes = step_sizes(batch.world, steps + 1, steps);
     let part = |first: usize| {
         let teams = width.min(batch.teams - first);
         (first, teams, arrays.split(sizes, teams))
@@ -166,35 +233,17 @@ struct Recorder<'a, 'b> {
     arrays: &'a mut StepArrays<'b>,
 }
 
-impl Recorder<'_, '_> {
-    /// Writes positions, headings and speeds to a row.
-    #[inline(always)]
-    fn write_states<S: Simd>(&mut self, block: &Block<S>, row: usize) {
-        let (simd, all, agents, row) = (block.simd, &block.agents, block.agents.len(), (row, self.world.steps() + 1));
-        to_rows(simd, agents * 2, row, self.arrays.positions, |column| {
-            if column % 2 == 0 { all[column / 2].x.as_slice() } else { all[column / 2].y.as_slice() }
-        });
-        to_rows(simd, agents * 2, row, self.arrays.headings, |column| {
-            if column % 2 == 0 { all[column / 2].hx.as_slice() } else { all[column / 2].hy.as_slice() }
-        });
-        to_rows(simd, agents, row, self.arrays.speeds, |column| all[column].speed.as_slice());
-    }
-}
-
 impl<S: Simd> Observer<S> for Recorder<'_, '_> {
     #[inline(always)]
     fn started(&mut self, block: &Block<S>) {
-        self.write_states(block, 0);
+        self.arrays.write_states(block.simd, &block.agents, (0, self.world.steps() + 1));
     }
 
     #[inline(always)]
     fn decided(&mut self, block: &mut Block<S>, step: usize) {
         let (simd, arrays, row) = (block.simd, &mut *self.arrays, (step, self.world.steps()));
-        let columns = self.world.leaders() * OUTPUTS;
-        to_rows(simd, self.world.leaders() * INPUTS, row, arrays.inputs, |column| {
-            block.inputs.as_flattened()[column].as_slice()
-        });
-        to_rows(simd, columns, row, arrays.outputs, |column| block.outputs.as_flattened()[column].as_slice());
+        arrays.write_inputs(block, row);
+        write_columns(simd, block.outputs.as_flattened(), row, arrays.outputs);
         if let Some(Noise { key, deviations, first: number }) = self.noise {
             let teams = S::u32s::from_fn(simd, |lane| number.wrapping_add((self.first + lane) as u32));
             for (leader, (outputs, deviations)) in block.outputs.iter_mut().zip(deviations).enumerate() {
@@ -204,7 +253,7 @@ impl<S: Simd> Observer<S> for Recorder<'_, '_> {
                 }
             }
         }
-        to_rows(simd, columns, row, arrays.actions, |column| block.outputs.as_flattened()[column].as_slice());
+        write_columns(simd, block.outputs.as_flattened(), row, arrays.actions);
         if self.noise.is_some() {
             for output in block.outputs.as_flattened_mut() {
                 *output = clamp_to::<S>(*output, splat(simd, -1.0), splat(simd, 1.0));
@@ -214,10 +263,8 @@ impl<S: Simd> Observer<S> for Recorder<'_, '_> {
 
     #[inline(always)]
     fn moved(&mut self, block: &Block<S>, sets: &[u32], step: usize) {
-        self.write_states(block, step + 1);
-        let (taken, agents_at_poi) = (bytemuck::cast_slice(sets), bytemuck::cast_slice_mut(self.arrays.agents_at_poi));
-        to_rows(block.simd, sets.len() / S::f32s::LEN, (step, self.world.steps()), agents_at_poi, |column| {
-            &taken[column * S::f32s::LEN..][..S::f32s::LEN]
-        });
+        let (simd, steps) = (block.simd, self.world.steps());
+        self.arrays.write_states(simd, &block.agents, (step + 1, steps + 1));
+        self.arrays.write_sets(simd, sets, (step, steps));
     }
 }

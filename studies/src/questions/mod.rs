@@ -249,7 +249,8 @@ impl Study {
                     teams: &teams,
                     fitnesses: evaluate::SCORES,
                 };
-                let played = evaluate::evaluate(backend, &group, &starts, &mut |_| {})?;
+                let played =
+                    evaluate::evaluate(backend, &group, &starts, &mut |_| std::ops::ControlFlow::Continue(()))?;
                 of_arms.push((0..trials).map(|team| played.team(team).mean / played.pois as f64).collect());
             }
             values.push((Measure::Played { poi_jitter, episodes }, of_arms));
