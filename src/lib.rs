@@ -60,7 +60,7 @@
 //! |---|---|
 //! | add a density | `model/sense.rs` and its shader `shaders/sense.wgsl`, `cli/src/measure/operations.rs` |
 //! | add an input | `model/sense.rs`, `shaders/sense.wgsl`, and the trace in `app/src/ops/rollout.rs` |
-//! | add a fitness | `config/learning.rs`, `credit/` (`mod.rs`, `replay.rs`; `record.rs` for what it needs, `fast.rs` for speed) |
+//! | add a fitness | `config/learning.rs`, `credit/` (`mod.rs`, `replay.rs`; `record.rs` for what it needs, `fast.rs` and `lanes.rs` for speed) |
 //! | test a new word of a key | `cli/tests/model.rs` or `tests/credit.rs`, a case in `tests/golden/cases.rs`; for a fitness `KINDS` in `verify.rs` |
 //! | show a fitness beside the others | `evaluate.rs`, `app/src/ops/rollout.rs`, `app/src/report/replay/page.rs`, `python/flotilla/_play.py`, `web/page/` |
 //! | add a place that holds populations | a backend with `Backend::hold` and a `DevicePopulation`, such as `FakeDevice` in `cli/tests/population.rs` |

@@ -43,6 +43,9 @@ pub struct Args {
     #[arg(long, value_name = "N,…", value_delimiter = ',',
         value_parser = between(1..=config::MAX_AGENTS as u32))]
     agents: Vec<u32>,
+    /// Train for this many generations first. Trained teams observe more POIs, so that scoring them takes longer
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = between(0..=1000))]
+    trained: u32,
     /// Measure rollouts only, not whole generations
     #[arg(long)]
     rollout_only: bool,
@@ -84,7 +87,7 @@ pub fn run(args: Args) -> Result<(), Error> {
         (false, true) => Generations::Profiled,
     };
     for config in configs {
-        let timing = measure::measure(&config, &mut subject, generations)?;
+        let timing = measure::measure(&config, &mut subject, args.trained as usize, generations)?;
         match args.json {
             true => {
                 let mut object = json(&timing);

@@ -547,6 +547,16 @@ fn bench_profile_reports_the_parts_of_a_generation() {
     assert_eq!(profile.len(), parts.len(), "the CPU has no other parts: {object}");
 }
 
+#[test]
+fn bench_plays_trained_teams() {
+    let mean_g = |generations: &str| {
+        let flags = ["--teams", "50", "--trained", generations, "--rollout-only"];
+        bench_json(&flags)[0]["mean_g"].as_f64().unwrap()
+    };
+    let (random, trained) = (mean_g("0"), mean_g("30"));
+    assert!(trained > random + 0.1, "mean G {random} of random teams, {trained} of trained ones");
+}
+
 /// `bench` plays the first of several stages. Ten steps are enough for the windows of this stage only.
 #[test]
 fn bench_plays_the_first_stage() {

@@ -61,6 +61,21 @@ impl<'a> ScoreTable<'a> {
         });
     }
 
+    /// Puts the scores of a team's leaders by the fitness of a row, and how many POIs the team observed.
+    #[inline(always)]
+    pub(crate) fn put(
+        &self,
+        (group, team): (usize, usize),
+        row: usize,
+        observed: u32,
+        scores: impl Iterator<Item = f32>,
+    ) {
+        let Group { world, fitnesses, .. } = self.groups[group];
+        let row = &self.scores[group][(team * fitnesses.len() + row) * world.leaders()..];
+        row.iter().zip(scores).for_each(|(to, score)| to.store(score.to_bits(), Relaxed));
+        self.observed[group][team].store(observed, Relaxed);
+    }
+
     /// Returns the scores of each group.
     pub(crate) fn finish(self) -> Vec<GroupScores> {
         let groups = self.observed.into_iter().zip(self.scores);

@@ -12,11 +12,13 @@
 
 mod assignment;
 mod fast;
+mod lanes;
 mod record;
 mod replay;
 
 pub use assignment::{UNASSIGNED, assign};
 pub use assignment::{find_leading, is_led_by};
+pub(crate) use lanes::LaneCredit;
 pub use record::{Episode, RecordRequest, Seen, Strided, owner_bits};
 pub use replay::observed_at;
 

@@ -9,7 +9,7 @@ use flotilla::backend::gpu::device::Traffic;
 use flotilla::backend::gpu::episode::{GpuBackend, PhaseTimes};
 use flotilla::backend::{Backend, BackendError, Group, Weights};
 use flotilla::config::{Config, Coupling};
-use flotilla::evolve::{Key, Purpose, contemporary_teams, random_policy};
+use flotilla::evolve::contemporary_teams;
 use flotilla::host::Instant;
 use flotilla::trainer::{GenerationTimes, Trainer};
 use flotilla::world::World;
@@ -85,7 +85,7 @@ pub(crate) struct Timing {
     pub generation: Option<f64>,
     /// The time of generations by phase. `None` unless requested.
     pub profile: Option<Profile>,
-    /// Mean G of the random teams of the rollout.
+    /// Mean G of the teams of the rollout.
     pub mean_g: f64,
     /// The numbers of entities in reach of agents. The operations depend on them.
     pub reach: Reach,
@@ -167,26 +167,29 @@ pub fn with_agents(config: &Config, agents: usize) -> Result<Config, String> {
     Ok(config)
 }
 
-/// Times rollouts of one trial's random teams, and its generations.
+/// Times rollouts of the teams of one trial after `trained` generations, and its next generations.
 ///
 /// # Errors
 /// The backend failed.
 pub(crate) fn measure(
     config: &Config,
     subject: &mut Subject,
+    trained: usize,
     generations: Generations,
 ) -> Result<Timing, BackendError> {
     let world = World::new(&config.validate()?);
     let ceiling = &mut subject.ceiling()?;
-    let ([rollout, ceiling], mean_g, reach) = rollout(config, &world, subject.backend(), ceiling)?;
+    let mut trainer = Trainer::new([config.validate()?]);
+    (0..trained).try_for_each(|_| trainer.advance(subject.backend()).map(drop))?;
+    let ([rollout, ceiling], mean_g, reach) = rollout(config, &world, &mut trainer, subject.backend(), ceiling)?;
     let (generation, profile) = match generations {
         Generations::LeftOut => (None, None),
-        Generations::Timed => (Some(self::generations(config, subject)?.0), None),
+        Generations::Timed => (Some(self::generations(&mut trainer, subject)?.0), None),
         Generations::Profiled => {
             if let Subject::Gpu(gpu) = subject {
                 gpu.use_clock();
             }
-            let (generation, profile) = self::generations(config, subject)?;
+            let (generation, profile) = self::generations(&mut trainer, subject)?;
             (Some(generation), Some(profile))
         }
     };
@@ -206,10 +209,9 @@ pub(crate) fn measure(
     })
 }
 
-/// Returns seconds per generation, and its phases. The first generation is not counted, because it compiles and
-/// allocates.
-fn generations(config: &Config, subject: &mut Subject) -> Result<(f64, Profile), BackendError> {
-    let mut trainer = Trainer::new([config.validate()?]);
+/// Returns seconds per generation, and its phases. The next generation is not counted, because it may compile and
+/// allocate.
+fn generations(trainer: &mut Trainer, subject: &mut Subject) -> Result<(f64, Profile), BackendError> {
     trainer.advance(subject.backend())?;
     let take = |trainer: &mut Trainer, subject: &mut Subject| {
         let (gpu_times, traffic) = match subject {
@@ -218,39 +220,36 @@ fn generations(config: &Config, subject: &mut Subject) -> Result<(f64, Profile),
         };
         Profile { generations: trainer.generation(0), times: trainer.take_times(), gpu_times, traffic }
     };
-    let before = take(&mut trainer, subject);
+    let before = take(trainer, subject);
     let [seconds, _] = time(|| trainer.advance(subject.backend()).map(drop), || Ok(0.0))?;
-    let profile = take(&mut trainer, subject);
+    let profile = take(trainer, subject);
     let generations = profile.generations - before.generations;
     Ok((seconds, Profile { generations, traffic: profile.traffic - before.traffic, ..profile }))
 }
 
-/// Returns seconds per rollout of random policies, scored as in training, and the arithmetic ceiling measured in
+/// Returns seconds per rollout of a trainer's policies, scored as in training, and the arithmetic ceiling measured in
 /// between; the mean G; and the entities in reach of agents.
 fn rollout(
     config: &Config,
     world: &World,
+    trainer: &mut Trainer,
     backend: &mut dyn Backend,
     ceiling: &mut Peak,
 ) -> Result<([f64; 2], f64, Reach), BackendError> {
-    let (population, leaders, seed) = (config.learning.population, world.leaders(), config.learning.seed);
-    let mut weights = vec![0.0; config.populations() * population * world.parameters()];
-    let key = Key::new(seed, 0, Purpose::Weights);
-    for (policy, weights) in weights.chunks_exact_mut(world.parameters()).enumerate() {
-        random_policy(Level::new(), key.at(0, policy / population, policy % population), weights);
-    }
+    let (policies, leaders) = (config.learning.slots(), world.leaders());
     // Teams with past champions take as long as others, which stand in for them.
-    let count = config.max_teams() - 1;
-    let teams: Vec<u32> =
-        contemporary_teams(&config.learning, 0, 0, leaders).into_iter().cycle().take(count * leaders).collect();
+    let (count, generation) = (config.max_teams() - 1, trainer.generation(0));
+    let teams = contemporary_teams(&config.learning, 0, generation, leaders);
+    let teams: Vec<u32> = teams.into_iter().cycle().take(count * leaders).collect();
+    let weights = trainer.weights(0, 0)?;
     // If generations play from the device's memory, so do these rollouts.
-    let held = backend.hold(&weights, [config.populations(), population, world.parameters()])?;
-    let played = held.as_deref().map_or(weights[..].into(), Weights::OnDevice);
+    let held = backend.hold(weights, [config.populations(), policies, world.parameters()])?;
+    let played = held.as_deref().map_or(weights.into(), Weights::OnDevice);
     let group = Group {
         world,
         starts: &world.starts,
         weights: played,
-        policies: population,
+        policies,
         sharing: config.learning.sharing,
         teams: &teams,
         fitnesses: std::slice::from_ref(&config.learning.fitness),
@@ -263,9 +262,9 @@ fn rollout(
     let times = time(play, ceiling)?;
     let mean_g = f64::from(observed) / (count * world.pois.len()) as f64;
     let pairs = world.steps() * world.agents() * world.agents();
-    let traced = (TRACED_PAIRS / pairs).clamp(1, TRACED_TEAMS).min(population);
+    let traced = (TRACED_PAIRS / pairs).clamp(1, TRACED_TEAMS).min(count);
     // The CPU traces, because every backend's trace is the same.
-    let traced = Group { weights: weights[..].into(), teams: &teams[..traced * leaders], ..group };
+    let traced = Group { weights: weights.into(), teams: &teams[..traced * leaders], ..group };
     let trace = Cpu::default().trace(&traced)?;
     Ok((times, mean_g, Reach::of(world, &trace)))
 }

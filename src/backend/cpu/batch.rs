@@ -3,6 +3,7 @@
 use std::ops::Range;
 
 use crate::backend::{Group, Weights};
+use crate::config::Fitness;
 use crate::host::prefetch;
 use crate::world::World;
 
@@ -15,6 +16,8 @@ pub(super) struct WorldBatch<'a> {
     pub(super) teams: usize,
     /// Whether sightings are recorded.
     pub(super) sighted: bool,
+    /// The fitnesses of every group; `None` if these differ.
+    pub(super) fitnesses: Option<&'a [Fitness]>,
     /// The number of teams up to the end of each group, `[groups]`.
     ends: Vec<usize>,
 }
@@ -29,7 +32,9 @@ impl<'a> WorldBatch<'a> {
         };
         let ends = groups.iter().map(add).collect();
         let sighted = groups.iter().any(|group| group.records().sights());
-        WorldBatch { world: groups[0].world, first, groups, teams, sighted, ends }
+        let fitnesses = Some(groups[0].fitnesses);
+        let fitnesses = fitnesses.filter(|fitnesses| groups.iter().all(|group| group.fitnesses == *fitnesses));
+        WorldBatch { world: groups[0].world, first, groups, teams, sighted, fitnesses, ends }
     }
 
     /// Returns the group, by its index here, and the team in it of a team of this batch.

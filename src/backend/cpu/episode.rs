@@ -2,11 +2,13 @@
 
 use fearless_simd::{Simd, prelude::*};
 
+use super::ScoreTable;
 use super::batch::WorldBatch;
 use super::block::Block;
 use super::network::Network;
 use super::pois::{load_pois, with_pois};
-use crate::credit::{Episode, Seen, Strided};
+use crate::config::Fitness;
+use crate::credit::{Episode, LaneCredit, Seen, Strided};
 use crate::world::World;
 
 /// Follows the episodes of one vector of teams. By default nothing is done.
@@ -38,6 +40,7 @@ pub(super) struct EpisodeBlock<S: Simd> {
     seen: Vec<u32>,
     /// The sightings, `[steps][followers][words of leaders][lanes]`; empty unless recorded.
     sights: Vec<u32>,
+    credit: LaneCredit<S>,
 }
 
 /// Returns the words of a team's sightings: 0 unless recorded.
@@ -55,6 +58,7 @@ impl<S: Simd> EpisodeBlock<S> {
             sets: vec![0; world.set_words() * S::f32s::LEN],
             seen: vec![0; world.followers() * world.leaders() * S::f32s::LEN],
             sights: vec![0; sight_words(world, sighted) * S::f32s::LEN],
+            credit: LaneCredit::new(simd, world),
         }
     }
 
@@ -101,6 +105,32 @@ impl<S: Simd> EpisodeBlock<S> {
         });
         for (words, count) in seen.chunks_exact_mut(S::f32s::LEN).zip(&block.counts) {
             count.store_slice(words);
+        }
+    }
+
+    /// Scores the teams that [`EpisodeBlock::play`] played: all lanes at once if the fitnesses allow it.
+    #[inline(always)]
+    pub(super) fn score(&mut self, batch: &WorldBatch<'_>, first: usize, teams: usize, scores: &ScoreTable<'_>) {
+        let places = |lane: usize| {
+            let (group, team) = batch.locate(first + lane);
+            (batch.first + group, team)
+        };
+        let in_lanes = |fitness: &Fitness| LaneCredit::<S>::can_score(batch.world, *fitness);
+        let Some(fitnesses) = batch.fitnesses.filter(|fitnesses| fitnesses.iter().all(in_lanes)) else {
+            for lane in 0..teams {
+                let (group, team) = places(lane);
+                scores.score(group, team, &self.episode(lane));
+            }
+            return;
+        };
+        // Without a fitness, only the observed POIs are wanted.
+        let counted = if fitnesses.is_empty() { &[Fitness::G] } else { fitnesses };
+        for (row, &fitness) in counted.iter().enumerate() {
+            self.credit.score(&self.sets, &self.block.counts, batch.world, fitness);
+            for lane in 0..teams {
+                let leaders = self.credit.scores(lane).take(fitnesses.len() * batch.world.leaders());
+                scores.put(places(lane), row, self.credit.observed(lane), leaders);
+            }
         }
     }
 

@@ -158,12 +158,11 @@ fn play<S: Simd>(simd: S, groups: &[Group<'_>], workspaces: &mut Option<Box<dyn 
             };
             simd.vectorize(
                 #[inline(always)]
-                || episodes.play(batch, first, teams, &mut Prefetch { batch, teams: ahead.clone() }),
+                || {
+                    episodes.play(batch, first, teams, &mut Prefetch { batch, teams: ahead.clone() });
+                    episodes.score(batch, first, teams, scores);
+                },
             );
-            for lane in 0..teams {
-                let (group, team) = batch.locate(first + lane);
-                scores.score(batch.first + group, team, &episodes.episode(lane));
-            }
             current = if early { following } else { take() };
         }
     });

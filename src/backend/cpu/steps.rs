@@ -206,17 +206,13 @@ fn record<S: Simd>(
                         *first,
                         *teams,
                         &mut Recorder { world: batch.world, noise, first: *first, arrays },
-                    )
+                    );
+                    block.score(batch, *first, *teams, scores);
                 },
             );
-            let mut observed_at = arrays.observed_at.chunks_exact_mut(batch.world.pois.len());
-            for lane in 0..*teams {
-                let ((group, team), episode) = (batch.locate(*first + lane), block.episode(lane));
-                scores.score(batch.first + group, team, &episode);
-                if let Some(to) = observed_at.next() {
-                    let steps = credit::observed_at(episode.sets, batch.world);
-                    to.iter_mut().zip(steps).for_each(|(to, step)| *to = step.unwrap_or(0) as u32);
-                }
+            for (lane, to) in arrays.observed_at.chunks_exact_mut(batch.world.pois.len()).enumerate() {
+                let steps = credit::observed_at(block.episode(lane).sets, batch.world);
+                to.iter_mut().zip(steps).for_each(|(to, step)| *to = step.unwrap_or(0) as u32);
             }
         }
     });
