@@ -32,7 +32,7 @@ pub use scores::GroupScores;
 pub use size::HELD_FROM;
 pub use size::{BATCH_BYTES, PACKED_FROM, held_bytes, record_bytes, state_bytes, weight_bytes};
 #[cfg(feature = "gpu")]
-use size::{FOUR, check_sizes, fours, record_words};
+use size::{VECTOR, WeightVector, check_sizes, record_words, weight_vectors};
 pub use trace::{Moment, Trace};
 
 /// Plays episodes and scores them. Every implementation returns the same bits.
