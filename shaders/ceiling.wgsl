@@ -1,5 +1,5 @@
 // The arithmetic ceiling: independent chains in registers, 6 of products and 6 of sums per thread. One iteration is
-// OPERATIONS_PER_ITERATION lane operations (src/bench/gpu_ceiling.rs).
+// OPERATIONS_PER_ITERATION lane operations (cli/src/measure/gpu_ceiling.rs).
 
 // A factor, a term, and a value that the sum never equals.
 @group(0) @binding(1) var<storage, read> numbers: array<f32>;

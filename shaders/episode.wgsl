@@ -11,8 +11,9 @@
 //   SLOTS      agents per thread, played one after another
 //   SHARED     agents of a workgroup's teams
 //   TRACE      whether every stage of every step is recorded
-//   SIGHTED    whether the leaders that each follower sees at each step are recorded
-//   TALLY      whether a follower counts the leaders it sees in registers (SIGHTS of them), not in the record
+//   SIGHTINGS  whether the leaders that each follower sees at each step are recorded
+//   COUNTS_IN_REGISTERS, COUNTED_LEADERS
+//              whether a follower counts the leaders it sees in registers, not in the record, and how many registers
 //   shape      the sizes
 //   variant    the choices between formulas
 //   set_shape  sets both for a task
@@ -53,7 +54,7 @@ struct Agent {
     speed: f32,
     next: Steering,
     // The number of steps at which it saw each leader.
-    seen: array<u32, SIGHTS>,
+    counts: array<u32, COUNTED_LEADERS>,
     // For the trace: a leader's inputs and outputs, or a follower's force.
     inputs: array<f32, INPUTS>,
     outputs: vec2<f32>,
@@ -127,7 +128,7 @@ fn lead(task: Task, first: u32, me: ptr<function, Agent>) {
 
 // Returns the index in the record of a follower's count of a leader.
 fn sight(task: Task, me: ptr<function, Agent>, leader: u32) -> u32 {
-    return task.seen + (((*me).agent - shape.leaders) * shape.leaders + leader) * task.teams + (*me).team;
+    return task.counts + (((*me).agent - shape.leaders) * shape.leaders + leader) * task.teams + (*me).team;
 }
 
 // A follower counts the leaders it sees, and follows the agents near it. Its team's positions start at `first`.
@@ -138,8 +139,8 @@ fn follow(task: Task, first: u32, me: ptr<function, Agent>) {
     for (var leader = 0u; leader < shape.leaders; leader++) {
         let place = positions[first + leader * shape.teams];
         let seen = u32(influence(place.x - x, place.y - y, &sums));
-        if TALLY {
-            (*me).seen[leader] += seen;
+        if COUNTS_IN_REGISTERS {
+            (*me).counts[leader] += seen;
         } else if seen != 0u {
             record[sight(task, me, leader)] += seen;
         }
@@ -198,7 +199,7 @@ fn record_sightings(task: Task, step: u32, now: u32, thread: u32) {
     let words = (shape.leaders + 31u) / 32u;
     let rows = followers * words;
     // Sightings come after the counts.
-    let sights = task.seen + followers * shape.leaders * task.teams;
+    let sights = task.counts + followers * shape.leaders * task.teams;
     for (var item = thread; item < rows * shape.teams; item += WORKGROUP) {
         let team = item % shape.teams;
         let row = item / shape.teams;
@@ -237,7 +238,7 @@ fn begin(task: Task, me: ptr<function, Agent>) {
     (*me).hx = heading.x;
     (*me).hy = heading.y;
     (*me).speed = world.speed;
-    for (var leader = 0u; !TALLY && leader < shape.leaders && (*me).agent >= shape.leaders; leader++) {
+    for (var leader = 0u; !COUNTS_IN_REGISTERS && leader < shape.leaders && (*me).agent >= shape.leaders; leader++) {
         record[sight(task, me, leader)] = 0u;
     }
     if TRACE {
@@ -253,15 +254,15 @@ fn resume(task: Task, me: ptr<function, Agent>) {
     (*me).hx = state.hx;
     (*me).hy = state.hy;
     (*me).speed = state.speed;
-    for (var leader = 0u; TALLY && leader < shape.leaders && (*me).agent >= shape.leaders; leader++) {
-        (*me).seen[leader] = record[sight(task, me, leader)];
+    for (var leader = 0u; COUNTS_IN_REGISTERS && leader < shape.leaders && (*me).agent >= shape.leaders; leader++) {
+        (*me).counts[leader] = record[sight(task, me, leader)];
     }
 }
 
 // Stores the state at the end of a dispatch.
 fn store_state(task: Task, me: ptr<function, Agent>) {
-    for (var leader = 0u; TALLY && leader < shape.leaders && (*me).agent >= shape.leaders; leader++) {
-        record[sight(task, me, leader)] = (*me).seen[leader];
+    for (var leader = 0u; COUNTS_IN_REGISTERS && leader < shape.leaders && (*me).agent >= shape.leaders; leader++) {
+        record[sight(task, me, leader)] = (*me).counts[leader];
     }
     if task.end < world.steps {
         let state = State((*me).x, (*me).y, (*me).hx, (*me).hy, (*me).speed);
@@ -299,7 +300,7 @@ fn episode(
     var now = 0u;
     for (var step = task.first; step < task.end; step++) {
         let next = SHARED - now;
-        if SIGHTED {
+        if SIGHTINGS {
             record_sightings(task, step, now, thread);
         }
         for (var slot = 0u; slot < SLOTS; slot++) {

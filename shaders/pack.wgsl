@@ -22,7 +22,7 @@ struct Packed {
 }
 
 // Replaces a binding of the episode. The minimum size of a kept set, per POI.
-@group(0) @binding(3) var<storage, read> least: array<u32>;
+@group(0) @binding(3) var<storage, read> minimums: array<u32>;
 @group(0) @binding(4) var<storage, read_write> packed: Packed;
 
 // Rows per team, and the offsets of their sets, or NOWHERE if these do not fit.
@@ -34,7 +34,7 @@ var<workgroup> offsets: array<u32, TEAMS>;
 fn keep(task: Task, sizes: Sizes, team: u32, poi: u32, offset: u32, all: u32) -> u32 {
     let row = sizes.pois * sizes.words * task.teams;
     let first = task.sets + poi * sizes.words * task.teams + team;
-    let enough = least[task.least + poi];
+    let enough = minimums[task.minimums + poi];
     var kept = 0u;
     // The offset of the set that is kept unless the next one contains it.
     var candidate = NOWHERE;
@@ -96,7 +96,7 @@ fn owner(task: Task, sizes: Sizes, team: u32, follower: u32, nobody: u32) -> u32
     var most = 0u;
     var best = nobody;
     for (var leader = 0u; leader < sizes.leaders; leader++) {
-        let steps = record[task.seen + (follower * sizes.leaders + leader) * task.teams + team];
+        let steps = record[task.counts + (follower * sizes.leaders + leader) * task.teams + team];
         if steps > most {
             most = steps;
             best = leader;

@@ -3,7 +3,7 @@
 //
 // Uses: lib/math.wgsl.
 //
-// The host prepends, from src/evolve and src/backend/gpu/population.rs:
+// The host prepends, from src/evolve and src/backend/gpu/source.rs:
 //   WORKGROUP               threads per workgroup, a multiple of TILE
 //   TILE                    rows and columns of a tile of `gather`
 //   BreedJob, GatherJob     what to do
@@ -21,7 +21,7 @@
 @group(0) @binding(1) var<storage, read> job: GatherJob;
 // The policy of each leader in each team, `[teams][leaders]`.
 @group(0) @binding(2) var<storage, read> choices: array<u32>;
-// Per task `[fours of a policy's weights][leaders][teams]`.
+// Per task `[vectors of a policy's weights][leaders][teams]`.
 @group(0) @binding(4) var<storage, read_write> weights: array<vec4<f32>>;
 // The populations of the leaders after the first.
 @group(0) @binding(5) var<storage, read> policies_1: array<f32>;
@@ -140,14 +140,14 @@ fn gather(
     let leader = job.first + policy / job.teams;
     let before = team / job.teams_per_task * job.teams_per_task;
     let teams = min(job.teams_per_task, job.teams - before);
-    let fours = (job.parameters + 3u) / 4u;
-    let task = job.weights + before * job.leaders * fours;
+    let vectors = (job.parameters + 3u) / 4u;
+    let task = job.weights + before * job.leaders * vectors;
     for (var row = thread / TILE; row < TILE / 4u && policy < played; row += WORKGROUP / TILE) {
-        let four = first_parameter / 4u + row;
-        if four < fours {
+        let vector = first_parameter / 4u + row;
+        if vector < vectors {
             let start = column * (TILE + 1u) + 4u * row;
             let some = vec4(tile[start], tile[start + 1u], tile[start + 2u], tile[start + 3u]);
-            weights[task + (four * job.leaders + leader) * teams + team - before] = some;
+            weights[task + (vector * job.leaders + leader) * teams + team - before] = some;
         }
     }
 }

@@ -290,7 +290,7 @@ impl Faults for OutOfMemory {
 fn a_device_out_of_memory_is_not_reported_as_inexact() {
     for (request, info) in support::adapters("a_device_out_of_memory_is_not_reported_as_inexact") {
         let gpu = open_gpu(&request);
-        for what in ["probe values", "record", "packed record", "a population"] {
+        for what in ["input", "record", "packed", "policies(0)"] {
             let error =
                 self_test::find_exact(with_faults(&gpu, &Arc::new(OutOfMemory(what))), &[gpu.pass]).unwrap_err();
             assert!(matches!(error, DeviceError::OutOfMemory { .. }), "{info}, {what}: {error}");

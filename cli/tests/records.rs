@@ -166,6 +166,7 @@ fn scores_are_the_same_from_whole_and_packed_records() {
 }
 
 /// A canary: each edit to the packing shader must change scores. Without it, the other tests might pass by chance.
+#[cfg(debug_assertions)]
 #[test]
 fn an_edited_packing_rule_changes_scores() {
     type Edit = fn(String) -> String;
@@ -379,7 +380,9 @@ fn compiling() {
 
 /// Prints the CPU's part of a generation, by phase. The device plays only the first steps of each episode.
 ///
-/// `FLOTILLA_TEAMS` sets the number of teams (2^20 by default), and `RAYON_NUM_THREADS` the number of threads.
+/// `FLOTILLA_TEAMS` sets the number of teams (2^20 by default), and `RAYON_NUM_THREADS` the number of threads. In release
+/// builds, edits of shaders need `CARGO_PROFILE_RELEASE_DEBUG_ASSERTIONS=true`.
+#[cfg(debug_assertions)]
 #[test]
 #[ignore = "prints a table"]
 fn the_cpus_part_of_a_generation() {

@@ -4,9 +4,9 @@
 @group(0) @binding(2) var<storage, read> tasks: array<Task>;
 // Start positions and POI positions.
 @group(0) @binding(3) var<storage, read> places: array<vec2<f32>>;
-// Per task `[fours of a policy's weights][leaders][teams]`, so that neighbouring threads load neighbouring weights.
+// Per task `[vectors of a policy's weights][leaders][teams]`, so that neighbouring threads load neighbouring weights.
 @group(0) @binding(4) var<storage, read> weights: array<vec4<f32>>;
-// Per task the sets `[steps][pois][words][teams]`, the counts `[followers][leaders][teams]` and, if SIGHTED, the
+// Per task the sets `[steps][pois][words][teams]`, the counts `[followers][leaders][teams]` and, if SIGHTINGS, the
 // sightings `[steps][followers][words of leaders][teams]`, and a status word.
 @group(0) @binding(5) var<storage, read_write> record: array<u32>;
 // Per task `[steps + 1][teams][agents]`; written only if TRACE.

@@ -31,7 +31,7 @@ pub use error::BackendError;
 pub use scores::GroupScores;
 pub(crate) use size::{BATCH_BYTES, PACKED_FROM, held_bytes, state_bytes, weight_bytes};
 #[cfg(feature = "gpu")]
-use size::{FOUR, check_sizes, fours, record_words};
+use size::{VECTOR, WeightVector, check_sizes, record_words, weight_vectors};
 pub use size::{HELD_FROM, record_bytes};
 pub use trace::{Moment, Trace};
 

@@ -15,8 +15,10 @@ pub const PACKED_FROM: u64 = 1 << 20;
 
 /// Target bytes of one buffer of a batch on a GPU: enough to fill the device, small enough to overlap batches.
 pub const BATCH_BYTES: u64 = 256 << 20;
-/// Weights that a GPU thread loads at once.
-pub(super) const FOUR: usize = 4;
+/// Weights per vector. A GPU thread loads one vector at a time.
+pub(super) const VECTOR: usize = 4;
+/// Neighbouring weights of a policy.
+pub(super) type WeightVector = [f32; VECTOR];
 
 /// Returns the words of a team's record: sets, counts and, if needed, sightings.
 pub(super) fn record_words(world: &World, records: RecordRequest<'_>) -> usize {
@@ -29,14 +31,14 @@ pub fn record_bytes(world: &World, fitness: Fitness) -> u64 {
     (record_words(world, RecordRequest(&[fitness])) * size_of::<u32>()) as u64
 }
 
-/// Returns the weights of a team as an episode on a GPU loads them, in fours.
-pub(super) fn fours(world: &World) -> usize {
-    world.leaders() * world.parameters().div_ceil(FOUR)
+/// Returns the vectors of a team's weights.
+pub(super) fn weight_vectors(world: &World) -> usize {
+    world.leaders() * world.parameters().div_ceil(VECTOR)
 }
 
 /// Returns the bytes of a team's weights as an episode on a GPU loads them.
 pub fn weight_bytes(world: &World) -> u64 {
-    (fours(world) * size_of::<[f32; FOUR]>()) as u64
+    (weight_vectors(world) * size_of::<WeightVector>()) as u64
 }
 
 /// Returns the bytes of a team's states that a GPU keeps between dispatches, 0 if one dispatch plays the whole episode.

@@ -2,10 +2,9 @@
 
 use std::time::Duration;
 
-use wgpu::BufferUsages;
-
-use flotilla::backend::gpu::CEILING;
-use flotilla::backend::gpu::device::{Binding, DeviceError, Gpu};
+use flotilla::backend::gpu::device::{DeviceError, Executor, Gpu, Workspace};
+use flotilla::backend::gpu::recording::{Buffer, Command, Recording};
+use flotilla::backend::gpu::source::Pipeline;
 
 /// Threads per workgroup, as `shaders/ceiling.wgsl` has it.
 const WORKGROUP: usize = 64;
@@ -18,12 +17,10 @@ const MIN_TIME: Duration = Duration::from_millis(20);
 
 /// Measures the arithmetic ceiling of a device under its pass.
 pub(crate) struct Ceiling {
-    gpu: Gpu,
-    pipeline: wgpu::ComputePipeline,
-    buffers: wgpu::BindGroup,
-    iterations: wgpu::Buffer,
+    executor: Executor,
+    workspace: Workspace,
+    iterations: u32,
     workgroups: u32,
-    operations: f64,
 }
 
 impl Ceiling {
@@ -32,48 +29,41 @@ impl Ceiling {
     /// # Errors
     /// The device failed.
     pub fn new(gpu: &Gpu) -> Result<Ceiling, DeviceError> {
-        let layout = gpu.layout("ceiling", &[Binding::Read, Binding::Read, Binding::Write])?;
-        let pipeline = gpu.own_pipeline("ceiling", CEILING, "ceiling", &layout)?;
-        let numbers = gpu.upload("ceiling's numbers", &[1.000_000_1f32, 0.25, -1.0, 0.0], BufferUsages::STORAGE)?;
-        let iterations = gpu.upload("ceiling's iterations", &[0u32; 4], BufferUsages::STORAGE)?;
-        let result = gpu.buffer("ceiling's result", (WORKGROUP * size_of::<f32>()) as u64, BufferUsages::STORAGE)?;
-        let bound = [&numbers, &iterations, &result].map(|buffer| buffer.as_entire_buffer_binding());
-        let buffers = gpu.bind("ceiling", &layout, &bound)?;
-        let mut ceiling = Ceiling { gpu: gpu.clone(), pipeline, buffers, iterations, workgroups: 0, operations: 0.0 };
+        let most = gpu.limits.max_compute_workgroups_per_dimension;
+        let (executor, workspace) = (Executor::new(gpu.clone()), Workspace::default());
         // As many threads as fill any GPU several times. More iterations, then more threads, until it takes long
         // enough.
-        let (mut iterations, mut workgroups) = (64, 4096);
-        loop {
-            ceiling.set(iterations, workgroups)?;
-            let seconds = ceiling.operations / ceiling.measure()?;
-            if seconds >= MIN_TIME.as_secs_f64() {
-                return Ok(ceiling);
-            } else if iterations < MAX_ITERATIONS {
-                iterations *= 2;
-            } else if workgroups * 2 <= gpu.limits.max_compute_workgroups_per_dimension {
-                workgroups *= 2;
+        let mut ceiling = Ceiling { executor, workspace, iterations: 64, workgroups: 4096 };
+        while ceiling.operations() / ceiling.measure()? < MIN_TIME.as_secs_f64() {
+            if ceiling.iterations < MAX_ITERATIONS {
+                ceiling.iterations *= 2;
+            } else if ceiling.workgroups * 2 <= most {
+                ceiling.workgroups *= 2;
             } else {
-                return Ok(ceiling);
+                break;
             }
         }
+        Ok(ceiling)
     }
 
-    fn set(&mut self, iterations: u32, workgroups: u32) -> Result<(), DeviceError> {
-        let words = [iterations; 4];
-        self.gpu.scoped("ceiling's iterations", || {
-            self.gpu.write(&self.iterations, 0, bytemuck::cast_slice(&words));
-        })?;
-        self.workgroups = workgroups;
-        self.operations = f64::from(iterations) * OPERATIONS_PER_ITERATION * f64::from(workgroups) * WORKGROUP as f64;
-        Ok(())
+    fn operations(&self) -> f64 {
+        f64::from(self.iterations) * OPERATIONS_PER_ITERATION * f64::from(self.workgroups) * WORKGROUP as f64
     }
 
     /// Returns lane operations per second.
     ///
     /// # Errors
     /// The device failed.
-    pub(crate) fn measure(&self) -> Result<f64, DeviceError> {
-        let time = self.gpu.time("ceiling", &self.pipeline, &self.buffers, [self.workgroups, 1, 1])?;
-        Ok(self.operations / time.as_secs_f64())
+    pub(crate) fn measure(&mut self) -> Result<f64, DeviceError> {
+        let mut recording = Recording::new("ceiling");
+        let bindings = vec![
+            recording.input(Buffer::Input, vec![1.000_000_1f32, 0.25, -1.0, 0.0]),
+            recording.input(Buffer::Iterations, vec![self.iterations; 4]),
+            recording.buffer(Buffer::Output, (WORKGROUP * size_of::<f32>()) as u64),
+        ];
+        let grid = [self.workgroups, 1, 1];
+        recording.commands.push(Command::Dispatch { pipeline: Pipeline::Ceiling, bindings, grid, iterations: 0 });
+        let time = self.executor.time(&recording, &mut self.workspace)?;
+        Ok(self.operations() / time.as_secs_f64())
     }
 }

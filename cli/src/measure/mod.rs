@@ -58,7 +58,7 @@ impl Subject {
         Ok(match self {
             &Subject::Cpu(_, level) => Box::new(move || Ok(ceiling::measure(level))),
             Subject::Gpu(gpu) => {
-                let ceiling = gpu_ceiling::Ceiling::new(gpu.gpu())?;
+                let mut ceiling = gpu_ceiling::Ceiling::new(gpu.gpu())?;
                 Box::new(move || Ok(ceiling.measure()?))
             }
         })

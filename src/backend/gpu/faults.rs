@@ -1,4 +1,5 @@
-//! Faults that tests inject into a device, to see that the backend notices each of them.
+//! Faults that tests inject into a device, to see that the backend notices each of them. Only builds with debug
+//! assertions have them.
 
 use std::time::Duration;
 

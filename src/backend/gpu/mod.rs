@@ -1,14 +1,17 @@
 //! The GPU backend, on any adapter that wgpu reaches.
 //!
-//! Each module imports only those above it:
+//! Each module imports only those above it. The first five need no device:
 //!
 //! | module | holds |
 //! |---|---|
 //! | [`exact`] | what makes the shaders' arithmetic bit-identical to the CPU's |
 //! | [`mod@faults`] | faults that tests inject |
-//! | [`device`] | adapters, and what is asked of an opened one |
+//! | [`shape`] | the kernels of episodes: what each is compiled for, and how teams fill its workgroups |
+//! | [`source`] | pipelines: the texts of their shaders, and the structs that these share with the host |
+//! | [`recording`] | GPU work as data |
+//! | [`device`] | adapters, and the executor of recordings |
 //! | [`population`] | policies that stay on the device |
-//! | [`episode`] | whole episodes |
+//! | [`episode`] | whole episodes: their plan, and the backend |
 //! | [`mod@self_test`] | opening a device, and the tests that it must pass |
 
 pub mod device;
@@ -17,15 +20,10 @@ pub mod exact;
 #[doc(hidden)]
 pub mod faults;
 pub mod population;
+pub mod recording;
 pub mod self_test;
+pub(crate) mod shape;
+pub mod source;
 
 pub use self_test::{open, self_test};
-
-/// The shader that measures a device's arithmetic ceiling.
-pub const CEILING: &str = include_str!("../../../shaders/ceiling.wgsl");
-
-/// Returns the name and the text of every shader, for lints and exactness tests.
-pub fn shaders() -> Vec<(&'static str, String)> {
-    [vec![("probe", self_test::SHADER.into()), ("ceiling", CEILING.into())], episode::shaders(), population::shaders()]
-        .concat()
-}
+pub use source::shaders;

@@ -1,34 +1,25 @@
 //! The self-test of a device: small computations whose bits must equal the CPU's.
 
-use std::collections::BTreeSet;
-use std::sync::Mutex;
-
 use glam::Vec2;
-use wgpu::BufferUsages;
 
-use super::device::{self, Binding, DeviceError, Gpu, Kind, Request};
+use super::device::{self, DeviceError, Executor, Gpu, Kind, Request, Workspace};
 use super::episode::{GpuBackend, Kernel, Records, ResidencyPolicy};
 use super::exact::Pass;
-use crate::backend::compare::{compare_breeding, compare_traces};
+use super::recording::{Buffer, Command, Recording};
+use super::source::Pipeline;
+use crate::backend::compare::{compare_breeding, compare_traces, first_difference};
 use crate::backend::cpu::Cpu;
 use crate::backend::{Backend, BackendError, Group, Weights};
 use crate::config::{Config, Fitness, Learning, Sharing};
 use crate::config_enum::Choice;
-use crate::credit::{Episode, Seen};
 use crate::model::sense::Density;
-use crate::parallel::lock;
 use crate::sample;
 use crate::world::World;
 
-/// The shader of the arithmetic probe.
-pub(super) const SHADER: &str = include_str!("../../../shaders/probe.wgsl");
-
 /// One probe. Describes the first difference from the CPU under the device's current pass, if any.
-type Probe = fn(&Gpu) -> Result<Option<String>, BackendError>;
+type Probe = fn(&Executor) -> Result<Option<String>, BackendError>;
 
 /// All probes that a pass must survive, the quickest first.
-///
-/// A new probe is a function here. It compiles its shader with `gpu.own_pipeline`, which applies the pass under test.
 const ALL: &[Probe] = &[arithmetic, episode, training];
 
 /// Opens an adapter, and finds the first pass under which every probe gives the CPU's bits: no contraction on Vulkan,
@@ -68,8 +59,9 @@ pub fn find_exact(mut gpu: Gpu, candidates: &[Pass]) -> Result<Gpu, DeviceError>
         if pass == Pass::Plain {
             return Ok(gpu);
         }
-        match self_test(&gpu.keeping_pipelines()) {
-            Ok(None) => return Ok(gpu),
+        let executor = Executor::new(gpu.clone());
+        match run(&executor) {
+            Ok(None) => return Ok(gpu.with_tested(executor.pipelines())),
             Ok(Some(mismatch)) => failures.push((pass, mismatch)),
             // These say nothing about the arithmetic.
             Err(error @ (DeviceError::Lost { .. } | DeviceError::OutOfMemory { .. })) => return Err(error),
@@ -84,111 +76,70 @@ pub fn find_exact(mut gpu: Gpu, candidates: &[Pass]) -> Result<Gpu, DeviceError>
 /// # Errors
 /// The device failed.
 pub fn self_test(gpu: &Gpu) -> Result<Option<String>, DeviceError> {
-    let refused = |error| match error {
-        BackendError::Gpu(error) => error,
-        error => DeviceError::Refused { adapter: gpu.adapter.to_string(), reason: error.to_string() },
-    };
-    ALL.iter().find_map(|probe| probe(gpu).transpose()).transpose().map_err(refused)
+    run(&Executor::new(gpu.clone()))
 }
 
-/// The computations of [`arithmetic`], in the order of `shaders/probe.wgsl`.
-const NAMES: [&str; 37] = [
-    "x*y + z",
-    "x*y - z",
-    "z - x*y",
-    "x*y + y*z",
-    "x*y - x*z",
-    "x*y - y*x",
-    "(x + y) - x",
-    "(x - y) + y",
-    "((x + y) + z) + w",
-    "x + (y + (z + w))",
-    "((x*y)*z)*w",
-    "x*(y*(z*w))",
-    "x + x + x",
-    "(x*0.1)*10",
-    "(x + 4096) - 4096",
-    "x*2.7 + x*0.3",
-    "x*x + y*y + z*z",
-    "-(x*y) + z",
-    "abs(x*y - z)",
-    "product(x, y) + z",
-    "a product kept over a branch",
-    "a selected product, plus z",
-    "vectors, v*v + v",
-    "vectors, v*y - (v + v)",
-    "a polynomial",
-    "Newton's reciprocal",
-    "Newton's reciprocal root",
-    "a sum in a loop",
-    "a sum of products in a loop",
-    "floor(x*y)",
-    "u32 to f32",
-    "i32 to f32",
-    "f32 to u32 and i32",
-    "comparisons",
-    "selection by comparison",
-    "bit casts",
-    "sums compared by their bits",
-];
+fn run(executor: &Executor) -> Result<Option<String>, DeviceError> {
+    let refused = |error| match error {
+        BackendError::Gpu(error) => error,
+        error => DeviceError::Refused { adapter: executor.gpu.adapter.to_string(), reason: error.to_string() },
+    };
+    ALL.iter().find_map(|probe| probe(executor).transpose()).transpose().map_err(refused)
+}
 
+/// Words per group of values.
+const WORDS: usize = 37;
 /// Groups of four values, the inputs of [`arithmetic`].
 const ITEMS: usize = 4096;
 const WORKGROUP: usize = 64;
 
 /// Tests contraction, reassociation, conversion and comparison on [`ITEMS`] groups of values.
-fn arithmetic(gpu: &Gpu) -> Result<Option<String>, BackendError> {
+fn arithmetic(executor: &Executor) -> Result<Option<String>, BackendError> {
     let values = values();
-    let bytes = (ITEMS * NAMES.len() * size_of::<u32>()) as u64;
-    let from = gpu.upload("probe values", &values, BufferUsages::STORAGE)?;
-    let to = gpu.buffer("probe words", bytes, BufferUsages::STORAGE | BufferUsages::COPY_SRC)?;
-    let layout = gpu.layout("probe", &[Binding::Read, Binding::Write])?;
-    let pipeline = gpu.own_pipeline("probe", SHADER, "probe", &layout)?;
-    let buffers = gpu.bind("probe", &layout, &[from.as_entire_buffer_binding(), to.as_entire_buffer_binding()])?;
-    gpu.dispatch("probe", &pipeline, &buffers, [ITEMS.div_ceil(WORKGROUP) as u32, 1, 1])?;
-    let words: Vec<u32> = gpu.read(&[(&to, 0..bytes)])?;
-    Ok((0..ITEMS).zip(words.chunks_exact(NAMES.len())).find_map(|(item, words)| {
-        let expected = expected(&values, item);
-        let differs = (0..NAMES.len()).find(|&probe| words[probe] != expected[probe])?;
+    let mut recording = Recording::new("probe");
+    let bytes = (ITEMS * WORDS * size_of::<u32>()) as u64;
+    let bindings = vec![recording.input(Buffer::Input, &values), recording.buffer(Buffer::Output, bytes)];
+    let (output, grid) = (bindings[1].clone(), [ITEMS.div_ceil(WORKGROUP) as u32, 1, 1]);
+    recording.commands.push(Command::Dispatch { pipeline: Pipeline::Probe, bindings, grid, iterations: 0 });
+    recording.read_back(output);
+    let mut workspace = Workspace::default();
+    let submitted = executor.run(&recording, &mut workspace, &[])?;
+    let words: Vec<u32> = executor.read(submitted, &workspace, &recording.readback, bytemuck::pod_collect_to_vec)?;
+    Ok((0..ITEMS).zip(words.chunks_exact(WORDS)).find_map(|(item, words)| {
+        let mut probes = expected(&values, item).into_iter().zip(words);
+        let ((name, expected), found) = probes.find(|((_, expected), found)| expected != *found)?;
         let inputs: Vec<String> = values[item * 4..][..4].iter().map(|value| format!("{value:e}")).collect();
-        Some(format!(
-            "probe \"{}\" gives {:#010x} instead of {:#010x} from {}",
-            NAMES[differs],
-            words[differs],
-            expected[differs],
-            inputs.join(", ")
-        ))
+        let inputs = inputs.join(", ");
+        Some(format!("probe \"{name}\" gives {found:#010x} instead of {expected:#010x} from {inputs}"))
     }))
 }
 
-/// The paper's first layout.
-fn config() -> Config {
-    Config::parse(include_str!("../../../configs/generally_forward.toml"), "generally_forward.toml")
-        .expect("the project's own config")
+/// Returns the world of the paper's first layout, with a density, and its config.
+fn world(density: Density) -> (World, Config) {
+    let mut config = Config::parse(include_str!("../../../configs/generally_forward.toml"), "generally_forward.toml")
+        .expect("the project's own config");
+    config.sense.density = density;
+    (World::new(&config.validate().expect("the project's own config")), config)
+}
+
+/// Returns a group of teams that play random policies.
+fn group<'a>(world: &'a World, weights: &'a [f32], policies: usize, teams: &'a [u32]) -> Group<'a> {
+    let (starts, weights, sharing) = (&world.starts[..], Weights::OnHost(weights), Sharing::PerLeader);
+    Group { world, starts, weights, policies, teams, sharing, fitnesses: &[] }
 }
 
 /// Tests an episode with each density, stage by stage.
-fn episode(gpu: &Gpu) -> Result<Option<String>, BackendError> {
+fn episode(executor: &Executor) -> Result<Option<String>, BackendError> {
     const TEAMS: usize = 8;
-    let mut backend = GpuBackend::new(gpu.clone())?;
-    if gpu.adapter.kind != Kind::Software {
+    let mut backend = GpuBackend::with_executor(executor.clone());
+    if executor.gpu.adapter.kind != Kind::Software {
         backend = backend.with_kernel(Kernel::Specialised);
     }
     for (_, density) in Density::ALL {
-        let mut config = config();
-        config.sense.density = *density;
-        let world = World::new(&config.validate().expect("the project's own config"));
+        let (world, _) = world(*density);
         let weights = sample::weights(&world, TEAMS, 0);
         let teams: Vec<u32> = (0..TEAMS as u32).flat_map(|team| vec![team; world.leaders()]).collect();
-        let group = Group {
-            world: &world,
-            starts: &world.starts,
-            weights: weights[..].into(),
-            policies: TEAMS,
-            teams: &teams,
-            sharing: Sharing::PerLeader,
-            fitnesses: &[],
-        };
+        let group = group(&world, &weights, TEAMS, &teams);
         if let Some(mismatch) = compare_traces(&group, &mut Cpu::default(), &mut backend)? {
             return Ok(Some(format!("an episode with {density} density differs: {mismatch}")));
         }
@@ -196,84 +147,43 @@ fn episode(gpu: &Gpu) -> Result<Option<String>, BackendError> {
     Ok(None)
 }
 
-/// Tests what a generation of training uses: populations on the device, from which 64 teams are gathered, both kernels,
-/// and packed records.
-fn training(gpu: &Gpu) -> Result<Option<String>, BackendError> {
+/// Tests what a generation of training uses: populations on the device, from which teams are gathered, both kernels, and
+/// packed records.
+fn training(executor: &Executor) -> Result<Option<String>, BackendError> {
     const TEAMS: usize = 64;
-    let config = config();
-    let world = World::new(&config.validate().expect("the project's own config"));
+    let (world, config) = world(Density::ALL[0].1);
     let (leaders, sizes) = (world.leaders(), [world.leaders(), TEAMS, world.parameters()]);
     let weights = sample::weights(&world, TEAMS, 1);
     let place = |place: usize| ((place / leaders * (2 * (place % leaders) + 1) + place % leaders) % TEAMS) as u32;
     let teams: Vec<u32> = (0..TEAMS * leaders).map(place).collect();
-    // Leaders start at POIs, alone, and followers out of sight, so that small sets and followers without a leader
-    // matter.
-    let start = |agent: usize| match agent.checked_sub(leaders) {
-        None => world.pois[agent % world.pois.len()],
-        Some(follower) => world.pois[follower % world.pois.len()] + Vec2::new(0.0, 11.0 + 3.5 * follower as f32 / 2.0),
+    // Scores show what packing drops if just enough agents are at a POI, and if followers at one saw no leader. So each
+    // POI has three agents, two of them only followers.
+    const POI_OF_AGENT: [usize; 12] = [1, 1, 2, 2, 0, 0, 0, 3, 3, 3, 1, 2];
+    let start = |(agent, &poi): (usize, &usize)| {
+        world.pois[poi] + Vec2::new((agent % 3) as f32, 0.5 * (agent / leaders) as f32)
     };
-    let starts: Vec<Vec2> = (0..world.agents()).map(start).collect();
-    let group = Group {
-        world: &world,
-        starts: &starts,
-        weights: weights[..].into(),
-        policies: TEAMS,
-        sharing: Sharing::PerLeader,
-        teams: &teams,
-        fitnesses: &[Fitness::D, Fitness::Df, Fitness::Dpp],
-    };
-    let trace = Cpu::default().trace(&group)?;
-    let expected: Vec<_> = (0..TEAMS).map(|team| what_scores_depend_on(&world, &trace.episode(&world, team))).collect();
+    let starts: Vec<Vec2> = POI_OF_AGENT.iter().enumerate().map(start).collect();
+    let group = Group { starts: &starts, ..group(&world, &weights, TEAMS, &teams) };
+    let fitnesses: [&[Fitness]; 2] = [&[Fitness::D, Fitness::Df], &[Fitness::Dpp]];
+    let groups = fitnesses.map(|fitnesses| Group { fitnesses, ..group });
+    let expected = Cpu::default().play(&groups)?;
     let learning = Learning { mutation_probability: 0.5, ..config.learning };
     // Software renderers play by the generic kernel, see [`GpuBackend::with_kernel`].
     let kernels = [Kernel::Generic, Kernel::Specialised];
-    let kernels = if gpu.adapter.kind == Kind::Software { &kernels[..1] } else { &kernels };
+    let kernels = if executor.gpu.adapter.kind == Kind::Software { &kernels[..1] } else { &kernels };
     for &kernel in kernels {
-        let backend = GpuBackend::new(gpu.clone())?.with_kernel(kernel);
+        let backend = GpuBackend::with_executor(executor.clone()).with_kernel(kernel);
         let mut backend = backend.with_residency(ResidencyPolicy::Always).with_records(Records::Packed);
         if let Some(mismatch) = compare_breeding(&weights, sizes, &learning, &mut backend)? {
             return Ok(Some(format!("breeding differs: {mismatch}")));
         }
         let held = backend.hold(&weights, sizes)?.expect("the device holds all populations");
-        let found = Mutex::new(vec![Vec::new(); TEAMS]);
-        let note = |_, team: usize, episode: &Episode<'_>| {
-            let words = what_scores_depend_on(&world, episode);
-            lock(&found)[team] = words;
-        };
-        backend.visit(&[Group { weights: Weights::OnDevice(&*held), ..group }], &note)?;
-        let found = lock(&found);
-        if let Some(team) = (0..TEAMS).find(|&team| expected[team] != found[team]) {
-            return Ok(Some(format!("a rollout as in training by the {kernel} kernel differs: team {team}")));
+        let groups = groups.map(|group| Group { weights: Weights::OnDevice(&*held), ..group });
+        if let Some((_, mismatch)) = first_difference(&groups, &expected, &backend.play(&groups)?) {
+            return Ok(Some(format!("a rollout as in training by the {kernel} kernel differs: {mismatch}")));
         }
     }
     Ok(None)
-}
-
-/// Returns what the scores of a team depend on, in a form that packing does not change: per POI the sets that no other
-/// set contains, and the leader that each follower saw most. Sets are of one word. Scores alone would miss some edits of
-/// the kernel that packs records.
-fn what_scores_depend_on(world: &World, episode: &Episode<'_>) -> Vec<u32> {
-    let (pois, leaders, followers) = (world.pois.len(), world.leaders(), world.followers());
-    let mut words = Vec::new();
-    for poi in 0..pois {
-        let sets: BTreeSet<u32> = episode.sets.iter().skip(poi).step_by(pois).filter(|&set| set != 0).collect();
-        let contained = |set: u32| sets.iter().any(|&other| other != set && other & set == set);
-        words.extend(sets.iter().filter(|&&set| !contained(set)));
-        // Where the sets of one POI end.
-        words.push(0);
-    }
-    match episode.seen {
-        Seen::Counts(counts) => words.extend((0..followers).map(|follower| {
-            let steps = |leader: &usize| counts.get(follower * leaders + leader);
-            // The first leader wins ties.
-            let most = (0..leaders).rev().max_by_key(steps).filter(|leader| steps(leader) > 0);
-            most.map_or(u32::from(u8::MAX), |leader| leader as u32)
-        })),
-        Seen::Owners(owners) => {
-            words.extend((0..followers).map(|follower| owners.get(follower / 4) >> (8 * (follower % 4)) & 0xff));
-        }
-    }
-    words
 }
 
 /// Returns reproducible values on which rounding shows: zeros, equal pairs, small integers, sums that nearly cancel,
@@ -340,9 +250,9 @@ fn reciprocal_root(d: f32) -> f32 {
     r
 }
 
-/// Twin of `probe` in `shaders/probe.wgsl`.
+/// Returns each computation of `shaders/probe.wgsl`, in its order, and its word.
 #[allow(clippy::eq_op, reason = "x*y - y*x is 0 but where it is contracted")]
-fn expected(values: &[f32], item: usize) -> [u32; NAMES.len()] {
+fn expected(values: &[f32], item: usize) -> [(&'static str, u32); WORDS] {
     let v: [f32; 4] = std::array::from_fn(|i| values[item * 4 + i]);
     let [x, y, z, w] = v;
     let select = |otherwise: f32, then: f32, condition: bool| if condition { then } else { otherwise };
@@ -356,43 +266,43 @@ fn expected(values: &[f32], item: usize) -> [u32; NAMES.len()] {
     }
     let flags = [x < y, x <= y, x == y, x >= y, x * y > z];
     [
-        bits(x * y + z),
-        bits(x * y - z),
-        bits(z - x * y),
-        bits(x * y + y * z),
-        bits(x * y - x * z),
-        bits(x * y - y * x),
-        bits((x + y) - x),
-        bits((x - y) + y),
-        bits(((x + y) + z) + w),
-        bits(x + (y + (z + w))),
-        bits(((x * y) * z) * w),
-        bits(x * (y * (z * w))),
-        bits(x + x + x),
-        bits((x * 0.1) * 10.0),
-        bits((x + 4096.0) - 4096.0),
-        bits(x * 2.7 + x * 0.3),
-        bits(x * x + y * y + z * z),
-        bits(-(x * y) + z),
-        bits((x * y - z).abs()),
-        bits(product(x, y) + z),
-        bits(kept),
-        bits(select(x * y, z * w, x < y) + z),
-        mixed(std::array::from_fn(|i| v[i] * v[(i + 1) % 4] + v[(i + 2) % 4])),
-        mixed(std::array::from_fn(|i| v[i] * y - (v[i] + v[(i + 3) % 4]))),
-        bits(((x * 0.3 + 0.7) * x - 1.1) * x + 0.9),
-        bits(reciprocal(1.0 + x.abs())),
-        bits(reciprocal_root(1.0 + y.abs())),
-        bits(sum),
-        bits(products),
-        bits((x * y).floor()),
-        bits((x.to_bits() >> 8) as f32),
-        bits((x.to_bits() as i32 >> 7) as f32),
-        x.abs() as u32 ^ y as i32 as u32,
-        (0..).zip(flags).map(|(bit, flag)| u32::from(flag) << bit).sum(),
-        bits(select(x, y, x <= y)) ^ bits(select(z, w, z >= w)),
-        bits(f32::from_bits(z.to_bits() & 0x7fff_ffff) + f32::from_bits(w.to_bits() & 0x7fff_0000)),
-        u32::from(x.abs() * 1.00001 + 4096.0 <= x.abs() + 4096.0),
+        ("x*y + z", bits(x * y + z)),
+        ("x*y - z", bits(x * y - z)),
+        ("z - x*y", bits(z - x * y)),
+        ("x*y + y*z", bits(x * y + y * z)),
+        ("x*y - x*z", bits(x * y - x * z)),
+        ("x*y - y*x", bits(x * y - y * x)),
+        ("(x + y) - x", bits((x + y) - x)),
+        ("(x - y) + y", bits((x - y) + y)),
+        ("((x + y) + z) + w", bits(((x + y) + z) + w)),
+        ("x + (y + (z + w))", bits(x + (y + (z + w)))),
+        ("((x*y)*z)*w", bits(((x * y) * z) * w)),
+        ("x*(y*(z*w))", bits(x * (y * (z * w)))),
+        ("x + x + x", bits(x + x + x)),
+        ("(x*0.1)*10", bits((x * 0.1) * 10.0)),
+        ("(x + 4096) - 4096", bits((x + 4096.0) - 4096.0)),
+        ("x*2.7 + x*0.3", bits(x * 2.7 + x * 0.3)),
+        ("x*x + y*y + z*z", bits(x * x + y * y + z * z)),
+        ("-(x*y) + z", bits(-(x * y) + z)),
+        ("abs(x*y - z)", bits((x * y - z).abs())),
+        ("product(x, y) + z", bits(product(x, y) + z)),
+        ("a product kept over a branch", bits(kept)),
+        ("a selected product, plus z", bits(select(x * y, z * w, x < y) + z)),
+        ("vectors, v*v + v", mixed(std::array::from_fn(|i| v[i] * v[(i + 1) % 4] + v[(i + 2) % 4]))),
+        ("vectors, v*y - (v + v)", mixed(std::array::from_fn(|i| v[i] * y - (v[i] + v[(i + 3) % 4])))),
+        ("a polynomial", bits(((x * 0.3 + 0.7) * x - 1.1) * x + 0.9)),
+        ("Newton's reciprocal", bits(reciprocal(1.0 + x.abs()))),
+        ("Newton's reciprocal root", bits(reciprocal_root(1.0 + y.abs()))),
+        ("a sum in a loop", bits(sum)),
+        ("a sum of products in a loop", bits(products)),
+        ("floor(x*y)", bits((x * y).floor())),
+        ("u32 to f32", bits((x.to_bits() >> 8) as f32)),
+        ("i32 to f32", bits((x.to_bits() as i32 >> 7) as f32)),
+        ("f32 to u32 and i32", x.abs() as u32 ^ y as i32 as u32),
+        ("comparisons", (0..).zip(flags).map(|(bit, flag)| u32::from(flag) << bit).sum()),
+        ("selection by comparison", bits(select(x, y, x <= y)) ^ bits(select(z, w, z >= w))),
+        ("bit casts", bits(f32::from_bits(z.to_bits() & 0x7fff_ffff) + f32::from_bits(w.to_bits() & 0x7fff_0000))),
+        ("sums compared by their bits", u32::from(x.abs() * 1.00001 + 4096.0 <= x.abs() + 4096.0)),
     ]
 }
 
@@ -405,10 +315,11 @@ mod tests {
     /// Returns how many groups give another word for `probe` by this formula.
     fn shown(probe: &str, formula: Formula) -> usize {
         let values = values();
-        let index = NAMES.iter().position(|name| *name == probe).expect("it is one of the probes");
         let differs = |item: &usize| {
             let group = std::array::from_fn(|i| values[item * 4 + i]);
-            bits(formula(group)) != expected(&values, *item)[index]
+            let (_, expected) =
+                *expected(&values, *item).iter().find(|(name, _)| *name == probe).expect("a probe's name");
+            bits(formula(group)) != expected
         };
         (0..ITEMS).filter(differs).count()
     }

@@ -19,7 +19,7 @@ pub enum DeviceError {
         found: Vec<AdapterInfo>,
     },
     /// No adapter has this name or number.
-    #[error("no adapter {} \"{name}\"; {}", if is_index(name) { "has the number" } else { "matches" }, there_are(.found))]
+    #[error("no adapter {} \"{name}\"; found: {}", if is_index(name) { "has the number" } else { "matches" }, list(.found))]
     UnknownAdapter {
         /// The name or number.
         name: String,
@@ -91,17 +91,8 @@ pub enum DeviceError {
 }
 
 fn list(found: &[AdapterInfo]) -> String {
-    found.iter().enumerate().map(|(index, info)| format!("{index}: {info}")).collect::<Vec<_>>().join(", ")
-}
-
-fn there_are(found: &[AdapterInfo]) -> String {
-    let one = |(index, info): (usize, &AdapterInfo)| format!("{index} ({info})");
-    let all: Vec<_> = found.iter().enumerate().map(one).collect();
-    match all.len() {
-        0 => "there is none at all".into(),
-        1 => format!("the only adapter is {}", all[0]),
-        _ => format!("the adapters are {}", all.join(", ")),
-    }
+    let all: Vec<_> = found.iter().enumerate().map(|(index, info)| format!("{index}: {info}")).collect();
+    if all.is_empty() { "none".into() } else { all.join(", ") }
 }
 
 fn inexact(failures: &[(Pass, String)]) -> String {

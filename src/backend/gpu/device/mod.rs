@@ -6,35 +6,31 @@
 //! |---|---|
 //! | `adapter` | adapters: finding them, describing them, choosing one |
 //! | `error` | why a GPU could not be opened, or failed |
-//! | `buffers` | buffers, and bytes to and from the device |
-//! | `compute` | pipelines and dispatches |
 //! | `waiting` | waiting for a device, which may never answer |
+//! | `executor` | buffers, pipelines, and carrying recordings out |
 
 use std::collections::HashMap;
 use std::fmt;
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 use std::sync::{Arc, Mutex};
-use std::time::Duration;
 
 use wgpu::util::DeviceExt;
 
 use super::exact::Pass;
 use super::faults::Faults;
+use super::source::Pipeline;
 use crate::host;
 use crate::parallel::lock;
 
 mod adapter;
-mod buffers;
-mod compute;
 mod error;
+mod executor;
 mod waiting;
 
 pub(super) use adapter::choose;
 pub use adapter::{AdapterChoice, AdapterInfo, Kind, Request, adapters, compiler, position};
-pub use buffers::Traffic;
-pub(super) use compute::{BINDING_ALIGNMENT, Stopwatch, grid, timed};
-pub use compute::{Binding, Bindings};
 pub use error::DeviceError;
+pub use executor::{Executor, Traffic, Workspace};
 pub use waiting::{WaitLimit, report_stalls};
 
 use error::chain;
@@ -70,15 +66,11 @@ pub struct Gpu {
     nonce: Arc<AtomicU32>,
     wait_limit: WaitLimit,
     /// Pipelines that the self-test has compiled.
-    kept: Arc<Mutex<HashMap<PipelineKey, wgpu::ComputePipeline>>>,
-    /// Whether this clone adds to them.
-    keeps: bool,
+    tested: Arc<HashMap<Pipeline, wgpu::ComputePipeline>>,
     /// Faults that tests inject.
+    #[cfg(debug_assertions)]
     faults: Option<Arc<dyn Faults>>,
 }
-
-/// Everything that a pipeline depends on: the text and entry point of its shader, and the pass.
-type PipelineKey = (String, String, Pass);
 
 impl fmt::Debug for Gpu {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -137,15 +129,15 @@ impl Gpu {
             traffic: Arc::default(),
             nonce,
             wait_limit,
-            kept: Arc::default(),
-            keeps: false,
+            tested: Arc::default(),
+            #[cfg(debug_assertions)]
             faults: None,
         })
     }
 
-    /// Returns a clone that keeps the pipelines that it compiles. All other clones reuse them.
-    pub(super) fn keeping_pipelines(&self) -> Gpu {
-        Gpu { keeps: true, ..self.clone() }
+    /// Returns the device with the pipelines of its self-test.
+    pub(super) fn with_tested(self, tested: HashMap<Pipeline, wgpu::ComputePipeline>) -> Gpu {
+        Gpu { tested: Arc::new(tested), ..self }
     }
 
     /// Injects faults, so that tests can show that each is noticed.
@@ -153,10 +145,22 @@ impl Gpu {
     /// # Safety
     /// Shaders are compiled without bounds checks. An edited shader must keep its indices in bounds and its loops
     /// finite, see [`Gpu::pipeline`].
+    #[cfg(debug_assertions)]
     #[doc(hidden)]
     #[expect(unsafe_code, reason = "edited shaders are compiled without bounds checks")]
     pub unsafe fn failing(self, faults: Arc<dyn Faults>) -> Gpu {
-        Gpu { faults: Some(faults), ..self }
+        Gpu { faults: Some(faults), ..self.with_tested(HashMap::new()) }
+    }
+
+    /// Returns the faults that a test injects. Release builds have none.
+    #[cfg(debug_assertions)]
+    pub(super) fn faults(&self) -> Option<&dyn Faults> {
+        self.faults.as_deref()
+    }
+
+    #[cfg(not(debug_assertions))]
+    pub(super) fn faults(&self) -> Option<&dyn Faults> {
+        None
     }
 
     /// Takes `count` consecutive numbers that no other work of this device has, and returns the first.
@@ -174,16 +178,9 @@ impl Gpu {
         DeviceError::Lost { adapter: self.adapter.to_string(), reason }
     }
 
-    /// Records that a result lacks its nonce, and returns the error.
-    pub(super) fn lose_undone(&self, what: &str) -> DeviceError {
-        self.lose(&format!(
-            "the driver reports {what} as done, but the device did not do it; a watchdog may have ended it"
-        ))
-    }
-
-    /// Returns how long work took, or seems to take under injected faults.
-    pub(super) fn taken(&self, iterations: u64, elapsed: Duration) -> Duration {
-        self.faults.as_ref().and_then(|faults| faults.takes(iterations)).unwrap_or(elapsed)
+    /// Records that a status word is missing, and returns the error.
+    fn lose_undone(&self) -> DeviceError {
+        self.lose("the driver reports work as done, but the device did not do it; a watchdog may have ended it")
     }
 
     /// Returns an error if the device was lost, or if anything failed outside of [`Gpu::scoped`]. Call it after every

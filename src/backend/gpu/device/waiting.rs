@@ -67,7 +67,7 @@ impl Gpu {
         let WaitLimit { wait, waits } = self.wait_limit;
         for waited in 1..=waits {
             let wanted = wgpu::PollType::Wait { submission_index: submission_index.clone(), timeout: Some(wait) };
-            let polled = match self.faults.as_ref().is_some_and(|faults| faults.stalls()) {
+            let polled = match self.faults().is_some_and(|faults| faults.stalls()) {
                 true => Err(wgpu::PollError::Timeout),
                 false => self.device.poll(wanted),
             };

@@ -2,13 +2,8 @@
 //!
 //! | file | holds |
 //! |---|---|
-//! | `shape` | kernels: what they are compiled for, and how teams fill their workgroups |
-//! | `planner` | teams cut into tasks, and tasks into batches |
-//! | `source` | the text of the shaders |
-//! | `pipelines` | compiled kernels |
-//! | `pace` | how long submissions take, so that none is too long |
-//! | `flight` | buffers, and submitting a batch |
-//! | `readback` | waiting for a batch, and reading its record |
+//! | `plan` | teams cut into tasks, tasks into batches, and the recording of each batch |
+//! | `inspect` | shaders and inputs of one workgroup, to see what compilers make of them |
 //!
 //! One shader text makes two kernels. The generic one plays any world. The specialised one is compiled for a world's
 //! sizes: all loops have constant bounds and the policy is straight-line code. See [`Kernel`].
@@ -16,43 +11,45 @@
 //! While the GPU plays one batch, the CPU reads the record of the batch before it. If only scores are requested, the
 //! GPU keeps the record and returns only what the scores depend on, see [`Records`].
 
-use std::collections::HashMap;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::any::Any;
+use std::ops::Range;
+use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use bytemuck::Zeroable;
 
-use super::device::{Binding, Bindings, DeviceError, Gpu, Kind, Traffic};
-use super::faults::Faults;
-use super::population::Kernels;
+use super::device::{DeviceError, Executor, Gpu, Kind, Traffic, Workspace};
+use super::population::{Held, Population};
+use super::recording::{Readback, iterations};
+use super::shape::{Capacity, MAX_OFFSET, specialised_shapes};
+use super::source::{NOWHERE, Pipeline, Task};
 use crate::backend::scores::ScoreTable;
 use crate::backend::{
-    BATCH_BYTES, Backend, BackendError, DevicePopulation, FOUR, Group, GroupScores, HELD_FROM, Moment, PACKED_FROM,
-    Trace, check_sizes,
+    BATCH_BYTES, Backend, BackendError, DevicePopulation, Group, GroupScores, HELD_FROM, Moment, PACKED_FROM, Trace,
+    WeightVector, Weights, check_sizes,
 };
 use crate::credit::{Episode, Seen, Strided};
 use crate::host::Instant;
-use crate::parallel::lock;
+use crate::parallel::*;
 
-mod flight;
-mod pace;
-mod pipelines;
-mod planner;
-mod readback;
-mod shape;
-mod source;
+mod inspect;
+mod plan;
 
-pub(crate) use planner::state_bytes;
-pub use planner::{State, Task};
-pub use shape::Kernel;
-pub use source::{WorkgroupBuffers, shader_of, shaders, workgroup_of};
+pub use super::shape::Kernel;
+pub use inspect::{WorkgroupBuffers, shader_of, workgroup_of};
+pub(crate) use plan::state_bytes;
 
-use flight::{Flight, KEPT_SHARE};
-use pace::Pace;
-use pipelines::KEPT_KERNELS;
-use planner::{NOWHERE, owner_words, plan};
-use readback::{Done, Readback};
-use shape::Shape;
+use plan::{BatchPlan, BatchReadback, PACKED_HEAD, PlannedTask, RecordingOptions, owner_words, plan};
+
+/// Target time of a submission, in seconds: no watchdog ends it, even if its kernels are several times as slow as others.
+/// Windows ends a submission after 2 s, other systems even earlier.
+const SUBMISSION_TIME: f64 = 0.1;
+/// Iterations per submission before the device's speed is known, and at least. They take milliseconds on slow GPUs.
+const MIN_CAP: u64 = 1 << 24;
+/// A batch that took less time, or for which the host hardly waited, shows only that the device is at least so fast.
+const SHORT: Duration = Duration::from_millis(5);
+/// Initial share of all sets that a packed record has room for.
+const KEPT_SHARE: f64 = 1.0 / 16.0;
 
 /// Selects the populations that a device holds between generations. Results do not depend on it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -82,7 +79,7 @@ impl Records {
     fn packs(self, bytes: u64) -> bool {
         match self {
             Records::Whole => false,
-            Records::PackedFrom(least) => bytes >= least,
+            Records::PackedFrom(minimum) => bytes >= minimum,
             Records::Packed => true,
         }
     }
@@ -90,31 +87,53 @@ impl Records {
 
 /// Plays episodes on a GPU.
 pub struct GpuBackend {
-    gpu: Gpu,
-    layout: Bindings,
+    executor: Executor,
     kernel: Kernel,
-    pipelines: HashMap<Shape, wgpu::ComputePipeline>,
-    pace: Pace,
-    /// When the last batch finished.
-    done_at: Option<Instant>,
-    /// Whether rollouts are timed by the device's clock.
-    clock: bool,
     residency: ResidencyPolicy,
     records: Records,
-    /// Compiled when first needed.
-    pack: Option<(wgpu::ComputePipeline, Bindings)>,
-    /// The share of all sets that packed records have room for.
-    kept_share: f64,
-    /// Compiled when populations are first held.
-    kernels: Option<Arc<Kernels>>,
-    /// Two sets of buffers, so that one batch plays while the other is read.
-    flights: [Flight; 2],
-    /// Weights to be copied to the device.
-    staging: Vec<[f32; FOUR]>,
     /// Target bytes of one buffer of a batch.
     batch_bytes: u64,
-    kept_kernels: usize,
+    /// Whether rollouts are timed by the device's clock.
+    clock: bool,
+    /// Two sets of buffers, so that one batch plays while the other is read.
+    workspaces: [Workspace; 2],
+    /// Weights to be copied to the device.
+    staging: Vec<WeightVector>,
+    /// Maximum work of a submission, in estimated iterations.
+    cap: u64,
+    /// When the last batch finished.
+    done_at: Option<Instant>,
+    /// The share of all sets that packed records have room for.
+    kept_share: f64,
     times: PhaseTimes,
+}
+
+/// The record of a batch, in the host's memory.
+#[derive(Clone, Copy)]
+enum RecordWords<'a> {
+    /// The whole record.
+    Whole(&'a [u32]),
+    /// The part that the scores depend on, as `shaders/pack.wgsl` writes it.
+    Packed(&'a [u32]),
+}
+
+/// Called for each task with the record and the moments of its batch.
+type Done<'a> = dyn Fn(&PlannedTask, RecordWords<'_>, &[Moment]) + Sync + 'a;
+
+/// A submitted batch.
+struct Submitted<'a> {
+    plan: &'a BatchPlan,
+    /// The index of its workspace.
+    workspace: usize,
+    last: wgpu::SubmissionIndex,
+    start: Instant,
+    nonce: u32,
+    /// The estimated work, and the number of submissions.
+    iterations: u64,
+    submissions: usize,
+    /// What it reads back, and where.
+    readback: Readback,
+    ranges: BatchReadback,
 }
 
 /// The time that rollouts took, by phase. The CPU's phases do not overlap; the GPU works at the same time.
@@ -132,7 +151,8 @@ pub struct PhaseTimes {
     pub score: Duration,
     /// Playing, by the GPU's clock. 0 if that was not requested or there is none.
     pub gpu: Duration,
-    /// The longest submission: by the GPU's clock if that was requested, else as the host saw it.
+    /// The longest submission, if those of a batch take equally long: by the GPU's clock if that was requested, else as
+    /// the host saw it.
     pub longest: Duration,
     /// Bytes copied to and from the device.
     pub traffic: Traffic,
@@ -144,28 +164,26 @@ impl GpuBackend {
     /// # Errors
     /// The device does not support the episode's bindings.
     pub fn new(gpu: Gpu) -> Result<GpuBackend, DeviceError> {
-        use Binding::{Read, Write};
-        let software = gpu.adapter.kind == Kind::Software;
-        let layout = gpu.layout("episode", &[Read, Read, Read, Read, Write, Write, Write])?;
-        Ok(GpuBackend {
-            gpu,
-            layout,
+        Ok(GpuBackend::with_executor(Executor::new(gpu)))
+    }
+
+    /// Returns a backend that shares the pipelines of an executor.
+    pub(super) fn with_executor(executor: Executor) -> GpuBackend {
+        let software = executor.gpu.adapter.kind == Kind::Software;
+        GpuBackend {
+            executor,
             kernel: if software { Kernel::Generic } else { Kernel::Best },
-            pipelines: HashMap::new(),
-            pace: Pace::default(),
-            done_at: None,
-            clock: false,
             residency: if software { ResidencyPolicy::Never } else { ResidencyPolicy::From(HELD_FROM) },
             records: if software { Records::Whole } else { Records::PackedFrom(PACKED_FROM) },
-            pack: None,
-            kept_share: KEPT_SHARE,
-            kernels: None,
-            flights: Default::default(),
-            staging: Vec::new(),
             batch_bytes: BATCH_BYTES,
-            kept_kernels: KEPT_KERNELS,
+            clock: false,
+            workspaces: Default::default(),
+            staging: Vec::new(),
+            cap: MIN_CAP,
+            done_at: None,
+            kept_share: KEPT_SHARE,
             times: PhaseTimes::default(),
-        })
+        }
     }
 
     /// Sets the target bytes of a batch's buffers. Results do not depend on it.
@@ -179,15 +197,12 @@ impl GpuBackend {
         GpuBackend { kernel, ..self }
     }
 
-    /// Sets the maximum number of kernels per batch and kept between batches, at least one. Results do not depend on it.
-    pub fn with_kernel_cache(self, kernels: usize) -> GpuBackend {
-        GpuBackend { kept_kernels: kernels.max(1), ..self }
-    }
-
     /// Returns how many generic and how many specialised kernels are compiled.
     pub fn compiled(&self) -> [usize; 2] {
-        let specialised = self.pipelines.keys().filter(|shape| shape.is_specialised()).count();
-        [self.pipelines.len() - specialised, specialised]
+        let pipelines = self.executor.pipelines();
+        let shapes = pipelines.keys().filter_map(Pipeline::shape);
+        let (specialised, generic): (Vec<_>, Vec<_>) = shapes.partition(|shape| shape.is_specialised());
+        [generic.len(), specialised.len()]
     }
 
     /// Chooses which populations the device holds.
@@ -205,22 +220,24 @@ impl GpuBackend {
     /// # Safety
     /// Shaders are compiled without bounds checks. An edited shader must keep its indices in bounds and its loops
     /// finite, see [`Gpu::pipeline`].
+    #[cfg(debug_assertions)]
     #[doc(hidden)]
     #[expect(unsafe_code, reason = "edited shaders are compiled without bounds checks")]
     pub unsafe fn edited(self, edit: fn(String) -> String) -> GpuBackend {
         struct Edit(fn(String) -> String);
-        impl Faults for Edit {
+        impl super::faults::Faults for Edit {
             fn edits(&self, text: String) -> String {
                 (self.0)(text)
             }
         }
         // SAFETY: see the function's own contract.
-        GpuBackend { gpu: unsafe { self.gpu.failing(Arc::new(Edit(edit))) }, ..self }
+        let gpu = unsafe { self.executor.gpu.failing(std::sync::Arc::new(Edit(edit))) };
+        GpuBackend { executor: Executor::new(gpu), ..self }
     }
 
     /// Starts to time rollouts by the GPU's clock, if it has one.
     pub fn use_clock(&mut self) {
-        self.clock = self.gpu.has_clock();
+        self.clock = true;
     }
 
     /// Returns and resets the times of rollouts.
@@ -230,53 +247,187 @@ impl GpuBackend {
 
     /// Returns the device.
     pub fn gpu(&self) -> &Gpu {
-        &self.gpu
+        &self.executor.gpu
+    }
+
+    /// Returns the limits of the device and of this backend for a batch.
+    fn capacity(&self) -> Capacity {
+        let limits = &self.gpu().limits;
+        Capacity {
+            batch: self.batch_bytes,
+            // Status words are read through the same buffer as the record.
+            buffer: (limits.max_buffer_size - (1 << 20)).min(limits.max_storage_buffer_binding_size).min(MAX_OFFSET),
+            workgroup: limits.max_compute_invocations_per_workgroup.min(limits.max_compute_workgroup_size_x) as usize,
+            workgroup_bytes: limits.max_compute_workgroup_storage_size as usize,
+        }
+    }
+
+    /// Returns the populations that a group plays, if they are on the device.
+    fn population<'a>(&self, group: &Group<'a>) -> Result<Option<&'a Population>, BackendError> {
+        let Weights::OnDevice(held) = group.weights else { return Ok(None) };
+        let own = (held as &dyn Any).downcast_ref().filter(|population: &&Population| population.is_of(&self.executor));
+        let population = own.ok_or(BackendError::HeldElsewhere)?;
+        population.check([group.populations(), group.policies, group.world.parameters()])?;
+        Ok(Some(population))
     }
 
     /// Plays all tasks, and calls `done` for each with the record and the moments of its batch.
     fn play_tasks(&mut self, groups: &[Group<'_>], trace: bool, done: &Done<'_>) -> Result<(), BackendError> {
-        let (start, before) = (Instant::now(), self.gpu.traffic());
-        let batches = plan(groups, trace, self.records, self.capacity(), &self.specialised(groups, trace))?;
+        let (start, before, capacity) = (Instant::now(), self.gpu().traffic(), self.capacity());
+        let populations = groups.iter().map(|group| self.population(group)).collect::<Result<Vec<_>, _>>()?;
+        let compiled = self.executor.pipelines();
+        let is_compiled = |shape| compiled.contains_key(&Pipeline::Episode(shape));
+        let specialised = specialised_shapes(groups, trace, self.kernel, capacity, &is_compiled);
+        let batches = plan(groups, trace, self.records, capacity, &specialised)?;
         self.times.gather += start.elapsed();
         let mut previous = None;
         for (index, plan) in batches.iter().enumerate() {
-            let submitted = self.submit(index % 2, groups, plan, trace)?;
-            if let Some((plan, submitted)) = previous.replace((plan, submitted)) {
-                self.collect(plan, submitted, done)?;
+            let submitted = self.submit(index % 2, groups, &populations, plan, trace)?;
+            if let Some(submitted) = previous.replace(submitted) {
+                self.collect(submitted, done)?;
             }
         }
-        if let Some((plan, submitted)) = previous {
-            self.collect(plan, submitted, done)?;
+        if let Some(submitted) = previous {
+            self.collect(submitted, done)?;
         }
-        self.times.traffic += self.gpu.traffic() - before;
+        self.times.traffic += self.gpu().traffic() - before;
         Ok(())
     }
 
-    /// Plays all groups, and calls `visit` with each team's group, its index there, and its record, from several
-    /// threads.
-    pub(crate) fn visit(
+    /// Submits one batch.
+    fn submit<'a>(
         &mut self,
+        workspace: usize,
         groups: &[Group<'_>],
-        visit: &(dyn Fn(usize, usize, &Episode<'_>) + Sync),
-    ) -> Result<(), BackendError> {
-        self.play_tasks(groups, false, &|planned, readback, _| {
+        populations: &[Option<&Population>],
+        plan: &'a BatchPlan,
+        trace: bool,
+    ) -> Result<Submitted<'a>, DeviceError> {
+        let start = Instant::now();
+        plan.stage(groups, &mut self.staging);
+        let gathered = Instant::now();
+        let held: Vec<Option<&Held>> = populations.iter().map(|held| Some(&(*held)?.held)).collect();
+        let workspaces: Vec<_> = populations.iter().map(|held| Some(&(*held)?.workspace)).collect();
+        let nonce = self.gpu().nonces(plan.rounds() as u32);
+        let options = RecordingOptions {
+            groups,
+            held: &held,
+            weights: &self.staging,
+            trace,
+            nonce,
+            cap: self.cap,
+            most_workgroups: self.gpu().limits.max_compute_workgroups_per_dimension,
+            records: self.records,
+            kept_share: self.kept_share,
+        };
+        let (recording, ranges) = plan.record(&options);
+        let (iterations, submissions) = (iterations(&recording.commands), recording.submissions().count());
+        if self.clock {
+            self.executor.start_clock(&mut self.workspaces[workspace])?;
+        }
+        let submission = Instant::now();
+        let last = self.executor.run(&recording, &mut self.workspaces[workspace], &workspaces)?;
+        self.times.gather += gathered - start;
+        self.times.upload += gathered.elapsed();
+        let (start, readback) = (submission, recording.readback);
+        Ok(Submitted { plan, workspace, last, start, nonce, iterations, submissions, readback, ranges })
+    }
+
+    /// Waits for one batch, and passes its record on.
+    fn collect(&mut self, mut submitted: Submitted<'_>, done: &Done<'_>) -> Result<(), DeviceError> {
+        let start = Instant::now();
+        self.gpu().wait_for(Some(submitted.last.clone()))?;
+        let waited = start.elapsed();
+        let elapsed = self.measure(&submitted, waited);
+        let clock = self.executor.clock(&self.workspaces[submitted.workspace])?;
+        let (used, mut score) = self.score(&submitted, done)?;
+        if score.is_none() {
+            // More was kept than the packed record has room for.
+            let (recording, ranges) = submitted.plan.record_of_played(submitted.nonce);
+            submitted.last = self.executor.run(&recording, &mut self.workspaces[submitted.workspace], &[])?;
+            (submitted.readback, submitted.ranges) = (recording.readback, ranges);
+            score = self.score(&submitted, done)?.1;
+        }
+        let score = score.unwrap_or_default();
+        if let (Some(used), Some(head)) = (used, submitted.plan.head) {
+            // The next generation may keep more, so there is room for half as much again. The room shrinks slowly.
+            let kept = 1.5 * used.saturating_sub(head) as f64 / submitted.plan.sets as f64;
+            self.kept_share = kept.max(0.9 * self.kept_share);
+        }
+        self.times.gpu += clock.unwrap_or_default();
+        self.times.longest = self.times.longest.max(clock.unwrap_or(elapsed) / submitted.submissions as u32);
+        self.times.wait += waited;
+        self.times.score += score;
+        self.times.read_back += start.elapsed().saturating_sub(waited + score);
+        Ok(())
+    }
+
+    /// Returns how long a batch took that is done, after the host has waited for it. Sets the cap of submissions by
+    /// that.
+    fn measure(&mut self, submitted: &Submitted<'_>, waited: Duration) -> Duration {
+        let now = Instant::now();
+        // The device plays one batch after the other.
+        let before = self.done_at.replace(now);
+        let elapsed = now - before.map_or(submitted.start, |before| submitted.start.max(before));
+        let seems = self.gpu().faults().and_then(|faults| faults.takes(submitted.iterations));
+        let elapsed = seems.unwrap_or(elapsed);
+        let cap = (submitted.iterations as f64 / elapsed.as_secs_f64().max(1e-9) * SUBMISSION_TIME) as u64;
+        if cap > self.cap || waited.min(elapsed) >= SHORT {
+            self.cap = cap.max(MIN_CAP);
+        }
+        elapsed
+    }
+
+    /// Passes the record of a batch on, if it was read back. Returns the words that packing needed, and how long that
+    /// took.
+    fn score(
+        &self,
+        submitted: &Submitted<'_>,
+        done: &Done<'_>,
+    ) -> Result<(Option<usize>, Option<Duration>), DeviceError> {
+        let Submitted { plan, workspace, last, readback, ranges: BatchReadback { moments, packed, record }, .. } =
+            submitted;
+        self.executor.read(last.clone(), &self.workspaces[*workspace], readback, |bytes| {
+            let words = |range: &Range<usize>| bytemuck::cast_slice::<u8, u32>(&bytes[range.clone()]);
+            let packed = packed.as_ref().map(|(room, range)| (*room, words(range)));
+            let used = packed.map(|(_, words)| words[0] as usize);
+            let record = match (packed, record) {
+                (Some((room, words)), _) if used <= Some(room) && words.len() > PACKED_HEAD => {
+                    RecordWords::Packed(&words[PACKED_HEAD..])
+                }
+                (_, Some(range)) => RecordWords::Whole(words(range)),
+                _ => return (used, None),
+            };
+            let (start, moments) = (Instant::now(), bytemuck::cast_slice(&bytes[moments.clone()]));
+            plan.tasks.par_iter().for_each(|planned| done(planned, record, moments));
+            (used, Some(start.elapsed()))
+        })
+    }
+}
+
+impl Backend for GpuBackend {
+    fn play(&mut self, groups: &[Group<'_>]) -> Result<Vec<GroupScores>, BackendError> {
+        groups.iter().try_for_each(Group::check)?;
+        let scores = ScoreTable::new(groups);
+        self.play_tasks(groups, false, &|planned, record, _| {
             let world = groups[planned.group].world;
-            let Task { sets, seen, table, owners, .. } = planned.task;
+            let Task { sets, counts, table, owners, .. } = planned.task;
             let stride = planned.task.teams as usize;
             let (group, first) = (planned.group, planned.first_team);
-            match readback {
-                Readback::Whole(record) => {
-                    let sets = &record[sets as usize..][..world.set_words() * stride];
+            match record {
+                RecordWords::Whole(words) => {
+                    let sets = &words[sets as usize..][..world.set_words() * stride];
                     let sight_words = if groups[group].records().sights() { world.sight_words() } else { 0 };
-                    let (seen, sights) = record[seen as usize..].split_at(world.leaders() * world.followers() * stride);
+                    let counted = world.leaders() * world.followers() * stride;
+                    let (counts, sights) = words[counts as usize..].split_at(counted);
                     let sights = &sights[..sight_words * stride];
                     for offset in 0..stride {
                         let strided = |words| Strided { words, stride, offset };
-                        let (sets, seen, sights) = (strided(sets), Seen::Counts(strided(seen)), strided(sights));
-                        visit(group, first + offset, &Episode { sets, seen, sights });
+                        let (sets, seen, sights) = (strided(sets), Seen::Counts(strided(counts)), strided(sights));
+                        scores.score(group, first + offset, &Episode { sets, seen, sights });
                     }
                 }
-                Readback::Packed(words) => {
+                RecordWords::Packed(words) => {
                     let table = &words[table as usize..][..=stride];
                     let owners = match owners {
                         NOWHERE => &[],
@@ -286,19 +437,11 @@ impl GpuBackend {
                         let words = &words[ends[0] as usize..ends[1] as usize];
                         let sets = Strided::contiguous(words);
                         let seen = Seen::Owners(Strided { words: owners, stride, offset });
-                        visit(group, first + offset, &Episode { sets, seen, sights: Strided::NONE });
+                        scores.score(group, first + offset, &Episode { sets, seen, sights: Strided::NONE });
                     }
                 }
             }
-        })
-    }
-}
-
-impl Backend for GpuBackend {
-    fn play(&mut self, groups: &[Group<'_>]) -> Result<Vec<GroupScores>, BackendError> {
-        groups.iter().try_for_each(Group::check)?;
-        let scores = ScoreTable::new(groups);
-        self.visit(groups, &|group, team, episode| scores.score(group, team, episode))?;
+        })?;
         Ok(scores.finish())
     }
 
@@ -316,12 +459,12 @@ impl Backend for GpuBackend {
             seen: vec![0; teams * seen_words],
             sights: vec![0; teams * sight_words],
         });
-        self.play_tasks(std::slice::from_ref(group), true, &|planned, readback, moments| {
-            let Readback::Whole(record) = readback else { unreachable!("no trace is packed") };
+        self.play_tasks(std::slice::from_ref(group), true, &|planned, record, moments| {
+            let RecordWords::Whole(record) = record else { unreachable!("no trace is packed") };
             let Trace { moments: all_moments, sets, seen, sights, .. } = &mut *lock(&trace);
-            let Task { teams: stride, moments: first_moment, sets: first_set, seen: first_seen, .. } = planned.task;
-            let [stride, first_moment, first_set, first_seen] =
-                [stride, first_moment, first_set, first_seen].map(|number| number as usize);
+            let Task { teams: stride, moments: first_moment, sets: first_set, counts: first_count, .. } = planned.task;
+            let [stride, first_moment, first_set, first_count] =
+                [stride, first_moment, first_set, first_count].map(|number| number as usize);
             for step in 0..=steps {
                 let from = first_moment + step * stride * agents;
                 let to = (step * teams + planned.first_team) * agents;
@@ -335,8 +478,8 @@ impl Backend for GpuBackend {
                 }
             };
             scatter(first_set, set_words, sets);
-            scatter(first_seen, seen_words, seen);
-            scatter(first_seen + seen_words * stride, sight_words, sights);
+            scatter(first_count, seen_words, seen);
+            scatter(first_count + seen_words * stride, sight_words, sights);
         })?;
         Ok(trace.into_inner().unwrap_or_else(PoisonError::into_inner))
     }
@@ -346,34 +489,24 @@ impl Backend for GpuBackend {
         let [populations, slots, parameters] = sizes;
         let allowed = self.capacity().buffer;
         let bytes = (slots * parameters * size_of::<f32>()) as u64;
-        let least = match self.residency {
+        let optional = match self.residency {
             ResidencyPolicy::Never => return Ok(None),
-            ResidencyPolicy::From(least) => least,
-            ResidencyPolicy::Always => 0,
+            ResidencyPolicy::From(minimum) if populations as u64 * bytes < minimum => return Ok(None),
+            ResidencyPolicy::From(_) => true,
+            ResidencyPolicy::Always => false,
         };
-        if populations as u64 * bytes < least {
-            return Ok(None);
-        }
         if bytes > allowed {
-            return match self.residency {
-                ResidencyPolicy::Always => Err(BackendError::TooLarge(format!(
+            let text = || {
+                format!(
                     "one population takes {bytes} bytes, this adapter holds {allowed} in one buffer; \
                      breed on the host, or use a smaller population"
-                ))),
-                _ => Ok(None),
+                )
             };
+            return if optional { Ok(None) } else { Err(BackendError::TooLarge(text())) };
         }
-        let kernels = match &self.kernels {
-            Some(kernels) => kernels,
-            None => self.kernels.insert(Arc::new(Kernels::new(self.gpu.clone())?)),
-        };
-        match kernels.hold(weights, sizes) {
+        match Population::new(self.executor.clone(), weights, sizes) {
             Ok(population) => Ok(Some(Box::new(population))),
-            Err(DeviceError::OutOfMemory { .. } | DeviceError::TooLarge { .. })
-                if self.residency != ResidencyPolicy::Always =>
-            {
-                Ok(None)
-            }
+            Err(DeviceError::OutOfMemory { .. } | DeviceError::TooLarge { .. }) if optional => Ok(None),
             Err(error) => Err(error.into()),
         }
     }
@@ -384,6 +517,6 @@ impl Backend for GpuBackend {
             ResidencyPolicy::From(bytes) => format!(", holds populations of {} KiB or more", bytes >> 10),
             ResidencyPolicy::Always => ", holds all populations".into(),
         };
-        format!("gpu ({}, {} pass{held})", self.gpu.adapter, self.gpu.pass)
+        format!("gpu ({}, {} pass{held})", self.gpu().adapter, self.gpu().pass)
     }
 }

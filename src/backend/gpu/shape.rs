@@ -1,5 +1,7 @@
-//! Kernels: what a pipeline is compiled for, and how teams are packed into its workgroups.
+//! Kernels of episodes: what each is compiled for, and how teams are packed into its workgroups.
 
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, HashSet};
 use std::fmt;
 
 use glam::Vec2;
@@ -24,6 +26,8 @@ pub(super) const TEAMS: [usize; 3] = [32, 16, 8];
 pub(super) const MAX_THREADS: usize = 512;
 /// Maximum weights of a policy that are written out as straight-line code.
 const MAX_STRAIGHT_WEIGHTS: usize = 512;
+/// Maximum number of specialised kernels per rollout under [`Kernel::Best`]: each takes a fraction of a second to compile.
+const MAX_SPECIALISED: usize = 16;
 
 /// Selects the kernel that plays. Results do not depend on it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -47,9 +51,9 @@ impl fmt::Display for Kernel {
     }
 }
 
-/// Everything that a pipeline is compiled for. Pipelines are cached by it.
+/// Everything that an episode's kernel is compiled for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub(super) struct Shape {
+pub struct Shape {
     /// Threads per workgroup.
     pub(super) workgroup: usize,
     /// Agents that a thread plays, one after another.
@@ -60,22 +64,22 @@ pub(super) struct Shape {
 
 /// Additional records of a kernel, besides sets and counts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub(super) struct Recorded {
+pub struct Recorded {
     /// Whether it records all quantities of every step.
     pub(super) trace: bool,
     /// Whether it records which leaders each follower sees at each step.
-    pub(super) sights: bool,
+    pub(super) sightings: bool,
 }
 
 impl Recorded {
     pub(super) fn of(group: &Group<'_>, trace: bool) -> Recorded {
-        Recorded { trace, sights: group.records().sights() && group.world.followers() > 0 }
+        Recorded { trace, sightings: group.records().sights() && group.world.followers() > 0 }
     }
 }
 
 /// The sizes that a kernel is compiled for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub(super) enum Sizes {
+pub enum Sizes {
     /// The widest layer, inputs included and rounded up to save compilations, and whether the outputs choose a
     /// behaviour.
     Any { widest: usize, chooses: bool },
@@ -91,28 +95,48 @@ impl Shape {
         matches!(self.sizes, Sizes::Fixed { .. })
     }
 
-    /// Returns the shape of the kernel that plays any world with policies up to this width.
-    pub(super) fn generic(world: &World, workgroup: Workgroup, records: Recorded) -> Shape {
-        let policy = &world.constants.policy;
+    /// Returns the kernel that plays any world with policies up to this width.
+    pub(super) fn generic(world: &World, capacity: Capacity, records: Recorded) -> (Shape, Workgroup) {
+        let (workgroup, policy) = (Workgroup::generic(world, capacity.workgroup), &world.constants.policy);
         let chooses = policy.actions() == Some(Actions::Behaviours);
         let sizes = Sizes::Any { widest: policy.widest().next_power_of_two(), chooses };
-        Shape { workgroup: workgroup.threads, slots: workgroup.slots, records, sizes }
+        (Shape { workgroup: workgroup.threads, slots: workgroup.slots, records, sizes }, workgroup)
     }
 
-    /// Returns the specialised shape, if it is requested and possible.
-    pub(super) fn asked_for(world: &World, kernel: Kernel, capacity: Capacity, records: Recorded) -> Option<Shape> {
-        let workgroup = Workgroup::specialised(world, capacity).filter(|_| kernel != Kernel::Generic);
-        workgroup.map(|workgroup| Shape::specialised(world, workgroup, records))
-    }
-
-    /// Returns the shape of the kernel that plays worlds of these sizes only.
-    pub(super) fn specialised(world: &World, workgroup: Workgroup, records: Recorded) -> Shape {
+    /// Returns the kernel that plays worlds of these sizes only, if one is possible.
+    pub(super) fn specialised(world: &World, capacity: Capacity, records: Recorded) -> Option<(Shape, Workgroup)> {
+        let workgroup = Workgroup::specialised(world, capacity)?;
         let Constants { leaders, followers, pois, variant, policy: PolicyConstants { widths, .. }, .. } =
             world.constants;
         let sizes =
             Sizes::Fixed { teams: workgroup.teams, leaders, agents: leaders + followers, pois, widths, variant };
-        Shape { workgroup: workgroup.threads, slots: workgroup.slots, records, sizes }
+        Some((Shape { workgroup: workgroup.threads, slots: workgroup.slots, records, sizes }, workgroup))
     }
+}
+
+/// Returns the shapes of some groups that get a specialised kernel. Under [`Kernel::Best`] these are the compiled ones,
+/// and of the others those with most agent-steps, up to [`MAX_SPECIALISED`] in all. Traces are not worth a compilation.
+pub(super) fn specialised_shapes(
+    groups: &[Group<'_>],
+    trace: bool,
+    kernel: Kernel,
+    capacity: Capacity,
+    is_compiled: &dyn Fn(Shape) -> bool,
+) -> HashSet<Shape> {
+    if kernel == Kernel::Generic || kernel == Kernel::Best && trace {
+        return HashSet::new();
+    }
+    let mut agent_steps: BTreeMap<Shape, usize> = BTreeMap::new();
+    for group in groups {
+        if let Some((shape, _)) = Shape::specialised(group.world, capacity, Recorded::of(group, trace)) {
+            *agent_steps.entry(shape).or_default() += group.team_count() * group.world.agents() * group.world.steps();
+        }
+    }
+    let mut shapes: Vec<_> = agent_steps.into_iter().collect();
+    shapes.sort_by_key(|&(shape, agent_steps)| (!is_compiled(shape), Reverse(agent_steps)));
+    let most = if kernel == Kernel::Best { MAX_SPECIALISED } else { usize::MAX };
+    let shapes = shapes.into_iter().map(|(shape, _)| shape).enumerate();
+    shapes.filter(|&(index, shape)| index < most || is_compiled(shape)).map(|(_, shape)| shape).collect()
 }
 
 /// A workgroup of one world's kernel.
@@ -165,8 +189,6 @@ pub(super) struct Capacity {
     pub(super) batch: u64,
     /// Maximum bytes of a buffer.
     pub(super) buffer: u64,
-    /// Maximum kernels per batch.
-    pub(super) kernels: usize,
     /// Maximum threads per workgroup, and bytes of workgroup memory.
     pub(super) workgroup: usize,
     pub(super) workgroup_bytes: usize,
@@ -181,6 +203,6 @@ impl Capacity {
     /// Returns the limits of a device with this maximum of threads per workgroup, and no limit on batches.
     pub(super) fn of_workgroups(threads: usize) -> Capacity {
         let bytes = MAX_OFFSET;
-        Capacity { batch: bytes, buffer: bytes, kernels: 1, workgroup: threads, workgroup_bytes: 16 << 10 }
+        Capacity { batch: bytes, buffer: bytes, workgroup: threads, workgroup_bytes: 16 << 10 }
     }
 }

@@ -1,0 +1,784 @@
+//! Plans: cuts groups of teams into tasks, tasks into batches that fit the device, and records what each batch does.
+
+use std::collections::{BTreeSet, HashSet};
+use std::ops::Range;
+
+use glam::Vec2;
+
+use super::Records;
+use crate::backend::gpu::population::Held;
+use crate::backend::gpu::recording::{BINDING_ALIGNMENT, Buffer, Command, Recording, Slice, grid};
+use crate::backend::gpu::shape::{Capacity, MAX_THREADS, Recorded, Shape, WORKGROUPS, Workgroup};
+use crate::backend::gpu::source::{GatherJob, LEADERS_PER_GATHER, NOWHERE, PACK_WORKGROUP, Pipeline, State, Task};
+use crate::backend::{BackendError, Group, Moment, VECTOR, WeightVector, Weights, record_words, weight_vectors};
+use crate::credit::{RecordRequest, owner_bits};
+use crate::model::Constants;
+use crate::model::policy::PolicyConstants;
+use crate::parallel::*;
+use crate::world::World;
+
+/// Maximum loop iterations per thread and dispatch, over all loops. Longer episodes take several dispatches: Mesa's
+/// llvmpipe 22.3 abandons every loop after 65 535 iterations, and drivers stop a dispatch that runs for seconds.
+const MAX_ITERATIONS: usize = 60_000;
+/// Words before the others in a packed record (`struct Packed` in the shader): words used, and words available.
+pub(super) const PACKED_HEAD: usize = 2;
+/// Words after a task's record.
+const STATUS: usize = 1;
+/// Alignment of each kernel's first task, in tasks, so that a binding may start there.
+const TASK_ALIGNMENT: usize = BINDING_ALIGNMENT / size_of::<Task>();
+const _: () = assert!(BINDING_ALIGNMENT.is_multiple_of(size_of::<Task>()));
+/// Words of a packed record beyond the share of sets that it has room for.
+const SPARE_PACKED_WORDS: usize = 256;
+
+/// Returns the estimated loop iterations per thread and step, over all loops.
+fn iterations_per_step(world: &World, workgroup: Workgroup, records: Recorded) -> usize {
+    let Constants { words, policy: PolicyConstants { widths, .. }, .. } = world.constants;
+    let network: u32 = widths.windows(2).map(|w| (w[0] + 2) * w[1]).sum();
+    // A leader iterates over all agents, and again over those in reach.
+    let agent = world.pois.len() + 2 * world.agents() + words as usize + network as usize + 20;
+    let sights = if records.sightings { world.followers() * world.leader_words() } else { 0 };
+    let items = |rows: usize| (rows * workgroup.teams).div_ceil(workgroup.threads);
+    let items = items(world.pois.len() * words as usize) + items(sights);
+    workgroup.slots * agent + items * 33
+}
+
+/// Returns the maximum steps per dispatch, see [`MAX_ITERATIONS`].
+fn steps_per_dispatch(world: &World, workgroup: Workgroup, records: Recorded) -> usize {
+    (MAX_ITERATIONS / iterations_per_step(world, workgroup, records)).max(1)
+}
+
+/// Returns the bytes of a team's states between two dispatches, 0 if one dispatch plays the whole episode. This is an
+/// upper bound: adapters with larger workgroups may need none.
+pub fn state_bytes(world: &World, request: RecordRequest<'_>) -> u64 {
+    let recorded = Recorded { trace: false, sightings: request.sights() && world.followers() > 0 };
+    let generic = Workgroup::generic(world, WORKGROUPS[2]);
+    let specialised = Workgroup::specialised(world, Capacity::of_workgroups(MAX_THREADS));
+    let is_parted = |workgroup| world.steps() > steps_per_dispatch(world, workgroup, recorded);
+    if is_parted(generic) || specialised.is_some_and(is_parted) {
+        (world.agents() * size_of::<State>()) as u64
+    } else {
+        0
+    }
+}
+
+/// A task and where its teams come from.
+#[derive(Clone, Copy)]
+pub(super) struct PlannedTask {
+    pub(super) group: usize,
+    pub(super) first_team: usize,
+    pub(super) shape: Shape,
+    /// The task, with all steps of the episode.
+    pub(super) task: Task,
+    steps_per_dispatch: usize,
+    /// The estimated work of a step: loop iterations over all threads.
+    iterations_per_step: usize,
+}
+
+impl PlannedTask {
+    /// Returns the range of its weights, in vectors.
+    fn weights(&self, groups: &[Group<'_>]) -> Range<usize> {
+        let first = self.task.weights as usize;
+        first..first + self.task.teams as usize * weight_vectors(groups[self.group].world)
+    }
+
+    /// Returns the number of rounds of dispatches.
+    fn rounds(&self) -> usize {
+        (self.task.end as usize).div_ceil(self.steps_per_dispatch)
+    }
+
+    /// Returns the task with the steps of one round of dispatches, or `None` after its last round.
+    fn round(&self, round: usize, nonce: u32) -> Option<Task> {
+        let first = (round * self.steps_per_dispatch) as u32;
+        let end = self.task.end.min(first + self.steps_per_dispatch as u32);
+        (first < end).then_some(Task { first, end, nonce, ..self.task })
+    }
+
+    /// Returns the offset of the status word in a packed record. It follows the table.
+    fn packed_status(&self) -> usize {
+        (self.task.table + self.task.teams) as usize + 1
+    }
+
+    /// Returns the value of the status word after the last round.
+    fn final_status(&self, nonce: u32) -> u32 {
+        nonce.wrapping_add(self.rounds() as u32 - 1)
+    }
+}
+
+/// Numbers of elements in the buffers that grow with the teams. [`BatchPlan::is_full`] counts those that grow with the
+/// groups.
+#[derive(Clone, Copy, Default)]
+struct Elements {
+    /// Words of records.
+    record: usize,
+    /// Vectors of weights.
+    weights: usize,
+    /// Moments of a trace.
+    moments: usize,
+    /// States between two dispatches.
+    states: usize,
+}
+
+impl Elements {
+    /// Returns the bytes of each buffer, in the order of the fields.
+    fn bytes(self) -> [u64; 4] {
+        let bytes = |count: usize, size: usize| count as u64 * size as u64;
+        [
+            bytes(self.record, size_of::<u32>()),
+            bytes(self.weights, size_of::<WeightVector>()),
+            bytes(self.moments, size_of::<Moment>()),
+            bytes(self.states, size_of::<State>()),
+        ]
+    }
+
+    /// Returns the bytes of the largest buffer. One buffer takes both records and moments to the host.
+    fn largest(self) -> u64 {
+        let [record, weights, moments, states] = self.bytes();
+        weights.max(states).max(record + moments)
+    }
+}
+
+/// How the teams of one group become tasks.
+struct GroupPlan<'a> {
+    group: &'a Group<'a>,
+    per_team: Elements,
+    /// Maximum bytes per team in one buffer.
+    bytes_per_team: u64,
+    teams_per_task: usize,
+    /// A task without teams.
+    template: PlannedTask,
+}
+
+impl<'a> GroupPlan<'a> {
+    /// Plans group `index`. Its world gets the specialised kernel if its shape is one of `specialised`.
+    fn new(
+        index: usize,
+        group: &'a Group<'a>,
+        trace: bool,
+        capacity: Capacity,
+        specialised: &HashSet<Shape>,
+    ) -> Result<GroupPlan<'a>, BackendError> {
+        let world = group.world;
+        let recorded = Recorded::of(group, trace);
+        let own_kernel = Shape::specialised(world, capacity, recorded).filter(|(shape, _)| specialised.contains(shape));
+        let (shape, workgroup) = own_kernel.unwrap_or_else(|| Shape::generic(world, capacity, recorded));
+        let steps_per_dispatch = steps_per_dispatch(world, workgroup, recorded);
+        let per_team = Elements {
+            record: record_words(world, group.records()),
+            weights: weight_vectors(world),
+            moments: if trace { (world.steps() + 1) * world.agents() } else { 0 },
+            states: if world.steps() > steps_per_dispatch { world.agents() } else { 0 },
+        };
+        let bytes_per_team = Elements { record: per_team.record + STATUS, ..per_team }.largest();
+        if bytes_per_team > capacity.buffer {
+            return Err(BackendError::TooLarge(format!(
+                "one team takes {bytes_per_team} bytes in one buffer, this adapter allows {}; \
+                 use the CPU, fewer steps or fewer POIs",
+                capacity.buffer
+            )));
+        }
+        let teams_per_task = workgroup.teams.min((capacity.target() / bytes_per_team.max(1)).max(1) as usize);
+        let template = PlannedTask {
+            group: index,
+            first_team: 0,
+            shape,
+            task: Task::default(),
+            steps_per_dispatch,
+            iterations_per_step: iterations_per_step(world, workgroup, recorded) * workgroup.threads,
+        };
+        Ok(GroupPlan { group, per_team, bytes_per_team, teams_per_task, template })
+    }
+}
+
+/// Tasks that fit the device's buffers together: one batch.
+#[derive(Default)]
+pub(super) struct BatchPlan {
+    pub(super) tasks: Vec<PlannedTask>,
+    pub(super) worlds: Vec<Constants>,
+    pub(super) places: Vec<Vec2>,
+    /// The elements that its tasks use.
+    used: Elements,
+    /// Words of all sets in the record.
+    pub(super) sets: usize,
+    /// If the record is packed: the words of tables and owners, and the minimum size of a set, `[pois]` per group.
+    pub(super) head: Option<usize>,
+    minimums: Vec<u32>,
+}
+
+impl BatchPlan {
+    /// Reports whether `teams` more teams of a group exceed the capacity, with the group's world and positions.
+    fn is_full(&self, plan: &GroupPlan<'_>, teams: usize, capacity: Capacity) -> bool {
+        let more = teams as u64 * plan.bytes_per_team;
+        let world = plan.group.world;
+        let places = self.places.len() + plan.group.starts.len() + world.pois.len() + world.headings.len();
+        let of_groups = [
+            places * size_of::<Vec2>(),
+            (self.worlds.len() + 1) * size_of::<Constants>(),
+            (self.tasks.len() + 1) * size_of::<Task>(),
+        ];
+        self.used.largest() + more > capacity.target()
+            || of_groups.into_iter().any(|bytes| bytes as u64 > capacity.target())
+    }
+
+    /// Stores a group's world, starts and POIs, and returns a task that refers to them.
+    fn store(&mut self, plan: &GroupPlan<'_>) -> Task {
+        let Group { world, starts, .. } = *plan.group;
+        let (index, first) = (self.worlds.len() as u32, self.places.len() as u32);
+        self.places.extend(starts);
+        if plan.group.moved_pois().is_none() {
+            self.places.extend(&world.pois);
+        }
+        // The shader finds headings behind the POIs.
+        self.places.extend(&world.headings);
+        self.worlds.push(world.constants);
+        let (pois, end) = (first + world.agents() as u32, world.constants.steps);
+        Task { world: index, starts: first, pois, end, ..Task::default() }
+    }
+
+    /// Adds a task. `stored` refers to its group's world.
+    fn push(&mut self, plan: &GroupPlan<'_>, first_team: usize, teams: usize, stored: Task) {
+        let (used, per_team, sets) = (&mut self.used, plan.per_team, plan.group.world.set_words() * teams);
+        let task = Task {
+            weights: used.weights as u32,
+            sets: used.record as u32,
+            counts: (used.record + sets) as u32,
+            moments: used.moments as u32,
+            states: used.states as u32,
+            teams: teams as u32,
+            status: (used.record + per_team.record * teams) as u32,
+            ..stored
+        };
+        used.record += per_team.record * teams + STATUS;
+        used.weights += per_team.weights * teams;
+        used.moments += per_team.moments * teams;
+        used.states += per_team.states * teams;
+        self.sets += sets;
+        self.tasks.push(PlannedTask { first_team, task, ..plan.template });
+    }
+
+    /// Lays out the packed record, unless the whole record is requested, the rule depends on when sets occur, packing
+    /// would take too long for one dispatch, or it would save nothing.
+    fn pack(&mut self, groups: &[Group<'_>], records: Records) {
+        let packs = |planned: &PlannedTask| {
+            let (world, need) = (groups[planned.group].world, groups[planned.group].records());
+            need.least(1).is_some() && !world.rule.is_timed() && pack_iterations(groups, planned) <= MAX_ITERATIONS
+        };
+        // The first task of a group is the largest.
+        let all_pack = self.tasks.chunk_by(|a, b| a.group == b.group).all(|tasks| packs(&tasks[0]));
+        if !records.packs(self.used.bytes()[0]) || !all_pack {
+            return;
+        }
+        let mut head = 0;
+        for tasks in self.tasks.chunk_by_mut(|a, b| a.group == b.group) {
+            let (world, need) = (groups[tasks[0].group].world, groups[tasks[0].group].records());
+            let minimums = self.minimums.len() as u32;
+            self.minimums.extend(world.coupling.iter().filter_map(|&coupling| need.least(coupling)));
+            for PlannedTask { task, .. } in tasks {
+                let teams = task.teams as usize;
+                (task.minimums, task.table, task.owners) = (minimums, head as u32, NOWHERE);
+                head += teams + 2;
+                if need.owners() && world.followers() > 0 {
+                    task.owners = head as u32;
+                    head += owner_words(world) * teams;
+                }
+            }
+        }
+        self.head = Some(head).filter(|head| head + PACKED_HEAD < self.used.record);
+    }
+
+    /// Returns the number of nonces that its status words need.
+    pub(super) fn rounds(&self) -> usize {
+        self.tasks.iter().map(PlannedTask::rounds).max().unwrap_or(0)
+    }
+
+    /// Gathers the weights of every task whose policies are on the host, and leaves room for the others.
+    pub(super) fn stage(&self, groups: &[Group<'_>], staging: &mut Vec<WeightVector>) {
+        if !self.tasks.iter().any(|planned| is_on_host(groups, planned)) {
+            return;
+        }
+        staging.resize(self.used.weights, WeightVector::default());
+        let mut rest = &mut staging[..];
+        let mut parts = Vec::with_capacity(self.tasks.len());
+        for planned in &self.tasks {
+            let part = rest.split_off_mut(..planned.weights(groups).len()).expect("staging holds every task's weights");
+            parts.push((planned, part));
+        }
+        parts.into_par_iter().for_each(|(planned, part)| {
+            let group = &groups[planned.group];
+            if let Weights::OnHost(weights) = group.weights {
+                gather(group, weights, planned.first_team, planned.task.teams as usize, part);
+            }
+        });
+    }
+
+    /// Returns everything that the batch does on a device.
+    pub(super) fn record<'a>(&'a self, options: &RecordingOptions<'a>) -> (Recording<'a>, BatchReadback) {
+        let &RecordingOptions { groups, held, weights: staging, trace, nonce, .. } = options;
+        let mut recording = Recording::new("episodes");
+        let [record, weights, moments, states] = self.used.bytes();
+        let (tasks, runs) = self.lay_out(nonce);
+        let worlds = recording.input(Buffer::Worlds, &self.worlds);
+        recording.input(Buffer::Tasks, tasks);
+        let places = recording.input(Buffer::Places, &self.places);
+        let [weights, record, moments, states] = [
+            (Buffer::Weights, weights),
+            (Buffer::Record, record),
+            (Buffer::Moments, moments),
+            (Buffer::States, states),
+        ]
+        .map(|(buffer, bytes)| recording.buffer(buffer, bytes));
+        for tasks in self.tasks.chunk_by(|a, b| is_on_host(groups, a) == is_on_host(groups, b)) {
+            if is_on_host(groups, &tasks[0]) {
+                let part = tasks[0].weights(groups).start..tasks[tasks.len() - 1].weights(groups).end;
+                let offset = (part.start * size_of::<WeightVector>()) as u64;
+                recording.upload(Buffer::Weights, offset, &staging[part]);
+            }
+        }
+        self.record_gathering(options, weights.clone(), &mut recording);
+        let packed = self.head.map(|head| {
+            let room = self.packed_room(head, options);
+            let packed = recording.buffer(Buffer::Packed, words(PACKED_HEAD + room));
+            recording.upload(Buffer::Packed, 0, vec![head as u32, room as u32]);
+            (room, packed, recording.input(Buffer::Minimums, &self.minimums))
+        });
+        // The dispatches, in submissions of at most `cap` iterations, and then those that pack.
+        let most = options.most_workgroups as usize / TASK_ALIGNMENT * TASK_ALIGNMENT;
+        let (mut packing, mut load, mut is_split) = (Vec::new(), 0, false);
+        for Run { shape, is_first_round, mut tasks, iterations: per_task } in runs {
+            while !tasks.is_empty() {
+                let allowed = (options.cap.saturating_sub(load) / per_task) as usize / TASK_ALIGNMENT * TASK_ALIGNMENT;
+                if allowed == 0 && load > 0 {
+                    recording.commands.push(Command::Submit);
+                    (load, is_split) = (0, true);
+                    continue;
+                }
+                let part = tasks.start..tasks.end.min(tasks.start + allowed.clamp(TASK_ALIGNMENT, most));
+                tasks.start = part.end;
+                let work = part.len() as u64 * per_task;
+                load += work;
+                let grid = [part.len() as u32, 1, 1];
+                let bytes = (part.start * size_of::<Task>()) as u64..(part.end * size_of::<Task>()) as u64;
+                let tasks = Slice { buffer: Buffer::Tasks, bytes };
+                if let (Some((_, packed, minimums)), true) = (&packed, is_first_round) {
+                    let bindings = [&worlds, &tasks, minimums, packed, &record].map(Slice::clone).into();
+                    packing.push(Command::Dispatch { pipeline: Pipeline::Pack, bindings, grid, iterations: 0 });
+                }
+                let bindings =
+                    [&worlds, &tasks, &places, &weights, &record, &moments, &states].map(Slice::clone).into();
+                let pipeline = Pipeline::Episode(shape);
+                recording.commands.push(Command::Dispatch { pipeline, bindings, grid, iterations: work });
+            }
+        }
+        if is_split && !packing.is_empty() {
+            recording.commands.push(Command::Submit);
+        }
+        recording.commands.extend(packing);
+        // What is read back, the record last, because its status words stand for everything before it.
+        let [.., moment_bytes, _] = self.used.bytes();
+        let moments = if trace { recording.read_back(first(Buffer::Moments, moment_bytes)) } else { 0..0 };
+        for tasks in self.tasks.chunk_by(|a, b| a.group == b.group) {
+            if let Some(held) = held[tasks[0].group] {
+                recording.read_status(Buffer::GroupStatus(tasks[0].group), &held.status);
+            }
+        }
+        let mut readback = BatchReadback { moments, ..BatchReadback::default() };
+        if let Some((room, ..)) = packed {
+            // If nearly all sets are kept, packing only measures when that changes.
+            let kept = if Some(room) == self.head { 0 } else { room };
+            let packed = recording.read_back(first(Buffer::Packed, words(PACKED_HEAD + kept)));
+            if kept > 0 {
+                self.expect(
+                    &mut recording,
+                    nonce,
+                    packed.start + words(PACKED_HEAD) as usize,
+                    PlannedTask::packed_status,
+                );
+            }
+            readback.packed = Some((room, packed));
+        }
+        if packed.is_none_or(|(room, ..)| Some(room) == self.head) {
+            readback.record = Some(self.read_record(&mut recording, nonce));
+        }
+        (recording, readback)
+    }
+
+    /// Copies the whole record to the host. Returns where it is.
+    fn read_record(&self, recording: &mut Recording<'_>, nonce: u32) -> Range<usize> {
+        let record = recording.read_back(first(Buffer::Record, self.used.bytes()[0]));
+        self.expect(recording, nonce, record.start, |planned| planned.task.status as usize);
+        record
+    }
+
+    /// Expects the status word of every task. `at` returns its offset, in words after `start` bytes. It stays as it is if
+    /// the device did not play the task.
+    fn expect(&self, recording: &mut Recording<'_>, nonce: u32, start: usize, at: impl Fn(&PlannedTask) -> usize) {
+        let status = |planned| (start + words(at(planned)) as usize, planned.final_status(nonce));
+        recording.readback.status.extend(self.tasks.iter().map(status));
+    }
+
+    /// Returns how many words a packed record has room for, including tables and owners, or only `head` if nearly all
+    /// sets are kept.
+    fn packed_room(&self, head: usize, options: &RecordingOptions<'_>) -> usize {
+        let most = self.used.record - PACKED_HEAD - 1;
+        let room = head + (self.sets as f64 * options.kept_share) as usize + SPARE_PACKED_WORDS;
+        match options.records {
+            Records::Packed => most,
+            _ if room <= most => room,
+            _ => head,
+        }
+    }
+
+    /// Lays out the tasks of all rounds. In each round the tasks of a shape are consecutive, and the first is at an
+    /// offset where a binding may start.
+    fn lay_out(&self, nonce: u32) -> (Vec<Task>, Vec<Run>) {
+        let shapes: BTreeSet<Shape> = self.tasks.iter().map(|planned| planned.shape).collect();
+        let (mut tasks, mut runs): (Vec<Task>, Vec<Run>) = Default::default();
+        for (round, &shape) in (0..self.rounds()).flat_map(|round| shapes.iter().map(move |shape| (round, shape))) {
+            tasks.resize(tasks.len().next_multiple_of(TASK_ALIGNMENT), Task::default());
+            let (first, mut iterations) = (tasks.len(), 1);
+            for planned in self.tasks.iter().filter(|planned| planned.shape == shape) {
+                if let Some(task) = planned.round(round, nonce) {
+                    iterations = iterations.max(u64::from(task.end - task.first) * planned.iterations_per_step as u64);
+                    tasks.push(task);
+                }
+            }
+            if tasks.len() > first {
+                runs.push(Run { shape, is_first_round: round == 0, tasks: first..tasks.len(), iterations });
+            }
+        }
+        (tasks, runs)
+    }
+
+    /// Records how policies are gathered from populations on the device.
+    fn record_gathering<'a>(&self, options: &RecordingOptions<'a>, weights: Slice, recording: &mut Recording<'a>) {
+        let (mut jobs, mut policies, mut chosen): (Vec<GatherJob>, Vec<[Slice; LEADERS_PER_GATHER]>, _) =
+            (Vec::new(), Vec::new(), 0);
+        for tasks in self.tasks.chunk_by(|a, b| a.group == b.group) {
+            let (index, group) = (tasks[0].group, &options.groups[tasks[0].group]);
+            let Some(held) = options.held[index] else { continue };
+            let leaders = group.world.leaders();
+            let teams: u32 = tasks.iter().map(|planned| planned.task.teams).sum();
+            let choices = &group.teams[tasks[0].first_team * leaders..][..teams as usize * leaders];
+            for first in (0..leaders).step_by(LEADERS_PER_GATHER) {
+                let count = LEADERS_PER_GATHER.min(leaders - first);
+                jobs.push(GatherJob {
+                    leaders: leaders as u32,
+                    first: first as u32,
+                    count: count as u32,
+                    parameters: group.world.constants.policy.parameters,
+                    teams,
+                    teams_per_task: tasks[0].task.teams,
+                    choices: chosen as u32,
+                    weights: tasks[0].task.weights,
+                });
+                // With fewer leaders, the remaining bindings are not read.
+                policies.push(std::array::from_fn(|leader| held.policies_of(index, first + leader.min(count - 1))));
+            }
+            recording.upload(Buffer::Choices, words(chosen), choices);
+            chosen += choices.len();
+        }
+        if jobs.is_empty() {
+            return;
+        }
+        let choices = recording.buffer(Buffer::Choices, words(chosen));
+        let parts = recording.jobs(Buffer::Jobs, &jobs);
+        for ((job, part), [first, second, third, fourth]) in jobs.iter().zip(parts).zip(policies) {
+            recording.commands.push(Command::Dispatch {
+                pipeline: Pipeline::Gather,
+                bindings: vec![part, choices.clone(), first, weights.clone(), second, third, fourth],
+                grid: grid(job.workgroups(), options.most_workgroups),
+                iterations: 0,
+            });
+        }
+    }
+
+    /// Returns what copies the whole record of a batch that was played.
+    pub(super) fn record_of_played(&self, nonce: u32) -> (Recording<'static>, BatchReadback) {
+        let mut recording = Recording::new("reading back");
+        let record = Some(self.read_record(&mut recording, nonce));
+        (recording, BatchReadback { record, ..BatchReadback::default() })
+    }
+}
+
+/// Tasks of one shape and round.
+struct Run {
+    shape: Shape,
+    is_first_round: bool,
+    tasks: Range<usize>,
+    /// The estimated work of a task.
+    iterations: u64,
+}
+
+/// What a batch's recording depends on, besides its plan.
+#[derive(Clone, Copy)]
+pub(super) struct RecordingOptions<'a> {
+    pub(super) groups: &'a [Group<'a>],
+    /// The populations that each group plays, if they are on the device.
+    pub(super) held: &'a [Option<&'a Held>],
+    /// The weights of policies on the host, see [`BatchPlan::stage`].
+    pub(super) weights: &'a [WeightVector],
+    pub(super) trace: bool,
+    /// The first of [`BatchPlan::rounds`] nonces.
+    pub(super) nonce: u32,
+    /// Maximum iterations per submission.
+    pub(super) cap: u64,
+    /// Maximum workgroups in each dimension of a dispatch.
+    pub(super) most_workgroups: u32,
+    pub(super) records: Records,
+    /// The share of all sets that packed records have room for.
+    pub(super) kept_share: f64,
+}
+
+/// Where the host finds what it reads of a batch, in bytes of [`Buffer::Readback`].
+#[derive(Default)]
+pub(super) struct BatchReadback {
+    pub(super) moments: Range<usize>,
+    /// The words that a packed record has room for, and what is copied of it: all of it, or only its header.
+    pub(super) packed: Option<(usize, Range<usize>)>,
+    /// The whole record.
+    pub(super) record: Option<Range<usize>>,
+}
+
+/// Returns the first bytes of a buffer.
+fn first(buffer: Buffer, bytes: u64) -> Slice {
+    Slice { buffer, bytes: 0..bytes }
+}
+
+/// Returns the bytes of some words.
+fn words(count: usize) -> u64 {
+    (count * size_of::<u32>()) as u64
+}
+
+fn is_on_host(groups: &[Group<'_>], planned: &PlannedTask) -> bool {
+    matches!(groups[planned.group].weights, Weights::OnHost(_))
+}
+
+/// Returns the words per team for the leader that each follower saw most.
+pub(super) fn owner_words(world: &World) -> usize {
+    world.followers().div_ceil((32 / owner_bits(world.constants.leaders)) as usize)
+}
+
+/// Returns the maximum loop iterations per thread to pack a task.
+fn pack_iterations(groups: &[Group<'_>], planned: &PlannedTask) -> usize {
+    let (world, teams) = (groups[planned.group].world, planned.task.teams as usize);
+    let sets = (world.pois.len() * teams).div_ceil(PACK_WORKGROUP);
+    let owners = (owner_words(world) * teams).div_ceil(PACK_WORKGROUP) * 4 * (world.leaders() + 2);
+    // Each set is read twice, and at most as many are written or skipped.
+    sets * 4 * world.steps() * (world.constants.words as usize + 1) + owners + 3 * teams
+}
+
+/// Cuts the groups' teams into tasks, and the tasks into batches. Worlds with one of the `specialised` shapes get that
+/// kernel.
+///
+/// # Errors
+/// One team's record exceeds the device's largest buffer.
+pub(super) fn plan(
+    groups: &[Group<'_>],
+    trace: bool,
+    records: Records,
+    capacity: Capacity,
+    specialised: &HashSet<Shape>,
+) -> Result<Vec<BatchPlan>, BackendError> {
+    let mut batches = vec![BatchPlan::default()];
+    for (index, group) in groups.iter().enumerate() {
+        let plan = GroupPlan::new(index, group, trace, capacity, specialised)?;
+        // A group's world, starts and POIs are stored once per batch.
+        let mut stored = None;
+        for first_team in (0..group.team_count()).step_by(plan.teams_per_task) {
+            let teams = plan.teams_per_task.min(group.team_count() - first_team);
+            let mut batch = batches.last_mut().expect("there is a batch");
+            if batch.is_full(&plan, teams, capacity) {
+                batches.push(BatchPlan::default());
+                batch = batches.last_mut().expect("just pushed");
+                stored = None;
+            }
+            let stored = *stored.get_or_insert_with(|| batch.store(&plan));
+            batch.push(&plan, first_team, teams, stored);
+        }
+    }
+    batches.retain(|batch| !batch.tasks.is_empty());
+    if !trace {
+        batches.iter_mut().for_each(|batch| batch.pack(groups, records));
+    }
+    Ok(batches)
+}
+
+/// Writes a task's weights, `[vectors of a policy's weights][leaders][teams]`, so that neighbouring threads load
+/// neighbouring weights.
+pub(super) fn gather(group: &Group<'_>, weights: &[f32], first_team: usize, teams: usize, to: &mut [WeightVector]) {
+    let (leaders, parameters) = (group.world.leaders(), group.world.parameters());
+    let policies = &group.teams[first_team * leaders..(first_team + teams) * leaders];
+    for (place, &policy) in policies.iter().enumerate() {
+        let (team, leader) = (place / leaders, place % leaders);
+        let from = group.place(leader, policy as usize);
+        let column = to[leader * teams + team..].iter_mut().step_by(leaders * teams);
+        for (vector, weights) in column.zip(weights[from..from + parameters].chunks(VECTOR)) {
+            vector[..weights.len()].copy_from_slice(weights);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::backend::BATCH_BYTES;
+    use crate::backend::gpu::recording::iterations;
+    use crate::config::{Config, Fitness, Sharing};
+
+    /// Returns a world of one leader, 255 followers and one POI. Episodes of more than about 40 steps take several
+    /// dispatches.
+    fn crowd(steps: usize) -> World {
+        let followers = vec!["[2, 2]"; 255].join(", ");
+        let text =
+            format!("[world]\nleaders = [[1, 1]]\nfollowers = [{followers}]\npois = [[9, 9]]\nsteps = {steps}\n");
+        World::new(&Config::parse(&text, "large").unwrap().validate().unwrap())
+    }
+
+    /// Plans groups, `(teams, world)` each, and checks the recording of every batch. Returns the numbers of batches,
+    /// submissions, and dispatches that play.
+    fn check(
+        groups: &[(usize, &World)],
+        buffer: u64,
+        [cap, most_workgroups]: [u64; 2],
+        records: Records,
+        is_held: bool,
+    ) -> [usize; 3] {
+        let held = Held { sizes: [1, 1, groups[0].1.parameters()], turn: 1, status: vec![7, 8] };
+        let (weights, choices) = (vec![0.0; groups[0].1.parameters()], vec![0; 30_000]);
+        let group = |&(teams, world): &(usize, _)| Group {
+            world,
+            starts: &world.starts,
+            weights: Weights::OnHost(&weights),
+            policies: 1,
+            teams: &choices[..teams],
+            sharing: Sharing::PerLeader,
+            fitnesses: &[Fitness::Df],
+        };
+        let groups: Vec<Group<'_>> = groups.iter().map(group).collect();
+        let capacity = Capacity { batch: BATCH_BYTES, buffer, ..Capacity::of_workgroups(256) };
+        let batches = plan(&groups, false, records, capacity, &HashSet::new()).unwrap();
+        // Every team is in one task.
+        let mut next = vec![0; groups.len()];
+        for planned in batches.iter().flat_map(|batch| &batch.tasks) {
+            assert_eq!(planned.first_team, next[planned.group]);
+            next[planned.group] += planned.task.teams as usize;
+        }
+        assert_eq!(next, groups.iter().map(Group::team_count).collect::<Vec<_>>());
+        let held: Vec<_> = groups.iter().map(|_| Some(&held).filter(|_| is_held)).collect();
+        let (mut weights, most_workgroups) = (Vec::new(), most_workgroups as u32);
+        let mut counts = [batches.len(), 0, 0];
+        for batch in &batches {
+            batch.stage(&groups, &mut weights);
+            let (groups, held, weights) = (&groups[..], &held[..], &weights[..]);
+            let options = RecordingOptions {
+                groups,
+                held,
+                weights,
+                trace: false,
+                nonce: 5,
+                cap,
+                most_workgroups,
+                records,
+                kept_share: 0.1,
+            };
+            let (recording, readback) = batch.record(&options);
+            let copies = 1 + usize::from(readback.packed.is_some() && readback.record.is_some());
+            let held = if is_held { 2 * batch.worlds.len() } else { 0 };
+            assert_eq!((recording.readback.status.len(), copies), (batch.tasks.len() + held, 1));
+            counts[1] += recording.submissions().count();
+            counts[2] += check_recording(&recording, batch, [cap, buffer], most_workgroups);
+        }
+        counts
+    }
+
+    /// Checks one recording. Returns its dispatches that play.
+    fn check_recording(recording: &Recording<'_>, batch: &BatchPlan, [cap, buffer]: [u64; 2], most: u32) -> usize {
+        let bytes_of = |buffer| recording.buffers.iter().find(|(other, _)| *other == buffer).map(|(_, bytes)| *bytes);
+        let fits = |slice: &Slice| bytes_of(slice.buffer).is_none_or(|bytes| slice.bytes.end <= bytes);
+        let too_large = recording.buffers.iter().find(|(id, bytes)| *id != Buffer::Tasks && *bytes > buffer);
+        assert_eq!(too_large, None);
+        let (mut tasks, mut played): (Vec<Task>, Vec<Task>) = Default::default();
+        let (mut packed, mut copied, mut dispatches) = (0, 0, 0);
+        for command in &recording.commands {
+            match command {
+                Command::Upload { to, offset, bytes } => {
+                    assert!(offset + bytes.len() as u64 <= bytes_of(*to).unwrap(), "{to:?} is too small");
+                    if *to == Buffer::Tasks {
+                        tasks = bytemuck::pod_collect_to_vec(bytes);
+                    }
+                }
+                Command::Dispatch { pipeline, bindings, grid, .. } => {
+                    assert_eq!(bindings.len(), pipeline.bindings().len());
+                    assert!(bindings.iter().all(fits) && grid.iter().all(|&count| count <= most), "{grid:?}");
+                    assert!(bindings.iter().all(|slice| slice.bytes.start % BINDING_ALIGNMENT as u64 == 0));
+                    let Some(slice) = bindings.iter().find(|slice| slice.buffer == Buffer::Tasks) else { continue };
+                    let [start, end] = [slice.bytes.start, slice.bytes.end].map(|at| at as usize / size_of::<Task>());
+                    assert_eq!(grid.iter().product::<u32>() as usize, end - start);
+                    if *pipeline == Pipeline::Pack {
+                        packed += tasks[start..end].iter().map(|task| task.teams).sum::<u32>();
+                    } else {
+                        played.extend(&tasks[start..end]);
+                        dispatches += 1;
+                    }
+                }
+                Command::ReadBack { from, offset } => {
+                    assert!(fits(from) && *offset == copied, "{from:?}");
+                    copied += from.bytes.end - from.bytes.start;
+                }
+                Command::Submit => {}
+            }
+        }
+        for commands in recording.submissions() {
+            let playing = |command: &&Command<'_>| matches!(command, Command::Dispatch { iterations: 1.., .. });
+            assert!(iterations(commands) <= cap || commands.iter().filter(playing).count() == 1);
+        }
+        // Every task plays each of its steps once, in order.
+        for planned in &batch.tasks {
+            let own = played.iter().filter(|task| task.teams > 0 && task.status == planned.task.status);
+            let last = own.fold(0, |end, task| {
+                assert_eq!((task.first, task.teams), (end, planned.task.teams));
+                task.end
+            });
+            assert_eq!(last, planned.task.end);
+        }
+        let teams: u32 = batch.tasks.iter().map(|planned| planned.task.teams).sum();
+        assert_eq!(packed, if batch.head.is_some() { teams } else { 0 });
+        // Tasks follow each other in every buffer, without overlap.
+        for pair in batch.tasks.windows(2) {
+            let [before, after] = [pair[0].task, pair[1].task];
+            assert!(before.sets < before.counts && before.counts < before.status && before.status < after.sets);
+            assert!(before.weights < after.weights && before.states <= after.states);
+            assert!(batch.head.is_none() || pair[0].packed_status() < after.table as usize);
+        }
+        dispatches
+    }
+
+    /// A small batch is one submission of one dispatch. Low caps, limits on workgroups, long episodes, small buffers and
+    /// many groups split work. Either way every team plays every step once, in memory of its own.
+    #[test]
+    fn recordings_play_every_team_once() {
+        const FREE: [u64; 2] = [u64::MAX, 65_535];
+        let (short, long) = (crowd(20), crowd(60));
+        let both = [(150, &short), (150, &long)];
+        // Batches, submissions, and dispatches that play.
+        let found = [
+            check(&[(3, &short)], 1 << 20, FREE, Records::Whole, false),
+            check(&[(3, &short)], 1 << 20, FREE, Records::Packed, true),
+            // The long episode takes a second round.
+            check(&both, 1 << 24, FREE, Records::Packed, false),
+            // 300 tasks in dispatches of 8, then 150.
+            check(&both, 1 << 24, [u64::MAX, 8], Records::Whole, true),
+            // The smallest dispatches have 4 tasks. Packing is a submission of its own.
+            check(&both, 1 << 24, [1, 65_535], Records::Packed, true),
+            // 4 tasks of the first round stay below the cap, or 12 of the second.
+            check(&both, 1 << 24, [1 << 26, 65_535], Records::Whole, false),
+            // Agents that wait between two dispatches count towards a batch, too.
+            check(&[(27_000, &long)], 1 << 20, FREE, Records::Whole, false),
+            // With one team per group, worlds and positions take more than records and weights.
+            check(&[(1, &short); 1000], 1 << 20, FREE, Records::Whole, false),
+        ];
+        let one_batch = [[1, 1, 1], [1, 1, 1], [1, 1, 2], [1, 1, 38 + 19], [1, 75 + 38 + 1, 75 + 38], [1, 88, 88]];
+        assert_eq!(found[..6], one_batch);
+        assert_eq!(found[6..], [[133, 133, 266], [4, 4, 4]]);
+        assert_eq!(state_bytes(&long, RecordRequest(&[Fitness::Df])), 256 * 20);
+    }
+}

@@ -1,0 +1,339 @@
+//! Pipelines: the texts of their shaders, and the structs that these share with the host.
+
+use std::collections::HashSet;
+use std::fmt::Write;
+
+use super::exact;
+use super::shape::{ROLE, Recorded, Shape, Sizes, TEAMS, WIDTHS, WORKGROUPS};
+use crate::backend::{Moment, VECTOR};
+use crate::config::MAX_AGENTS;
+use crate::evolve::{MAX_WEIGHT, MIN_WEIGHT, UNCHANGED};
+use crate::gpu_struct::{GpuStruct, gpu_constants, gpu_struct};
+use crate::model::policy::Actions;
+use crate::model::{self, Variant};
+use crate::world::{INPUTS, OUTPUTS};
+
+/// Maximum leaders whose sightings a follower counts in registers.
+const MAX_COUNTED_LEADERS: usize = 8;
+/// Threads per workgroup of the pipelines that pack records, and of those that work on populations.
+pub(super) const PACK_WORKGROUP: usize = 64;
+pub(super) const POPULATION_WORKGROUP: usize = 256;
+/// Rows and columns of the tile that a workgroup transposes when it gathers policies.
+const TILE: usize = 32;
+/// Leaders per dispatch that gathers. With three other storage buffers they stay below the 8 that every WebGPU device
+/// allows.
+pub(super) const LEADERS_PER_GATHER: usize = 4;
+/// Sentinel: no offset.
+pub(super) const NOWHERE: u32 = u32::MAX;
+
+gpu_struct! {
+    /// The work of one workgroup: some teams of one group. All offsets are in elements.
+    #[derive(Default)]
+    pub struct Task {
+        /// The index of the world in the batch.
+        pub world: u32,
+        /// The offset of the agents' start positions.
+        pub starts: u32,
+        /// The offset of the POI positions.
+        pub pois: u32,
+        /// The offset of the weights.
+        pub weights: u32,
+        /// The offset of the sets of agents at each POI.
+        pub sets: u32,
+        /// The offset of the numbers of steps at which followers saw leaders.
+        pub counts: u32,
+        /// The offset of a trace's moments.
+        pub moments: u32,
+        /// The offset of the agents' states between two dispatches.
+        pub states: u32,
+        /// The number of teams.
+        pub teams: u32,
+        /// The first step of a dispatch.
+        pub first: u32,
+        /// The step before which a dispatch ends.
+        pub end: u32,
+        /// The offset of the minimum size of each POI's sets, for packing (`shaders/pack.wgsl`).
+        pub minimums: u32,
+        /// The offset of the table of packed sets, which packing writes.
+        pub table: u32,
+        /// The offset of the leaders that followers saw most, which packing writes, or all ones for nowhere.
+        pub owners: u32,
+        /// The offset of the status word in the record. The first dispatch writes the nonce there; each later one adds
+        /// 1.
+        pub status: u32,
+        /// A number that no earlier work of the device had.
+        pub nonce: u32,
+    }
+
+    /// The state of an agent between two dispatches.
+    pub struct State {
+        /// x, in units.
+        pub x: f32,
+        /// y, in units.
+        pub y: f32,
+        /// The heading's cosine.
+        pub hx: f32,
+        /// The heading's sine.
+        pub hy: f32,
+        /// The speed, in units per second.
+        pub speed: f32,
+    }
+
+    /// How to breed one population's next generation.
+    pub struct BreedJob {
+        /// The slots' key before the slot is xored in, see [`Key::of_population`](crate::evolve::Key::of_population).
+        pub key: [u32; 4],
+        /// Slots per population.
+        pub slots: u32,
+        /// Weights per policy.
+        pub parameters: u32,
+        /// The index of the population.
+        pub population: u32,
+        /// The offset of its parents in the plan.
+        pub parents: u32,
+        /// A weight mutates if its random word is below this threshold.
+        pub threshold: u32,
+        /// Not 0 if every weight mutates.
+        pub all: u32,
+        /// Not 0 if noise scales with the weight.
+        pub scaled: u32,
+        /// The standard deviation of the noise.
+        pub sigma: f32,
+    }
+
+    /// A request to gather policies for consecutive tasks of one group.
+    pub struct GatherJob {
+        /// Leaders per team.
+        pub leaders: u32,
+        /// The first leader to gather.
+        pub first: u32,
+        /// Leaders to gather, up to 4 (`LEADERS_PER_GATHER`).
+        pub count: u32,
+        /// Weights per policy.
+        pub parameters: u32,
+        /// Teams of these tasks.
+        pub teams: u32,
+        /// Teams per task. The last task has the remainder.
+        pub teams_per_task: u32,
+        /// The offset of the teams' policies in their buffer.
+        pub choices: u32,
+        /// The offset of the output.
+        pub weights: u32,
+    }
+}
+
+impl GatherJob {
+    /// Returns the number of workgroups.
+    pub(super) fn workgroups(&self) -> usize {
+        (self.teams as usize * self.count as usize).div_ceil(TILE) * (self.parameters as usize).div_ceil(TILE)
+    }
+}
+
+/// How a shader uses a buffer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Binding {
+    /// `var<uniform>`.
+    Uniform,
+    /// `var<storage, read>`.
+    Read,
+    /// `var<storage, read_write>`.
+    Write,
+}
+
+/// A pipeline of the crate's own.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Pipeline {
+    /// Tests a device's arithmetic.
+    Probe,
+    /// Measures a device's arithmetic ceiling.
+    Ceiling,
+    /// Makes a population's next generation.
+    Breed,
+    /// Gathers the policies of a batch's teams.
+    Gather,
+    /// Packs records.
+    Pack,
+    /// Plays episodes.
+    Episode(Shape),
+}
+
+impl Pipeline {
+    /// Returns the name of the shader's entry point.
+    pub fn entry(self) -> &'static str {
+        match self {
+            Pipeline::Probe => "probe",
+            Pipeline::Ceiling => "ceiling",
+            Pipeline::Breed => "breed",
+            Pipeline::Gather => "gather",
+            Pipeline::Pack => "pack",
+            Pipeline::Episode(_) => "episode",
+        }
+    }
+
+    /// Returns what an episode's kernel is compiled for.
+    pub(super) fn shape(&self) -> Option<Shape> {
+        match self {
+            Pipeline::Episode(shape) => Some(*shape),
+            _ => None,
+        }
+    }
+
+    /// Returns the use of each buffer, from binding 1 of group 0 on. Binding 0 is the guard's.
+    pub fn bindings(self) -> &'static [Binding] {
+        use Binding::{Read, Write};
+        match self {
+            Pipeline::Probe => &[Read, Write],
+            Pipeline::Ceiling => &[Read, Read, Write],
+            Pipeline::Breed => &[Read, Read, Read, Write, Write],
+            Pipeline::Gather => &[Read, Read, Read, Write, Read, Read, Read],
+            Pipeline::Pack => &[Read, Read, Read, Write, Write],
+            Pipeline::Episode(_) => &[Read, Read, Read, Read, Write, Write, Write],
+        }
+    }
+
+    /// Returns the text of the shader.
+    pub fn text(self) -> String {
+        match self {
+            Pipeline::Probe => include_str!("../../../shaders/probe.wgsl").into(),
+            Pipeline::Ceiling => include_str!("../../../shaders/ceiling.wgsl").into(),
+            Pipeline::Breed | Pipeline::Gather => exact::assemble(&[
+                &gpu_constants!(WORKGROUP = POPULATION_WORKGROUP, TILE, UNCHANGED, MIN_WEIGHT, MAX_WEIGHT),
+                &[BreedJob::wgsl(), GatherJob::wgsl()].concat(),
+                include_str!("../../../shaders/lib/math.wgsl"),
+                include_str!("../../../shaders/population.wgsl"),
+            ]),
+            Pipeline::Pack => exact::assemble(&[
+                &declarations(),
+                &gpu_constants!(
+                    WORKGROUP = PACK_WORKGROUP,
+                    TEAMS = WORKGROUPS[WORKGROUPS.len() - 1].max(TEAMS[0]),
+                    NOWHERE
+                ),
+                include_str!("../../../shaders/lib/layout.wgsl"),
+                include_str!("../../../shaders/pack.wgsl"),
+            ]),
+            Pipeline::Episode(shape) => episode(shape),
+        }
+    }
+}
+
+/// Returns the structs of episodes and records.
+fn declarations() -> String {
+    [model::declarations(), Task::wgsl(), State::wgsl(), Moment::wgsl()].concat()
+}
+
+/// Returns the episode's shader for a shape.
+fn episode(shape: Shape) -> String {
+    let Shape { workgroup, slots, records: Recorded { trace, sightings }, sizes } = shape;
+    let (shared, in_registers, counted) = match sizes {
+        // The agents of one large team, or of several small ones.
+        Sizes::Any { .. } => ((workgroup * slots).min(MAX_AGENTS), false, 1),
+        Sizes::Fixed { teams, leaders, agents, .. } => {
+            let in_registers = leaders < agents && leaders as usize <= MAX_COUNTED_LEADERS;
+            (teams * agents as usize, in_registers, if in_registers { leaders } else { 1 })
+        }
+    };
+    let constants = gpu_constants!(
+        ROLE,
+        WORKGROUP = workgroup,
+        SLOTS = slots,
+        SHARED = shared,
+        TRACE = trace,
+        SIGHTINGS = sightings,
+        COUNTS_IN_REGISTERS = in_registers,
+        COUNTED_LEADERS = counted,
+    );
+    let front = match sizes {
+        Sizes::Any { widest, chooses } => {
+            let variant = Variant::copied_from("world");
+            let generic = include_str!("../../../shaders/generic.wgsl");
+            format!(
+                "{}fn world_variant() -> Variant {{ return {variant}; }}\n{generic}",
+                gpu_constants!(WIDEST = widest, CHOOSES = chooses)
+            )
+        }
+        Sizes::Fixed { teams, leaders, agents, pois, widths, variant } => format!(
+            "const shape = Shape({leaders}u, {agents}u, {pois}u, {words}u, {teams}u);\nconst variant = {variant};\n\
+             fn set_shape(task: Task) {{}}\n{}",
+            straight_policy(&widths),
+            words = agents.div_ceil(32),
+            variant = variant.value()
+        ),
+    };
+    let structs = declarations();
+    let libraries = [include_str!("../../../shaders/lib/layout.wgsl"), include_str!("../../../shaders/lib/math.wgsl")];
+    let parts = [&*constants, &front, &structs].into_iter().chain(libraries).chain(model::WGSL);
+    exact::assemble(&parts.chain([include_str!("../../../shaders/episode.wgsl")]).collect::<Vec<_>>())
+}
+
+/// Returns a policy of these widths as straight-line code: `decide` of `shaders/generic.wgsl` with its loops unrolled.
+/// Each unit is a variable. Weights are loaded four at a time, in order of use, so that a compiler may start many loads
+/// before it waits for the first.
+fn straight_policy(widths: &[u32; WIDTHS]) -> String {
+    let mut text = String::from("fn decide(start: u32, stride: u32, inputs: array<f32, INPUTS>) -> vec2<f32> {\n");
+    let mut line = |line: std::fmt::Arguments<'_>| writeln!(text, "    {line}").expect("a string takes a line");
+    let mut read = HashSet::new();
+    let mut inputs: Vec<String> = (0..INPUTS).map(|input| format!("inputs[{input}]")).collect();
+    let mut first = 0;
+    let layers = widths.windows(2).take_while(|pair| pair[1] > 0);
+    for (layer, pair) in layers.enumerate() {
+        let (rows, columns) = (pair[0] as usize, pair[1] as usize);
+        // Biases first.
+        for row in std::iter::once(rows).chain(0..rows) {
+            for column in 0..columns {
+                let weight = first + row * columns + column;
+                let (vector, axis) = (weight / VECTOR, AXES[weight % VECTOR]);
+                if read.insert(vector) {
+                    line(format_args!("let w{vector} = weights[start + {vector}u * stride];"));
+                }
+                match row == rows {
+                    true => line(format_args!("var s{layer}_{column} = w{vector}.{axis};")),
+                    false => line(format_args!("s{layer}_{column} += {} * w{vector}.{axis};", inputs[row])),
+                }
+            }
+        }
+        inputs = (0..columns).map(|column| format!("u{layer}_{column}")).collect();
+        for (column, unit) in inputs.iter().enumerate() {
+            line(format_args!("let {unit} = activate(s{layer}_{column});"));
+        }
+        first += (rows + 1) * columns;
+    }
+    match inputs.len() {
+        OUTPUTS => line(format_args!("return vec2({});", inputs.join(", "))),
+        _ => line(format_args!("return choose(inputs, array({}));", inputs.join(", "))),
+    }
+    text + "}\n"
+}
+
+const AXES: [&str; VECTOR] = ["x", "y", "z", "w"];
+
+/// Returns the name and the text of every shader, for lints and exactness tests. Of the episode's there are some
+/// variants, generic and specialised for the paper's first layout.
+pub fn shaders() -> Vec<(&'static str, String)> {
+    const PLAIN: Recorded = Recorded { trace: false, sightings: false };
+    const SIGHTINGS: Recorded = Recorded { sightings: true, ..PLAIN };
+    const TRACE: Recorded = Recorded { trace: true, sightings: true };
+    let generic = |workgroup, slots, widest, records: Recorded| {
+        Pipeline::Episode(Shape { workgroup, slots, records, sizes: Sizes::Any { widest, chooses: records.trace } })
+    };
+    let specialised = |records, actions: Actions| {
+        let widths = [INPUTS as u32, 10, actions.outputs() as u32, 0, 0];
+        let variant = Variant { density: 0, by_sine: 1 };
+        let sizes = Sizes::Fixed { teams: 32, leaders: 4, agents: 12, pois: 4, widths, variant };
+        Pipeline::Episode(Shape { workgroup: 384, slots: 1, records, sizes })
+    };
+    let all = [
+        ("probe", Pipeline::Probe),
+        ("ceiling", Pipeline::Ceiling),
+        ("episode", generic(64, 1, 16, PLAIN)),
+        ("episode, traced", generic(128, 1, 64, TRACE)),
+        ("episode, large teams", generic(256, 5, 64, PLAIN)),
+        ("episode, specialised", specialised(PLAIN, Actions::Direct)),
+        ("episode, specialised, behaviours", specialised(PLAIN, Actions::Behaviours)),
+        ("episode, specialised, with sights", specialised(SIGHTINGS, Actions::Direct)),
+        ("episode, specialised, traced", specialised(TRACE, Actions::Direct)),
+        ("pack", Pipeline::Pack),
+        ("population", Pipeline::Breed),
+    ];
+    all.map(|(name, pipeline)| (name, pipeline.text())).into()
+}
