@@ -7,7 +7,7 @@ use flotilla::backend::gpu::episode::{GpuBackend, ResidencyPolicy};
 use flotilla::front::{self, Processor};
 use flotilla::parallel;
 use flotilla_app::choice::{self, Chosen, Work};
-use flotilla_app::ops::advice_on_device;
+use flotilla_app::ops::MessageWithRemedy;
 
 /// Opens the requested backend for some work, by which `--backend auto` decides, and describes it for people.
 /// `--threads` applies to the whole process.
@@ -53,7 +53,7 @@ pub fn open_gpu(options: &RunOptions, work: Option<Work>) -> Result<(Option<GpuB
     device::report_stalls(|text| say(format_args!("note: {text}")));
     let Chosen { gpu, reason, passed_over } = choice::find(&processor, holding, work)?;
     if let Some(error) = passed_over {
-        say(format_args!("note: no GPU is used: {error}{}", advice_on_device(&error)));
+        say(format_args!("note: no GPU is used: {}", MessageWithRemedy::from(&error)));
     }
     Ok((gpu, reason))
 }

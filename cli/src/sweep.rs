@@ -14,7 +14,7 @@ use flotilla::escape::PathExt;
 use flotilla_app::ops::sweep::{Request, Results, claim};
 use flotilla_app::ops::{self, output};
 use flotilla_app::record::disk::Disk;
-use flotilla_app::record::folder::SWEEP;
+use flotilla_app::record::folder::{RUNS, SWEEP};
 use flotilla_app::record::ownership;
 use flotilla_app::report::curves::Band;
 use flotilla_app::report::runs::TeamKind;
@@ -137,7 +137,7 @@ impl Args {
     }
 
     fn out(&self, sweep: &Sweep) -> PathBuf {
-        self.out.clone().unwrap_or_else(|| Path::new(ops::RUNS).join(&sweep.name))
+        self.out.clone().unwrap_or_else(|| Path::new(RUNS).join(&sweep.name))
     }
 
     /// Returns the arguments that run this sweep again, without those that differ between processes.

@@ -55,7 +55,6 @@ pub mod error;
 pub mod output;
 pub mod plot;
 mod points;
-mod remedy;
 pub mod replay;
 pub mod rollout;
 pub mod sweep;
@@ -63,7 +62,6 @@ pub mod train;
 pub mod verify;
 
 pub use error::{Error, MessageWithRemedy, with_remedy};
-pub use remedy::{RUNS, device as advice_on_device};
 
 /// An event while a use case runs.
 pub enum Event<'a> {

@@ -8,14 +8,13 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::remedy::RUNS;
 use super::{BackendSource, ConfigText, Context, Error, Event, Processor, check_memory, escaped, with_remedy};
 use crate::choice::Work;
 use crate::record::RecordError;
 use crate::record::digests::Verification;
 use crate::record::disk::Disk;
 use crate::record::finished::{Finished, Storage};
-use crate::record::folder::{self, CONFIG, FirstAndLastRows, METRICS, POLICIES, RUN, Start};
+use crate::record::folder::{self, CONFIG, FirstAndLastRows, METRICS, POLICIES, RUN, RUNS, Start};
 use crate::record::ownership::{self, CURVES};
 use crate::record::policies::{self, Init};
 use crate::record::runs;

@@ -18,12 +18,14 @@
 //! before they are used. Nothing in it can name another file.
 
 use std::fmt::Display;
-use std::io;
+use std::io::{self, ErrorKind};
 use std::path::{Path, PathBuf};
 
 use sha2::{Digest, Sha256};
 
+use crate::shell;
 use disk::Place;
+use ownership::CONFIG;
 use flotilla::config::{self, Config, ConfigError};
 use flotilla::escape::{self, PathExt};
 use flotilla::file::{self, TextError};
@@ -42,10 +44,16 @@ pub(crate) mod rooted_folder;
 pub mod runs;
 pub mod tensors;
 
+/// `EMFILE`: the process has too many open files. The number is the same on every Unix, and the standard library has no
+/// name for it.
+const TOO_MANY_FILES: i32 = 24;
+/// `EIO`: a device failed to read or write. The number is the same on every Unix.
+const INPUT_OUTPUT: i32 = 5;
+
 /// Reason why the files of a run could not be written, read or used.
 #[derive(Debug, thiserror::Error)]
 pub enum RecordError {
-    /// A write failed. The command adds what the user can do.
+    /// A write failed.
     #[error("{path}: cannot be written: {error}", path = path.escaped())]
     Write {
         /// Path of the file or folder.
@@ -220,6 +228,76 @@ impl RecordError {
 
     fn damaged(path: &Path, reason: impl Display) -> RecordError {
         RecordError::Damaged { path: path.into(), reason: reason.to_string() }
+    }
+
+    /// Returns what the user can do about it. `next` follows the remedy of a full disk, such as "run it again".
+    pub fn help(&self, next: &str) -> Option<String> {
+        Some(match self {
+            RecordError::Write { error, .. } | RecordError::Read { error, .. }
+                if cfg!(unix) && error.raw_os_error() == Some(TOO_MANY_FILES) =>
+            {
+                format!("the system allows no more open files here (see `ulimit -n`): raise that, then {next}")
+            }
+            RecordError::Write { error, .. } => match error.kind() {
+                ErrorKind::StorageFull | ErrorKind::QuotaExceeded => format!("free some space, then {next}"),
+                ErrorKind::FileTooLarge => {
+                    format!("the system allows no larger file here (see `ulimit -f`): raise that, then {next}")
+                }
+                ErrorKind::PermissionDenied | ErrorKind::ReadOnlyFilesystem => {
+                    "choose a place you may write to".into()
+                }
+                _ if cfg!(unix) && error.raw_os_error() == Some(INPUT_OUTPUT) => {
+                    format!("check the disk, then {next}")
+                }
+                _ => return None,
+            },
+            RecordError::Read { error, .. } => match error.kind() {
+                ErrorKind::NotFound | ErrorKind::NotADirectory => "check the path".into(),
+                ErrorKind::PermissionDenied => "ask its owner for permission to read it".into(),
+                _ => return None,
+            },
+            RecordError::Exists { .. } => {
+                "pass --resume to continue it or --force to overwrite it, or choose another --out".into()
+            }
+            RecordError::NotOurs { .. } => "move it away, or choose another --out".into(),
+            RecordError::OfAnotherUser { .. } => "to write there all the same, name it with --out".into(),
+            RecordError::NoFolder { .. } => "choose a folder with --out".into(),
+            RecordError::Shorter { existing, .. } => {
+                format!("resume with --generations {existing} or more, or choose another --out")
+            }
+            RecordError::Locked { .. } => "wait for it, stop it, or choose another --out".into(),
+            RecordError::ConfigDiffers { path, .. } => format!(
+                "resume with the config it was started with ({}/{CONFIG}), or choose another --out",
+                path.escaped()
+            ),
+            RecordError::InitDiffers { existing, .. } => {
+                let file = if existing.is_some() { " or with that file" } else { "" };
+                format!("resume without --init{file}, or choose another --out")
+            }
+            RecordError::InitNeeded { .. } => "pass that file with --init".into(),
+            RecordError::OriginUnknown { .. } => {
+                "pass the policies that it started from with --init, or start over with --force".into()
+            }
+            RecordError::OwnFitness { .. } => {
+                "start a new run from its policies with --init, or choose another --out".into()
+            }
+            RecordError::Edited { path } => format!(
+                "restore what it was, or move {} away and name the run's own config, or choose another --out",
+                path.display()
+            ),
+            RecordError::Differs { path } => {
+                let folder = file::folder(path);
+                let words = [folder.join(CONFIG), "--out".into(), folder.into(), "--resume".into()];
+                let command = shell::command([PathBuf::from("flotilla"), "train".into()].into_iter().chain(words));
+                let again = match path.ends_with(CONFIG) {
+                    true => String::new(),
+                    false => format!(", make it again with `{command}`"),
+                };
+                format!("restore it{again}, or read it all the same with --unverified")
+            }
+            RecordError::Newer { .. } => "use that version, or choose another --out".into(),
+            RecordError::Damaged { .. } | RecordError::NoTrial { .. } => return None,
+        })
     }
 }
 

@@ -1,14 +1,16 @@
 //! Reads the configs and metrics of finished and unfinished runs.
 
+use std::ffi::OsString;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use super::RecordError;
 use super::digests::{Digests, Verification};
 use super::disk::Place;
-use super::folder::{self, CONFIG, METRICS, POLICIES};
+use super::folder::{self, CONFIG, METRICS, POLICIES, RUNS};
 use super::metrics::{self, RowsError};
 use super::{finished, policies};
+use crate::shell;
 use flotilla::config::{Config, ConfigError};
 use flotilla::escape::PathExt;
 use flotilla::file;
@@ -61,6 +63,35 @@ pub enum ReadError {
     /// The run's files cannot be read.
     #[error(transparent)]
     Record(#[from] RecordError),
+}
+
+impl ReadError {
+    /// Returns what the user can do about it.
+    pub fn help(&self) -> Option<String> {
+        Some(match self {
+            ReadError::Missing(folder) if Path::new(RUNS).join(folder).is_dir() => {
+                format!("did you mean {}?", Path::new(RUNS).join(folder).escaped())
+            }
+            ReadError::Missing(folder) => {
+                let words = ["flotilla", "train", "CONFIG", "--out"].map(OsString::from);
+                format!("`{}` makes a run there", shell::command(words.into_iter().chain([shell::argument(folder)])))
+            }
+            ReadError::NoFolder(path) if file::is_zip(path) => {
+                format!("unpack it with `{}`", shell::command(["unzip".into(), shell::argument(path)]))
+            }
+            ReadError::NoFolder(_) | ReadError::Foreign { .. } => "`flotilla train CONFIG --out DIR` makes one".into(),
+            ReadError::Config { .. } => {
+                "find a config that is whole, and repeat the run with `flotilla train CONFIG --out DIR`".into()
+            }
+            ReadError::Unfinished { folder, .. } => {
+                let [config, out] = [&folder.join(CONFIG), folder].map(|path| shell::argument(path));
+                let words = ["flotilla".into(), "train".into(), config, "--out".into(), out, "--resume".into()];
+                format!("finish the run with `{}`", shell::command(words))
+            }
+            ReadError::Record(error) => return error.help("try again"),
+            ReadError::Collection { .. } => return None,
+        })
+    }
 }
 
 /// Reads a run's config.

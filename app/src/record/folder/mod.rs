@@ -30,6 +30,8 @@ pub use resume::{FirstAndLastRows, differences};
 pub(crate) use run::RunSums;
 pub use run::{FileSums, OWN_FITNESS, Origin, Run, Status, now};
 
+/// The folder for runs whose folder is not named.
+pub const RUNS: &str = "runs";
 /// Exists while a run from given policies starts in a folder, until `run.json` records those policies.
 const INIT_MARK: &str = ".init";
 /// Locked by the process that trains in the folder. The system releases the lock when the process ends, even after a
