@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
-use super::rooted_folder::{FileKind, FolderEntry, RootedFolder, is_link};
+use super::rooted_folder::{FileKind, FolderEntry, OpenAs, RootedFolder, is_link};
 use flotilla::file;
 
 /// Kind of operation on a disk.
@@ -203,7 +203,7 @@ impl Disk {
     /// Creates a file. Fails if the name is taken.
     pub(crate) fn create_new(&self, path: &Path) -> io::Result<Output> {
         self.check(Operation::Create, path)?;
-        let file = self.entry(path)?.create_new()?;
+        let file = self.entry(path)?.open(OpenAs::New)?;
         Ok(Output { disk: self.clone(), path: path.into(), file })
     }
 
@@ -212,7 +212,7 @@ impl Disk {
     /// # Errors
     /// Returns the system's error.
     pub fn append(&self, path: &Path, length: u64) -> io::Result<Output> {
-        let mut file = self.unshared(path, FolderEntry::write)?;
+        let mut file = self.unshared(path, OpenAs::Write)?;
         self.check(Operation::Truncate, path)?;
         file.set_len(length)?;
         file.seek(SeekFrom::End(0))?;
@@ -225,22 +225,22 @@ impl Disk {
     /// Returns the system's error.
     pub fn extend(&self, path: &Path, bytes: &[u8]) -> io::Result<Output> {
         self.check(Operation::Create, path)?;
-        let file = self.unshared(path, FolderEntry::extend)?;
+        let file = self.unshared(path, OpenAs::Append)?;
         let mut output = Output { disk: self.clone(), path: path.into(), file };
         output.write_all(bytes)?;
         Ok(output)
     }
 
     /// Opens a file to change it. A file with other names is copied first, because a backup may consist of hard links.
-    fn unshared(&self, path: &Path, open: fn(&FolderEntry) -> io::Result<File>) -> io::Result<File> {
+    fn unshared(&self, path: &Path, how: OpenAs) -> io::Result<File> {
         let entry = self.entry(path)?;
-        let file = open(&entry)?;
+        let file = entry.open(how)?;
         if entry.links(&file)? <= 1 {
             return Ok(file);
         }
         let mut content = self.read(path)?;
         self.replace_shared(path, |output| io::copy(&mut content, output).map(drop), || Ok(()))?;
-        open(&self.entry(path)?)
+        self.entry(path)?.open(how)
     }
 
     /// Replaces the content of a file. After a crash at any moment, the file has either all of the old content or all
@@ -344,7 +344,7 @@ impl Disk {
         if self.root.is_some() && self.kind(path)? != Some(FileKind::Other) {
             if self.kind(path)?.is_some() {
                 // A link must not be replaced, nor a file without write permission.
-                self.entry(path)?.write()?;
+                self.entry(path)?.open(OpenAs::Write)?;
             }
             return self.replace_shared(path, content, || Ok(()));
         }
@@ -392,7 +392,7 @@ impl Disk {
     /// # Errors
     /// Returns the system's error.
     pub fn read(&self, path: &Path) -> io::Result<File> {
-        self.entry(path)?.read()
+        self.entry(path)?.open(OpenAs::Read)
     }
 
     /// Opens and locks a file, which is created if it is missing. The lock lasts while the file is open. Returns `None` if
@@ -403,7 +403,7 @@ impl Disk {
     pub(crate) fn lock(&self, path: &Path) -> io::Result<Option<File>> {
         self.check(Operation::Create, path)?;
         for attempt in 0.. {
-            let file = self.entry(path)?.extend()?;
+            let file = self.entry(path)?.open(OpenAs::Append)?;
             match file.try_lock() {
                 Ok(()) => {}
                 Err(TryLockError::WouldBlock) => return Err(io::ErrorKind::WouldBlock.into()),
