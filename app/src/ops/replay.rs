@@ -13,7 +13,8 @@ use crate::record::digests::Verification;
 use crate::record::disk::Disk;
 use crate::record::ownership::{self, REPLAY};
 use crate::report::curves::PRINT;
-use crate::report::replay::{self, FPS, Film, History, ReplayError, Replayed, Which};
+use crate::report::replay::{self, FPS, Film, ReplayError, Replayed, Which};
+use crate::report::runs;
 use crate::report::scene::Format;
 use flotilla::config::{Config, Learning, ValidConfig};
 use flotilla::escape::PathExt;
@@ -197,7 +198,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let generation = match generation {
         Some(generation) => generation,
         None if trial < config.learning.trials => {
-            History::read(folder, &config, trial, verification)?.newest().unwrap_or(0)
+            runs::trials(folder, &config, verification)?[trial].len().saturating_sub(1)
         }
         None => 0,
     };

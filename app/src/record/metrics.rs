@@ -13,7 +13,8 @@ use std::path::Path;
 use sha2::{Digest, Sha256};
 
 use super::disk::{Disk, Output, Place};
-use super::{RecordError, hex};
+use super::ownership::CONFIG;
+use super::{RecordError, hash_rest, hex};
 use flotilla::config::{Config, MAX_GENERATIONS, MAX_TRIALS};
 use flotilla::trainer::Row;
 pub use flotilla::trainer::digest::digest;
@@ -146,13 +147,7 @@ fn before(place: Place<'_>, mark: &Extent) -> io::Result<Option<(Vec<u8>, Sha256
     let (mut first, mut hash) = (Vec::new(), Sha256::new());
     file.by_ref().take(MAX_LINE).read_until(b'\n', &mut first)?;
     hash.update(&first);
-    let mut chunk = [0; 1 << 14];
-    loop {
-        match file.read(&mut chunk)? {
-            0 => break,
-            read => hash.update(&chunk[..read]),
-        }
-    }
+    hash_rest(&mut file, &mut hash)?;
     let same = file.limit() == 0 && hex(&hash.clone().finalize()) == mark.sha256;
     Ok(same.then_some((first, hash)))
 }
@@ -299,4 +294,51 @@ pub fn open<'a>(place: impl Into<Place<'a>>) -> Result<Rows<BufReader<File>>, Re
     let place = place.into();
     let file = place.open().map_err(RecordError::read(place.path()))?;
     Rows::new(BufReader::new(file)).map_err(|reason| RecordError::damaged(place.path(), reason))
+}
+
+/// What a file of metrics held.
+pub(crate) struct Extracted {
+    /// Number of rows.
+    pub rows: usize,
+    /// Whether an incomplete line follows them. It belongs to a run that is still training or was killed.
+    pub is_torn: bool,
+    /// SHA-256 of the rows without their seconds and stages.
+    pub digest: Sha256,
+}
+
+/// Calls `each` with every complete row of a run's metrics. The rows of each trial must be in order, from generation 0.
+pub(crate) fn visit(place: Place<'_>, config: &Config, mut each: impl FnMut(&Row)) -> Result<Extracted, RecordError> {
+    let path = place.path();
+    let mut rows = open(place)?;
+    let (mut count, mut is_torn, mut next) = (0, false, vec![0; config.learning.trials]);
+    for row in &mut rows {
+        let row = match row {
+            Ok((row, _)) => row,
+            Err(RowsError::CutShort(_)) => {
+                is_torn = true;
+                break;
+            }
+            Err(RowsError::Read(error)) => return Err(RecordError::read(path)(error)),
+            Err(wrong) => return Err(RecordError::damaged(path, wrong)),
+        };
+        let Row { trial, generation, .. } = row;
+        count += 1;
+        if trial >= next.len() || generation > config.learning.generations {
+            let line = count + 1;
+            let text = format!(
+                "line {line} is trial {trial}, generation {generation}, which the run's {CONFIG} does not have"
+            );
+            return Err(RecordError::damaged(path, text));
+        }
+        if generation != next[trial] {
+            let text = format!(
+                "trial {trial} of generation {generation} is out of order; it must have one row per trial and generation, \
+                 in order"
+            );
+            return Err(RecordError::damaged(path, text));
+        }
+        next[trial] += 1;
+        each(&row);
+    }
+    Ok(Extracted { rows: count, is_torn, digest: rows.digest() })
 }

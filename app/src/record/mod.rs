@@ -18,17 +18,17 @@
 //! before they are used. Nothing in it can name another file.
 
 use std::fmt::Display;
-use std::io::{self, ErrorKind};
+use std::io::{self, ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
 
 use sha2::{Digest, Sha256};
 
 use crate::shell;
 use disk::Place;
-use ownership::CONFIG;
 use flotilla::config::{self, Config, ConfigError};
 use flotilla::escape::{self, PathExt};
 use flotilla::file::{self, TextError};
+use ownership::CONFIG;
 
 pub use flotilla::trainer::digest::hex;
 
@@ -243,9 +243,7 @@ impl RecordError {
                 ErrorKind::FileTooLarge => {
                     format!("the system allows no larger file here (see `ulimit -f`): raise that, then {next}")
                 }
-                ErrorKind::PermissionDenied | ErrorKind::ReadOnlyFilesystem => {
-                    "choose a place you may write to".into()
-                }
+                ErrorKind::PermissionDenied | ErrorKind::ReadOnlyFilesystem => "choose a place you may write to".into(),
                 _ if cfg!(unix) && error.raw_os_error() == Some(INPUT_OUTPUT) => {
                     format!("check the disk, then {next}")
                 }
@@ -299,6 +297,29 @@ impl RecordError {
             RecordError::Damaged { .. } | RecordError::NoTrial { .. } => return None,
         })
     }
+}
+
+/// Passes bytes on, and hashes them.
+struct Hashing<'a> {
+    output: &'a mut dyn Write,
+    hash: &'a mut Sha256,
+}
+
+impl Write for Hashing<'_> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let written = self.output.write(bytes)?;
+        self.hash.update(&bytes[..written]);
+        Ok(written)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.output.flush()
+    }
+}
+
+/// Hashes everything that is left in a file.
+fn hash_rest(file: &mut impl Read, hash: &mut Sha256) -> io::Result<()> {
+    io::copy(file, &mut Hashing { output: &mut io::sink(), hash }).map(drop)
 }
 
 /// Reads a text file of at most `most` bytes.

@@ -19,7 +19,8 @@ use serde::Deserialize;
 use sha2::{Digest, Sha256};
 
 use super::disk::{Disk, Place};
-use super::{RecordError, checkpoint, hex, load_config, metrics, policies, read_text, tensors, without_checkpoint};
+use super::without_checkpoint;
+use super::{Hashing, RecordError, checkpoint, hash_rest, hex, load_config, metrics, policies, read_text, tensors};
 use flotilla::config::Config;
 use flotilla::file;
 
@@ -292,29 +293,6 @@ fn digest(disk: &Disk, path: &Path) -> Result<Option<String>, RecordError> {
     // A link, a folder or a pipe is an error, because it could not be replaced either.
     let mut file = disk.read(path).map_err(RecordError::write(path))?;
     let mut hash = Sha256::new();
-    let mut chunk = vec![0; 1 << 16];
-    loop {
-        match file.read(&mut chunk).map_err(RecordError::read(path))? {
-            0 => return Ok(Some(hex(&hash.finalize()))),
-            read => hash.update(&chunk[..read]),
-        }
-    }
-}
-
-/// Writer that also hashes all bytes it writes.
-struct Hashing<'a> {
-    output: &'a mut dyn Write,
-    hash: &'a mut Sha256,
-}
-
-impl Write for Hashing<'_> {
-    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        let written = self.output.write(bytes)?;
-        self.hash.update(&bytes[..written]);
-        Ok(written)
-    }
-
-    fn flush(&mut self) -> io::Result<()> {
-        self.output.flush()
-    }
+    hash_rest(&mut file, &mut hash).map_err(RecordError::read(path))?;
+    Ok(Some(hex(&hash.finalize())))
 }

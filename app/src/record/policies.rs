@@ -119,8 +119,7 @@ pub fn read_init<'a>(place: impl Into<Place<'a>>, config: &Config) -> Result<Ini
     let place = place.into();
     let path = place.path();
     let mut hash = Sha256::new();
-    io::copy(&mut place.open().map_err(RecordError::read(path))?, &mut HashWriter(&mut hash))
-        .map_err(RecordError::read(path))?;
+    place.open().and_then(|mut file| super::hash_rest(&mut file, &mut hash)).map_err(RecordError::read(path))?;
     let mut file = tensors::open(place)?;
     let trial = |trial| {
         let own = file.info(&tensor(trial)).is_some() || file.info(ALL).is_none();
@@ -129,20 +128,6 @@ pub fn read_init<'a>(place: impl Into<Place<'a>>, config: &Config) -> Result<Ini
     let trials = (0..config.learning.trials).map(trial).collect::<Result<_, String>>();
     let trials = trials.map_err(|reason| RecordError::damaged(path, reason))?;
     Ok(Init { digest: super::hex(&hash.finalize()), trials })
-}
-
-/// Writer that only hashes what is written.
-struct HashWriter<'a>(&'a mut Sha256);
-
-impl Write for HashWriter<'_> {
-    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        self.0.update(bytes);
-        Ok(bytes.len())
-    }
-
-    fn flush(&mut self) -> io::Result<()> {
-        Ok(())
-    }
 }
 
 /// Reads the policies of all trials that a run of this config wrote.

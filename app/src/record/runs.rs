@@ -8,7 +8,7 @@ use super::RecordError;
 use super::digests::{Digests, Verification};
 use super::disk::Place;
 use super::folder::{self, CONFIG, METRICS, POLICIES, RUNS};
-use super::metrics::{self, RowsError};
+use super::metrics;
 use super::{finished, policies};
 use crate::shell;
 use flotilla::config::{Config, ConfigError};
@@ -134,7 +134,7 @@ pub fn metrics<'a>(
     place: impl Into<Place<'a>>,
     config: &Config,
     verification: Verification,
-    mut each: impl FnMut(&Row),
+    each: impl FnMut(&Row),
 ) -> Result<(), ReadError> {
     let place = place.into();
     let (folder, path) = (place.path(), place.path().join(METRICS));
@@ -144,29 +144,9 @@ pub fn metrics<'a>(
     if !place.at(&path).exists().map_err(RecordError::read(&path))? {
         return Err(unfinished(format!("it has no {METRICS} yet")));
     }
-    let damaged = |reason: String| ReadError::Record(RecordError::Damaged { path: path.clone(), reason });
-    let mut count = 0;
-    let mut rows = metrics::open(place.at(&path))?;
-    for row in &mut rows {
-        let row = match row {
-            Ok((row, _)) => row,
-            // A partial last line belongs to a run that is still training or was killed.
-            Err(RowsError::CutShort(_)) => break,
-            Err(error) => return Err(damaged(error.to_string())),
-        };
-        let (trials, generations) = (config.learning.trials, config.learning.generations);
-        if row.trial >= trials || row.generation > generations {
-            let (trial, generation) = (row.trial, row.generation);
-            return Err(damaged(format!(
-                "line {} is trial {trial}, generation {generation}, which the run's {CONFIG} does not have",
-                count + 2
-            )));
-        }
-        each(&row);
-        count += 1;
-    }
-    digests.compare_metrics(&path, rows.digest())?;
-    if count == 0 { Err(unfinished(format!("its {METRICS} has no rows yet"))) } else { Ok(()) }
+    let found = metrics::visit(place.at(&path), config, each)?;
+    digests.compare_metrics(&path, found.digest)?;
+    if found.rows == 0 { Err(unfinished(format!("its {METRICS} has no rows yet"))) } else { Ok(()) }
 }
 
 /// Reads the results of a finished run from its folder.
@@ -175,18 +155,8 @@ pub fn metrics<'a>(
 /// The folder has no finished run, or its files are damaged or were changed after the run.
 pub fn trained(folder: &Path, verification: Verification) -> Result<Trained, ReadError> {
     let config = config(folder, verification)?;
-    let (mut rows, mut next) = (Vec::new(), vec![0; config.learning.trials]);
-    let mut in_order = true;
-    metrics(folder, &config, verification, |row| {
-        in_order &= next[row.trial] == row.generation;
-        next[row.trial] += 1;
-        rows.push(*row);
-    })?;
-    if !in_order {
-        let path = folder.join(METRICS);
-        let reason = "it must have one row per trial and generation, in order".into();
-        return Err(RecordError::Damaged { path, reason }.into());
-    }
+    let mut rows = Vec::new();
+    metrics(folder, &config, verification, |row| rows.push(*row))?;
     let (found, expected) = (rows.len(), config.learning.trials * (config.learning.generations + 1));
     if found != expected {
         let reason = format!("its {} has {found} rows of {expected}", METRICS);

@@ -6,9 +6,8 @@ use serde::de::IntoDeserializer;
 use serde::{Deserialize, Serialize};
 
 use super::curves::{Band, Curve, Figure, Panel};
-use crate::record::RecordError;
 use crate::record::digests::{Digests, UNVERIFIED, Verification};
-use crate::record::folder::{METRICS, OWN_FITNESS, Run};
+use crate::record::folder::{OWN_FITNESS, Run};
 pub use crate::record::runs::{ReadError, config, metrics};
 use flotilla::config::Config;
 use flotilla::escape::PathExt;
@@ -74,31 +73,17 @@ impl std::str::FromStr for TeamKind {
     }
 }
 
-/// A run's metrics by generation, as shares of the POIs averaged over trials.
+/// A run's metrics by generation, as shares of the POIs averaged over trials: G of each [`TeamKind`].
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(crate) struct RunMetrics {
-    /// G of the best team.
-    pub best: Vec<Average>,
-    /// G of the mean team.
-    pub mean: Vec<Average>,
-    /// G of the champion.
-    pub champion: Vec<Average>,
-}
+pub(crate) struct RunMetrics([Vec<Average>; TeamKind::ALL.len()]);
 
 impl RunMetrics {
     /// Returns G of one kind of team.
     pub fn of(&self, kind: TeamKind) -> &[Average] {
-        match kind {
-            TeamKind::Best => &self.best,
-            TeamKind::Champion => &self.champion,
-            TeamKind::Mean => &self.mean,
-        }
+        &self.0[kind as usize]
     }
 
     /// Reads a run's metrics. Memory grows only with the number of generations.
-    ///
-    /// # Errors
-    /// See [`metrics()`].
     pub fn read(folder: &Path, config: &Config, verification: Verification) -> Result<RunMetrics, ReadError> {
         let mut run = RunMetrics::default();
         metrics(folder, config, verification, |row| run.add(row))?;
@@ -106,12 +91,11 @@ impl RunMetrics {
     }
 
     pub(crate) fn add(&mut self, row: &Row) {
-        let added = [(&mut self.best, row.best_g), (&mut self.mean, row.mean_g), (&mut self.champion, row.champion_g)];
-        for (averages, g) in added {
+        for (averages, kind) in self.0.iter_mut().zip(TeamKind::ALL) {
             if averages.len() <= row.generation {
                 averages.resize(row.generation + 1, Average::default());
             }
-            averages[row.generation].add(g);
+            averages[row.generation].add(kind.of(row));
         }
     }
 }
@@ -119,21 +103,11 @@ impl RunMetrics {
 /// Reads G of the best team and of the champion, `[trials][generations]`, as far as the run has progressed.
 ///
 /// # Errors
-/// See [`metrics()`]. It also fails if a trial's rows are out of order.
+/// See [`metrics()`].
 pub fn trials(folder: &Path, config: &Config, verification: Verification) -> Result<Vec<Vec<[f64; 2]>>, ReadError> {
     let mut trials = vec![vec![]; config.learning.trials];
-    let mut skipped = None;
-    metrics(folder, config, verification, |row| match &mut trials[row.trial] {
-        trial if trial.len() == row.generation => trial.push([row.best_g, row.champion_g]),
-        _ => skipped = skipped.or(Some((row.trial, row.generation))),
-    })?;
-    match skipped {
-        None => Ok(trials),
-        Some((trial, generation)) => Err(ReadError::Record(RecordError::Damaged {
-            path: folder.join(METRICS),
-            reason: format!("trial {trial} of generation {generation} is out of order"),
-        })),
-    }
+    metrics(folder, config, verification, |row| trials[row.trial].push([row.best_g, row.champion_g]))?;
+    Ok(trials)
 }
 
 /// Returns the figure of G by generation: of one kind of team in each run, or of all kinds in a single run.

@@ -202,29 +202,20 @@ fn read(point: &Point, place: Place<'_>, options: &Detail) -> Result<(Vec<Row>, 
     let (trials, last) = (config.learning.trials, config.learning.generations);
     let mut rows: Vec<Vec<Row>> = vec![Vec::new(); trials];
     let mut reached = vec![None; trials];
-    let mut next = 0;
-    let mut source = metrics::open(place.at(&path)).map_err(|error| damaged(&error))?;
-    for row in &mut source {
-        let (row, _) = row.map_err(|error| damaged(&format!("{}: {error}", path.escaped())))?;
-        let Row { trial, generation, .. } = row;
-        if (generation, trial) != (next / trials, next % trials) || generation > last {
-            return Err(Missing::Damaged(format!(
-                "{}: trial {trial} of generation {generation} is out of order",
-                path.escaped()
-            )));
-        }
-        next += 1;
+    let found = metrics::visit(place.at(&path), &config, |row| {
+        let &Row { trial, generation, .. } = row;
         // G of an easier stage is not comparable.
-        if options.measure.of(&row) >= options.reach && reached[trial].is_none() && generation >= config.last_from() {
+        if options.measure.of(row) >= options.reach && reached[trial].is_none() && generation >= config.last_from() {
             reached[trial] = Some(generation);
         }
         if generation % options.every == 0 || generation == last {
-            rows[trial].push(row);
+            rows[trial].push(*row);
         }
-    }
-    digests.compare_metrics(&path, source.digest()).map_err(|error| damaged(&error))?;
-    if next < trials * (last + 1) {
-        return Err(Missing::Unfinished(next / trials, last));
+    });
+    let found = found.map_err(|error| damaged(&error))?;
+    digests.compare_metrics(&path, found.digest).map_err(|error| damaged(&error))?;
+    if found.rows < trials * (last + 1) {
+        return Err(Missing::Unfinished(found.rows / trials, last));
     }
     let ends = || rows.iter().filter_map(|rows| rows.last());
     let curve = (0..rows[0].len()).map(|at| {

@@ -3,13 +3,13 @@
 use std::io::ErrorKind;
 use std::path::Path;
 
-use sha2::{Digest, Sha256};
+use sha2::Digest;
 
 use super::{
     CHECKPOINTS, CONFIG, Checkpoint, Folder, INIT_MARK, METRICS, Note, Origin, POLICIES, RUN, Resumed, Run, RunSums,
 };
 use super::{StartFrom, Status};
-use crate::record::metrics::{self, RowsError};
+use crate::record::metrics;
 use crate::record::{RecordError, checkpoint, config_digest, hex, policies, tensors, without_checkpoint};
 use flotilla::config::{Config, MAX_STAGES};
 use flotilla::escape::PathExt;
@@ -245,32 +245,21 @@ impl Folder {
         policies: &[impl AsRef<[f32]>],
     ) -> Result<(FirstAndLastRows, RunSums), RecordError> {
         let path = self.file(METRICS);
-        let damaged = |reason: String| RecordError::damaged(&path, reason);
-        let mut rows = metrics::open(self.disk.at(&path))?;
         let (trials, last) = (config.learning.trials, config.learning.generations);
         let mut ends = FirstAndLastRows { first: vec![], last: vec![] };
-        let mut count = 0;
-        for row in &mut rows {
-            let (row, _) = row.map_err(|error| match error {
-                RowsError::Read(error) => RecordError::read(&path)(error),
-                wrong => RecordError::damaged(&path, wrong),
-            })?;
-            if (row.generation, row.trial) != (count / trials, count % trials) {
-                let (generation, trial) = (count / trials, count % trials);
-                return Err(damaged(format!("line {} is not trial {trial}, generation {generation}", count + 2)));
-            }
+        let found = metrics::visit(self.disk.at(&path), config, |row| {
             if row.generation == 0 {
-                ends.first.push(row);
+                ends.first.push(*row);
             }
             if row.generation == last {
-                ends.last.push(row);
+                ends.last.push(*row);
             }
-            count += 1;
+        })?;
+        let (count, mut hash) = (found.rows, found.digest);
+        if count != trials * (last + 1) || found.is_torn {
+            let reason = format!("it has {count} whole rows, not {}", trials * (last + 1));
+            return Err(RecordError::damaged(&path, reason));
         }
-        if count != trials * (last + 1) {
-            return Err(damaged(format!("it has {count} rows, not {}", trials * (last + 1))));
-        }
-        let mut hash: Sha256 = rows.digest();
         let metrics = hex(&hash.clone().finalize());
         policies.iter().for_each(|weights| hash.update(bytemuck::cast_slice::<f32, u8>(weights.as_ref())));
         Ok((ends, RunSums { run: hex(&hash.finalize()), metrics }))
