@@ -17,6 +17,7 @@
 //! Every file that is read is untrusted. Its size is checked before memory is allocated, and its values are checked
 //! before they are used. Nothing in it can name another file.
 
+use std::collections::BTreeMap;
 use std::fmt::Display;
 use std::io::{self, ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
@@ -370,4 +371,22 @@ pub fn config_digest(config: &Config) -> String {
 /// Returns the config with the default `[checkpoint]`, because that section may differ between sessions of a run.
 pub(crate) fn without_checkpoint(config: &Config) -> Config {
     Config { checkpoint: config::CheckpointConfig::default(), ..config.clone() }
+}
+
+/// Returns the values of a config by their dotted keys. Each stage is one value.
+pub(crate) fn values_by_key(config: &Config) -> BTreeMap<String, toml::Value> {
+    let mut values = BTreeMap::new();
+    for (section, content) in toml::Table::try_from(config).unwrap_or_default() {
+        match content {
+            toml::Value::Table(keys) => {
+                values.extend(keys.into_iter().map(|(key, value)| (format!("{section}.{key}"), value)));
+            }
+            toml::Value::Array(stages) => {
+                let stages = stages.into_iter().enumerate();
+                values.extend(stages.map(|(index, stage)| (format!("{section}[{index}]"), stage)));
+            }
+            value => drop(values.insert(section, value)),
+        }
+    }
+    values
 }

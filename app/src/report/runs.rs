@@ -1,14 +1,17 @@
 //! The learning curves of finished and unfinished runs.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use serde::de::IntoDeserializer;
 use serde::{Deserialize, Serialize};
 
 use super::curves::{Band, Curve, Figure, Panel};
+use super::map::counted;
 use crate::record::digests::{Digests, UNVERIFIED, Verification};
 use crate::record::folder::{OWN_FITNESS, Run};
 pub use crate::record::runs::{ReadError, config, metrics};
+use crate::record::{values_by_key, without_checkpoint};
 use flotilla::config::Config;
 use flotilla::escape::PathExt;
 use flotilla::statistics::Average;
@@ -208,46 +211,30 @@ pub fn paired(folders: &[PathBuf], verification: Verification) -> Result<bool, R
 /// Labels runs by the config keys that differ between them, or by their directories if none differ. A fitness that is
 /// not the config's is labelled [`OWN_FITNESS`].
 pub fn labels(folders: &[PathBuf], configs: &[Config]) -> Vec<String> {
-    let table = |(config, folder): (&Config, &PathBuf)| {
-        let mut table = toml::Table::try_from(config).unwrap_or_default();
-        if let Some(learning) = table.get_mut("learning").filter(|_| Run::has_own_fitness(folder)) {
-            learning["fitness"] = OWN_FITNESS.into();
-        }
-        table
-    };
-    let tables: Vec<toml::Table> = configs.iter().zip(folders).map(table).collect();
-    let Some(first) = tables.first() else { return vec![] };
-    let value = |table: &toml::Table, section: &str, key: &str| {
-        let text = table.get(section).and_then(|section| section.get(key)).map_or("-".into(), toml::Value::to_string);
-        text.trim_matches('"').to_string()
-    };
-    let mut keys = Vec::new();
-    for (section, entries) in first {
+    let values = |(config, folder): (&Config, &PathBuf)| {
         // The checkpoint interval does not affect results.
-        for key in entries.as_table().into_iter().flat_map(toml::Table::keys).filter(|_| section != "checkpoint") {
-            let differs = tables.iter().any(|table| value(table, section, key) != value(first, section, key));
-            if differs {
-                keys.push((section, key));
-            }
+        let mut values = values_by_key(&without_checkpoint(config));
+        if Run::has_own_fitness(folder) {
+            values.insert("learning.fitness".into(), OWN_FITNESS.into());
         }
-    }
+        values
+    };
+    let tables: Vec<BTreeMap<String, toml::Value>> = configs.iter().zip(folders).map(values).collect();
+    let Some(first) = tables.first() else { return vec![] };
+    let differs = |key: &&String| tables.iter().any(|table| table.get(*key) != first.get(*key));
+    let keys: Vec<_> = first.keys().filter(differs).filter_map(|key| Some((key, key.split_once('.')?.1))).collect();
     let staged = configs.iter().any(|config| config.stages != configs[0].stages);
-    let label = |((folder, table), config): ((&PathBuf, &toml::Table), &Config)| {
+    let label = |((folder, table), config): ((&PathBuf, &BTreeMap<String, toml::Value>), &Config)| {
         let stages = match config.stages.len() {
             0 => "no stages".into(),
-            1 => "1 stage".into(),
-            several => format!("{several} stages"),
+            _ => counted(config.stages.len(), "stage"),
         };
-        let parts: Vec<String> = keys
-            .iter()
-            .map(|(section, key)| {
-                let value = value(table, section, key);
-                // Long values such as positions are unreadable in a label.
-                if value.len() > 24 { String::new() } else { format!("{key} {value}") }
-            })
-            .filter(|part| !part.is_empty())
-            .chain(Some(stages).filter(|_| staged))
-            .collect();
+        let part = |&(key, leaf): &(&String, &str)| {
+            let value = table.get(key).map_or("-".into(), toml::Value::to_string);
+            // Long values such as positions are unreadable in a label.
+            Some(value.trim_matches('"')).filter(|value| value.len() <= 24).map(|value| format!("{leaf} {value}"))
+        };
+        let parts: Vec<String> = keys.iter().filter_map(part).chain(Some(stages).filter(|_| staged)).collect();
         if parts.is_empty() { folder.escaped().to_string() } else { parts.join(", ") }
     };
     let labels: Vec<String> = folders.iter().zip(&tables).zip(configs).map(label).collect();

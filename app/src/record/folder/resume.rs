@@ -1,5 +1,6 @@
 //! Where a run in a folder resumes, and whether it is finished.
 
+use std::collections::BTreeSet;
 use std::io::ErrorKind;
 use std::path::Path;
 
@@ -10,8 +11,10 @@ use super::{
 };
 use super::{StartFrom, Status};
 use crate::record::metrics;
-use crate::record::{RecordError, checkpoint, config_digest, hex, policies, tensors, without_checkpoint};
-use flotilla::config::{Config, MAX_STAGES};
+use crate::record::{
+    RecordError, checkpoint, config_digest, hex, policies, tensors, values_by_key, without_checkpoint,
+};
+use flotilla::config::Config;
 use flotilla::escape::PathExt;
 use flotilla::trainer::Row;
 
@@ -299,34 +302,13 @@ impl Folder {
 
 /// Returns a line for each key in which two configs differ. Keys without influence on the results are ignored.
 pub fn differences(old: &Config, new: &Config) -> Vec<String> {
-    let table = |config: &Config| toml::Table::try_from(without_checkpoint(config)).unwrap_or_default();
-    let (old, new) = (table(old), table(new));
-    let mut differences = Vec::new();
-    for (section, keys) in &new {
-        for (key, value) in keys.as_table().into_iter().flatten() {
-            let before = old.get(section).and_then(|keys| keys.get(key));
-            if before != Some(value) {
-                let before = before.map_or("nothing".to_string(), shorten);
-                differences.push(format!("  {section}.{key}: {before} there, {} here", shorten(value)));
-            }
-        }
-    }
-    let stage = |table: &toml::Table, index: usize| table.get("stages")?.as_array()?.get(index).cloned();
-    for index in 0..MAX_STAGES {
-        match [stage(&old, index), stage(&new, index)] {
-            [None, None] => break,
-            [existing, requested] if existing == requested => {}
-            [existing, requested] => {
-                let describe = |stage: Option<toml::Value>| stage.as_ref().map_or("nothing".into(), shorten);
-                differences.push(format!(
-                    "  stages[{index}]: {} there, {} here",
-                    describe(existing),
-                    describe(requested)
-                ));
-            }
-        }
-    }
-    differences
+    let [old, new] = [old, new].map(|config| values_by_key(&without_checkpoint(config)));
+    let keys: BTreeSet<_> = old.keys().chain(new.keys()).collect();
+    let line = |key: &String| {
+        let [there, here] = [&old, &new].map(|values| values.get(key).map_or("nothing".into(), shorten));
+        format!("  {key}: {there} there, {here} here")
+    };
+    keys.into_iter().filter(|key| old.get(*key) != new.get(*key)).map(line).collect()
 }
 
 fn shorten(value: &toml::Value) -> String {
