@@ -81,9 +81,6 @@ pub struct Found {
 }
 
 /// Plays the baselines of a config, one repetition after the other.
-///
-/// # Errors
-/// The config is invalid, or the backend fails.
 pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
     if request.seeds == 0 {
         return Err(Error::Usage("--seeds 0: allowed 1 or more".into()));

@@ -38,9 +38,6 @@ pub struct Outcome {
 }
 
 /// Checks a config.
-///
-/// # Errors
-/// The config is invalid, or the picture cannot be written.
 pub fn run(request: &Request, context: Context<'_>) -> Result<Outcome, Error> {
     output::check(&[("--out", request.out.as_deref())], &[])?;
     let picture = request.out.as_deref().map(|out| Ok::<_, Error>((out, plot::kind_of(out)?))).transpose()?;

@@ -50,9 +50,6 @@ fn reach() -> f64 {
 }
 
 /// Parses a generation to compare at.
-///
-/// # Errors
-/// The text is neither a number nor `last`.
 pub fn at(text: &str) -> Result<At, String> {
     match text {
         "last" => Ok(At::Last),
@@ -82,9 +79,6 @@ pub struct Outcome {
 type Contest = (String, Vec<Cohort>);
 
 /// Compares runs, or points of a sweep.
-///
-/// # Errors
-/// A run cannot be read, or there is nothing to compare.
 pub fn run(args: &Request, context: Context<'_>) -> Result<Outcome, Error> {
     let at = args.at.iter().map(|text| at(text).map_err(|error| Error::Usage(format!("--at {text}: {error}").into())));
     let question = Question { at: at.collect::<Result<_, _>>()?, reach: args.reach, paired: args.paired };

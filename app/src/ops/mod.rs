@@ -206,9 +206,6 @@ impl Context<'_> {
 /// Opens the backend when it is needed, so that requests are checked first.
 pub trait BackendSource {
     /// Returns the backend that plays some work, and its description for people.
-    ///
-    /// # Errors
-    /// It cannot be opened.
     fn open(&mut self, work: Work) -> Result<(&mut OpenBackend, String), Error>;
 }
 
@@ -234,9 +231,6 @@ pub struct ConfigText {
 
 impl ConfigText {
     /// Reads the config.
-    ///
-    /// # Errors
-    /// The text or a key is invalid. The error lists the problems.
     pub fn read(&self) -> Result<Config, Error> {
         Ok(Config::read(&self.text, &self.name, &[], &self.set)?)
     }
@@ -255,9 +249,6 @@ fn escaped<S: serde::Serializer>(path: &Path, serializer: S) -> Result<S::Ok, S:
 }
 
 /// Refuses configs that need more memory than there is, each alone.
-///
-/// # Errors
-/// A config needs more memory than there is.
 pub fn check_memory<'a>(
     configs: impl IntoIterator<Item = &'a ValidConfig>,
     (_, machine): &OpenBackend,

@@ -47,9 +47,6 @@ pub struct Outcome {
 }
 
 /// Draws the curves of runs.
-///
-/// # Errors
-/// A run cannot be read, or the picture cannot be written.
 pub fn run(request: &Request, context: Context<'_>) -> Result<Outcome, Error> {
     let verification = Verification::unless(request.unverified);
     if request.runs.len() > MAX_RUNS {

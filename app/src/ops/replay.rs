@@ -158,9 +158,6 @@ impl std::str::FromStr for WhichTrial {
 
 impl WhichTrial {
     /// Returns the trial's number in a run.
-    ///
-    /// # Errors
-    /// The run cannot be read or lacks the generation.
     pub fn find(
         self,
         folder: &Path,
@@ -179,9 +176,6 @@ impl WhichTrial {
 }
 
 /// Replays episodes, and writes them.
-///
-/// # Errors
-/// The run cannot be read, the request does not fit it, the backend fails, or a file cannot be written.
 pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
     let Request { generation, team, compare, step, width, fps, unverified, .. } = *request;
     let verification = Verification::unless(unverified);
@@ -271,9 +265,6 @@ pub fn play(
 }
 
 /// Returns the config that all the generations play with.
-///
-/// # Errors
-/// The generations cannot be shown side by side, because their worlds differ.
 fn stage<'a>(config: &'a ValidConfig, generations: &[usize]) -> Result<&'a Config, Error> {
     let refused = |text: String| Err(Error::Usage(text.into()));
     let first = generations.first().copied().unwrap_or(0);
@@ -289,9 +280,6 @@ fn stage<'a>(config: &'a ValidConfig, generations: &[usize]) -> Result<&'a Confi
 
 /// Checks the output, and creates the folder of a film. Called before the trial is trained again, which may take hours.
 /// `run` is the run's folder.
-///
-/// # Errors
-/// The file cannot be written, or would overwrite a file of the run.
 fn prepare_output(place: &Destination, kind: &Form, run: &Path) -> Result<(), Error> {
     let Destination::Named(out) = place else { return Ok(place.check()?) };
     if matches!(kind, Form::Film(_)) {

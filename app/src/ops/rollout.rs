@@ -115,9 +115,6 @@ impl Request {
 }
 
 /// Plays the teams. Team j consists of policy j of every leader.
-///
-/// # Errors
-/// The config or the policies cannot be used, the backend fails, or a file cannot be written.
 pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
     let path = &request.path;
     let (config_path, trained) = match path.is_dir() {

@@ -90,9 +90,6 @@ impl Default for Results {
 
 impl Request {
     /// Reads the sweep.
-    ///
-    /// # Errors
-    /// The text or a point is invalid.
     pub fn read(&self) -> Result<Sweep, Error> {
         Ok(Sweep::read(&self.text, &self.name, &self.set, self.skip_impossible)?)
     }
@@ -192,9 +189,6 @@ impl Outcome {
 }
 
 /// Trains all points, and collects their results.
-///
-/// # Errors
-/// The sweep is invalid, the folder cannot be used, or training fails or is stopped.
 pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
     let sweep = request.read()?;
     let axes = picture_axes(&sweep, &request.results.axes)?;
@@ -203,9 +197,6 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
 }
 
 /// Returns the axes that pictures have across and down.
-///
-/// # Errors
-/// A name is no axis of the sweep.
 pub fn picture_axes(sweep: &Sweep, names: &[String]) -> Result<Vec<usize>, Error> {
     let find = |name: &String| {
         let keys = || sweep.axes.iter().map(|axis| &*axis.key).collect::<Vec<_>>().join(", ");
@@ -301,9 +292,6 @@ fn open_folder(out: &Path, named: bool) -> Result<Disk, Error> {
 }
 
 /// Trains the points of a request's shard. Returns the disk in the sweep's folder.
-///
-/// # Errors
-/// The folder cannot be used, or training fails or is stopped.
 pub fn train(
     request: &Request,
     sweep: &Sweep,
@@ -458,9 +446,6 @@ pub fn free_memory() -> usize {
 }
 
 /// Collects the results that exist, and draws them.
-///
-/// # Errors
-/// The folder holds no such sweep, or files cannot be written.
 pub fn collect(request: &Request, sweep: &Sweep, axes: &[usize]) -> Result<Outcome, Error> {
     let out = &*request.out;
     if !runs::exists(&out.join(SWEEP))? {

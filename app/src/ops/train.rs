@@ -166,9 +166,6 @@ impl Request {
 }
 
 /// Starts or resumes a run, trains it to its end, and draws its curves.
-///
-/// # Errors
-/// The config is invalid, the folder cannot be used, or training fails or is stopped.
 pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
     let (config, notes) = request.config.read_noted(context)?;
     let (backend, on) = backends.open(Work::of([&*config]))?;
@@ -320,9 +317,6 @@ pub struct InMemory {
 }
 
 /// Trains without a folder. [`save`] writes the results later. `champions` asks for the champions of every generation.
-///
-/// # Errors
-/// The config is invalid, memory is too small, training fails, or it is stopped.
 pub fn in_memory(
     config: &Config,
     champions: bool,
@@ -359,9 +353,6 @@ pub fn in_memory(
 }
 
 /// Writes a finished run that was trained in memory, with the files of [`run`]. Returns its digest.
-///
-/// # Errors
-/// A file cannot be written.
 pub fn save(finished: Finished<'_>, storage: &mut dyn Storage) -> Result<String, RecordError> {
     let (config, rows) = (finished.config, finished.rows);
     let digest = finished.write(storage)?;

@@ -92,9 +92,6 @@ impl<N: AsRef<[f32]>> Checkpoint<N> {
     }
 
     /// Writes the content of a checkpoint file to a stream.
-    ///
-    /// # Errors
-    /// Returns the stream's error.
     pub fn put(&self, output: &mut dyn Write, of: &Config) -> std::io::Result<()> {
         let Checkpoint { config, init, seconds, metrics, snapshot } = self;
         let mut metadata = BTreeMap::from(
@@ -130,9 +127,6 @@ impl<N: AsRef<[f32]>> Checkpoint<N> {
 
 impl Checkpoint {
     /// Reads a checkpoint of a run with the given config.
-    ///
-    /// # Errors
-    /// Returns a description of the problem.
     pub fn read(source: impl Read + Seek, of: &Config) -> Result<Checkpoint, String> {
         let mut file = TensorFile::open(source)?;
         if file.kind() != Some(KIND) {
@@ -235,9 +229,6 @@ impl Shapes {
 }
 
 /// Returns the generations of the checkpoints in a folder, oldest first. Temporary files are ignored.
-///
-/// # Errors
-/// The folder cannot be read.
 pub fn list<'a>(folder: impl Into<Place<'a>>) -> Result<Vec<usize>, RecordError> {
     let mut generations: Vec<usize> =
         names(folder.into())?.iter().filter_map(|name| name.to_str().and_then(generation_of)).collect();
@@ -268,9 +259,6 @@ pub fn path(folder: &Path, generation: usize) -> PathBuf {
 
 /// Reads the checkpoint at a path. The weights of a finished run come from the file `policies`. Returns `None` if that
 /// file is missing, damaged or from another run.
-///
-/// # Errors
-/// The checkpoint or the policies cannot be read, or the checkpoint is damaged.
 pub fn read<'a>(
     place: impl Into<Place<'a>>,
     policies: impl Into<Place<'a>>,
@@ -342,9 +330,6 @@ impl CheckpointWriter {
 
     /// Starts to write a checkpoint after the previous one is complete. `metrics` is flushed to the disk first. The
     /// cost of the checkpoint counts from `since`.
-    ///
-    /// # Errors
-    /// The previous checkpoint could not be written.
     pub fn save(&mut self, checkpoint: Checkpoint, metrics: Output, since: Instant) -> Result<(), RecordError> {
         self.wait()?;
         let generation = checkpoint.snapshot.generation;
@@ -361,9 +346,6 @@ impl CheckpointWriter {
     }
 
     /// Writes a checkpoint of borrowed weights before it returns. See [`CheckpointWriter::save`].
-    ///
-    /// # Errors
-    /// This checkpoint or the previous one could not be written.
     pub fn save_now(
         &mut self,
         checkpoint: &Checkpoint<&[f32]>,
@@ -382,9 +364,6 @@ impl CheckpointWriter {
     }
 
     /// Waits until the last checkpoint is written, and removes old ones.
-    ///
-    /// # Errors
-    /// The last checkpoint could not be written.
     pub fn wait(&mut self) -> Result<(), RecordError> {
         let Some(writing) = self.writing.take() else { return Ok(()) };
         let (generation, cost) = writing.finish()?;
@@ -407,9 +386,6 @@ impl CheckpointWriter {
     }
 
     /// Rewrites all checkpoints for the same run with the fewer generations of `config`.
-    ///
-    /// # Errors
-    /// A checkpoint could not be read or written.
     pub(crate) fn shorten(&mut self, config: &Config) -> Result<(), RecordError> {
         self.wait()?;
         for &generation in &self.kept {
@@ -426,9 +402,6 @@ impl CheckpointWriter {
     }
 
     /// Completes the last checkpoint if its writer has finished.
-    ///
-    /// # Errors
-    /// The last checkpoint could not be written.
     pub(crate) fn poll(&mut self) -> Result<(), RecordError> {
         if self.writing.as_ref().is_some_and(BackgroundTask::is_finished) { self.wait() } else { Ok(()) }
     }
@@ -449,9 +422,6 @@ impl Drop for CheckpointWriter {
 }
 
 /// Removes temporary files of interrupted writers, and returns the generations of the checkpoints, oldest first.
-///
-/// # Errors
-/// The folder cannot be read or written.
 pub(crate) fn remove_temporary_files(disk: &Disk, folder: &Path) -> Result<Vec<usize>, RecordError> {
     let generations = list(disk.at(folder))?;
     for name in names(disk.at(folder))? {

@@ -80,9 +80,6 @@ pub struct Writer {
 
 impl Writer {
     /// Creates a file with its header and replaces any other file.
-    ///
-    /// # Errors
-    /// Returns the system's error.
     pub fn create(disk: &Disk, path: &Path, config: &Config) -> io::Result<Writer> {
         let output = BufWriter::new(disk.create(path)?);
         let mut writer = Writer { output, bytes: 0, hash: Sha256::new(), lines: Lines::of(config) };
@@ -93,9 +90,6 @@ impl Writer {
 
     /// Continues a file at a mark and drops everything after it. Returns `None` if the file is missing or its content
     /// up to the mark has changed.
-    ///
-    /// # Errors
-    /// Returns the system's error.
     pub fn resume(disk: &Disk, path: &Path, mark: &Extent, config: &Config) -> io::Result<Option<Writer>> {
         let Some((first, hash)) = before(disk.at(path), mark)? else { return Ok(None) };
         // A run that was shortened to end before its later stages keeps the column `stage`.
@@ -111,25 +105,16 @@ impl Writer {
     }
 
     /// Adds rows that became complete after `seconds` of training.
-    ///
-    /// # Errors
-    /// Returns the system's error.
     pub fn add(&mut self, rows: &[Row], seconds: f64) -> io::Result<()> {
         rows.iter().try_for_each(|row| self.write(&self.lines.line(row, seconds)))
     }
 
     /// Passes all lines to the system, so that other processes can read them.
-    ///
-    /// # Errors
-    /// Returns the system's error.
     pub fn flush(&mut self) -> io::Result<()> {
         self.output.flush()
     }
 
     /// Returns the current extent, and the file, so that the caller can flush this part to the disk.
-    ///
-    /// # Errors
-    /// Returns the system's error.
     pub fn mark(&mut self) -> io::Result<(Extent, Output)> {
         self.output.flush()?;
         let sha256 = hex(&self.hash.clone().finalize());
@@ -158,9 +143,6 @@ pub(crate) fn has_extent<'a>(place: impl Into<Place<'a>>, mark: &Extent) -> bool
 }
 
 /// Reports whether a file starts like a metrics file. The header may be incomplete.
-///
-/// # Errors
-/// Returns the system's error.
 pub(crate) fn begins(place: Place<'_>) -> io::Result<bool> {
     let mut start = Vec::new();
     place.open()?.take("trial,generation,".len() as u64).read_to_end(&mut start)?;
@@ -199,9 +181,6 @@ pub struct Rows<R> {
 
 impl<R: BufRead> Rows<R> {
     /// Reads the header of a metrics file.
-    ///
-    /// # Errors
-    /// The first line is not the header.
     pub fn new(source: R) -> Result<Rows<R>, RowsError> {
         let mut rows = Rows { source, line: 0, done: false, staged: false, hash: Sha256::new() };
         match rows.line() {
@@ -287,9 +266,6 @@ impl<R: BufRead> Iterator for Rows<R> {
 }
 
 /// Opens the metrics of a run.
-///
-/// # Errors
-/// The file is missing or has another header.
 pub fn open<'a>(place: impl Into<Place<'a>>) -> Result<Rows<BufReader<File>>, RecordError> {
     let place = place.into();
     let file = place.open().map_err(RecordError::read(place.path()))?;

@@ -61,9 +61,6 @@ const NEW_LINES: usize = 50;
 
 /// Prepares a folder for writing. No symbolic link below it is followed. `named` is true if the user named the folder
 /// as the output folder.
-///
-/// # Errors
-/// The folder cannot be opened, or it belongs to another user and was not named.
 pub(crate) fn open_output_folder(disk: &Disk, folder: &Path, named: bool) -> Result<Disk, RecordError> {
     let inside = disk.within(folder).map_err(RecordError::write(folder))?;
     let owners = inside.root().map_or(Ok(None), |root| root.owners()).map_err(RecordError::write(folder))?;
@@ -155,9 +152,6 @@ pub(crate) fn holds_run(folder: Place<'_>, config: &Config) -> Result<bool, Reco
 }
 
 /// Fails if one of the run's own files is a link. Callers check this before they change anything.
-///
-/// # Errors
-/// A file of the run is a link, or the folder cannot be read.
 pub(crate) fn refuse_links(disk: &Disk, folder: &Path) -> Result<(), RecordError> {
     for path in [RUN, CONFIG, METRICS, POLICIES, CHECKPOINTS].map(|name| folder.join(name)) {
         disk.refuse_link(&path).map_err(RecordError::write(&path))?;
@@ -166,9 +160,6 @@ pub(crate) fn refuse_links(disk: &Disk, folder: &Path) -> Result<(), RecordError
 }
 
 /// Fails if one of the files exists and flotilla did not create it, or its content has changed.
-///
-/// # Errors
-/// A file may not be replaced, or a folder cannot be read.
 pub fn check<P: AsRef<Path>>(disk: &Disk, paths: impl IntoIterator<Item = P>) -> Result<(), RecordError> {
     let mut lists = BTreeMap::new();
     for path in paths {
@@ -216,9 +207,6 @@ pub fn publish(
 }
 
 /// Deletes a file made from runs. A file that flotilla did not create, or that has changed, is kept.
-///
-/// # Errors
-/// The file cannot be read or deleted.
 pub fn remove_published(disk: &Disk, path: &Path) -> Result<(), RecordError> {
     match check(disk, [path]) {
         Ok(()) => disk.remove(path).map_err(RecordError::write(path)),

@@ -72,9 +72,6 @@ pub(crate) fn digests_in(place: Place<'_>) -> (Option<String>, Option<String>) {
 }
 
 /// Writes the content of such a file to a stream. Returns its checksum.
-///
-/// # Errors
-/// Returns the stream's error.
 pub fn put(output: &mut dyn Write, config: &Config, trials: &[impl AsRef<[f32]>]) -> io::Result<String> {
     let shape = vec![config.populations(), config.learning.population, config.parameters()];
     let of_trial = |(trial, weights)| Tensor::floats(tensor(trial), shape.clone(), [weights]);
@@ -86,9 +83,6 @@ pub fn put(output: &mut dyn Write, config: &Config, trials: &[impl AsRef<[f32]>]
 
 /// Reads the policies of one trial for teams of a config. Trial N is read from the tensor `weights.N`. Without a trial,
 /// the tensor is `weights`, or else `weights.0`. A policy that all leaders share fits any number of leaders.
-///
-/// # Errors
-/// The file is missing or damaged, its shape does not match the config, or its weights are not allowed.
 pub fn read<'a>(place: impl Into<Place<'a>>, config: &Config, trial: Option<usize>) -> Result<Policies, RecordError> {
     let place = place.into();
     let path = place.path();
@@ -112,9 +106,6 @@ pub struct Init {
 
 /// Reads the initial policies of all trials of a config. Trial i is read from the tensor `weights.i`, or from `weights`
 /// if there is no `weights.i`.
-///
-/// # Errors
-/// See [`read`].
 pub fn read_init<'a>(place: impl Into<Place<'a>>, config: &Config) -> Result<Init, RecordError> {
     let place = place.into();
     let path = place.path();
@@ -152,17 +143,11 @@ pub fn read_all<'a>(place: impl Into<Place<'a>>, config: &Config) -> Result<Vec<
 }
 
 /// Reads like [`read`], from any source.
-///
-/// # Errors
-/// Returns a description of the problem.
 pub fn from_source(source: impl Read + Seek, config: &Config, trial: Option<usize>) -> Result<Policies, String> {
     from_file(&mut TensorFile::open(source)?, config, &[config.learners(), 1], trial)
 }
 
 /// Reads like [`read`], from an open file. `populations` lists the accepted numbers of populations.
-///
-/// # Errors
-/// Returns a description of the problem.
 pub(crate) fn from_file(
     file: &mut TensorFile<impl Read + Seek>,
     config: &Config,

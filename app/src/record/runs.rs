@@ -95,9 +95,6 @@ impl ReadError {
 }
 
 /// Reads a run's config.
-///
-/// # Errors
-/// The folder does not exist, is not a run, or its config is damaged or was changed after the run.
 pub fn config(folder: &Path, verification: Verification) -> Result<Config, ReadError> {
     let kind = std::fs::metadata(folder).map_err(|error| match error.kind() {
         ErrorKind::NotFound => ReadError::Missing(folder.into()),
@@ -150,9 +147,6 @@ pub fn metrics<'a>(
 }
 
 /// Reads the results of a finished run from its folder.
-///
-/// # Errors
-/// The folder has no finished run, or its files are damaged or were changed after the run.
 pub fn trained(folder: &Path, verification: Verification) -> Result<Trained, ReadError> {
     let config = config(folder, verification)?;
     let mut rows = Vec::new();

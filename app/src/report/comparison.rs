@@ -38,9 +38,6 @@ pub struct Trial {
 
 impl Cohort {
     /// Reads the trials of some runs, which may be unfinished.
-    ///
-    /// # Errors
-    /// A run cannot be read.
     pub fn read(name: String, folders: Vec<PathBuf>, verification: Verification) -> Result<Cohort, ReadError> {
         let mut arm = Cohort { name, folders, planned: 0, trials: vec![] };
         for folder in &arm.folders {
@@ -331,9 +328,6 @@ pub fn compare(place: &str, arms: &[Cohort], options: &Question) -> Result<Compa
 }
 
 /// Compares two or more arms by given values per measure, `[arms][trials]` each.
-///
-/// # Errors
-/// An arm has fewer than two trials.
 pub fn of_values(
     place: &str,
     generation: usize,
@@ -501,9 +495,6 @@ pub fn latex(all: &[Comparison], options: &Question) -> String {
 }
 
 /// Writes the comparisons as CSV: one row per measure and arm, then one per measure and pair.
-///
-/// # Errors
-/// The output cannot be written.
 pub fn csv(all: &[Comparison], output: impl io::Write) -> io::Result<()> {
     let mut table = csv::Writer::from_writer(output);
     table.write_record([

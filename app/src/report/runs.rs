@@ -104,9 +104,6 @@ impl RunMetrics {
 }
 
 /// Reads G of the best team and of the champion, `[trials][generations]`, as far as the run has progressed.
-///
-/// # Errors
-/// See [`metrics()`].
 pub fn trials(folder: &Path, config: &Config, verification: Verification) -> Result<Vec<Vec<[f64; 2]>>, ReadError> {
     let mut trials = vec![vec![]; config.learning.trials];
     metrics(folder, config, verification, |row| trials[row.trial].push([row.best_g, row.champion_g]))?;
@@ -117,9 +114,6 @@ pub fn trials(folder: &Path, config: &Config, verification: Verification) -> Res
 ///
 /// By default, one run shows all kinds of teams, and several runs show their champions. Several runs are labelled by
 /// the config keys that differ.
-///
-/// # Errors
-/// A run cannot be read.
 pub fn figure(
     folders: &[PathBuf],
     measure: Option<TeamKind>,
@@ -199,9 +193,6 @@ fn figure_of_runs(
 /// Reports whether trials of several runs form pairs, because all runs have the same seed.
 ///
 /// Paired trials share their starts and all random numbers. If sizes agree, they also share their first populations.
-///
-/// # Errors
-/// A run cannot be read.
 pub fn paired(folders: &[PathBuf], verification: Verification) -> Result<bool, ReadError> {
     let seed = |folder: &PathBuf| Ok(config(folder, verification)?.learning.seed);
     let seeds = folders.iter().map(seed).collect::<Result<Vec<_>, ReadError>>()?;

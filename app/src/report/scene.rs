@@ -382,9 +382,6 @@ impl Scene {
 
     /// Returns the picture as a PNG file with the given number of pixels per millimetre. The file states its
     /// resolution, so that it prints at the scene's size.
-    ///
-    /// # Errors
-    /// The encoder fails, which happens only if memory runs out.
     pub fn png(&self, per_mm: f64) -> std::io::Result<Vec<u8>> {
         let pixmap = self.pixels(per_mm);
         let mut file = Vec::new();
@@ -407,9 +404,6 @@ impl Scene {
     }
 
     /// Returns the picture as a file. `per_mm` is the number of pixels per millimetre of a PNG.
-    ///
-    /// # Errors
-    /// An encoder fails, which happens only if memory runs out.
     pub fn file(&self, kind: Format, per_mm: f64) -> std::io::Result<Vec<u8>> {
         match kind {
             Format::Svg => Ok(self.svg().into_bytes()),

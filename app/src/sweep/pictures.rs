@@ -43,9 +43,6 @@ pub fn names() -> impl Iterator<Item = String> {
 
 /// Draws the figures of the finished points over one or two axes. Returns the names of the files, or the reason why
 /// there are none.
-///
-/// # Errors
-/// A file cannot be written.
 pub fn draw(
     sweep: &Sweep,
     outcomes: &[Result<Outcome, Missing>],

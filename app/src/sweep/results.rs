@@ -95,9 +95,6 @@ pub enum Missing {
 
 /// Writes `results.csv` and `points.csv` of the finished points to a disk in the sweep's folder. The points are read
 /// in `place`. Returns the results of every point.
-///
-/// # Errors
-/// The files cannot be written.
 pub fn write(
     sweep: &Sweep,
     place: Place<'_>,

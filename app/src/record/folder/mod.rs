@@ -300,9 +300,6 @@ impl Folder {
     }
 
     /// Writes `run.json`.
-    ///
-    /// # Errors
-    /// The file cannot be written.
     pub fn write_run(&self, run: &Run) -> Result<(), RecordError> {
         self.write_text(RUN, &run.to_json())
     }
@@ -341,9 +338,6 @@ fn numbered_config(number: usize) -> String {
 
 /// Checks whether runs may be started in folders, without changing them. With `Start::Fresh`, no folder may hold a run.
 /// Otherwise no other process may train in them.
-///
-/// # Errors
-/// One of the folders may not be used or cannot be read.
 pub fn check<'a>(
     disk: &Disk,
     folders: impl IntoIterator<Item = (&'a Path, &'a Config)>,

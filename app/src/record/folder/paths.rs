@@ -60,9 +60,6 @@ pub fn around(path: &Path) -> Option<&Path> {
 }
 
 /// Creates the next folder after the last existing one of `stem`, `stem-2`, `stem-3`, … and returns its path.
-///
-/// # Errors
-/// The folder cannot be created.
 pub fn next_free(parent: &Path, stem: &str) -> Result<PathBuf, RecordError> {
     fs::create_dir_all(parent).map_err(RecordError::write(parent))?;
     let mut number = newest(parent, stem) + 1;

@@ -157,9 +157,6 @@ impl Run {
     }
 
     /// Reads `run.json`.
-    ///
-    /// # Errors
-    /// The file cannot be read, has invalid content, or a newer version wrote it.
     pub fn read<'a>(place: impl Into<Place<'a>>) -> Result<Run, RecordError> {
         let place = place.into();
         let text = read_text(place, MAX_RUN_BYTES)?;
@@ -175,9 +172,6 @@ impl Run {
     }
 
     /// Parses the text of `run.json`.
-    ///
-    /// # Errors
-    /// Returns a description of the problem.
     pub fn parse(text: &str) -> Result<Run, String> {
         let run: Run = serde_json::from_str(text).map_err(|error| format!("not the record of a run: {error}"))?;
         match run.state == Status::Done && (run.digest.is_none() || run.files.is_none()) {

@@ -204,9 +204,6 @@ fn g_of(trial: &[[f64; 2]], generation: usize, which: Which) -> Option<f64> {
 ///
 /// G is the champion's if `which` requests it, otherwise the best team's. Without a generation, the newest that all
 /// trials have is used.
-///
-/// # Errors
-/// The run cannot be read or lacks the generation.
 pub(crate) fn extreme_trials(
     folder: &Path,
     config: &Config,
@@ -334,9 +331,6 @@ fn nearest(
 }
 
 /// Plays the current generation of a trainer with a single trial, and traces its best team.
-///
-/// # Errors
-/// The backend fails.
 pub fn best(
     config: &Config,
     trainer: &mut Trainer,
@@ -447,9 +441,6 @@ impl<'a> Episodes<'a> {
 }
 
 /// Plays and traces a group of a single team. `led` is filled only if Dt is among the group's fitnesses.
-///
-/// # Errors
-/// The backend fails.
 pub fn one(group: &Group<'_>, backend: &mut dyn Backend) -> Result<Replayed, BackendError> {
     let (world, trace) = (group.world, backend.trace(group)?);
     let episode = trace.episode(world, 0);
