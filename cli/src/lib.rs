@@ -25,7 +25,7 @@ use flotilla::escape;
 use flotilla::file;
 use flotilla::host::MAX_THREADS;
 use flotilla_app::ops::ConfigText;
-pub use flotilla_app::ops::{Error, Processor, with_remedy};
+pub use flotilla_app::ops::{Error, ProcessorInfo, with_remedy};
 use flotilla_app::record::folder::Start;
 
 mod backend;

@@ -36,11 +36,11 @@ pub(crate) struct Progress {
     /// The bar of the whole task. It estimates the rate and the time left, whether it is drawn or not.
     whole: ProgressBar,
     /// The curve of every arm, and its line on the terminal. Empty for a fraction.
-    arms: Vec<(Curve, ProgressBar)>,
+    arms: Vec<(GrowingCurve, ProgressBar)>,
 }
 
 /// One arm's curve so far: for each part of the run, the sum of the champions' G and the number of rows.
-struct Curve {
+struct GrowingCurve {
     /// Number of POIs. None if stages differ in it.
     pois: Option<usize>,
     parts: Vec<(f64, u32)>,
@@ -56,7 +56,7 @@ struct Newest {
     trials: u32,
 }
 
-impl Curve {
+impl GrowingCurve {
     fn add(&mut self, row: &Row, last: usize) {
         let part = (row.generation * self.parts.len() / (last + 1)).min(self.parts.len() - 1);
         self.parts[part].0 += row.champion_g;
@@ -121,7 +121,7 @@ impl Progress {
         for (at, (name, pois)) in arms.into_iter().enumerate() {
             let bar = ProgressBar::hidden().with_style(line.clone()).with_prefix(format!("{name:width$}"));
             progress.terminal.iter().filter(|_| at < MAX_BARS).for_each(|terminal| drop(terminal.add(bar.clone())));
-            let curve = Curve { pois, parts: vec![(0.0, 0); CURVE.min(last + 1)], newest: Newest::default() };
+            let curve = GrowingCurve { pois, parts: vec![(0.0, 0); CURVE.min(last + 1)], newest: Newest::default() };
             progress.arms.push((curve, bar));
         }
         progress.terminal.iter().for_each(|terminal| drop(terminal.add(progress.whole.clone())));

@@ -10,7 +10,7 @@
 //!
 //! let text = flotilla::config::LAYOUTS[2].1.into();
 //! let config = ConfigText { text, name: "chaotic.toml".into(), set: vec![] };
-//! let request = check::Request { config, name: "chaotic".into(), out: None };
+//! let request = check::CheckRequest { config, name: "chaotic".into(), out: None };
 //! let found = check::run(&request, Context::new(&|_| ()))?;
 //! println!("{} teams play {} steps", found.cost.teams, found.cost.team_steps);
 //! # Ok::<(), ops::Error>(())
@@ -262,7 +262,7 @@ pub fn check_memory<'a>(
 
 /// The processor that episodes were played on, with the names that `run.json` has.
 #[derive(Clone, Debug, Serialize)]
-pub struct Processor {
+pub struct ProcessorInfo {
     /// "cpu" or "gpu".
     pub backend: String,
     /// The processor in words.
@@ -275,17 +275,17 @@ pub struct Processor {
     pub threads: usize,
 }
 
-impl Processor {
+impl ProcessorInfo {
     /// Describes the processor of an open backend.
-    pub fn of(machine: &Machine, description: &str) -> Processor {
+    pub fn of(machine: &Machine, description: &str) -> ProcessorInfo {
         let Machine { backend, adapter, driver, threads, .. } = machine.clone();
-        Processor { backend, description: description.into(), adapter, driver, threads }
+        ProcessorInfo { backend, description: description.into(), adapter, driver, threads }
     }
 
     /// Returns the processor of a run's last session.
-    pub fn of_run(run: &Run) -> Processor {
+    pub fn of_run(run: &Run) -> ProcessorInfo {
         let Run { backend, description, adapter, driver, threads, .. } = run.clone();
-        Processor { backend, description, adapter, driver, threads }
+        ProcessorInfo { backend, description, adapter, driver, threads }
     }
 
     /// Adds the fields to a JSON object.

@@ -43,7 +43,7 @@ impl Destination {
             Destination::Named(_) => return Ok(()),
             Destination::OfRun(_) => ownership::check(&self.disk()?, [path])?,
             Destination::Here(_) if path.symlink_metadata().is_err() || ownership::is_drawing(path) => {}
-            Destination::Here(_) => return Err(RecordError::NotOurs { path: path.into() }),
+            Destination::Here(_) => return Err(RecordError::NotOurs(path.into())),
         }
         check_folder(file::folder(path)).map_err(RecordError::write(path))
     }

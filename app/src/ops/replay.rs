@@ -20,10 +20,10 @@ use flotilla::config::{Config, Learning, ValidConfig};
 use flotilla::escape::PathExt;
 use flotilla::file;
 
-/// Request of a replay.
+/// ReplayRequest of a replay.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Request {
+pub struct ReplayRequest {
     /// A run's folder.
     pub folder: PathBuf,
     /// The trial. The first by default.
@@ -57,7 +57,7 @@ pub struct Request {
 
 /// Results of a replay.
 #[derive(Clone, Debug, Serialize)]
-pub struct Outcome {
+pub struct ReplayOutcome {
     /// The written files.
     #[serde(flatten)]
     pub written: Written,
@@ -176,8 +176,12 @@ impl WhichTrial {
 }
 
 /// Replays episodes, and writes them.
-pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
-    let Request { generation, team, compare, step, width, fps, unverified, .. } = *request;
+pub fn run(
+    request: &ReplayRequest,
+    backends: &mut dyn BackendSource,
+    context: Context<'_>,
+) -> Result<ReplayOutcome, Error> {
+    let ReplayRequest { generation, team, compare, step, width, fps, unverified, .. } = *request;
     let verification = Verification::unless(unverified);
     let folder = &*request.folder;
     let place = match &request.out {
@@ -288,9 +292,9 @@ fn prepare_output(place: &Destination, kind: &Form, run: &Path) -> Result<(), Er
     output::check(&[("--out", Some(out.as_path()))], &[run])
 }
 
-fn outcome(written: Written, played: &[Replayed]) -> Outcome {
+fn outcome(written: Written, played: &[Replayed]) -> ReplayOutcome {
     let unverified = played.iter().any(|played| played.unverified);
-    Outcome { written, episodes: played.iter().map(Episode::of).collect(), unverified }
+    ReplayOutcome { written, episodes: played.iter().map(Episode::of).collect(), unverified }
 }
 
 /// Writes one numbered picture per moment. The folder must exist.
@@ -300,7 +304,7 @@ fn write_film(numbered: &Numbered, out: &Path, frames: &replay::Frames<'_>) -> R
     if let Some(path) =
         (0..count).map(place).find(|path| path.symlink_metadata().is_ok() && !ownership::is_drawing(path))
     {
-        return Err(RecordError::NotOurs { path }.into());
+        return Err(RecordError::NotOurs(path).into());
     }
     let disk = ownership::open_output_folder(&Disk::default(), file::folder(out), true)?;
     for (number, &moment) in frames.places.iter().enumerate() {
@@ -352,8 +356,8 @@ impl Form {
     }
 
     /// Rejects flags that have no effect.
-    fn takes(&self, out: &Path, request: &Request) -> Result<(), Error> {
-        let Request { width, fps, step, .. } = request;
+    fn takes(&self, out: &Path, request: &ReplayRequest) -> Result<(), Error> {
+        let ReplayRequest { width, fps, step, .. } = request;
         let moves = matches!(self, Form::Gif | Form::Film(_));
         let pixels = moves || matches!(self, Form::Still(Format::Png));
         let unused = [

@@ -16,10 +16,10 @@ use flotilla::host::Instant;
 use flotilla::verify::{Agreement, Plan, compare};
 use flotilla::version::{COMMIT, VERSION};
 
-/// Request of a verification.
+/// VerifyRequest of a verification.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct Request {
+pub struct VerifyRequest {
     /// The name and the text of a config to compare, instead of random worlds.
     pub config: Option<(String, String)>,
     /// Config keys to set.
@@ -43,9 +43,9 @@ pub const TEAMS: u32 = 48;
 /// The name of the processor, in place of an adapter's.
 pub const CPU: &str = "cpu";
 
-impl Default for Request {
-    fn default() -> Request {
-        Request {
+impl Default for VerifyRequest {
+    fn default() -> VerifyRequest {
+        VerifyRequest {
             config: None,
             set: vec![],
             teams: TEAMS,
@@ -60,7 +60,7 @@ impl Default for Request {
 
 /// Results of a verification.
 #[derive(Clone, Debug, Serialize)]
-pub struct Outcome {
+pub struct VerifyOutcome {
     /// Whether all comparisons are equal.
     pub equal: bool,
     /// The comparisons.
@@ -94,9 +94,9 @@ pub struct Compared {
     pub failure: Option<String>,
 }
 
-impl Outcome {
-    fn new(comparisons: Vec<Compared>) -> Outcome {
-        Outcome {
+impl VerifyOutcome {
+    fn new(comparisons: Vec<Compared>) -> VerifyOutcome {
+        VerifyOutcome {
             equal: comparisons.iter().all(|line| line.equal),
             comparisons,
             version: VERSION,
@@ -121,10 +121,10 @@ impl Outcome {
 ///
 /// # Errors
 /// There is nothing to compare, or the request is invalid. A difference is an outcome.
-pub fn run(args: &Request, context: Context<'_>) -> Result<Outcome, Error> {
+pub fn run(args: &VerifyRequest, context: Context<'_>) -> Result<VerifyOutcome, Error> {
     let (plan, budget) = plan(args)?;
     if args.adapter.as_deref() == Some(CPU) {
-        return instruction_sets(&plan, budget, args, context).map(Outcome::new);
+        return instruction_sets(&plan, budget, args, context).map(VerifyOutcome::new);
     }
     let adapters = adapters(args.adapter.as_deref())?;
     let mut lines = Vec::new();
@@ -155,7 +155,7 @@ pub fn run(args: &Request, context: Context<'_>) -> Result<Outcome, Error> {
         });
     }
     (context.report)(Event::Pause);
-    Ok(Outcome::new(lines))
+    Ok(VerifyOutcome::new(lines))
 }
 
 /// Default number of random worlds. A time budget may leave out the last ones.
@@ -230,7 +230,7 @@ fn line(adapter: String, reference: &Cpu, result: Result<Agreement, Error>) -> C
 fn instruction_sets(
     plan: &Plan,
     budget: Option<Duration>,
-    args: &Request,
+    args: &VerifyRequest,
     context: Context<'_>,
 ) -> Result<Vec<Compared>, Error> {
     let levels = Cpu::levels();
@@ -260,7 +260,7 @@ fn instruction_sets(
 }
 
 /// Returns what to compare, and the time budget if no amount is requested.
-fn plan(args: &Request) -> Result<(Plan, Option<Duration>), Error> {
+fn plan(args: &VerifyRequest) -> Result<(Plan, Option<Duration>), Error> {
     let (seed, teams) = (u64::from(args.seed), args.teams as usize);
     let is_open = args.config.is_none() && args.worlds.is_none();
     let plan = match &args.config {
@@ -372,10 +372,10 @@ mod tests {
     #[test]
     fn only_a_bare_request_has_a_budget() {
         let config = ("small".to_string(), flotilla::config::LAYOUTS[0].1.to_string());
-        let budget = |request: Request| plan(&request).unwrap().1;
-        assert_eq!(budget(Request::default()), Some(BUDGET));
-        assert_eq!(budget(Request { worlds: Some(3), ..Request::default() }), None);
-        assert_eq!(budget(Request { config: Some(config), ..Request::default() }), None);
+        let budget = |request: VerifyRequest| plan(&request).unwrap().1;
+        assert_eq!(budget(VerifyRequest::default()), Some(BUDGET));
+        assert_eq!(budget(VerifyRequest { worlds: Some(3), ..VerifyRequest::default() }), None);
+        assert_eq!(budget(VerifyRequest { config: Some(config), ..VerifyRequest::default() }), None);
     }
 
     #[test]
@@ -384,7 +384,7 @@ mod tests {
             let agreement =
                 |failure: &Option<&str>| Agreement { mismatch: failure.map(String::from), ..Agreement::default() };
             let lines = failures.iter().map(|failure| line("a GPU".into(), &Cpu::default(), Ok(agreement(failure))));
-            Outcome::new(lines.collect())
+            VerifyOutcome::new(lines.collect())
         };
         assert!(compared(&[None, None]).difference().is_none());
         let error = compared(&[Some("stage credit"), None, None]).difference().unwrap();

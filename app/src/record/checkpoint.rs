@@ -24,7 +24,6 @@ use super::tensors::{self, Tensor, TensorFile};
 use super::{RecordError, config_digest};
 use flotilla::config::Config;
 use flotilla::evolve;
-use flotilla::file;
 use flotilla::host::Instant;
 use flotilla::parallel::BackgroundTask;
 use flotilla::trainer::{Row, Snapshot};
@@ -89,6 +88,14 @@ impl<N: AsRef<[f32]>> Checkpoint<N> {
     /// The file cannot be written. Nothing else was changed in that case.
     pub fn write(&self, disk: &Disk, path: &Path, of: &Config) -> std::io::Result<()> {
         disk.replace(path, |output| self.put(output, of))
+    }
+
+    /// Flushes the metrics to the disk, then writes the checkpoint in its folder.
+    fn write_after(&self, metrics: &Output, disk: &Disk, folder: &Path, of: &Config) -> Result<(), RecordError> {
+        let path = path(folder, self.snapshot.generation);
+        metrics.sync().map_err(RecordError::write(metrics.path()))?;
+        let written = self.write(disk, &path, of).and_then(|()| disk.sync_folder(folder));
+        written.map_err(RecordError::write(&path))
     }
 
     /// Writes the content of a checkpoint file to a stream.
@@ -334,12 +341,9 @@ impl CheckpointWriter {
         self.wait()?;
         let generation = checkpoint.snapshot.generation;
         self.last = (generation, Instant::now());
-        let (disk, config) = (self.disk.clone(), self.config.clone());
-        let path = path(&self.folder, generation);
+        let (disk, config, folder) = (self.disk.clone(), self.config.clone(), self.folder.clone());
         self.writing = Some(BackgroundTask::start(move || {
-            metrics.sync().map_err(RecordError::write(metrics.path()))?;
-            checkpoint.write(&disk, &path, &config).map_err(RecordError::write(&path))?;
-            disk.sync_folder(file::folder(&path)).map_err(RecordError::write(&path))?;
+            checkpoint.write_after(&metrics, &disk, &folder, &config)?;
             Ok((generation, since.elapsed()))
         }));
         Ok(())
@@ -354,10 +358,7 @@ impl CheckpointWriter {
     ) -> Result<(), RecordError> {
         self.wait()?;
         let generation = checkpoint.snapshot.generation;
-        let path = path(&self.folder, generation);
-        metrics.sync().map_err(RecordError::write(metrics.path()))?;
-        checkpoint.write(&self.disk, &path, &self.config).map_err(RecordError::write(&path))?;
-        self.disk.sync_folder(&self.folder).map_err(RecordError::write(&path))?;
+        checkpoint.write_after(metrics, &self.disk, &self.folder, &self.config)?;
         self.last = (generation, Instant::now());
         self.add_cost(since.elapsed());
         self.keep(generation)

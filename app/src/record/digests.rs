@@ -84,5 +84,5 @@ impl Digests {
 }
 
 fn same(path: &Path, same: bool) -> Result<(), RecordError> {
-    if same { Ok(()) } else { Err(RecordError::Differs { path: path.into() }) }
+    if same { Ok(()) } else { Err(RecordError::Differs(path.into())) }
 }

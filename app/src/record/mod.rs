@@ -87,29 +87,17 @@ pub enum RecordError {
         reason: String,
     },
     /// The folder already holds a run, which would be overwritten.
-    #[error("{path} holds a run already", path = path.escaped())]
-    Exists {
-        /// Path of the folder.
-        path: PathBuf,
-    },
+    #[error("{} holds a run already", .0.escaped())]
+    Exists(PathBuf),
     /// A file that flotilla did not create would be overwritten.
-    #[error("{path} was not made by flotilla and would be overwritten", path = path.escaped())]
-    NotOurs {
-        /// Path of the file.
-        path: PathBuf,
-    },
+    #[error("{} was not made by flotilla and would be overwritten", .0.escaped())]
+    NotOurs(PathBuf),
     /// The folder belongs to another user, and the user did not name it as the output folder.
-    #[error("{path} belongs to another user, so nothing is written there", path = path.escaped())]
-    OfAnotherUser {
-        /// Path of the folder.
-        path: PathBuf,
-    },
+    #[error("{} belongs to another user, so nothing is written there", .0.escaped())]
+    OfAnotherUser(PathBuf),
     /// A file has the path of the folder.
-    #[error("{path} is a file", path = path.escaped())]
-    NoFolder {
-        /// Path of the file.
-        path: PathBuf,
-    },
+    #[error("{} is a file", .0.escaped())]
+    NoFolder(PathBuf),
     /// The run has more generations than requested.
     #[error("{path} is a run of {existing} generations, which cannot become one of {requested}", path = path.escaped())]
     Shorter {
@@ -121,11 +109,8 @@ pub enum RecordError {
         requested: usize,
     },
     /// Another process already trains in the folder.
-    #[error("another process is training in {path}", path = path.escaped())]
-    Locked {
-        /// Path of the folder.
-        path: PathBuf,
-    },
+    #[error("another process is training in {}", .0.escaped())]
+    Locked(PathBuf),
     /// The run started from other policies than those given, so it cannot be resumed with them.
     #[error("{path} {}, so it cannot continue as a run {}", started(existing), started_from(requested), path = path.escaped())]
     InitDiffers {
@@ -145,31 +130,20 @@ pub enum RecordError {
         existing: String,
     },
     /// It is not known which policies the run started from.
-    #[error("{path}: its run.json is missing or damaged, so it is not known what policies this run started from")]
-    OriginUnknown {
-        /// Path of the folder.
-        path: PathBuf,
-    },
+    #[error("{}: its run.json is missing or damaged, so it is not known what policies this run started from", .0.escaped())]
+    OriginUnknown(PathBuf),
     /// Only the program that trained the run knows its fitness.
     #[error(
-        "{path}: its fitness is not the config's, but came from the program that trained it, so it cannot be extended"
+        "{}: its fitness is not the config's, but came from the program that trained it, so it cannot be extended",
+        .0.escaped()
     )]
-    OwnFitness {
-        /// Path of the folder.
-        path: PathBuf,
-    },
+    OwnFitness(PathBuf),
     /// The config was changed after the run was started.
-    #[error("{path}: it is not the config that this run was started with (run.json has another digest)")]
-    Edited {
-        /// Path of the file.
-        path: PathBuf,
-    },
+    #[error("{}: it is not the config that this run was started with (run.json has another digest)", .0.escaped())]
+    Edited(PathBuf),
     /// The file has changed since the run wrote it.
-    #[error("{path}: it has changed since the run wrote it (run.json has another digest)")]
-    Differs {
-        /// Path of the file.
-        path: PathBuf,
-    },
+    #[error("{}: it has changed since the run wrote it (run.json has another digest)", .0.escaped())]
+    Differs(PathBuf),
     /// A newer version of the program wrote the file.
     #[error(
         "{path}: it was written by {}, in a format that is newer than this version ({}) reads",
@@ -280,11 +254,11 @@ impl RecordError {
             RecordError::OwnFitness { .. } => {
                 "start a new run from its policies with --init, or choose another --out".into()
             }
-            RecordError::Edited { path } => format!(
+            RecordError::Edited(path) => format!(
                 "restore what it was, or move {} away and name the run's own config, or choose another --out",
                 path.display()
             ),
-            RecordError::Differs { path } => {
+            RecordError::Differs(path) => {
                 let folder = file::folder(path);
                 let words = [folder.join(CONFIG), "--out".into(), folder.into(), "--resume".into()];
                 let command = shell::command([PathBuf::from("flotilla"), "train".into()].into_iter().chain(words));

@@ -65,9 +65,7 @@ pub(crate) fn open_output_folder(disk: &Disk, folder: &Path, named: bool) -> Res
     let inside = disk.within(folder).map_err(RecordError::write(folder))?;
     let owners = inside.root().map_or(Ok(None), |root| root.owners()).map_err(RecordError::write(folder))?;
     match owners {
-        Some([owner, user]) if !may_write(owner, user, named) => {
-            Err(RecordError::OfAnotherUser { path: folder.into() })
-        }
+        Some([owner, user]) if !may_write(owner, user, named) => Err(RecordError::OfAnotherUser(folder.into())),
         _ => Ok(inside),
     }
 }
@@ -109,7 +107,7 @@ pub(crate) fn holds_run(folder: Place<'_>, config: &Config) -> Result<bool, Reco
         let exists = folder.at(&path).exists().map_err(RecordError::read(&path))?;
         Ok::<_, RecordError>(exists.then_some(path))
     };
-    let refuse = |path: PathBuf| Err(RecordError::NotOurs { path });
+    let refuse = |path: PathBuf| Err(RecordError::NotOurs(path));
     let run = find(RUN)?;
     if let Some(path) = &run {
         match read_text(folder.at(path), MAX_RUN_BYTES) {
@@ -170,7 +168,7 @@ pub fn check<P: AsRef<Path>>(disk: &Disk, paths: impl IntoIterator<Item = P>) ->
             lists.insert(folder.to_path_buf(), listed(disk, folder)?);
         }
         if !lists[folder].contains(&line(&digest, path)) {
-            return Err(RecordError::NotOurs { path: path.into() });
+            return Err(RecordError::NotOurs(path.into()));
         }
     }
     Ok(())

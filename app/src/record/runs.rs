@@ -163,7 +163,7 @@ pub fn trained(folder: &Path, verification: Verification) -> Result<Trained, Rea
     let trained = Trained::new(config, &rows, policies, ending);
     // The config and the metrics match their digests, so the policies must differ.
     match digests.run {
-        Some(digest) if digest != trained.digest() => Err(RecordError::Differs { path }.into()),
+        Some(digest) if digest != trained.digest() => Err(RecordError::Differs(path).into()),
         _ => Ok(trained),
     }
 }

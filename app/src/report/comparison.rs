@@ -494,26 +494,13 @@ pub fn latex(all: &[Comparison], options: &Question) -> String {
     text
 }
 
+/// Columns of the comparisons as CSV.
+const COLUMNS: &str = "where,measure,generation,reach,arm,other,trials,other_trials,value,low,high,reached,a,p,p_holm";
+
 /// Writes the comparisons as CSV: one row per measure and arm, then one per measure and pair.
 pub fn csv(all: &[Comparison], output: impl io::Write) -> io::Result<()> {
     let mut table = csv::Writer::from_writer(output);
-    table.write_record([
-        "where",
-        "measure",
-        "generation",
-        "reach",
-        "arm",
-        "other",
-        "trials",
-        "other_trials",
-        "value",
-        "low",
-        "high",
-        "reached",
-        "a",
-        "p",
-        "p_holm",
-    ])?;
+    table.write_record(COLUMNS.split(','))?;
     for Comparison { place, generation: last, arms: named, measures, .. } in all {
         for Measured { measure, arms, pairs } in measures {
             let (generation, reach) = match *measure {

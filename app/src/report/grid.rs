@@ -2,7 +2,7 @@
 //! at a time.
 
 use super::curves::{Axes, Band, Curve, Look, NORMAL, SMALL, band_caption, distinct, draw_caption, needs_bars};
-use super::scene::{Anchor, BLACK, Color, Fill, GREY, LIGHT, Pen, Scene, WHITE, text_width};
+use super::scene::{Anchor, BLACK, Color, Fill, GREY, LIGHT, Pen, Scene, WHITE, colors, text_width};
 
 /// Maximum width of a figure in millimetres. Further panels go to the next row.
 const WIDEST: f64 = 180.0;
@@ -10,17 +10,8 @@ const GAP: f64 = 5.0;
 
 /// A sequential palette of decreasing lightness (ColorBrewer's YlGnBu). It keeps its order for colour-blind readers and
 /// in greyscale.
-const PALETTE: [Color; 9] = [
-    [255, 255, 217],
-    [237, 248, 177],
-    [199, 233, 180],
-    [127, 205, 187],
-    [65, 182, 196],
-    [29, 145, 192],
-    [34, 94, 168],
-    [37, 52, 148],
-    [8, 29, 88],
-];
+const PALETTE: [Color; 9] =
+    colors([0xffffd9, 0xedf8b1, 0xc7e9b4, 0x7fcdbb, 0x41b6c4, 0x1d91c0, 0x225ea8, 0x253494, 0x081d58]);
 
 /// Returns the colour of a value in 0..1.
 pub(crate) fn shade(value: f64) -> Color {

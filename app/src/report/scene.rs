@@ -23,6 +23,17 @@ const MAX_PIXELS: f64 = 8192.0;
 /// Red, green and blue.
 pub type Color = [u8; 3];
 
+/// Returns colours from their codes, such as 0xff8800.
+pub(crate) const fn colors<const N: usize>(codes: [u32; N]) -> [Color; N] {
+    let (mut colors, mut at) = ([[0; 3]; N], 0);
+    while at < N {
+        let [_, red, green, blue] = codes[at].to_be_bytes();
+        colors[at] = [red, green, blue];
+        at += 1;
+    }
+    colors
+}
+
 /// Text.
 pub(crate) const BLACK: Color = [0, 0, 0];
 /// Background.
@@ -34,8 +45,7 @@ pub(crate) const LIGHT: Color = [222, 222, 222];
 
 /// Colours that colour-blind readers can distinguish, after Okabe and Ito. The first ones are also distinct in
 /// greyscale.
-pub(crate) const COLORS: [Color; 7] =
-    [[0, 114, 178], [213, 94, 0], [0, 158, 115], [204, 121, 167], [86, 180, 233], [140, 109, 0], [0, 0, 0]];
+pub(crate) const COLORS: [Color; 7] = colors([0x0072b2, 0xd55e00, 0x009e73, 0xcc79a7, 0x56b4e9, 0x8c6d00, 0x000000]);
 
 /// The style of a line.
 #[derive(Clone, Debug, PartialEq)]

@@ -34,7 +34,7 @@ pub struct Detail {
 
 /// The results of a point's trials.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Outcome {
+pub struct PointResults {
     /// The best team's G in the last generation, averaged over trials.
     pub best: Average,
     /// The champion's G in the last generation, averaged over trials.
@@ -46,7 +46,7 @@ pub struct Outcome {
     pub curve: Vec<(usize, Average)>,
 }
 
-impl Outcome {
+impl PointResults {
     /// Returns the average over trials of [`Detail::measure`]'s G in the last generation.
     pub fn measured(&self) -> Average {
         self.curve.last().map_or(Average::default(), |(_, average)| *average)
@@ -100,7 +100,7 @@ pub fn write(
     place: Place<'_>,
     options: &Detail,
     disk: &Disk,
-) -> Result<Vec<Result<Outcome, Missing>>, RecordError> {
+) -> Result<Vec<Result<PointResults, Missing>>, RecordError> {
     let out = place.path();
     let mut outcomes = Vec::new();
     let path = out.join(RESULTS);
@@ -140,23 +140,13 @@ fn labels(sweep: &Sweep, point: &Point) -> Vec<String> {
 /// Writes `points.csv`, one row per point.
 fn summary(
     sweep: &Sweep,
-    outcomes: &[Result<Outcome, Missing>],
+    outcomes: &[Result<PointResults, Missing>],
     options: &Detail,
     output: &mut dyn Write,
 ) -> io::Result<()> {
     let mut table = csv::Writer::from_writer(output);
-    let columns = [
-        "point",
-        "trials",
-        "generations",
-        "champion_g",
-        "champion_g_low",
-        "champion_g_high",
-        "best_g",
-        "reach",
-        "reached",
-        "median",
-    ];
+    let columns =
+        "point,trials,generations,champion_g,champion_g_low,champion_g_high,best_g,reach,reached,median".split(',');
     table.write_record(sweep.axes.iter().map(|axis| &*axis.key).chain(columns))?;
     for (point, outcome) in sweep.points.iter().zip(outcomes) {
         let Ok(outcome) = outcome else { continue };
@@ -182,7 +172,7 @@ fn summary(
 }
 
 /// Reads the rows of a finished point for `results.csv`, by trial and generation, and its results.
-fn read(point: &Point, place: Place<'_>, options: &Detail) -> Result<(Vec<Row>, Outcome), Missing> {
+fn read(point: &Point, place: Place<'_>, options: &Detail) -> Result<(Vec<Row>, PointResults), Missing> {
     let folder = point_folder(place.path(), point);
     let damaged = |error: &dyn std::fmt::Display| Missing::Damaged(error.to_string());
     let path = folder.join(METRICS);
@@ -220,7 +210,7 @@ fn read(point: &Point, place: Place<'_>, options: &Detail) -> Result<(Vec<Row>, 
         rows.iter().for_each(|rows| average.add(options.measure.of(&rows[at])));
         (rows[0][at].generation, average)
     });
-    let outcome = Outcome {
+    let outcome = PointResults {
         best: ends().map(|row| &row.best_g).collect(),
         champion: ends().map(|row| &row.champion_g).collect(),
         reached,

@@ -166,12 +166,12 @@ impl Folder {
         disk: Disk,
     ) -> Result<(Folder, Resumed), RecordError> {
         if path.is_file() {
-            return Err(RecordError::NoFolder { path: path.into() });
+            return Err(RecordError::NoFolder(path.into()));
         }
         let disk = ownership::create_output_folder(&disk, path, true)?;
         ownership::refuse_links(&disk, path)?;
         let holds_run = || match ownership::holds_run(disk.at(path), config)? {
-            true if start == Start::Fresh => Err(RecordError::Exists { path: path.into() }),
+            true if start == Start::Fresh => Err(RecordError::Exists(path.into())),
             holds => Ok(holds),
         };
         holds_run()?;
@@ -350,7 +350,7 @@ pub fn check<'a>(
             disk => disk.map_err(RecordError::write(path))?,
         };
         if ownership::holds_run(disk.at(path), config)? && start == Start::Fresh {
-            return Err(RecordError::Exists { path: path.into() });
+            return Err(RecordError::Exists(path.into()));
         }
         // Without a lock file, no process trains in the folder.
         let name = path.join(LOCK);
@@ -388,7 +388,7 @@ fn is_read_only(error: &io::Error) -> bool {
 pub fn lock(disk: &Disk, path: &Path) -> Result<Option<File>, RecordError> {
     let name = path.join(LOCK);
     disk.lock(&name).map_err(|error| match error.kind() {
-        ErrorKind::WouldBlock => RecordError::Locked { path: path.into() },
+        ErrorKind::WouldBlock => RecordError::Locked(path.into()),
         _ => RecordError::write(&name)(error),
     })
 }

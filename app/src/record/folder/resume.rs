@@ -41,7 +41,7 @@ impl Folder {
             return Ok(());
         }
         if found.run.as_ref().is_some_and(|run| run.own_fitness) {
-            return Err(RecordError::OwnFitness { path: self.path.clone() });
+            return Err(RecordError::OwnFitness(self.path.clone()));
         }
         let mut kept = checkpoint::remove_temporary_files(&self.disk, &checkpoints)?;
         let origin_error = self.origin_error(config, found.run.as_ref(), before.is_some());
@@ -98,7 +98,7 @@ impl Folder {
         let (path, existing, requested) = (self.path.clone(), origin.generations, config.learning.generations);
         Some(match existing > requested {
             true => RecordError::Shorter { path, existing, requested },
-            false if has_config => RecordError::Edited { path: self.file(CONFIG) },
+            false if has_config => RecordError::Edited(self.file(CONFIG)),
             false => {
                 let differences = vec![format!("  {} has another digest", self.file(RUN).display())];
                 RecordError::ConfigDiffers { path, differences }
@@ -171,7 +171,7 @@ impl Folder {
                     || self.has(METRICS)?
                     || self.has(POLICIES)?)
             {
-                return Err(RecordError::OriginUnknown { path });
+                return Err(RecordError::OriginUnknown(path));
             }
             return Ok(());
         };
