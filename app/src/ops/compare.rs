@@ -211,30 +211,23 @@ fn of_sweep(out: &Path, args: &CompareRequest, notes: &mut Vec<String>) -> Resul
     for group in sweep.arms(by) {
         let mut arms = Vec::new();
         for (name, points) in group.arms {
-            let mut folders = Vec::new();
+            let mut arm = Cohort::read(name, vec![], verification)?;
             for point in points {
                 let folder = results::point_folder(out, point);
-                let read = runs::config(&folder, verification)
-                    .and_then(|config| runs::metrics(&folder, &config, verification, |_| {}).map(|()| config));
-                match read {
-                    Ok(config) if record::without_checkpoint(&config) == record::without_checkpoint(&point.config) => {
-                        folders.push(folder);
-                    }
+                match arm.add(folder.clone(), verification) {
+                    Ok(config) if record::without_checkpoint(&config) == record::without_checkpoint(&point.config) => {}
                     Ok(_) => {
                         return Err(Error::Refused(format!("{} is a run of another config", folder.escaped()).into()));
                     }
                     Err(ReadError::Missing(_) | ReadError::Unfinished { .. }) => {
-                        notes.push(format!(
-                            "{} was not run, and is left out: {}",
-                            folder.escaped(),
-                            sweep.describe(point)
-                        ));
+                        let point = sweep.describe(point);
+                        notes.push(format!("{} was not run, and is left out: {point}", folder.escaped()));
                     }
                     Err(error) => return Err(error.into()),
                 }
             }
-            if !folders.is_empty() {
-                arms.push(Cohort::read(name, folders, verification)?);
+            if !arm.folders.is_empty() {
+                arms.push(arm);
             }
         }
         too_many(arms.len(), "values")?;

@@ -138,7 +138,7 @@ pub fn run(args: &VerifyRequest, context: Context<'_>) -> Result<VerifyOutcome, 
             return Err(Error::Stopped("before everything was compared".into()));
         }
         let since = Instant::now();
-        let mut shown = |now: &Agreement| {
+        let shown = |now: &Agreement| {
             let (done, of) = match budget {
                 Some(budget) => ((since.elapsed().as_secs_f64() / budget.as_secs_f64()).min(1.0), String::new()),
                 None => (now.worlds as f64 / plan.worlds.len() as f64, format!(" of {}", plan.worlds.len())),
@@ -174,9 +174,11 @@ struct Combination<'a> {
     pass: Option<Pass>,
     kernel: Option<Kernel>,
     reference: Cpu,
-    /// Opens it. The inner error is a difference that its self-test found.
-    open: Box<dyn Fn() -> Result<Result<Box<dyn Backend>, String>, Error> + 'a>,
+    open: Box<dyn Fn() -> Result<Opened, Error> + 'a>,
 }
+
+/// An open processor, or a difference that its self-test found.
+type Opened = Result<Box<dyn Backend>, String>;
 
 /// Returns a message about what is compared and how long that takes.
 fn expected(plan: &Plan, budget: Option<Duration>, combinations: usize) -> String {
@@ -260,7 +262,7 @@ fn gpus<'a>(name: Option<&str>, args: &VerifyRequest) -> Result<Vec<Combination<
         for pass in passes(args.pass.as_deref(), &info) {
             for kernel in kernels(args.kernel.as_deref()) {
                 let choice = choice.clone();
-                let open = move || -> Result<Result<Box<dyn Backend>, String>, Error> {
+                let open = move || -> Result<Opened, Error> {
                     let gpu = gpu::open(device::Request { pass: Some(pass), ..choice.clone().into() })?;
                     if let Some(mismatch) = gpu::self_test(&gpu)? {
                         return Ok(Err(mismatch.to_string()));

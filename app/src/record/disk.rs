@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
-use super::rooted_folder::{FileKind, FolderEntry, OpenAs, RootedFolder, is_link};
+use super::rooted_folder::{FileKind, FolderEntry, OpenAs, RootedFolder, is_file_on_the_way, is_link};
 use flotilla::file;
 
 /// Kind of operation on a disk.
@@ -172,9 +172,7 @@ impl Disk {
             return root.create_folder(path);
         }
         fs::create_dir_all(path).map_err(|error| match error.kind() {
-            kind @ (io::ErrorKind::AlreadyExists | io::ErrorKind::NotADirectory) => {
-                io::Error::new(kind, "a part of this path is a file, not a folder; choose another path")
-            }
+            kind @ (io::ErrorKind::AlreadyExists | io::ErrorKind::NotADirectory) => is_file_on_the_way(kind),
             _ => error,
         })
     }

@@ -13,7 +13,6 @@ use std::path::Path;
 use sha2::{Digest, Sha256};
 
 use super::disk::{Disk, Output, Place};
-use super::ownership::CONFIG;
 use super::{RecordError, hash_rest, hex};
 use flotilla::config::{Config, MAX_GENERATIONS, MAX_TRIALS};
 use flotilla::trainer::Row;
@@ -302,7 +301,7 @@ pub(crate) fn visit(place: Place<'_>, config: &Config, mut each: impl FnMut(&Row
         if trial >= next.len() || generation > config.learning.generations {
             let line = count + 1;
             let text = format!(
-                "line {line} is trial {trial}, generation {generation}, which the run's {CONFIG} does not have"
+                "line {line} is trial {trial}, generation {generation}, which the run's config.toml does not have"
             );
             return Err(RecordError::damaged(path, text));
         }

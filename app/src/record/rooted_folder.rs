@@ -194,11 +194,14 @@ pub(crate) fn is_link(path: &Path) -> io::Error {
 fn not_a_folder(entry: &FolderEntry, error: io::Error) -> io::Error {
     match entry.kind().ok().flatten() {
         Some(FileKind::Link) => is_link(&entry.path),
-        Some(FileKind::File | FileKind::Other) => {
-            io::Error::new(ErrorKind::NotADirectory, "a part of this path is a file, not a folder; choose another path")
-        }
+        Some(FileKind::File | FileKind::Other) => is_file_on_the_way(ErrorKind::NotADirectory),
         Some(FileKind::Folder) | None => error,
     }
+}
+
+/// Returns the error for a file in the path of a folder.
+pub(crate) fn is_file_on_the_way(kind: ErrorKind) -> io::Error {
+    io::Error::new(kind, "a part of this path is a file, not a folder; choose another path")
 }
 
 /// An open folder. Empty on systems without such handles.

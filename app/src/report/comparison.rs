@@ -9,6 +9,7 @@ use serde::Serialize;
 use super::runs::{self, ReadError};
 use super::table;
 use crate::record::digests::Verification;
+use flotilla::config::Config;
 use flotilla::escape::{self, PathExt};
 use flotilla::statistics::{self, Estimate, Tested, power_of};
 
@@ -39,15 +40,20 @@ pub struct Trial {
 impl Cohort {
     /// Reads the trials of some runs, which may be unfinished.
     pub fn read(name: String, folders: Vec<PathBuf>, verification: Verification) -> Result<Cohort, ReadError> {
-        let mut arm = Cohort { name, folders, planned: 0, trials: vec![] };
-        for folder in &arm.folders {
-            let config = runs::config(folder, verification)?;
-            let trials = runs::trials(folder, &config, verification)?.into_iter().enumerate();
-            let from = config.last_from();
-            arm.trials.extend(trials.map(|(trial, scores)| Trial { key: (config.learning.seed, trial), scores, from }));
-            arm.planned = arm.planned.max(config.learning.generations);
-        }
+        let mut arm = Cohort { name, folders: vec![], planned: 0, trials: vec![] };
+        folders.into_iter().try_for_each(|folder| arm.add(folder, verification).map(drop))?;
         Ok(arm)
+    }
+
+    /// Adds the trials of a run, which may be unfinished. Returns its config.
+    pub(crate) fn add(&mut self, folder: PathBuf, verification: Verification) -> Result<Config, ReadError> {
+        let config = runs::config(&folder, verification)?;
+        let trials = runs::trials(&folder, &config, verification)?.into_iter().enumerate();
+        let from = config.last_from();
+        self.trials.extend(trials.map(|(trial, scores)| Trial { key: (config.learning.seed, trial), scores, from }));
+        self.planned = self.planned.max(config.learning.generations);
+        self.folders.push(folder);
+        Ok(config)
     }
 
     /// Returns the arm's name and its directories, for messages.
