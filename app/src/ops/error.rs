@@ -58,6 +58,33 @@ impl From<&DeviceError> for MessageWithRemedy {
     }
 }
 
+/// Returns advice on a device that could not be opened, or that failed. The engine does not know the flags.
+fn device_help(error: &DeviceError) -> Option<&'static str> {
+    Some(match error {
+        DeviceError::NoRealAdapter { .. } => {
+            "an adapter that may be a software renderer is used only with --adapter (--adapter 0); --backend cpu is faster"
+        }
+        DeviceError::Refused { .. } | DeviceError::Inexact { .. } => {
+            "choose another with --adapter, or use --backend cpu"
+        }
+        DeviceError::Lost { .. } => "run again, or use --backend cpu",
+        DeviceError::OutOfMemory { .. } | DeviceError::TooLarge { .. } => "or use --backend cpu",
+        DeviceError::NoAdapter | DeviceError::Failed { .. } => "use --backend cpu",
+        DeviceError::UnknownAdapter { found, .. } if found.is_empty() => "use --backend cpu",
+        DeviceError::UnknownAdapter { .. } | DeviceError::Shader { .. } => return None,
+    })
+}
+
+/// Returns advice on episodes that could not be played.
+fn backend_help(error: &BackendError) -> Option<&'static str> {
+    match error {
+        BackendError::Gpu(error) => device_help(error),
+        BackendError::TooLarge(_) => Some("pass --backend cpu, or --breed host"),
+        BackendError::Gone => Some("run it again"),
+        BackendError::InvalidInput(_) | BackendError::HeldElsewhere => None,
+    }
+}
+
 /// The error of a use case.
 ///
 /// It serialises as `code`, `message` and `remedy`, which is null if there is no advice. Its text is the message with
@@ -93,33 +120,6 @@ pub enum Error {
     Missing(MessageWithRemedy),
     /// Stopped by a signal. Runs are saved and can be resumed.
     Stopped(MessageWithRemedy),
-}
-
-/// Returns advice on a device that could not be opened, or that failed. The engine does not know the flags.
-fn device_help(error: &DeviceError) -> Option<&'static str> {
-    Some(match error {
-        DeviceError::NoRealAdapter { .. } => {
-            "an adapter that may be a software renderer is used only with --adapter (--adapter 0); --backend cpu is faster"
-        }
-        DeviceError::Refused { .. } | DeviceError::Inexact { .. } => {
-            "choose another with --adapter, or use --backend cpu"
-        }
-        DeviceError::Lost { .. } => "run again, or use --backend cpu",
-        DeviceError::OutOfMemory { .. } | DeviceError::TooLarge { .. } => "or use --backend cpu",
-        DeviceError::NoAdapter | DeviceError::Failed { .. } => "use --backend cpu",
-        DeviceError::UnknownAdapter { found, .. } if found.is_empty() => "use --backend cpu",
-        DeviceError::UnknownAdapter { .. } | DeviceError::Shader { .. } => return None,
-    })
-}
-
-/// Returns advice on episodes that could not be played.
-fn backend_help(error: &BackendError) -> Option<&'static str> {
-    match error {
-        BackendError::Gpu(error) => device_help(error),
-        BackendError::TooLarge(_) => Some("pass --backend cpu, or --breed host"),
-        BackendError::Gone => Some("run it again"),
-        BackendError::InvalidInput(_) | BackendError::HeldElsewhere => None,
-    }
 }
 
 impl Error {
