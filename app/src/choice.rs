@@ -107,9 +107,6 @@ pub struct Chosen {
 
 /// Opens the GPU that a processor asks for, if any, see [`front::find_gpu`]. With [`Processor::Auto`], `work` decides.
 /// Without it, any usable GPU is taken.
-///
-/// # Errors
-/// The requested GPU does not exist, cannot be used, or fails.
 pub fn find(
     processor: &Processor,
     holding: Option<ResidencyPolicy>,

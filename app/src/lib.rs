@@ -1,7 +1,8 @@
 //! Runs on disk, sweeps, pictures and use cases, which the command, the Python package, the page and the studies share,
 //! on top of the engine ([`flotilla`]).
 //!
-//! Each module imports only modules above it.
+//! Each module imports only modules above it. Errors are described by their types; a section on errors says what these do
+//! not.
 //!
 //! | module | contents |
 //! |---|---|

@@ -7,13 +7,10 @@ use flotilla::backend::gpu::episode::{GpuBackend, ResidencyPolicy};
 use flotilla::front::{self, Processor};
 use flotilla::parallel;
 use flotilla_app::choice::{self, Chosen, Work};
-use flotilla_app::ops::advice_on_device;
+use flotilla_app::ops::MessageWithRemedy;
 
 /// Opens the requested backend for some work, by which `--backend auto` decides, and describes it for people.
 /// `--threads` applies to the whole process.
-///
-/// # Errors
-/// Fails if the backend is not available, or if the flags contradict each other.
 pub fn open_for(options: &RunOptions, work: Work) -> Result<(OpenBackend, String), Error> {
     let (gpu, reason) = open_gpu(options, Some(work))?;
     let opened = gpu.map_or_else(front::cpu, front::on_gpu);
@@ -24,9 +21,6 @@ pub fn open_for(options: &RunOptions, work: Work) -> Result<(OpenBackend, String
 
 /// Opens the requested GPU. Returns `None` if the CPU plays, and why that was chosen if nobody asked for it. Without
 /// `work`, `--backend auto` takes any usable GPU. `--threads` applies to the whole process.
-///
-/// # Errors
-/// Fails if the GPU is not available, or if the flags contradict each other.
 pub fn open_gpu(options: &RunOptions, work: Option<Work>) -> Result<(Option<GpuBackend>, Option<&'static str>), Error> {
     start_threads(options.threads);
     let holding = match options.breed {
@@ -53,7 +47,7 @@ pub fn open_gpu(options: &RunOptions, work: Option<Work>) -> Result<(Option<GpuB
     device::report_stalls(|text| say(format_args!("note: {text}")));
     let Chosen { gpu, reason, passed_over } = choice::find(&processor, holding, work)?;
     if let Some(error) = passed_over {
-        say(format_args!("note: no GPU is used: {error}{}", advice_on_device(&error)));
+        say(format_args!("note: no GPU is used: {}", MessageWithRemedy::from(&error)));
     }
     Ok((gpu, reason))
 }

@@ -6,7 +6,7 @@ use clap::builder::PossibleValuesParser as Words;
 use flotilla::baseline::SPEEDS;
 use flotilla::config::{Actions, Choice, Paradigm};
 use flotilla::evaluate::MAX_EPISODES;
-use flotilla_app::ops::baseline::{self, Outcome, Request};
+use flotilla_app::ops::baseline::{self, BaselineOutcome, BaselineRequest};
 use flotilla_app::report::table::markdown;
 
 #[derive(clap::Args)]
@@ -40,14 +40,14 @@ pub fn run(args: Args) -> Result<(), Error> {
     let Args { config, seeds, episodes, generations, population, paradigm, set, printed, run } = args;
     let overrides = Overrides { generations, population, paradigm, set, ..Overrides::default() };
     let config = config.text(overrides.list())?;
-    let request = Request { config, seeds, episodes };
+    let request = BaselineRequest { config, seeds, episodes };
     let mut console = Console::new(&run, printed.quiet);
     let found = console.play(|backends, context| baseline::run(&request, backends, context))?;
     printed.outcome(&found, in_words)
 }
 
-fn in_words(found: &Outcome) -> String {
-    let &Outcome { pois, seeds, teams, paradigm, actions, ref constant, ref action, ref network, .. } = found;
+fn in_words(found: &BaselineOutcome) -> String {
+    let &BaselineOutcome { pois, seeds, teams, paradigm, actions, ref constant, ref action, ref network, .. } = found;
     let head = [&format!("POIs observed, of {pois}"), "mean [95 % interval]", "lowest", "highest"];
     let mut rows = vec![head.map(|head| head.to_string()).to_vec()];
     let constants = match actions {

@@ -8,7 +8,7 @@ use fearless_simd::Level;
 use serde_json::json;
 
 use super::{
-    BackendChoice, Breed, Error, Overrides, Processor, RunOptions, backend, between, print, print_json, with_remedy,
+    BackendChoice, Breed, Error, Overrides, ProcessorInfo, RunOptions, backend, between, print, print_json, with_remedy,
 };
 use crate::measure::{self, Generations, Profile, Subject, Timing};
 use flotilla::backend::Machine;
@@ -91,7 +91,7 @@ pub fn run(args: Args) -> Result<(), Error> {
         match args.json {
             true => {
                 let mut object = json(&timing);
-                Processor::of(&machine, &subject.backend().describe()).add_to(&mut object);
+                ProcessorInfo::of(&machine, &subject.backend().describe()).add_to(&mut object);
                 print_json(&object)?;
             }
             false => print(&line(&timing))?,

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use super::{ConfigArgs, Error, backend, console, print, print_json};
-use flotilla_app::ops::check::{self, Cost, Outcome, Request};
+use flotilla_app::ops::check::{self, CheckOutcome, CheckRequest, Cost};
 use flotilla_app::ops::output;
 
 #[derive(clap::Args)]
@@ -23,12 +23,12 @@ pub fn run(args: Args) -> Result<(), Error> {
     backend::start_threads(None);
     let Args { config, json, out } = args;
     output::check(&[("--out", out.as_deref())], &[&config.file.path])?;
-    let request = Request { name: config.name(), config: config.text(vec![])?, out };
+    let request = CheckRequest { name: config.name(), config: config.text(vec![])?, out };
     let found = console::run_without_backend(false, |context| check::run(&request, context))?;
     if json {
         return print_json(&found);
     }
-    let Outcome { config, cost, .. } = found;
+    let CheckOutcome { config, cost, .. } = found;
     let Cost {
         agents, learners, travel, teams, team_steps, agent_steps, parameters, policy_bytes, record_bytes, ..
     } = cost;

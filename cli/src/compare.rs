@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use super::sweep::share;
 use super::{Error, console, print, print_json};
 use flotilla_app::ops;
-use flotilla_app::ops::compare::{Request, at};
+use flotilla_app::ops::compare::{CompareRequest, at};
 use flotilla_app::record::digests::UNVERIFIED;
 use flotilla_app::report::comparison;
 
@@ -47,7 +47,7 @@ fn generation(text: &str) -> Result<String, String> {
 
 pub fn run(args: Args) -> Result<(), Error> {
     let Args { folders, by, at, reach, paired, unverified, json, csv, latex } = args;
-    let request = Request { folders, by, at, reach, paired, unverified };
+    let request = CompareRequest { folders, by, at, reach, paired, unverified };
     let found = console::run_without_backend(false, |context| ops::compare::run(&request, context))?;
     if csv {
         let mut text = Vec::new();

@@ -5,7 +5,7 @@ use std::ffi::OsString;
 
 use super::recovery::{self, Signals};
 use super::{Error, RunOptions, backend, say};
-use crate::progress::{Meter, ProgressBars};
+use crate::progress::Progress;
 use flotilla::backend::OpenBackend;
 use flotilla_app::choice::Work;
 use flotilla_app::ops::{BackendSource, Context, Event};
@@ -39,9 +39,6 @@ impl<'a> Console<'a> {
     }
 
     /// Runs a use case that signals stop.
-    ///
-    /// # Errors
-    /// The use case fails, or the system does not allow signal handlers.
     pub fn run<R>(
         &mut self,
         work: impl FnOnce(&mut dyn BackendSource, Context<'_>) -> Result<R, Error>,
@@ -50,9 +47,6 @@ impl<'a> Console<'a> {
     }
 
     /// Runs a use case that signals end at once, because it leaves nothing to save.
-    ///
-    /// # Errors
-    /// The use case fails.
     pub fn play<R>(
         &mut self,
         work: impl FnOnce(&mut dyn BackendSource, Context<'_>) -> Result<R, Error>,
@@ -71,9 +65,6 @@ impl<'a> Console<'a> {
 }
 
 /// Runs a use case that needs no backend. A signal ends the process.
-///
-/// # Errors
-/// The use case fails.
 pub fn run_without_backend<R>(quiet: bool, work: impl FnOnce(Context<'_>) -> Result<R, Error>) -> Result<R, Error> {
     run_reported(quiet, &Signals::default(), &[], work)
 }
@@ -84,7 +75,7 @@ fn run_reported<R>(
     flags: &[OsString],
     work: impl FnOnce(Context<'_>) -> Result<R, Error>,
 ) -> Result<R, Error> {
-    let (show, command) = (Display::new(quiet), recovery::command_line());
+    let (show, command) = (Display { quiet, progress: RefCell::default() }, recovery::command_line());
     let (Signals { stop, save }, report) = (signals, |event: Event<'_>| show.event(event));
     let done = work(Context { stop, save, command: &command, flags, ..Context::new(&report) });
     show.event(Event::Pause);
@@ -94,45 +85,23 @@ fn run_reported<R>(
 /// Shows events on standard error.
 struct Display {
     quiet: bool,
-    shown: RefCell<View>,
-}
-
-/// The drawing on the terminal.
-enum View {
-    Nothing,
-    Curves(ProgressBars),
-    Meter(Meter),
+    progress: RefCell<Option<Progress>>,
 }
 
 impl Display {
-    fn new(quiet: bool) -> Display {
-        Display { quiet, shown: RefCell::new(View::Nothing) }
-    }
-
     fn event(&self, event: Event<'_>) {
-        let shown = &mut *self.shown.borrow_mut();
-        match (event, &mut *shown) {
-            (Event::Warning(text) | Event::Note(text), _) => say(text),
-            (Event::Message(text), _) if !self.quiet => say(text),
-            (Event::Begin(names, from, last), shown) => {
-                *shown = View::Curves(ProgressBars::new(names, from, last, self.quiet));
+        let progress = &mut *self.progress.borrow_mut();
+        match event {
+            Event::Warning(text) | Event::Note(text) => say(text),
+            Event::Message(text) if !self.quiet => say(text),
+            Event::Message(_) => {}
+            Event::Begin(names, from, last) => *progress = Some(Progress::of_arms(names, from, last, self.quiet)),
+            Event::Rows { next, rows, .. } => progress.iter_mut().for_each(|progress| progress.add(next, rows)),
+            Event::Fraction(part, text) => {
+                *progress = progress.take().filter(|progress| !progress.has_arms());
+                progress.get_or_insert_with(|| Progress::of_fraction(self.quiet)).show(part, || text);
             }
-            (Event::Rows { next, rows, .. }, View::Curves(board)) => board.show(next, rows),
-            (Event::Fraction(part, text), View::Meter(meter)) => meter.show(part, || text),
-            (Event::Fraction(part, text), shown) => {
-                let mut meter = Meter::new(self.quiet);
-                meter.show(part, || text);
-                *shown = View::Meter(meter);
-            }
-            (Event::Pause, shown) => {
-                match shown {
-                    View::Nothing => {}
-                    View::Curves(board) => board.clear(),
-                    View::Meter(meter) => meter.clear(),
-                }
-                *shown = View::Nothing;
-            }
-            (Event::Message(_) | Event::Rows { .. }, _) => {}
+            Event::Pause => progress.take().iter().for_each(Progress::clear),
         }
     }
 }

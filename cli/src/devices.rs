@@ -8,7 +8,7 @@ use flotilla::backend::cpu::Cpu;
 use flotilla::backend::gpu;
 use flotilla::backend::gpu::device::{self, AdapterChoice, DeviceError, Gpu};
 use flotilla::host::Instant;
-use flotilla_app::ops::advice_on_device;
+use flotilla_app::ops::MessageWithRemedy;
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -60,7 +60,7 @@ pub fn run(args: Args) -> Result<(), Error> {
         text += &format!("{index}: {info}\n");
         text += &match opened {
             Ok(gpu) => exact(gpu, *seconds),
-            Err(error) => format!("   not usable: {error}{}\n", advice_on_device(error)),
+            Err(error) => format!("   not usable: {}\n", MessageWithRemedy::from(error)),
         };
     }
     if adapters.is_empty() {

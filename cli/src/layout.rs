@@ -69,9 +69,6 @@ impl StartLayout {
     }
 
     /// Returns the text of the config file: a comment that describes the layout, and the layout's keys.
-    ///
-    /// # Errors
-    /// Fails if the layout does not result in a valid config.
     pub fn text(&self) -> Result<String, ConfigError> {
         let short = Config::parse(&self.with_steps(1), "layout")?;
         // An episode is long enough to reach the farthest POI with time to spare.

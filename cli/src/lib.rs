@@ -25,7 +25,7 @@ use flotilla::escape;
 use flotilla::file;
 use flotilla::host::MAX_THREADS;
 use flotilla_app::ops::ConfigText;
-pub use flotilla_app::ops::{Error, Processor, with_remedy};
+pub use flotilla_app::ops::{Error, ProcessorInfo, with_remedy};
 use flotilla_app::record::folder::Start;
 
 mod backend;
@@ -347,9 +347,6 @@ pub fn say(text: impl Display) {
 
 /// Prints a result to standard output, with control characters escaped. A reader that closes the pipe early (`| head`)
 /// causes no error.
-///
-/// # Errors
-/// Fails if standard output cannot be written, for example because the disk is full.
 pub fn print(text: &str) -> Result<(), Error> {
     write_out(&escape::lines(text))
 }
@@ -384,9 +381,6 @@ impl serde_json::ser::Formatter for TerminalSafe {
 }
 
 /// Prints a result as one line of JSON to standard output. JSON does not have the escapes of [`print()`].
-///
-/// # Errors
-/// Fails if standard output cannot be written, for example because the disk is full.
 pub fn print_json(value: &impl Serialize) -> Result<(), Error> {
     let mut text = Vec::new();
     let mut serializer = serde_json::Serializer::with_formatter(&mut text, TerminalSafe);
@@ -409,9 +403,6 @@ pub struct ConfigFile {
 
 impl ConfigFile {
     /// Reads the file, for a request that sets some keys.
-    ///
-    /// # Errors
-    /// The file cannot be read.
     pub fn text(&self, set: Vec<Override>) -> Result<ConfigText, Error> {
         Ok(ConfigText { text: config::read_file(&self.path)?, name: config::name(&self.path), set })
     }
@@ -438,9 +429,6 @@ impl ConfigArgs {
     }
 
     /// Reads the file, for a request that sets the keys of the flags and `more`.
-    ///
-    /// # Errors
-    /// The file cannot be read.
     pub fn text(&self, more: Vec<Override>) -> Result<ConfigText, Error> {
         self.file.text([self.overrides.list(), more].concat())
     }
@@ -459,17 +447,11 @@ pub struct Printed {
 
 impl Printed {
     /// Prints an outcome as JSON or, by `text`, for people.
-    ///
-    /// # Errors
-    /// Standard output cannot be written.
     pub fn outcome<T: Serialize>(self, outcome: &T, text: impl FnOnce(&T) -> String) -> Result<(), Error> {
         if self.json { print_json(outcome) } else { print(&text(outcome)) }
     }
 
     /// Prints an outcome that people may not want to see.
-    ///
-    /// # Errors
-    /// Standard output cannot be written.
     pub fn summary<T: Serialize>(self, outcome: &T, text: impl FnOnce(&T) -> String) -> Result<(), Error> {
         if self.quiet && !self.json { Ok(()) } else { self.outcome(outcome, text) }
     }

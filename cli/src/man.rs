@@ -33,7 +33,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     {
         let path = args.out.join(page.get_filename());
         if path.symlink_metadata().is_ok() && !fs::read_to_string(&path).is_ok_and(|text| text.contains(TITLE)) {
-            return Err(RecordError::NotOurs { path }.into());
+            return Err(RecordError::NotOurs(path).into());
         }
         disk.replace(&path, |output| page.render(output)).map_err(RecordError::write(&path))?;
     }

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use super::{Error, console, print, print_json};
 use flotilla::escape::PathExt;
-use flotilla_app::ops::plot::{self, Request};
+use flotilla_app::ops::plot::{self, PlotRequest};
 use flotilla_app::record::digests::UNVERIFIED;
 use flotilla_app::report::curves::Band;
 use flotilla_app::report::runs::TeamKind;
@@ -35,7 +35,7 @@ pub struct Args {
 
 pub fn run(args: Args) -> Result<(), Error> {
     let Args { runs, out, measure, band, unverified, json } = args;
-    let request = Request { runs, out, measure, band, unverified };
+    let request = PlotRequest { runs, out, measure, band, unverified };
     let found = console::run_without_backend(false, |context| plot::run(&request, context))?;
     let out = found.out.escaped();
     match json {

@@ -4,9 +4,6 @@ use super::{Error, say};
 use flotilla_app::ops::output;
 
 /// Sets the process up: silences drivers, and turns the system's limits into errors that can be reported.
-///
-/// # Errors
-/// Fails if the system does not allow signal handlers.
 pub fn set_up() -> Result<(), Error> {
     suppress_driver_noise();
     output::report_waiting(|text| say(text));

@@ -19,110 +19,28 @@ const DRAWS: Duration = Duration::from_millis(100);
 /// Number of steps of a full bar.
 const PARTS: u64 = 1000;
 
-/// Decides whether and when progress is shown.
-struct Pace {
-    quiet: bool,
-    terminal: bool,
-    since: Instant,
-    shown: Instant,
-    pause: Duration,
-}
-
-impl Pace {
-    fn new(quiet: bool) -> Pace {
-        let terminal = !quiet && is_capable(io::stderr().is_terminal(), std::env::var("TERM").ok().as_deref());
-        let now = Instant::now();
-        Pace { quiet, terminal, since: now, shown: now, pause: if terminal { DRAWS } else { LINES } }
-    }
-
-    /// Reports whether it is time to show progress. If so, restarts the interval.
-    fn is_due(&mut self) -> bool {
-        let due = !self.quiet && self.shown.elapsed() >= self.pause;
-        if due {
-            self.shown = Instant::now();
-        }
-        due
-    }
-
-    fn seconds(&self) -> f64 {
-        self.since.elapsed().as_secs_f64().max(1e-9)
-    }
-}
-
 /// Reports whether standard error can be redrawn. `name` is the value of `TERM`.
 fn is_capable(terminal: bool, name: Option<&str>) -> bool {
     terminal && name.map_or(cfg!(windows), |name| name != "dumb")
 }
 
-/// Writes a line. Errors are ignored, because a closed standard error must not stop the work.
-fn line(to: &mut dyn Write, text: &str) {
-    let _ = writeln!(to, "{text}");
-}
-
-/// Shows the progress of one task on standard error.
-pub(crate) struct Meter {
-    pace: Pace,
-    bar: Option<ProgressBar>,
+/// Shows the progress of one task on standard error: a fraction, or the training of several arms.
+pub(crate) struct Progress {
+    quiet: bool,
+    /// When progress was last shown, and the interval after which it is shown again.
+    shown: Instant,
+    pause: Duration,
+    /// Where bars are drawn. None without a terminal, where lines are written.
+    terminal: Option<MultiProgress>,
     lines: Box<dyn Write + Send>,
-}
-
-impl Meter {
-    /// Starts a meter. With `quiet` it never shows anything.
-    pub fn new(quiet: bool) -> Meter {
-        let pace = Pace::new(quiet);
-        let bar = pace.terminal.then(|| {
-            let style = ProgressStyle::with_template("{bar:24} {percent}%  {msg}  {eta} left");
-            let style = style.unwrap_or_else(|_| ProgressStyle::default_bar());
-            ProgressBar::with_draw_target(Some(PARTS), ProgressDrawTarget::stderr()).with_style(style)
-        });
-        Meter { pace, bar, lines: Box::new(io::stderr()) }
-    }
-
-    /// Shows the completed fraction, 0 to 1. `describe` describes the current work and is called only if it is shown.
-    pub fn show(&mut self, part: f64, describe: impl FnOnce() -> String) {
-        if !self.pace.is_due() {
-            return;
-        }
-        match &self.bar {
-            Some(bar) => {
-                bar.set_message(describe());
-                bar.set_position((part * PARTS as f64) as u64);
-            }
-            None => {
-                let left = self.pace.seconds() * (1.0 - part) / part.max(1e-9);
-                let left = if part > 0.0 { format!(", {left:.0} s left") } else { String::new() };
-                line(&mut self.lines, &format!("{}, {:.0} %{left}", describe(), part * 100.0));
-            }
-        }
-    }
-
-    /// Clears the bar, so that other output can follow.
-    pub(crate) fn clear(&self) {
-        if let Some(bar) = &self.bar {
-            bar.finish_and_clear();
-        }
-    }
-}
-
-/// Shows the training progress of several arms on standard error.
-pub(crate) struct ProgressBars {
-    arms: Vec<GrowingBar>,
-    last: usize,
-    /// The generation at which this session started.
-    from: usize,
-    pace: Pace,
-    terminal: Option<Terminal>,
-}
-
-struct Terminal {
-    all: MultiProgress,
-    curves: Vec<ProgressBar>,
-    generation: ProgressBar,
+    /// The bar of the whole task. It estimates the rate and the time left, whether it is drawn or not.
+    whole: ProgressBar,
+    /// The curve of every arm, and its line on the terminal. Empty for a fraction.
+    arms: Vec<(GrowingCurve, ProgressBar)>,
 }
 
 /// One arm's curve so far: for each part of the run, the sum of the champions' G and the number of rows.
-struct GrowingBar {
-    name: String,
+struct GrowingCurve {
     /// Number of POIs. None if stages differ in it.
     pois: Option<usize>,
     parts: Vec<(f64, u32)>,
@@ -138,7 +56,7 @@ struct Newest {
     trials: u32,
 }
 
-impl GrowingBar {
+impl GrowingCurve {
     fn add(&mut self, row: &Row, last: usize) {
         let part = (row.generation * self.parts.len() / (last + 1)).min(self.parts.len() - 1);
         self.parts[part].0 += row.champion_g;
@@ -175,77 +93,112 @@ impl GrowingBar {
     }
 }
 
-impl ProgressBars {
-    /// Starts the bars of experiments, each with its name and number of POIs (none if that changes during the run).
+impl Progress {
+    fn new(quiet: bool, length: u64, template: &str) -> Progress {
+        let is_terminal = !quiet && is_capable(io::stderr().is_terminal(), std::env::var("TERM").ok().as_deref());
+        let terminal = is_terminal.then(|| MultiProgress::with_draw_target(ProgressDrawTarget::stderr()));
+        let whole =
+            ProgressBar::with_draw_target(Some(length), ProgressDrawTarget::hidden()).with_style(style(template));
+        let pause = if is_terminal { DRAWS } else { LINES };
+        let lines = Box::new(io::stderr());
+        Progress { quiet, shown: Instant::now(), pause, terminal, lines, whole, arms: vec![] }
+    }
+
+    /// Starts to show a fraction. With `quiet` nothing is ever shown.
+    pub fn of_fraction(quiet: bool) -> Progress {
+        let progress = Progress::new(quiet, PARTS, "{bar:24} {percent}%  {msg}  {eta} left");
+        progress.terminal.iter().for_each(|terminal| drop(terminal.add(progress.whole.clone())));
+        progress
+    }
+
+    /// Starts the curves of experiments, each with its name and number of POIs (none if that changes during the run).
     ///
     /// The arms train up to generation `last`. This session starts at generation `from`.
-    pub fn new(arms: Vec<(String, Option<usize>)>, from: usize, last: usize, quiet: bool) -> ProgressBars {
-        let parts = vec![(0.0, 0); CURVE.min(last + 1)];
-        let arms: Vec<GrowingBar> = arms
-            .into_iter()
-            .map(|(name, pois)| GrowingBar { name, pois, parts: parts.clone(), newest: Newest::default() })
-            .collect();
-        let pace = Pace::new(quiet);
-        let terminal = pace.terminal.then(|| Terminal::new(&arms, from, last));
-        ProgressBars { arms, last, from, pace, terminal }
+    pub fn of_arms(arms: Vec<(String, Option<usize>)>, from: usize, last: usize, quiet: bool) -> Progress {
+        let mut progress = Progress::new(quiet, last as u64, "{bar:32} generation {pos}/{len}  {msg}  {eta} left");
+        let width = arms.iter().map(|(name, _)| name.chars().count()).max().unwrap_or(0);
+        let line = style(if width == 0 { "{msg}" } else { "{prefix}  {msg}" });
+        for (at, (name, pois)) in arms.into_iter().enumerate() {
+            let bar = ProgressBar::hidden().with_style(line.clone()).with_prefix(format!("{name:width$}"));
+            progress.terminal.iter().filter(|_| at < MAX_BARS).for_each(|terminal| drop(terminal.add(bar.clone())));
+            let curve = GrowingCurve { pois, parts: vec![(0.0, 0); CURVE.min(last + 1)], newest: Newest::default() };
+            progress.arms.push((curve, bar));
+        }
+        progress.terminal.iter().for_each(|terminal| drop(terminal.add(progress.whole.clone())));
+        progress.whole.set_position(from as u64);
+        progress.whole.reset_eta();
+        progress
+    }
+
+    /// Reports whether the arms of a training are shown, and not a fraction.
+    pub fn has_arms(&self) -> bool {
+        !self.arms.is_empty()
+    }
+
+    /// Reports whether it is time to show progress. If so, restarts the interval.
+    fn is_due(&mut self) -> bool {
+        let due = !self.quiet && self.shown.elapsed() >= self.pause;
+        if due {
+            self.shown = Instant::now();
+        }
+        due
+    }
+
+    /// Writes a line. Errors are ignored, because a closed standard error must not stop the work.
+    fn line(&mut self, text: &str) {
+        let _ = writeln!(self.lines, "{text}");
+    }
+
+    /// Shows the completed fraction, 0 to 1. `describe` describes the current work and is called only if it is shown.
+    pub fn show(&mut self, part: f64, describe: impl FnOnce() -> String) {
+        self.whole.set_position((part * PARTS as f64) as u64);
+        if !self.is_due() {
+            return;
+        }
+        if self.terminal.is_some() {
+            return self.whole.set_message(describe());
+        }
+        let left = if part > 0.0 { format!(", {} s left", self.whole.eta().as_secs()) } else { String::new() };
+        self.line(&format!("{}, {:.0} %{left}", describe(), part * 100.0));
     }
 
     /// Adds complete rows. `next` is the generation that plays next.
-    pub fn show(&mut self, next: usize, rows: &[Row]) {
+    pub fn add(&mut self, next: usize, rows: &[Row]) {
+        let last = self.whole.length().unwrap_or(0) as usize;
         for row in rows {
-            if let Some(arm) = self.arms.get_mut(row.experiment) {
-                arm.add(row, self.last);
+            if let Some((curve, _)) = self.arms.get_mut(row.experiment) {
+                curve.add(row, last);
             }
         }
-        if !self.pace.is_due() {
+        self.whole.set_position(next.min(last) as u64);
+        if !self.is_due() {
             return;
         }
-        let rate = (next - self.from.min(next)) as f64 / self.pace.seconds();
-        match &self.terminal {
-            Some(terminal) => {
-                terminal.generation.set_position(next.min(self.last) as u64);
-                terminal.generation.set_message(format!("{rate:.1} generations/s"));
-                for (bar, arm) in terminal.curves.iter().zip(&self.arms) {
-                    bar.set_message(format!("{}  {}", arm.spark(), arm.value(self.arms.len() == 1)));
-                }
+        let rate = format!("{:.1} generations/s", self.whole.per_sec());
+        if self.terminal.is_some() {
+            for (curve, bar) in self.arms.iter().take(MAX_BARS) {
+                bar.set_message(format!("{}  {}", curve.spark(), curve.value(self.arms.len() == 1)));
             }
-            None => {
-                let left = (self.last + 1).saturating_sub(next) as f64 / rate.max(1e-9);
-                let values: Vec<String> = match &*self.arms {
-                    [arm] => vec![arm.value(true)],
-                    arms => vec![format!("{} experiments", arms.len())],
-                };
-                let (generation, last, values) = (next.saturating_sub(1).min(self.last), self.last, values.concat());
-                let text =
-                    format!("generation {generation}/{last}  {values}  {rate:.1} generations/s  {left:.0} s left");
-                line(&mut io::stderr(), &text);
-            }
+            return self.whole.set_message(rate);
         }
+        let values = match &*self.arms {
+            [(curve, _)] => curve.value(true),
+            arms => format!("{} experiments", arms.len()),
+        };
+        let (generation, left) = (next.saturating_sub(1).min(last), self.whole.eta().as_secs());
+        self.line(&format!("generation {generation}/{last}  {values}  {rate}  {left} s left"));
     }
 
-    /// Clears the curves, so that other output can follow.
-    pub(crate) fn clear(&self) {
-        if let Some(Terminal { all, .. }) = &self.terminal {
-            let _ = all.clear();
+    /// Clears the bars, so that other output can follow.
+    pub fn clear(&self) {
+        if let Some(terminal) = &self.terminal {
+            let _ = terminal.clear();
         }
     }
 }
 
-impl Terminal {
-    fn new(arms: &[GrowingBar], from: usize, last: usize) -> Terminal {
-        let all = MultiProgress::with_draw_target(ProgressDrawTarget::stderr());
-        let style = |template| ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar());
-        let width = arms.iter().map(|arm| arm.name.chars().count()).max().unwrap_or(0);
-        let curve = |arm: &GrowingBar| {
-            let bar =
-                all.add(ProgressBar::new(1)).with_style(style(if width == 0 { "{msg}" } else { "{prefix}  {msg}" }));
-            bar.with_prefix(format!("{:width$}", arm.name))
-        };
-        let curves = arms.iter().take(MAX_BARS).map(curve).collect();
-        let generation = all.add(ProgressBar::new(last as u64));
-        generation.set_style(style("{bar:32} generation {pos}/{len}  {msg}  {eta} left"));
-        Terminal { curves, generation: generation.with_position(from as u64), all }
-    }
+fn style(template: &str) -> ProgressStyle {
+    ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar())
 }
 
 #[cfg(test)]
@@ -281,9 +234,8 @@ mod tests {
         let (sender, lines) = mpsc::channel();
         let pause = Duration::from_millis(50);
         let meter = |quiet| {
-            let now = Instant::now();
-            let pace = Pace { quiet, terminal: false, since: now, shown: now, pause };
-            Meter { pace, bar: None, lines: Box::new(Sent(sender.clone())) }
+            let lines = Box::new(Sent(sender.clone()));
+            Progress { pause, terminal: None, lines, quiet, ..Progress::of_fraction(true) }
         };
         let (mut meter, mut quiet) = (meter(false), meter(true));
         let shown = || lines.try_iter().collect::<String>();

@@ -95,9 +95,6 @@ impl Signals {
     /// A SIGINT after any of the first three ends the process at once, because a person who presses Ctrl-C again does not
     /// want to wait. Another SIGTERM changes nothing: batch systems send it to a script and to its processes, and to
     /// these twice at a time limit.
-    ///
-    /// # Errors
-    /// Fails if the system does not allow signal handlers.
     pub fn listen() -> Result<Signals, Error> {
         use signal_hook::consts::{SIGINT, SIGTERM};
         use signal_hook::flag;

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use super::console::Console;
 use super::{Error, Printed, RunOptions, between, whole, words};
 use flotilla::escape::PathExt;
-use flotilla_app::ops::replay::{self, Outcome, Request, WhichTrial, Written};
+use flotilla_app::ops::replay::{self, ReplayOutcome, ReplayRequest, WhichTrial, Written};
 use flotilla_app::record::digests::UNVERIFIED;
 use flotilla_app::report::replay::{FPS, Which};
 use flotilla_app::shell;
@@ -55,14 +55,14 @@ pub fn run(args: Args) -> Result<(), Error> {
     if let Some(out) = &out {
         refuse_video(out, fps)?;
     }
-    let request = Request { folder, trial, generation, team, compare, step, out, width, fps, unverified };
+    let request = ReplayRequest { folder, trial, generation, team, compare, step, out, width, fps, unverified };
     let mut console = Console::new(&run, printed.quiet);
     let found = console.run(|backends, context| replay::run(&request, backends, context))?;
     printed.summary(&found, in_words)
 }
 
 /// Returns what was played and where it was written.
-fn in_words(found: &Outcome) -> String {
+fn in_words(found: &ReplayOutcome) -> String {
     let mut text: String = found.episodes.iter().map(|episode| format!("{}\n", episode.text)).collect();
     if found.unverified {
         text += &format!("{UNVERIFIED}\n");

@@ -26,23 +26,23 @@ pub enum Request {
     /// See [`questions`].
     Questions(paper::run::Request),
     /// See [`sweep`].
-    Sweep(sweep::Request),
+    Sweep(sweep::SweepRequest),
     /// See [`compare`].
-    Compare(compare::Request),
+    Compare(compare::CompareRequest),
     /// See [`verify`].
-    Verify(verify::Request),
+    Verify(verify::VerifyRequest),
     /// See [`train`].
-    Train(train::Request),
+    Train(train::TrainRequest),
     /// See [`check`].
-    Check(check::Request),
+    Check(check::CheckRequest),
     /// See [`rollout`].
-    Rollout(rollout::Request),
+    Rollout(rollout::RolloutRequest),
     /// See [`replay`].
-    Replay(replay::Request),
+    Replay(replay::ReplayRequest),
     /// See [`plot`].
-    Plot(plot::Request),
+    Plot(plot::PlotRequest),
     /// See [`baseline`].
-    Baseline(baseline::Request),
+    Baseline(baseline::BaselineRequest),
     /// See [`tasks`].
     Tasks(tasks::Request),
 }

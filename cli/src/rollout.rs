@@ -8,7 +8,7 @@ use super::console::Console;
 use super::{Error, Printed, RunOptions, SetKeys, between, canonical, real, whole};
 use flotilla::config::{Choice, Override, Paradigm};
 use flotilla::evaluate::{MAX_EPISODES, Spread};
-use flotilla_app::ops::rollout::{self, Outcome, Request, counted};
+use flotilla_app::ops::rollout::{self, RolloutOutcome, RolloutRequest, counted};
 use flotilla_app::record::digests::UNVERIFIED;
 
 const HELD_OUT: &str = "Held-out starts";
@@ -75,14 +75,14 @@ pub fn run(args: Args) -> Result<(), Error> {
         key("poi_jitter", args.poi_jitter.map(toml::Value::from)),
     ];
     let set = keys.into_iter().flatten().chain(set.set).collect();
-    let request = Request { path, set, policies, trial, stage, trace, scores, unverified, episodes, seed };
+    let request = RolloutRequest { path, set, policies, trial, stage, trace, scores, unverified, episodes, seed };
     let mut console = Console::new(&args.run, args.printed.quiet);
     let found = console.play(|backends, context| rollout::run(&request, backends, context))?;
     args.printed.outcome(&found, in_words)
 }
 
-fn in_words(found: &Outcome) -> String {
-    let Outcome { teams, pois, episodes, team_0, best, mean, unverified, .. } = found;
+fn in_words(found: &RolloutOutcome) -> String {
+    let RolloutOutcome { teams, pois, episodes, team_0, best, mean, unverified, .. } = found;
     let mark = if *unverified { format!("{UNVERIFIED}\n") } else { String::new() };
     let counted = counted(*teams, *episodes);
     if *episodes == 1 {

@@ -11,10 +11,10 @@ use super::recovery;
 use super::{Error, ExistingResults, Overrides, RunOptions, between, print, print_json, say, whole};
 use flotilla::config;
 use flotilla::escape::PathExt;
-use flotilla_app::ops::sweep::{Request, Results, claim};
+use flotilla_app::ops::sweep::{ResultOptions, SweepRequest, claim};
 use flotilla_app::ops::{self, output};
 use flotilla_app::record::disk::Disk;
-use flotilla_app::record::folder::SWEEP;
+use flotilla_app::record::folder::{RUNS, SWEEP};
 use flotilla_app::record::ownership;
 use flotilla_app::report::curves::Band;
 use flotilla_app::report::runs::TeamKind;
@@ -24,7 +24,7 @@ use flotilla_app::sweep::shard::{self, MAX_SHARDS, Shard};
 use flotilla_app::sweep::slurm::Job;
 
 const SCALE_OUT: &str = "Many processes (docs/how-to/clusters.md)";
-const RESULTS: &str = "Results";
+const RESULTS: &str = "ResultOptions";
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -137,7 +137,7 @@ impl Args {
     }
 
     fn out(&self, sweep: &Sweep) -> PathBuf {
-        self.out.clone().unwrap_or_else(|| Path::new(ops::RUNS).join(&sweep.name))
+        self.out.clone().unwrap_or_else(|| Path::new(RUNS).join(&sweep.name))
     }
 
     /// Returns the arguments that run this sweep again, without those that differ between processes.
@@ -152,8 +152,8 @@ impl Args {
         words
     }
 
-    fn request(&self, sweep: &Sweep, out: &Path, shard: Option<Shard>) -> Request {
-        Request {
+    fn request(&self, sweep: &Sweep, out: &Path, shard: Option<Shard>) -> SweepRequest {
+        SweepRequest {
             text: sweep.text.clone(),
             name: sweep.name.clone(),
             set: vec![],
@@ -163,7 +163,7 @@ impl Args {
             start: self.existing.start(),
             shard: shard.map(|shard| (shard.index, shard.count)),
             memory: self.memory.map(|gib| (gib * f64::from(1 << 30)) as usize),
-            results: Results {
+            results: ResultOptions {
                 every: self.every as usize,
                 reach: self.reach,
                 unverified: self.unverified,

@@ -8,7 +8,7 @@ use super::recovery::{Checkpoints, quoted};
 use super::{ConfigArgs, Error, ExistingResults, Printed, RunOptions};
 use flotilla::escape::PathExt;
 use flotilla::trainer::Row;
-use flotilla_app::ops::train::{self, Extremes, Outcome, Request};
+use flotilla_app::ops::train::{self, Extremes, TrainOutcome, TrainRequest};
 use flotilla_app::record::folder::{CONFIG, METRICS, POLICIES, RUN};
 use flotilla_app::record::ownership::CURVES;
 use flotilla_app::report::map::counted;
@@ -38,7 +38,7 @@ pub struct Args {
 pub fn run(args: Args) -> Result<(), Error> {
     let Args { config, run, out, existing, init, printed, checkpoints } = args;
     let (name, start) = (config.name(), existing.start());
-    let request = Request { config: config.text(checkpoints.list())?, name, out, start, init };
+    let request = TrainRequest { config: config.text(checkpoints.list())?, name, out, start, init };
     let mut console = Console::new(&run, printed.quiet);
     let found = console.run(|backends, context| train::run(&request, backends, context))?;
     printed.summary(&found, report)
@@ -60,8 +60,8 @@ fn time(seconds: f64) -> String {
 }
 
 /// Returns the report of a run for people.
-fn report(found: &Outcome) -> String {
-    let Outcome { folder, rows: ends, digest, .. } = found;
+fn report(found: &TrainOutcome) -> String {
+    let TrainOutcome { folder, rows: ends, digest, .. } = found;
     let trained = match &found.trained_on {
         None => "This run was done already".into(),
         Some(on) => format!(

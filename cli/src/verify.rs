@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use super::{Error, Printed, SetKeys, backend, between, console};
 use flotilla::config;
-use flotilla_app::ops::verify::{self, Compared, Request, TEAMS};
+use flotilla_app::ops::verify::{self, Compared, TEAMS, VerifyRequest};
 
 #[derive(clap::Args)]
 #[command(after_help = EXIT_CODES)]
@@ -44,8 +44,16 @@ pub fn run(args: Args) -> Result<(), Error> {
     backend::start_threads(None);
     let read = |path: PathBuf| Ok::<_, Error>((config::name(&path), config::read_file(&path)?));
     let Args { config, set, teams, worlds, seed, adapter, pass, kernel, printed } = args;
-    let request =
-        Request { config: config.map(read).transpose()?, set: set.set, teams, worlds, seed, adapter, pass, kernel };
+    let request = VerifyRequest {
+        config: config.map(read).transpose()?,
+        set: set.set,
+        teams,
+        worlds,
+        seed,
+        adapter,
+        pass,
+        kernel,
+    };
     let found = console::run_without_backend(printed.quiet, |context| verify::run(&request, context))?;
     printed.outcome(&found, |found| in_words(&found.comparisons))?;
     found.difference().map_or(Ok(()), Err)

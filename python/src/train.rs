@@ -4,8 +4,8 @@ use std::path::PathBuf;
 
 use flotilla::front::Trained;
 use flotilla::trainer::{Ending, Row};
-use flotilla_app::ops::train::{InMemory, Request};
-use flotilla_app::ops::{self, ConfigText, Processor};
+use flotilla_app::ops::train::{InMemory, TrainRequest};
+use flotilla_app::ops::{self, ConfigText, ProcessorInfo};
 use flotilla_app::record::digests::Verification;
 use flotilla_app::record::disk::Disk;
 use flotilla_app::record::finished::Finished;
@@ -146,12 +146,12 @@ pub fn outcomes(py: Python<'_>, trained: Trained, digest: String) -> PyResult<Ou
 /// State that a longer run continues from: of each trial the weights, if they are needed, and the scores.
 type End<T> = Option<(Vec<T>, Vec<T>)>;
 
-/// The fields of [`Processor`], the time when the training started, the digest of the initial policies if they were
+/// The fields of [`ProcessorInfo`], the time when the training started, the digest of the initial policies if they were
 /// given, and whether the fitness was not the config's.
 type Played = (String, String, Option<String>, Option<String>, usize, String, Option<String>, bool);
 
-fn played(processor: Processor, started: String, init: Option<String>, own_fitness: bool) -> Played {
-    let Processor { backend, description, adapter, driver, threads, .. } = processor;
+fn played(processor: ProcessorInfo, started: String, init: Option<String>, own_fitness: bool) -> Played {
+    let ProcessorInfo { backend, description, adapter, driver, threads, .. } = processor;
     (backend, description, adapter, driver, threads, started, init, own_fitness)
 }
 
@@ -220,7 +220,7 @@ pub fn train_into(
         _ => Start::Fresh,
     };
     let config = ConfigText { text: config.0.to_toml(), name: "config".into(), set: vec![] };
-    let request = Request { config, name: "run".into(), out: Some(out), start, init };
+    let request = TrainRequest { config, name: "run".into(), out: Some(out), start, init };
     let watcher = Watcher { callback: callback.as_ref(), populations: 0 };
     let watch = |rows: &[Row], last, _: Option<&[f32]>| watcher.tell(rows, last, None);
     perform(py, backend, command, &watch, |backends, context| ops::train::run(&request, backends, context)).map(drop)
@@ -240,7 +240,11 @@ pub fn open(py: Python<'_>, folder: PathBuf, unverified: bool) -> PyResult<(Outc
         });
         Ok::<_, PyErr>((trained, digest, run, times.collect::<Result<_, _>>().raise()?))
     })?;
-    Ok((outcomes(py, trained, digest)?, played(Processor::of_run(&run), run.started, run.init, run.own_fitness), times))
+    Ok((
+        outcomes(py, trained, digest)?,
+        played(ProcessorInfo::of_run(&run), run.started, run.init, run.own_fitness),
+        times,
+    ))
 }
 
 /// Writes the results of a training in memory as a run directory, and returns the digest.

@@ -3,17 +3,17 @@
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
-use super::{BackendSource, ConfigText, Context, Error, Processor};
+use super::{BackendSource, ConfigText, Context, Error, ProcessorInfo};
 use crate::choice::Work;
 use flotilla::backend::Backend;
 use flotilla::baseline::{self, Baselines, SPEEDS};
 use flotilla::config::{Actions, Paradigm, ValidConfig};
 use flotilla::statistics;
 
-/// Request of baselines.
+/// BaselineRequest of baselines.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Request {
+pub struct BaselineRequest {
     /// The config.
     pub config: ConfigText,
     /// Independent repetitions of the random baselines.
@@ -24,7 +24,7 @@ pub struct Request {
 
 /// Results of baselines, in POIs observed.
 #[derive(Clone, Debug, Serialize)]
-pub struct Outcome {
+pub struct BaselineOutcome {
     /// Who learns.
     pub paradigm: Paradigm,
     /// Number of POIs.
@@ -40,14 +40,14 @@ pub struct Outcome {
     /// The best constant action of each seed.
     pub chosen: Vec<Value>,
     /// The best constant action.
-    pub constant: Found,
+    pub constant: BaselineScore,
     /// The best random constant actions.
-    pub action: Found,
+    pub action: BaselineScore,
     /// The best random networks.
-    pub network: Found,
+    pub network: BaselineScore,
     /// The processor.
     #[serde(flatten)]
-    pub processor: Processor,
+    pub processor: ProcessorInfo,
     /// The meaning of the policies' outputs.
     #[serde(skip)]
     pub actions: Actions,
@@ -71,7 +71,7 @@ pub struct Constant {
 
 /// A baseline.
 #[derive(Clone, Debug, Serialize)]
-pub struct Found {
+pub struct BaselineScore {
     /// The mean over seeds.
     pub mean: f64,
     /// The 95 % interval of the mean. Constant actions have none if nothing moves, because all seeds are the same.
@@ -81,10 +81,11 @@ pub struct Found {
 }
 
 /// Plays the baselines of a config, one repetition after the other.
-///
-/// # Errors
-/// The config is invalid, or the backend fails.
-pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
+pub fn run(
+    request: &BaselineRequest,
+    backends: &mut dyn BackendSource,
+    context: Context<'_>,
+) -> Result<BaselineOutcome, Error> {
     if request.seeds == 0 {
         return Err(Error::Usage("--seeds 0: allowed 1 or more".into()));
     }
@@ -102,7 +103,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let mean = |observed: &[f64]| observed.iter().sum::<f64>() / observed.len() as f64;
     let found = |seeds: Vec<f64>, differ: bool| {
         let interval = statistics::bounded(&seeds.iter().collect(), [0.0, pois as f64]).filter(|_| differ);
-        Found { mean: mean(&seeds), interval_95: interval.map(|mean| [mean.low, mean.high]), seeds }
+        BaselineScore { mean: mean(&seeds), interval_95: interval.map(|mean| [mean.low, mean.high]), seeds }
     };
     let speed = |index: usize| (index + 1) as f64 / SPEEDS as f64;
     let constant = |index: usize| {
@@ -116,7 +117,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         Actions::Direct => json!(speed(outcome.best_constant)),
         Actions::Behaviours => json!(outcome.best_constant),
     };
-    Ok(Outcome {
+    Ok(BaselineOutcome {
         paradigm: learning.paradigm,
         pois,
         teams: learning.teams() * (learning.generations + 1),
@@ -127,7 +128,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         constant: found(observed(&|outcome| outcome.constants[outcome.best_constant]), moves),
         action: found(observed(&|outcome| outcome.action), true),
         network: found(observed(&|outcome| outcome.network), true),
-        processor: Processor::of(machine, &backend.describe()),
+        processor: ProcessorInfo::of(machine, &backend.describe()),
         actions,
         moves,
     })

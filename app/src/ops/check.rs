@@ -13,10 +13,10 @@ use flotilla::parallel;
 use flotilla::reach;
 use flotilla::world::World;
 
-/// Request of a check.
+/// CheckRequest of a check.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Request {
+pub struct CheckRequest {
     /// The config.
     pub config: ConfigText,
     /// The name of the layout, for the picture.
@@ -28,7 +28,7 @@ pub struct Request {
 
 /// Results of a check.
 #[derive(Clone, Debug, Serialize)]
-pub struct Outcome {
+pub struct CheckOutcome {
     /// The config with all defaults.
     pub config: Config,
     /// The cost of a run.
@@ -38,10 +38,7 @@ pub struct Outcome {
 }
 
 /// Checks a config.
-///
-/// # Errors
-/// The config is invalid, or the picture cannot be written.
-pub fn run(request: &Request, context: Context<'_>) -> Result<Outcome, Error> {
+pub fn run(request: &CheckRequest, context: Context<'_>) -> Result<CheckOutcome, Error> {
     output::check(&[("--out", request.out.as_deref())], &[])?;
     let picture = request.out.as_deref().map(|out| Ok::<_, Error>((out, plot::kind_of(out)?))).transpose()?;
     let (config, notes) = request.config.read_noted(context)?;
@@ -49,7 +46,7 @@ pub fn run(request: &Request, context: Context<'_>) -> Result<Outcome, Error> {
         output::write(out, &plot::content(&map::layout(&request.name, config.as_ref()), kind, out)?)?;
     }
     context.warn_of_unreachable(&config);
-    Ok(Outcome { cost: Cost::of(&config), config: config.into_config(), notes })
+    Ok(CheckOutcome { cost: Cost::of(&config), config: config.into_config(), notes })
 }
 
 /// The cost of a whole run: all trials, all generations including the random start, all teams and the champions.

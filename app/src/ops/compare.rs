@@ -18,10 +18,10 @@ use flotilla::escape::PathExt;
 use flotilla::file;
 use flotilla::statistics;
 
-/// Request of a comparison.
+/// CompareRequest of a comparison.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Request {
+pub struct CompareRequest {
     /// Folders of runs, two at least, or the folder of one sweep.
     pub folders: Vec<PathBuf>,
     /// The axis of a sweep whose values are compared. The default is the only axis.
@@ -50,9 +50,6 @@ fn reach() -> f64 {
 }
 
 /// Parses a generation to compare at.
-///
-/// # Errors
-/// The text is neither a number nor `last`.
 pub fn at(text: &str) -> Result<At, String> {
     match text {
         "last" => Ok(At::Last),
@@ -62,7 +59,7 @@ pub fn at(text: &str) -> Result<At, String> {
 
 /// Results of a comparison.
 #[derive(Clone, Debug, Serialize)]
-pub struct Outcome {
+pub struct CompareOutcome {
     /// The confidence of every interval.
     pub confidence: f64,
     /// The test: `mann-whitney` or `wilcoxon`.
@@ -82,10 +79,7 @@ pub struct Outcome {
 type Contest = (String, Vec<Cohort>);
 
 /// Compares runs, or points of a sweep.
-///
-/// # Errors
-/// A run cannot be read, or there is nothing to compare.
-pub fn run(args: &Request, context: Context<'_>) -> Result<Outcome, Error> {
+pub fn run(args: &CompareRequest, context: Context<'_>) -> Result<CompareOutcome, Error> {
     let at = args.at.iter().map(|text| at(text).map_err(|error| Error::Usage(format!("--at {text}: {error}").into())));
     let question = Question { at: at.collect::<Result<_, _>>()?, reach: args.reach, paired: args.paired };
     if args.folders.is_empty() {
@@ -129,7 +123,7 @@ pub fn run(args: &Request, context: Context<'_>) -> Result<Outcome, Error> {
         notes.push("these arms have the same seeds, so their trials are pairs: --paired compares pair by pair".into());
     }
     report(&notes[reported..]);
-    Ok(Outcome {
+    Ok(CompareOutcome {
         confidence: statistics::CONFIDENCE,
         test: if args.paired { "wilcoxon" } else { "mann-whitney" },
         comparisons: all,
@@ -140,7 +134,7 @@ pub fn run(args: &Request, context: Context<'_>) -> Result<Outcome, Error> {
 }
 
 /// Reads every run as an arm, named after what sets it apart from the others.
-fn of_runs(folders: &[PathBuf], args: &Request, notes: &mut Vec<String>) -> Result<Vec<Cohort>, Error> {
+fn of_runs(folders: &[PathBuf], args: &CompareRequest, notes: &mut Vec<String>) -> Result<Vec<Cohort>, Error> {
     let verification = Verification::unless(args.unverified);
     if let Some(by) = &args.by {
         return Err(Error::Usage(
@@ -200,7 +194,7 @@ fn copies(folders: &[PathBuf], configs: &[Config]) -> Vec<String> {
 }
 
 /// Returns the values of an axis as arms, for each combination of the other axes. Notes list the points without runs.
-fn of_sweep(out: &Path, args: &Request, notes: &mut Vec<String>) -> Result<Vec<Contest>, Error> {
+fn of_sweep(out: &Path, args: &CompareRequest, notes: &mut Vec<String>) -> Result<Vec<Contest>, Error> {
     let sweep = Sweep::load(&out.join(SWEEP), &[], false)?;
     let keys = || sweep.axes.iter().map(|axis| &*axis.key).collect::<Vec<_>>().join(", ");
     let by = match (&args.by, sweep.axes.len()) {
@@ -217,30 +211,23 @@ fn of_sweep(out: &Path, args: &Request, notes: &mut Vec<String>) -> Result<Vec<C
     for group in sweep.arms(by) {
         let mut arms = Vec::new();
         for (name, points) in group.arms {
-            let mut folders = Vec::new();
+            let mut arm = Cohort::read(name, vec![], verification)?;
             for point in points {
                 let folder = results::point_folder(out, point);
-                let read = runs::config(&folder, verification)
-                    .and_then(|config| runs::metrics(&folder, &config, verification, |_| {}).map(|()| config));
-                match read {
-                    Ok(config) if record::without_checkpoint(&config) == record::without_checkpoint(&point.config) => {
-                        folders.push(folder);
-                    }
+                match arm.add(folder.clone(), verification) {
+                    Ok(config) if record::without_checkpoint(&config) == record::without_checkpoint(&point.config) => {}
                     Ok(_) => {
                         return Err(Error::Refused(format!("{} is a run of another config", folder.escaped()).into()));
                     }
                     Err(ReadError::Missing(_) | ReadError::Unfinished { .. }) => {
-                        notes.push(format!(
-                            "{} was not run, and is left out: {}",
-                            folder.escaped(),
-                            sweep.describe(point)
-                        ));
+                        let point = sweep.describe(point);
+                        notes.push(format!("{} was not run, and is left out: {point}", folder.escaped()));
                     }
                     Err(error) => return Err(error.into()),
                 }
             }
-            if !folders.is_empty() {
-                arms.push(Cohort::read(name, folders, verification)?);
+            if !arm.folders.is_empty() {
+                arms.push(arm);
             }
         }
         too_many(arms.len(), "values")?;

@@ -5,7 +5,6 @@ use std::io;
 
 use serde::ser::{Serialize, SerializeStruct, Serializer};
 
-use super::remedy;
 use crate::record::RecordError;
 use crate::report::comparison::ComparisonError;
 use crate::report::replay::ReplayError;
@@ -53,53 +52,73 @@ impl Display for MessageWithRemedy {
     }
 }
 
+impl From<&DeviceError> for MessageWithRemedy {
+    fn from(error: &DeviceError) -> MessageWithRemedy {
+        MessageWithRemedy { message: error.to_string(), remedy: device_help(error).map(String::from) }
+    }
+}
+
+/// Returns advice on a device that could not be opened, or that failed. The engine does not know the flags.
+fn device_help(error: &DeviceError) -> Option<&'static str> {
+    Some(match error {
+        DeviceError::NoRealAdapter { .. } => {
+            "an adapter that may be a software renderer is used only with --adapter (--adapter 0); --backend cpu is faster"
+        }
+        DeviceError::Refused { .. } | DeviceError::Inexact { .. } => {
+            "choose another with --adapter, or use --backend cpu"
+        }
+        DeviceError::Lost { .. } => "run again, or use --backend cpu",
+        DeviceError::OutOfMemory { .. } | DeviceError::TooLarge { .. } => "or use --backend cpu",
+        DeviceError::NoAdapter | DeviceError::Failed { .. } => "use --backend cpu",
+        DeviceError::UnknownAdapter { found, .. } if found.is_empty() => "use --backend cpu",
+        DeviceError::UnknownAdapter { .. } | DeviceError::Shader { .. } => return None,
+    })
+}
+
+/// Returns advice on episodes that could not be played.
+fn backend_help(error: &BackendError) -> Option<&'static str> {
+    match error {
+        BackendError::Gpu(error) => device_help(error),
+        BackendError::TooLarge(_) => Some("pass --backend cpu, or --breed host"),
+        BackendError::Gone => Some("run it again"),
+        BackendError::InvalidInput(_) | BackendError::HeldElsewhere => None,
+    }
+}
+
 /// The error of a use case.
 ///
 /// It serialises as `code`, `message` and `remedy`, which is null if there is no advice. Its text is the message with
 /// the remedy.
 #[derive(Debug, thiserror::Error)]
+#[error("{}", MessageWithRemedy { message: self.message(), remedy: self.remedy() })]
 pub enum Error {
     /// A config that cannot be read or is invalid.
-    #[error("{}{}", .0, remedy::config(.0))]
     Config(#[from] ConfigError),
     /// A GPU that could not be opened, or episodes that could not be played.
-    #[error("{}{}", .0, remedy::backend(.0))]
     Backend(#[from] BackendError),
     /// There is no GPU to compare with the CPU.
-    #[error("{}{}", .0, remedy::NONE_TO_VERIFY)]
     NoneToVerify(DeviceError),
     /// Files of runs that could not be written, read or used.
-    #[error("{}{}", .0, remedy::record(.0, "run it again"))]
     Record(#[from] RecordError),
     /// A run that could not continue.
-    #[error("{}{}", .0, remedy::run(.0))]
     Run(#[from] RunError),
     /// A run that could not be read to show it.
-    #[error("{}{}", .0, remedy::read(.0))]
     Read(#[from] ReadError),
     /// An episode that could not be replayed.
-    #[error("{}{}", .0, remedy::replayed(.0))]
     Replayed(#[from] ReplayError),
     /// Results that could not be printed.
-    #[error("standard output cannot be written: {0}")]
     Output(io::Error),
     /// Signal handlers that could not be installed.
-    #[error("signal handlers cannot be installed: {0}")]
     Signals(io::Error),
     /// Wrong usage that is only found when flags are read together.
-    #[error("{0}")]
     Usage(MessageWithRemedy),
     /// Results that differ but should be equal.
-    #[error("{0}")]
     Different(MessageWithRemedy),
     /// A command that is refused, for example because it would overwrite files.
-    #[error("{0}")]
     Refused(MessageWithRemedy),
     /// Results that do not exist yet.
-    #[error("{0}")]
     Missing(MessageWithRemedy),
     /// Stopped by a signal. Runs are saved and can be resumed.
-    #[error("{0}")]
     Stopped(MessageWithRemedy),
 }
 
@@ -145,30 +164,47 @@ impl Error {
 
     /// Returns what went wrong, without advice.
     pub fn message(&self) -> String {
-        match self {
-            Error::Config(error) => error.to_string(),
-            Error::Backend(error) => error.to_string(),
-            Error::NoneToVerify(error) => error.to_string(),
-            Error::Record(error) => error.to_string(),
-            Error::Run(error) => error.to_string(),
-            Error::Read(error) => error.to_string(),
-            Error::Replayed(error) => error.to_string(),
+        let error: &dyn Display = match self {
+            Error::Config(error) => error,
+            Error::Backend(error) => error,
+            Error::NoneToVerify(error) => error,
+            Error::Record(error) => error,
+            Error::Run(error) => error,
+            Error::Read(error) => error,
+            Error::Replayed(error) => error,
+            Error::Output(error) => &format!("standard output cannot be written: {error}"),
+            Error::Signals(error) => &format!("signal handlers cannot be installed: {error}"),
             Error::Usage(text)
             | Error::Different(text)
             | Error::Refused(text)
             | Error::Missing(text)
-            | Error::Stopped(text) => text.message.clone(),
-            Error::Output(_) | Error::Signals(_) => self.to_string(),
-        }
+            | Error::Stopped(text) => &text.message,
+        };
+        error.to_string()
     }
 
     /// Returns the remedy, if there is one.
     pub fn remedy(&self) -> Option<String> {
-        let (whole, message) = (self.to_string(), self.message());
-        // The library's errors are followed by advice in the same sentence.
-        let advice = whole.strip_prefix(&message)?.trim_start_matches([';', ',', ':', ' ', '\n']);
-        let advice = advice.strip_prefix('(').and_then(|inner| inner.strip_suffix(')')).unwrap_or(advice);
-        (!advice.is_empty()).then(|| advice.to_string())
+        let help = match self {
+            Error::Config(ConfigError::Unreadable { is_missing: true, .. }) => {
+                Some("check the path, or write a config with `flotilla init`")
+            }
+            Error::Backend(error) | Error::Replayed(ReplayError::Backend(error)) => backend_help(error),
+            Error::NoneToVerify(_) => Some("--adapter cpu compares the processor's instruction sets"),
+            Error::Replayed(ReplayError::NoGeneration { newest: Some(_), .. }) => {
+                Some("or finish the run with --resume")
+            }
+            Error::Record(error) => return error.help("run it again"),
+            Error::Run(error) => return error.help(),
+            Error::Read(error) | Error::Replayed(ReplayError::Run(error)) => return error.help(),
+            Error::Usage(text)
+            | Error::Different(text)
+            | Error::Refused(text)
+            | Error::Missing(text)
+            | Error::Stopped(text) => return text.remedy.clone(),
+            Error::Config(_) | Error::Replayed(_) | Error::Output(_) | Error::Signals(_) => None,
+        };
+        help.map(String::from)
     }
 
     /// Adds a remedy to wrong usage, a missing result, a refused request or a stop, unless it has one. The caller knows

@@ -10,7 +10,7 @@
 //!
 //! let text = flotilla::config::LAYOUTS[2].1.into();
 //! let config = ConfigText { text, name: "chaotic.toml".into(), set: vec![] };
-//! let request = check::Request { config, name: "chaotic".into(), out: None };
+//! let request = check::CheckRequest { config, name: "chaotic".into(), out: None };
 //! let found = check::run(&request, Context::new(&|_| ()))?;
 //! println!("{} teams play {} steps", found.cost.teams, found.cost.team_steps);
 //! # Ok::<(), ops::Error>(())
@@ -55,7 +55,6 @@ pub mod error;
 pub mod output;
 pub mod plot;
 mod points;
-mod remedy;
 pub mod replay;
 pub mod rollout;
 pub mod sweep;
@@ -63,7 +62,6 @@ pub mod train;
 pub mod verify;
 
 pub use error::{Error, MessageWithRemedy, with_remedy};
-pub use remedy::{RUNS, device as advice_on_device};
 
 /// An event while a use case runs.
 pub enum Event<'a> {
@@ -208,9 +206,6 @@ impl Context<'_> {
 /// Opens the backend when it is needed, so that requests are checked first.
 pub trait BackendSource {
     /// Returns the backend that plays some work, and its description for people.
-    ///
-    /// # Errors
-    /// It cannot be opened.
     fn open(&mut self, work: Work) -> Result<(&mut OpenBackend, String), Error>;
 }
 
@@ -236,9 +231,6 @@ pub struct ConfigText {
 
 impl ConfigText {
     /// Reads the config.
-    ///
-    /// # Errors
-    /// The text or a key is invalid. The error lists the problems.
     pub fn read(&self) -> Result<Config, Error> {
         Ok(Config::read(&self.text, &self.name, &[], &self.set)?)
     }
@@ -257,9 +249,6 @@ fn escaped<S: serde::Serializer>(path: &Path, serializer: S) -> Result<S::Ok, S:
 }
 
 /// Refuses configs that need more memory than there is, each alone.
-///
-/// # Errors
-/// A config needs more memory than there is.
 pub fn check_memory<'a>(
     configs: impl IntoIterator<Item = &'a ValidConfig>,
     (_, machine): &OpenBackend,
@@ -273,7 +262,7 @@ pub fn check_memory<'a>(
 
 /// The processor that episodes were played on, with the names that `run.json` has.
 #[derive(Clone, Debug, Serialize)]
-pub struct Processor {
+pub struct ProcessorInfo {
     /// "cpu" or "gpu".
     pub backend: String,
     /// The processor in words.
@@ -286,17 +275,17 @@ pub struct Processor {
     pub threads: usize,
 }
 
-impl Processor {
+impl ProcessorInfo {
     /// Describes the processor of an open backend.
-    pub fn of(machine: &Machine, description: &str) -> Processor {
+    pub fn of(machine: &Machine, description: &str) -> ProcessorInfo {
         let Machine { backend, adapter, driver, threads, .. } = machine.clone();
-        Processor { backend, description: description.into(), adapter, driver, threads }
+        ProcessorInfo { backend, description: description.into(), adapter, driver, threads }
     }
 
     /// Returns the processor of a run's last session.
-    pub fn of_run(run: &Run) -> Processor {
+    pub fn of_run(run: &Run) -> ProcessorInfo {
         let Run { backend, description, adapter, driver, threads, .. } = run.clone();
-        Processor { backend, description, adapter, driver, threads }
+        ProcessorInfo { backend, description, adapter, driver, threads }
     }
 
     /// Adds the fields to a JSON object.

@@ -43,7 +43,7 @@ impl Destination {
             Destination::Named(_) => return Ok(()),
             Destination::OfRun(_) => ownership::check(&self.disk()?, [path])?,
             Destination::Here(_) if path.symlink_metadata().is_err() || ownership::is_drawing(path) => {}
-            Destination::Here(_) => return Err(RecordError::NotOurs { path: path.into() }),
+            Destination::Here(_) => return Err(RecordError::NotOurs(path.into())),
         }
         check_folder(file::folder(path)).map_err(RecordError::write(path))
     }
@@ -133,18 +133,12 @@ fn check_folder(folder: &Path) -> io::Result<()> {
 }
 
 /// Writes a file as [`write_with`] does.
-///
-/// # Errors
-/// Fails if the file cannot be written.
 pub fn write(path: &Path, content: &[u8]) -> Result<(), Error> {
     write_with(path, |output| output.write_all(content))
 }
 
 /// Writes a file completely or not at all. A pipe blocks until a reader opens it. In the folder of a run, sweep or
 /// paper no link is followed, because other users may write there.
-///
-/// # Errors
-/// Fails if the file cannot be written.
 pub fn write_with(path: &Path, content: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> Result<(), Error> {
     let opened = report_waiting_later(path);
     let content = |output: &mut dyn Write| {
@@ -156,9 +150,6 @@ pub fn write_with(path: &Path, content: impl FnOnce(&mut dyn Write) -> io::Resul
 }
 
 /// Writes a file that must not exist yet.
-///
-/// # Errors
-/// Fails if the file exists or cannot be written.
 pub fn write_new(path: &Path, content: &[u8]) -> Result<(), Error> {
     let created = OpenOptions::new().write(true).create_new(true).open(path);
     let written = match created {

@@ -14,10 +14,10 @@ use crate::report::runs::{self, MAX_RUNS, TeamKind};
 use crate::report::scene::{Format, Scene};
 use flotilla::escape::PathExt;
 
-/// Request of a picture of learning curves.
+/// PlotRequest of a picture of learning curves.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Request {
+pub struct PlotRequest {
     /// Folders of runs.
     pub runs: Vec<PathBuf>,
     /// The picture. By default `curves.svg` in the folder of one run, or `comparison.svg` here of several.
@@ -36,7 +36,7 @@ pub struct Request {
 
 /// The picture.
 #[derive(Clone, Debug, Serialize)]
-pub struct Outcome {
+pub struct PlotOutcome {
     /// The file.
     #[serde(serialize_with = "escaped")]
     pub out: PathBuf,
@@ -47,10 +47,7 @@ pub struct Outcome {
 }
 
 /// Draws the curves of runs.
-///
-/// # Errors
-/// A run cannot be read, or the picture cannot be written.
-pub fn run(request: &Request, context: Context<'_>) -> Result<Outcome, Error> {
+pub fn run(request: &PlotRequest, context: Context<'_>) -> Result<PlotOutcome, Error> {
     let verification = Verification::unless(request.unverified);
     if request.runs.len() > MAX_RUNS {
         let text = format!("{} runs are too many to tell apart", request.runs.len());
@@ -73,7 +70,7 @@ pub fn run(request: &Request, context: Context<'_>) -> Result<Outcome, Error> {
         );
     }
     let named = runs.iter().map(|run| run.escaped().to_string()).collect();
-    Ok(Outcome { out: out.into(), runs: named, unverified: request.unverified })
+    Ok(PlotOutcome { out: out.into(), runs: named, unverified: request.unverified })
 }
 
 /// Returns the format of a picture, from the extension of its file name.

@@ -15,9 +15,6 @@ use flotilla::escape::PathExt;
 const MAX_LISTED_POINTS: usize = 40;
 
 /// Reads a run's config. If the folder is a sweep's, the error lists its points with their values.
-///
-/// # Errors
-/// Fails if the folder is not a run's folder, or if its config is damaged.
 pub fn config(folder: &Path, verification: Verification) -> Result<Config, Error> {
     runs::config(folder, verification).map_err(|error| match error {
         ReadError::Collection { what: "a sweep", .. } => match Sweep::load(&folder.join(SWEEP), &[], false) {

@@ -13,16 +13,17 @@ use crate::record::digests::Verification;
 use crate::record::disk::Disk;
 use crate::record::ownership::{self, REPLAY};
 use crate::report::curves::PRINT;
-use crate::report::replay::{self, FPS, Film, History, ReplayError, Replayed, Which};
+use crate::report::replay::{self, FPS, Film, ReplayError, Replayed, Which};
+use crate::report::runs;
 use crate::report::scene::Format;
 use flotilla::config::{Config, Learning, ValidConfig};
 use flotilla::escape::PathExt;
 use flotilla::file;
 
-/// Request of a replay.
+/// ReplayRequest of a replay.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Request {
+pub struct ReplayRequest {
     /// A run's folder.
     pub folder: PathBuf,
     /// The trial. The first by default.
@@ -56,7 +57,7 @@ pub struct Request {
 
 /// Results of a replay.
 #[derive(Clone, Debug, Serialize)]
-pub struct Outcome {
+pub struct ReplayOutcome {
     /// The written files.
     #[serde(flatten)]
     pub written: Written,
@@ -157,9 +158,6 @@ impl std::str::FromStr for WhichTrial {
 
 impl WhichTrial {
     /// Returns the trial's number in a run.
-    ///
-    /// # Errors
-    /// The run cannot be read or lacks the generation.
     pub fn find(
         self,
         folder: &Path,
@@ -178,11 +176,12 @@ impl WhichTrial {
 }
 
 /// Replays episodes, and writes them.
-///
-/// # Errors
-/// The run cannot be read, the request does not fit it, the backend fails, or a file cannot be written.
-pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
-    let Request { generation, team, compare, step, width, fps, unverified, .. } = *request;
+pub fn run(
+    request: &ReplayRequest,
+    backends: &mut dyn BackendSource,
+    context: Context<'_>,
+) -> Result<ReplayOutcome, Error> {
+    let ReplayRequest { generation, team, compare, step, width, fps, unverified, .. } = *request;
     let verification = Verification::unless(unverified);
     let folder = &*request.folder;
     let place = match &request.out {
@@ -197,7 +196,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let generation = match generation {
         Some(generation) => generation,
         None if trial < config.learning.trials => {
-            History::read(folder, &config, trial, verification)?.newest().unwrap_or(0)
+            runs::trials(folder, &config, verification)?[trial].len().saturating_sub(1)
         }
         None => 0,
     };
@@ -270,9 +269,6 @@ pub fn play(
 }
 
 /// Returns the config that all the generations play with.
-///
-/// # Errors
-/// The generations cannot be shown side by side, because their worlds differ.
 fn stage<'a>(config: &'a ValidConfig, generations: &[usize]) -> Result<&'a Config, Error> {
     let refused = |text: String| Err(Error::Usage(text.into()));
     let first = generations.first().copied().unwrap_or(0);
@@ -288,9 +284,6 @@ fn stage<'a>(config: &'a ValidConfig, generations: &[usize]) -> Result<&'a Confi
 
 /// Checks the output, and creates the folder of a film. Called before the trial is trained again, which may take hours.
 /// `run` is the run's folder.
-///
-/// # Errors
-/// The file cannot be written, or would overwrite a file of the run.
 fn prepare_output(place: &Destination, kind: &Form, run: &Path) -> Result<(), Error> {
     let Destination::Named(out) = place else { return Ok(place.check()?) };
     if matches!(kind, Form::Film(_)) {
@@ -299,9 +292,9 @@ fn prepare_output(place: &Destination, kind: &Form, run: &Path) -> Result<(), Er
     output::check(&[("--out", Some(out.as_path()))], &[run])
 }
 
-fn outcome(written: Written, played: &[Replayed]) -> Outcome {
+fn outcome(written: Written, played: &[Replayed]) -> ReplayOutcome {
     let unverified = played.iter().any(|played| played.unverified);
-    Outcome { written, episodes: played.iter().map(Episode::of).collect(), unverified }
+    ReplayOutcome { written, episodes: played.iter().map(Episode::of).collect(), unverified }
 }
 
 /// Writes one numbered picture per moment. The folder must exist.
@@ -311,7 +304,7 @@ fn write_film(numbered: &Numbered, out: &Path, frames: &replay::Frames<'_>) -> R
     if let Some(path) =
         (0..count).map(place).find(|path| path.symlink_metadata().is_ok() && !ownership::is_drawing(path))
     {
-        return Err(RecordError::NotOurs { path }.into());
+        return Err(RecordError::NotOurs(path).into());
     }
     let disk = ownership::open_output_folder(&Disk::default(), file::folder(out), true)?;
     for (number, &moment) in frames.places.iter().enumerate() {
@@ -363,8 +356,8 @@ impl Form {
     }
 
     /// Rejects flags that have no effect.
-    fn takes(&self, out: &Path, request: &Request) -> Result<(), Error> {
-        let Request { width, fps, step, .. } = request;
+    fn takes(&self, out: &Path, request: &ReplayRequest) -> Result<(), Error> {
+        let ReplayRequest { width, fps, step, .. } = request;
         let moves = matches!(self, Form::Gif | Form::Film(_));
         let pixels = moves || matches!(self, Form::Still(Format::Png));
         let unused = [

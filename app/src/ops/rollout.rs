@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::{BackendSource, ConfigText, Context, Error, Processor, output, points, with_remedy};
+use super::{BackendSource, ConfigText, Context, Error, ProcessorInfo, output, points, with_remedy};
 use crate::choice::Work;
 use crate::record::digests::{Digests, Verification};
 use crate::record::{folder, policies, tensors};
@@ -25,10 +25,10 @@ const STATES: &str = "team,step,agent,role,x,y,heading_x,heading_y,speed";
 const SENSED: &str = "pois_back_right,pois_front_right,pois_front_left,pois_back_left,\
                       agents_back_right,agents_front_right,agents_front_left,agents_back_left,turn_output,speed_output";
 
-/// Request of a rollout.
+/// RolloutRequest of a rollout.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Request {
+pub struct RolloutRequest {
     /// A run's folder, or a config file.
     pub path: PathBuf,
     /// Config keys to set.
@@ -62,7 +62,7 @@ pub struct Request {
 
 /// Results of a rollout.
 #[derive(Clone, Debug, Serialize)]
-pub struct Outcome {
+pub struct RolloutOutcome {
     /// Number of teams.
     pub teams: usize,
     /// Leaders per team.
@@ -87,7 +87,7 @@ pub struct Outcome {
     pub unverified: bool,
     /// The processor.
     #[serde(flatten)]
-    pub processor: Processor,
+    pub processor: ProcessorInfo,
 }
 
 /// The best team.
@@ -100,7 +100,7 @@ pub struct Best {
     pub spread: Spread,
 }
 
-impl Request {
+impl RolloutRequest {
     /// Returns where episodes start, given the config's jitters.
     fn starts(&self, jitter: f64, poi_jitter: f64) -> Result<Starts, Error> {
         let (Some(episodes), seed) = (self.episodes, self.seed.unwrap_or(0)) else { return Ok(Starts::Own) };
@@ -115,10 +115,11 @@ impl Request {
 }
 
 /// Plays the teams. Team j consists of policy j of every leader.
-///
-/// # Errors
-/// The config or the policies cannot be used, the backend fails, or a file cannot be written.
-pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
+pub fn run(
+    request: &RolloutRequest,
+    backends: &mut dyn BackendSource,
+    context: Context<'_>,
+) -> Result<RolloutOutcome, Error> {
     let path = &request.path;
     let (config_path, trained) = match path.is_dir() {
         true => {
@@ -187,7 +188,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         Starts::Own => (None, None, None),
     };
     let best = evaluation.best();
-    Ok(Outcome {
+    Ok(RolloutOutcome {
         teams: evaluation.observed.len(),
         leaders: evaluation.leaders,
         pois: evaluation.pois,
@@ -199,7 +200,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         best: Best { team: best, spread: evaluation.team(best) },
         mean: evaluation.mean(),
         unverified: request.unverified,
-        processor: Processor::of(machine, &backend.describe()),
+        processor: ProcessorInfo::of(machine, &backend.describe()),
     })
 }
 

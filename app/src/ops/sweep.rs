@@ -32,10 +32,10 @@ use flotilla::memory;
 use flotilla::reach::{self, Unreachable};
 use flotilla::statistics;
 
-/// Request to train or collect a sweep.
+/// SweepRequest to train or collect a sweep.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Request {
+pub struct SweepRequest {
     /// The text of the sweep file.
     pub text: String,
     /// The file's name in errors.
@@ -60,13 +60,13 @@ pub struct Request {
     pub memory: Option<usize>,
     /// How results are collected.
     #[serde(default)]
-    pub results: Results,
+    pub results: ResultOptions,
 }
 
 /// How the results of a sweep are collected.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct Results {
+pub struct ResultOptions {
     /// Generations per row of `results.csv`.
     pub every: usize,
     /// G whose first generation is reported, 0 to 1.
@@ -81,18 +81,15 @@ pub struct Results {
     pub band: Band,
 }
 
-impl Default for Results {
-    fn default() -> Results {
+impl Default for ResultOptions {
+    fn default() -> ResultOptions {
         let (measure, band) = (TeamKind::default(), Band::default());
-        Results { every: 1, reach: 0.75, unverified: false, axes: vec![], measure, band }
+        ResultOptions { every: 1, reach: 0.75, unverified: false, axes: vec![], measure, band }
     }
 }
 
-impl Request {
+impl SweepRequest {
     /// Reads the sweep.
-    ///
-    /// # Errors
-    /// The text or a point is invalid.
     pub fn read(&self) -> Result<Sweep, Error> {
         Ok(Sweep::read(&self.text, &self.name, &self.set, self.skip_impossible)?)
     }
@@ -112,15 +109,15 @@ pub struct PointOutcome {
     pub missing: Option<String>,
     /// The results.
     #[serde(flatten)]
-    pub found: Option<Found>,
+    pub found: Option<PointScores>,
     /// The values for people.
     #[serde(skip)]
     pub described: String,
 }
 
-/// Results of a finished point.
+/// ResultOptions of a finished point.
 #[derive(Clone, Debug, Serialize)]
-pub struct Found {
+pub struct PointScores {
     /// The run's digest.
     pub digest: Option<String>,
     /// G of the champion in the last generation, mean over trials.
@@ -150,7 +147,7 @@ pub struct Files {
 
 /// The results of a sweep.
 #[derive(Clone, Debug, Serialize)]
-pub struct Outcome {
+pub struct SweepOutcome {
     /// The folder.
     pub folder: String,
     /// The sweep's name.
@@ -168,7 +165,7 @@ pub struct Outcome {
     pub text: String,
 }
 
-impl Outcome {
+impl SweepOutcome {
     /// Returns an error that names the points without results, if there are any.
     pub fn missing(&self) -> Option<Error> {
         let missing = |point: &PointOutcome| {
@@ -192,10 +189,11 @@ impl Outcome {
 }
 
 /// Trains all points, and collects their results.
-///
-/// # Errors
-/// The sweep is invalid, the folder cannot be used, or training fails or is stopped.
-pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
+pub fn run(
+    request: &SweepRequest,
+    backends: &mut dyn BackendSource,
+    context: Context<'_>,
+) -> Result<SweepOutcome, Error> {
     let sweep = request.read()?;
     let axes = picture_axes(&sweep, &request.results.axes)?;
     let disk = train(request, &sweep, backends, context)?;
@@ -203,9 +201,6 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
 }
 
 /// Returns the axes that pictures have across and down.
-///
-/// # Errors
-/// A name is no axis of the sweep.
 pub fn picture_axes(sweep: &Sweep, names: &[String]) -> Result<Vec<usize>, Error> {
     let find = |name: &String| {
         let keys = || sweep.axes.iter().map(|axis| &*axis.key).collect::<Vec<_>>().join(", ");
@@ -226,7 +221,7 @@ pub fn picture_axes(sweep: &Sweep, names: &[String]) -> Result<Vec<usize>, Error
 pub fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
     let path = out.join(SWEEP);
     if out.is_file() {
-        return Err(RecordError::NoFolder { path: out.into() }.into());
+        return Err(RecordError::NoFolder(out.into()).into());
     }
     let refuse = |message: String| {
         let problems = vec![Problem { line: None, key: String::new(), message }];
@@ -285,7 +280,7 @@ pub fn claim(disk: &Disk, sweep: &Sweep, out: &Path) -> Result<(), Error> {
 }
 
 /// Checks the numbers of a request. The command line checks its own flags, other callers may not.
-fn check(results: &Results) -> Result<(), Error> {
+fn check(results: &ResultOptions) -> Result<(), Error> {
     match results.every {
         0 => Err(Error::Usage("--every 0: allowed 1 or more".into())),
         _ => Ok(()),
@@ -301,11 +296,8 @@ fn open_folder(out: &Path, named: bool) -> Result<Disk, Error> {
 }
 
 /// Trains the points of a request's shard. Returns the disk in the sweep's folder.
-///
-/// # Errors
-/// The folder cannot be used, or training fails or is stopped.
 pub fn train(
-    request: &Request,
+    request: &SweepRequest,
     sweep: &Sweep,
     backends: &mut dyn BackendSource,
     context: Context<'_>,
@@ -458,10 +450,7 @@ pub fn free_memory() -> usize {
 }
 
 /// Collects the results that exist, and draws them.
-///
-/// # Errors
-/// The folder holds no such sweep, or files cannot be written.
-pub fn collect(request: &Request, sweep: &Sweep, axes: &[usize]) -> Result<Outcome, Error> {
+pub fn collect(request: &SweepRequest, sweep: &Sweep, axes: &[usize]) -> Result<SweepOutcome, Error> {
     let out = &*request.out;
     if !runs::exists(&out.join(SWEEP))? {
         return Err(Error::Usage(format!("{} holds no sweep", out.escaped()).into()));
@@ -475,14 +464,14 @@ pub fn collect(request: &Request, sweep: &Sweep, axes: &[usize]) -> Result<Outco
 
 /// Writes the results of the points in `place`, which is the sweep's folder, and the pictures.
 fn write_results(
-    request: &Request,
+    request: &SweepRequest,
     sweep: &Sweep,
     axes: &[usize],
     disk: &Disk,
     place: Place<'_>,
-) -> Result<Outcome, Error> {
+) -> Result<SweepOutcome, Error> {
     let out = place.path();
-    let Results { every, reach, unverified, measure, band, .. } = request.results;
+    let ResultOptions { every, reach, unverified, measure, band, .. } = request.results;
     let options = results::Detail { every, reach, verification: Verification::unless(unverified), measure, band };
     let folders: Vec<PathBuf> = sweep.points.iter().map(|point| results::point_folder(out, point)).collect();
     let outcomes = results::write(sweep, place, &options, disk)?;
@@ -505,25 +494,26 @@ fn write_results(
     text.extend(note.map(|note| note + "\n"));
     text += &if unverified { format!("{UNVERIFIED}\n") } else { String::new() };
     let path = |name: &str| out.join(name).escaped().to_string();
-    let point = |((point, outcome), folder): ((&Point, &Result<results::Outcome, Missing>), &PathBuf)| PointOutcome {
-        point: point.index,
-        folder: folder.escaped().to_string(),
-        values: (sweep.axes.iter().zip(&point.values))
-            .map(|(axis, &value)| (axis.key.clone(), serde_json::json!(axis.values[value])))
-            .collect(),
-        missing: outcome.as_ref().err().map(ToString::to_string),
-        found: outcome.as_ref().ok().map(|outcome| Found {
-            digest: Run::read(place.at(&folder.join(RUN))).ok().and_then(|run| run.digest),
-            champion_g: outcome.champion.mean(),
-            champion_g_interval_95: statistics::bounded(&outcome.champion, [0.0, 1.0])
-                .map(|mean| [mean.low, mean.high]),
-            best_g: outcome.best.mean(),
-            reached: outcome.reached.iter().flatten().count(),
-            median: outcome.median_reached(),
-        }),
-        described: sweep.describe(point),
-    };
-    Ok(Outcome {
+    let point =
+        |((point, outcome), folder): ((&Point, &Result<results::PointResults, Missing>), &PathBuf)| PointOutcome {
+            point: point.index,
+            folder: folder.escaped().to_string(),
+            values: (sweep.axes.iter().zip(&point.values))
+                .map(|(axis, &value)| (axis.key.clone(), serde_json::json!(axis.values[value])))
+                .collect(),
+            missing: outcome.as_ref().err().map(ToString::to_string),
+            found: outcome.as_ref().ok().map(|outcome| PointScores {
+                digest: Run::read(place.at(&folder.join(RUN))).ok().and_then(|run| run.digest),
+                champion_g: outcome.champion.mean(),
+                champion_g_interval_95: statistics::bounded(&outcome.champion, [0.0, 1.0])
+                    .map(|mean| [mean.low, mean.high]),
+                best_g: outcome.best.mean(),
+                reached: outcome.reached.iter().flatten().count(),
+                median: outcome.median_reached(),
+            }),
+            described: sweep.describe(point),
+        };
+    Ok(SweepOutcome {
         folder: out.escaped().to_string(),
         sweep: sweep.name.clone(),
         reach,
@@ -540,7 +530,7 @@ fn write_results(
 }
 
 /// Returns the results for people: the best and the worst points.
-fn summary(sweep: &Sweep, outcomes: &[Result<results::Outcome, Missing>], options: &results::Detail) -> String {
+fn summary(sweep: &Sweep, outcomes: &[Result<results::PointResults, Missing>], options: &results::Detail) -> String {
     const LISTED: usize = 12;
     let done = sweep.points.iter().zip(outcomes).filter_map(|(point, outcome)| Some((point, outcome.as_ref().ok()?)));
     let mut done: Vec<_> = done.map(|(point, outcome)| (outcome.measured(), point, outcome)).collect();

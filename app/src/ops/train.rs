@@ -8,14 +8,13 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::remedy::RUNS;
-use super::{BackendSource, ConfigText, Context, Error, Event, Processor, check_memory, escaped, with_remedy};
+use super::{BackendSource, ConfigText, Context, Error, Event, ProcessorInfo, check_memory, escaped, with_remedy};
 use crate::choice::Work;
 use crate::record::RecordError;
 use crate::record::digests::Verification;
 use crate::record::disk::Disk;
 use crate::record::finished::{Finished, Storage};
-use crate::record::folder::{self, CONFIG, FirstAndLastRows, METRICS, POLICIES, RUN, Start};
+use crate::record::folder::{self, CONFIG, FirstAndLastRows, METRICS, POLICIES, RUN, RUNS, Start};
 use crate::record::ownership::{self, CURVES};
 use crate::record::policies::{self, Init};
 use crate::record::runs;
@@ -35,10 +34,10 @@ use flotilla::trainer::Row;
 const FILES: [(&str, &str); 5] =
     [("config", CONFIG), ("run", RUN), ("metrics", METRICS), ("policies", POLICIES), ("curves", CURVES)];
 
-/// Request of a training.
+/// TrainRequest of a training.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Request {
+pub struct TrainRequest {
     /// The config.
     pub config: ConfigText,
     /// The name of the run. Its folder has this name by default.
@@ -55,7 +54,7 @@ pub struct Request {
 
 /// Results of a run.
 #[derive(Clone, Debug, Serialize)]
-pub struct Outcome {
+pub struct TrainOutcome {
     /// The run's folder.
     #[serde(serialize_with = "escaped")]
     pub folder: PathBuf,
@@ -87,7 +86,7 @@ pub struct Outcome {
     pub files: BTreeMap<&'static str, String>,
     /// The processor of the run's last session.
     #[serde(flatten)]
-    pub processor: Processor,
+    pub processor: ProcessorInfo,
     /// The rows of the random start and of the last generation.
     #[serde(skip)]
     pub rows: FirstAndLastRows,
@@ -146,7 +145,7 @@ impl Extremes {
     }
 }
 
-impl Request {
+impl TrainRequest {
     /// Returns the command that resumes the run.
     fn command_to_resume(&self, folder: &Path, context: Context<'_>) -> String {
         let words: [OsString; 3] = ["flotilla".into(), "train".into(), shell::argument(&folder.join(CONFIG))];
@@ -167,10 +166,11 @@ impl Request {
 }
 
 /// Starts or resumes a run, trains it to its end, and draws its curves.
-///
-/// # Errors
-/// The config is invalid, the folder cannot be used, or training fails or is stopped.
-pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context<'_>) -> Result<Outcome, Error> {
+pub fn run(
+    request: &TrainRequest,
+    backends: &mut dyn BackendSource,
+    context: Context<'_>,
+) -> Result<TrainOutcome, Error> {
     let (config, notes) = request.config.read_noted(context)?;
     let (backend, on) = backends.open(Work::of([&*config]))?;
     check_memory([&config], backend)?;
@@ -210,7 +210,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         warn_that_nothing_was_observed(&folder, context);
     }
     let learning = &config.learning;
-    Ok(Outcome {
+    Ok(TrainOutcome {
         config: request.name.clone(),
         digest: results.digest.clone(),
         seed: learning.seed,
@@ -224,7 +224,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         first: GenerationScores::of(&results.rows.first),
         last: GenerationScores::of(&results.rows.last),
         files: FILES.into_iter().map(|(name, file)| (name, folder.join(file).escaped().to_string())).collect(),
-        processor: Processor::of_run(session.run(0)),
+        processor: ProcessorInfo::of_run(session.run(0)),
         rows: results.rows.clone(),
         teams: config.max_teams() - 1,
         trained_on: (!was_done).then_some(on),
@@ -232,9 +232,9 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     })
 }
 
-/// Opens the run's folder, and reports what it found. `policies` are those of [`Request::init`].
+/// Opens the run's folder, and reports what it found. `policies` are those of [`TrainRequest::init`].
 fn open_session(
-    request: &Request,
+    request: &TrainRequest,
     config: &Config,
     policies: Option<Init>,
     folder: &Path,
@@ -273,7 +273,7 @@ fn open_session(
 /// Trains a run to its end, or until the user ends it. Returns the last generation, which is earlier in that case.
 fn train(
     session: &mut Session,
-    request: &Request,
+    request: &TrainRequest,
     folder: &Path,
     backend: &mut OpenBackend,
     context: Context<'_>,
@@ -317,13 +317,10 @@ pub struct InMemory {
     /// Seconds since the start at which each generation was complete.
     pub seconds: Vec<f64>,
     /// The processor that trained.
-    pub processor: Processor,
+    pub processor: ProcessorInfo,
 }
 
 /// Trains without a folder. [`save`] writes the results later. `champions` asks for the champions of every generation.
-///
-/// # Errors
-/// The config is invalid, memory is too small, training fails, or it is stopped.
 pub fn in_memory(
     config: &Config,
     champions: bool,
@@ -356,13 +353,10 @@ pub fn in_memory(
     }
     // After an early end, one more generation is played and not reported.
     seconds.resize(trained.config.learning.generations + 1, since.elapsed().as_secs_f64());
-    Ok(InMemory { trained, seconds, processor: Processor::of(&backend.1, &on) })
+    Ok(InMemory { trained, seconds, processor: ProcessorInfo::of(&backend.1, &on) })
 }
 
 /// Writes a finished run that was trained in memory, with the files of [`run`]. Returns its digest.
-///
-/// # Errors
-/// A file cannot be written.
 pub fn save(finished: Finished<'_>, storage: &mut dyn Storage) -> Result<String, RecordError> {
     let (config, rows) = (finished.config, finished.rows);
     let digest = finished.write(storage)?;

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use super::{Context, Error, Event, with_remedy};
+use super::{Context, Error, with_remedy};
 use flotilla::backend::Backend;
 use flotilla::backend::cpu::{Cpu, level_name};
 use flotilla::backend::gpu;
@@ -16,10 +16,10 @@ use flotilla::host::Instant;
 use flotilla::verify::{Agreement, Plan, compare};
 use flotilla::version::{COMMIT, VERSION};
 
-/// Request of a verification.
+/// VerifyRequest of a verification.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct Request {
+pub struct VerifyRequest {
     /// The name and the text of a config to compare, instead of random worlds.
     pub config: Option<(String, String)>,
     /// Config keys to set.
@@ -43,9 +43,9 @@ pub const TEAMS: u32 = 48;
 /// The name of the processor, in place of an adapter's.
 pub const CPU: &str = "cpu";
 
-impl Default for Request {
-    fn default() -> Request {
-        Request {
+impl Default for VerifyRequest {
+    fn default() -> VerifyRequest {
+        VerifyRequest {
             config: None,
             set: vec![],
             teams: TEAMS,
@@ -60,7 +60,7 @@ impl Default for Request {
 
 /// Results of a verification.
 #[derive(Clone, Debug, Serialize)]
-pub struct Outcome {
+pub struct VerifyOutcome {
     /// Whether all comparisons are equal.
     pub equal: bool,
     /// The comparisons.
@@ -94,9 +94,9 @@ pub struct Compared {
     pub failure: Option<String>,
 }
 
-impl Outcome {
-    fn new(comparisons: Vec<Compared>) -> Outcome {
-        Outcome {
+impl VerifyOutcome {
+    fn new(comparisons: Vec<Compared>) -> VerifyOutcome {
+        VerifyOutcome {
             equal: comparisons.iter().all(|line| line.equal),
             comparisons,
             version: VERSION,
@@ -121,41 +121,43 @@ impl Outcome {
 ///
 /// # Errors
 /// There is nothing to compare, or the request is invalid. A difference is an outcome.
-pub fn run(args: &Request, context: Context<'_>) -> Result<Outcome, Error> {
+pub fn run(args: &VerifyRequest, context: Context<'_>) -> Result<VerifyOutcome, Error> {
     let (plan, budget) = plan(args)?;
-    if args.adapter.as_deref() == Some(CPU) {
-        return instruction_sets(&plan, budget, args, context).map(Outcome::new);
+    let mut combinations = match args.adapter.as_deref() {
+        Some(CPU) => instruction_sets(args)?,
+        name => gpus(name, args)?,
+    };
+    let count = combinations.len();
+    if args.adapter.as_deref() != Some(CPU) {
+        context.message(expected(&plan, budget, count));
     }
-    let adapters = adapters(args.adapter.as_deref())?;
+    let budget = budget.map(|all| all / count as u32);
     let mut lines = Vec::new();
-    let mut combinations = Vec::new();
-    for (choice, info) in &adapters {
-        for pass in passes(args.pass.as_deref(), info) {
-            for kernel in kernels(args.kernel.as_deref()) {
-                combinations.push(Combination { choice, info, pass, kernel });
-            }
-        }
-    }
-    context.message(expected(&plan, budget, combinations.len()));
-    for (place, combination) in combinations.iter().enumerate() {
+    for (place, Combination { names, pass, kernel, reference, open }) in combinations.iter_mut().enumerate() {
         if context.is_stopped() {
             return Err(Error::Stopped("before everything was compared".into()));
         }
-        let mut shown = |done: f64, outcome: &Agreement| {
-            let Combination { info, pass, kernel, .. } = combination;
-            let of = if budget.is_some() { String::new() } else { format!(" of {}", plan.worlds.len()) };
-            let text = format!("{}, {pass} pass, {kernel} kernel: {}{of} worlds", info.name, outcome.worlds);
-            (context.report)(Event::Fraction((place as f64 + done) / combinations.len() as f64, text));
+        let since = Instant::now();
+        let shown = |now: &Agreement| {
+            let (done, of) = match budget {
+                Some(budget) => ((since.elapsed().as_secs_f64() / budget.as_secs_f64()).min(1.0), String::new()),
+                None => (now.worlds as f64 / plan.worlds.len() as f64, format!(" of {}", plan.worlds.len())),
+            };
+            context.fraction((place as f64 + done) / count as f64, format!("{}: {}{of} worlds", names[1], now.worlds));
         };
-        let result = verify(&plan, budget.map(|all| all / combinations.len() as u32), combination, &mut shown);
-        lines.push(Compared {
-            pass: Some(combination.pass.to_string()),
-            kernel: Some(combination.kernel.to_string()),
-            ..line(combination.info.to_string(), &Cpu::default(), result)
+        let result = open().and_then(|opened| match opened {
+            Err(mismatch) => Ok(Agreement { mismatch: Some(mismatch), ..Agreement::default() }),
+            Ok(mut backend) => Ok(compare_within(&plan, budget, |part, before| {
+                compare(part, reference, &mut *backend, |now| {
+                    shown(&Agreement { worlds: before.worlds + now.worlds, ..now.clone() });
+                })
+            })?),
         });
+        let [pass, kernel] = [pass.map(|pass| pass.to_string()), kernel.map(|kernel| kernel.to_string())];
+        lines.push(Compared { pass, kernel, ..line(names[0].clone(), reference, result) });
     }
-    (context.report)(Event::Pause);
-    Ok(Outcome::new(lines))
+    context.pause();
+    Ok(VerifyOutcome::new(lines))
 }
 
 /// Default number of random worlds. A time budget may leave out the last ones.
@@ -165,13 +167,18 @@ const PART: usize = 10;
 /// Time for all comparisons, if no config or number of worlds is requested.
 const BUDGET: Duration = Duration::from_secs(60);
 
-/// A combination that is compared with the CPU.
+/// A processor to compare with a reference.
 struct Combination<'a> {
-    choice: &'a AdapterChoice,
-    info: &'a AdapterInfo,
-    pass: Pass,
-    kernel: Kernel,
+    /// Its name in the table, and in progress.
+    names: [String; 2],
+    pass: Option<Pass>,
+    kernel: Option<Kernel>,
+    reference: Cpu,
+    open: Box<dyn Fn() -> Result<Opened, Error> + 'a>,
 }
+
+/// An open processor, or a difference that its self-test found.
+type Opened = Result<Box<dyn Backend>, String>;
 
 /// Returns a message about what is compared and how long that takes.
 fn expected(plan: &Plan, budget: Option<Duration>, combinations: usize) -> String {
@@ -226,41 +233,58 @@ fn line(adapter: String, reference: &Cpu, result: Result<Agreement, Error>) -> C
     Compared { adapter, pass: None, kernel: None, against, worlds, agent_steps, equal, failure }
 }
 
-/// Compares every instruction set of the processor with the narrowest.
-fn instruction_sets(
-    plan: &Plan,
-    budget: Option<Duration>,
-    args: &Request,
-    context: Context<'_>,
-) -> Result<Vec<Compared>, Error> {
+/// Returns the comparisons of every instruction set of the processor with the narrowest.
+fn instruction_sets<'a>(args: &VerifyRequest) -> Result<Vec<Combination<'a>>, Error> {
     let levels = Cpu::levels();
-    let (narrowest, wider) = levels.split_first().expect("every processor has an instruction set");
+    let (&narrowest, wider) = levels.split_first().expect("every processor has an instruction set");
     if args.pass.is_some() || args.kernel.is_some() {
         let text = "--adapter cpu compares instruction sets, which have no passes and kernels";
         return Err(Error::Usage(with_remedy(text, "leave out --pass and --kernel")));
     }
     if wider.is_empty() {
-        let text = format!("this processor has one instruction set, {}: nothing to compare", level_name(*narrowest));
+        let text = format!("this processor has one instruction set, {}: nothing to compare", level_name(narrowest));
         return Err(Error::Refused(text.into()));
     }
-    let compare_one = |(place, &level): (usize, _)| {
-        let (mut reference, mut backend) = (Cpu::at_level(*narrowest), Cpu::at_level(level));
-        let found = compare_within(plan, budget.map(|all| all / wider.len() as u32), |part, before| {
-            compare(part, &mut reference, &mut backend, |now| {
-                let worlds = before.worlds + now.worlds;
-                let part = (place as f64 + worlds as f64 / plan.worlds.len() as f64) / wider.len() as f64;
-                (context.report)(Event::Fraction(part, format!("{}: {worlds} worlds", level_name(level))));
-            })
-        });
-        line(backend.describe(), &reference, found.map_err(Error::from))
+    let combination = |&level| Combination {
+        names: [Cpu::at_level(level).describe(), level_name(level).to_string()],
+        pass: None,
+        kernel: None,
+        reference: Cpu::at_level(narrowest),
+        open: Box::new(move || Ok(Ok(Box::new(Cpu::at_level(level))))),
     };
-    let lines = wider.iter().enumerate().map(compare_one).collect();
-    (context.report)(Event::Pause);
-    Ok(lines)
+    Ok(wider.iter().map(combination).collect())
+}
+
+/// Returns the comparisons of every adapter, pass and kernel with the CPU, or of the requested ones.
+fn gpus<'a>(name: Option<&str>, args: &VerifyRequest) -> Result<Vec<Combination<'a>>, Error> {
+    let mut combinations = Vec::new();
+    for (choice, info) in adapters(name)? {
+        for pass in passes(args.pass.as_deref(), &info) {
+            for kernel in kernels(args.kernel.as_deref()) {
+                let choice = choice.clone();
+                let open = move || -> Result<Opened, Error> {
+                    let gpu = gpu::open(device::Request { pass: Some(pass), ..choice.clone().into() })?;
+                    if let Some(mismatch) = gpu::self_test(&gpu)? {
+                        return Ok(Err(mismatch.to_string()));
+                    }
+                    let gpu = GpuBackend::new(gpu)?.with_kernel(kernel).with_residency(ResidencyPolicy::Always);
+                    Ok(Ok(Box::new(gpu.with_records(Records::Packed))))
+                };
+                combinations.push(Combination {
+                    names: [info.to_string(), format!("{}, {pass} pass, {kernel} kernel", info.name)],
+                    pass: Some(pass),
+                    kernel: Some(kernel),
+                    reference: Cpu::default(),
+                    open: Box::new(open),
+                });
+            }
+        }
+    }
+    Ok(combinations)
 }
 
 /// Returns what to compare, and the time budget if no amount is requested.
-fn plan(args: &Request) -> Result<(Plan, Option<Duration>), Error> {
+fn plan(args: &VerifyRequest) -> Result<(Plan, Option<Duration>), Error> {
     let (seed, teams) = (u64::from(args.seed), args.teams as usize);
     let is_open = args.config.is_none() && args.worlds.is_none();
     let plan = match &args.config {
@@ -314,32 +338,6 @@ fn kernels(name: Option<&str>) -> impl Iterator<Item = Kernel> {
     all.into_iter().filter(move |kernel| name.is_none_or(|name| kernel.to_string() == name))
 }
 
-/// Compares a combination with the CPU. `shown` receives the fraction that is done, and the result so far.
-fn verify(
-    plan: &Plan,
-    budget: Option<Duration>,
-    combination: &Combination<'_>,
-    shown: &mut dyn FnMut(f64, &Agreement),
-) -> Result<Agreement, Error> {
-    let since = Instant::now();
-    let gpu = gpu::open(device::Request { pass: Some(combination.pass), ..combination.choice.clone().into() })?;
-    if let Some(mismatch) = gpu::self_test(&gpu)? {
-        return Ok(Agreement { mismatch: Some(mismatch.to_string()), ..Agreement::default() });
-    }
-    let gpu = GpuBackend::new(gpu)?.with_kernel(combination.kernel);
-    let mut gpu = gpu.with_residency(ResidencyPolicy::Always).with_records(Records::Packed);
-    Ok(compare_within(plan, budget, |part, before| {
-        compare(part, &mut Cpu::default(), &mut gpu, |now| {
-            let now = Agreement { worlds: before.worlds + now.worlds, ..now.clone() };
-            let done = match budget {
-                Some(budget) => (since.elapsed().as_secs_f64() / budget.as_secs_f64()).min(1.0),
-                None => now.worlds as f64 / plan.worlds.len() as f64,
-            };
-            shown(done, &now);
-        })
-    })?)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -372,10 +370,10 @@ mod tests {
     #[test]
     fn only_a_bare_request_has_a_budget() {
         let config = ("small".to_string(), flotilla::config::LAYOUTS[0].1.to_string());
-        let budget = |request: Request| plan(&request).unwrap().1;
-        assert_eq!(budget(Request::default()), Some(BUDGET));
-        assert_eq!(budget(Request { worlds: Some(3), ..Request::default() }), None);
-        assert_eq!(budget(Request { config: Some(config), ..Request::default() }), None);
+        let budget = |request: VerifyRequest| plan(&request).unwrap().1;
+        assert_eq!(budget(VerifyRequest::default()), Some(BUDGET));
+        assert_eq!(budget(VerifyRequest { worlds: Some(3), ..VerifyRequest::default() }), None);
+        assert_eq!(budget(VerifyRequest { config: Some(config), ..VerifyRequest::default() }), None);
     }
 
     #[test]
@@ -384,7 +382,7 @@ mod tests {
             let agreement =
                 |failure: &Option<&str>| Agreement { mismatch: failure.map(String::from), ..Agreement::default() };
             let lines = failures.iter().map(|failure| line("a GPU".into(), &Cpu::default(), Ok(agreement(failure))));
-            Outcome::new(lines.collect())
+            VerifyOutcome::new(lines.collect())
         };
         assert!(compared(&[None, None]).difference().is_none());
         let error = compared(&[Some("stage credit"), None, None]).difference().unwrap();

@@ -24,7 +24,6 @@ use super::tensors::{self, Tensor, TensorFile};
 use super::{RecordError, config_digest};
 use flotilla::config::Config;
 use flotilla::evolve;
-use flotilla::file;
 use flotilla::host::Instant;
 use flotilla::parallel::BackgroundTask;
 use flotilla::trainer::{Row, Snapshot};
@@ -91,10 +90,15 @@ impl<N: AsRef<[f32]>> Checkpoint<N> {
         disk.replace(path, |output| self.put(output, of))
     }
 
+    /// Flushes the metrics to the disk, then writes the checkpoint in its folder.
+    fn write_after(&self, metrics: &Output, disk: &Disk, folder: &Path, of: &Config) -> Result<(), RecordError> {
+        let path = path(folder, self.snapshot.generation);
+        metrics.sync().map_err(RecordError::write(metrics.path()))?;
+        let written = self.write(disk, &path, of).and_then(|()| disk.sync_folder(folder));
+        written.map_err(RecordError::write(&path))
+    }
+
     /// Writes the content of a checkpoint file to a stream.
-    ///
-    /// # Errors
-    /// Returns the stream's error.
     pub fn put(&self, output: &mut dyn Write, of: &Config) -> std::io::Result<()> {
         let Checkpoint { config, init, seconds, metrics, snapshot } = self;
         let mut metadata = BTreeMap::from(
@@ -130,9 +134,6 @@ impl<N: AsRef<[f32]>> Checkpoint<N> {
 
 impl Checkpoint {
     /// Reads a checkpoint of a run with the given config.
-    ///
-    /// # Errors
-    /// Returns a description of the problem.
     pub fn read(source: impl Read + Seek, of: &Config) -> Result<Checkpoint, String> {
         let mut file = TensorFile::open(source)?;
         if file.kind() != Some(KIND) {
@@ -235,9 +236,6 @@ impl Shapes {
 }
 
 /// Returns the generations of the checkpoints in a folder, oldest first. Temporary files are ignored.
-///
-/// # Errors
-/// The folder cannot be read.
 pub fn list<'a>(folder: impl Into<Place<'a>>) -> Result<Vec<usize>, RecordError> {
     let mut generations: Vec<usize> =
         names(folder.into())?.iter().filter_map(|name| name.to_str().and_then(generation_of)).collect();
@@ -268,9 +266,6 @@ pub fn path(folder: &Path, generation: usize) -> PathBuf {
 
 /// Reads the checkpoint at a path. The weights of a finished run come from the file `policies`. Returns `None` if that
 /// file is missing, damaged or from another run.
-///
-/// # Errors
-/// The checkpoint or the policies cannot be read, or the checkpoint is damaged.
 pub fn read<'a>(
     place: impl Into<Place<'a>>,
     policies: impl Into<Place<'a>>,
@@ -342,28 +337,19 @@ impl CheckpointWriter {
 
     /// Starts to write a checkpoint after the previous one is complete. `metrics` is flushed to the disk first. The
     /// cost of the checkpoint counts from `since`.
-    ///
-    /// # Errors
-    /// The previous checkpoint could not be written.
     pub fn save(&mut self, checkpoint: Checkpoint, metrics: Output, since: Instant) -> Result<(), RecordError> {
         self.wait()?;
         let generation = checkpoint.snapshot.generation;
         self.last = (generation, Instant::now());
-        let (disk, config) = (self.disk.clone(), self.config.clone());
-        let path = path(&self.folder, generation);
+        let (disk, config, folder) = (self.disk.clone(), self.config.clone(), self.folder.clone());
         self.writing = Some(BackgroundTask::start(move || {
-            metrics.sync().map_err(RecordError::write(metrics.path()))?;
-            checkpoint.write(&disk, &path, &config).map_err(RecordError::write(&path))?;
-            disk.sync_folder(file::folder(&path)).map_err(RecordError::write(&path))?;
+            checkpoint.write_after(&metrics, &disk, &folder, &config)?;
             Ok((generation, since.elapsed()))
         }));
         Ok(())
     }
 
     /// Writes a checkpoint of borrowed weights before it returns. See [`CheckpointWriter::save`].
-    ///
-    /// # Errors
-    /// This checkpoint or the previous one could not be written.
     pub fn save_now(
         &mut self,
         checkpoint: &Checkpoint<&[f32]>,
@@ -372,19 +358,13 @@ impl CheckpointWriter {
     ) -> Result<(), RecordError> {
         self.wait()?;
         let generation = checkpoint.snapshot.generation;
-        let path = path(&self.folder, generation);
-        metrics.sync().map_err(RecordError::write(metrics.path()))?;
-        checkpoint.write(&self.disk, &path, &self.config).map_err(RecordError::write(&path))?;
-        self.disk.sync_folder(&self.folder).map_err(RecordError::write(&path))?;
+        checkpoint.write_after(metrics, &self.disk, &self.folder, &self.config)?;
         self.last = (generation, Instant::now());
         self.add_cost(since.elapsed());
         self.keep(generation)
     }
 
     /// Waits until the last checkpoint is written, and removes old ones.
-    ///
-    /// # Errors
-    /// The last checkpoint could not be written.
     pub fn wait(&mut self) -> Result<(), RecordError> {
         let Some(writing) = self.writing.take() else { return Ok(()) };
         let (generation, cost) = writing.finish()?;
@@ -407,9 +387,6 @@ impl CheckpointWriter {
     }
 
     /// Rewrites all checkpoints for the same run with the fewer generations of `config`.
-    ///
-    /// # Errors
-    /// A checkpoint could not be read or written.
     pub(crate) fn shorten(&mut self, config: &Config) -> Result<(), RecordError> {
         self.wait()?;
         for &generation in &self.kept {
@@ -426,9 +403,6 @@ impl CheckpointWriter {
     }
 
     /// Completes the last checkpoint if its writer has finished.
-    ///
-    /// # Errors
-    /// The last checkpoint could not be written.
     pub(crate) fn poll(&mut self) -> Result<(), RecordError> {
         if self.writing.as_ref().is_some_and(BackgroundTask::is_finished) { self.wait() } else { Ok(()) }
     }
@@ -449,9 +423,6 @@ impl Drop for CheckpointWriter {
 }
 
 /// Removes temporary files of interrupted writers, and returns the generations of the checkpoints, oldest first.
-///
-/// # Errors
-/// The folder cannot be read or written.
 pub(crate) fn remove_temporary_files(disk: &Disk, folder: &Path) -> Result<Vec<usize>, RecordError> {
     let generations = list(disk.at(folder))?;
     for name in names(disk.at(folder))? {

@@ -52,9 +52,6 @@ pub struct Digests {
 
 impl Digests {
     /// Reads the digests of the run in a folder. They are empty if nothing is to be compared.
-    ///
-    /// # Errors
-    /// `run.json` is damaged or cannot be read.
     pub fn read<'a>(folder: impl Into<Place<'a>>, verification: Verification) -> Result<Digests, RecordError> {
         let folder = folder.into();
         if verification.is_skipped() {
@@ -71,30 +68,21 @@ impl Digests {
     }
 
     /// Compares a config that was read from a file.
-    ///
-    /// # Errors
-    /// The config differs.
     pub(crate) fn compare_config(&self, path: &Path, config: &Config) -> Result<(), RecordError> {
         same(path, self.origin.as_ref().is_none_or(|origin| *origin == Origin::of(config)))
     }
 
     /// Compares metrics that were read from a file. See [`super::metrics::Rows::digest`].
-    ///
-    /// # Errors
-    /// The metrics differ.
     pub(crate) fn compare_metrics(&self, path: &Path, found: Sha256) -> Result<(), RecordError> {
         same(path, self.files.as_ref().is_none_or(|files| files.metrics == hex(&found.finalize())))
     }
 
     /// Compares the checksum of policies that were read from a file.
-    ///
-    /// # Errors
-    /// The checksum differs.
     pub(crate) fn compare_policies(&self, path: &Path, checksum: Option<&str>) -> Result<(), RecordError> {
         same(path, self.files.as_ref().is_none_or(|files| Some(&*files.policies) == checksum))
     }
 }
 
 fn same(path: &Path, same: bool) -> Result<(), RecordError> {
-    if same { Ok(()) } else { Err(RecordError::Differs { path: path.into() }) }
+    if same { Ok(()) } else { Err(RecordError::Differs(path.into())) }
 }

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
-use super::rooted_folder::{FileKind, FolderEntry, RootedFolder, is_link};
+use super::rooted_folder::{FileKind, FolderEntry, OpenAs, RootedFolder, is_file_on_the_way, is_link};
 use flotilla::file;
 
 /// Kind of operation on a disk.
@@ -79,9 +79,6 @@ impl<'a> Place<'a> {
     }
 
     /// Reports whether the file or folder exists.
-    ///
-    /// # Errors
-    /// Returns the system's error.
     pub fn exists(&self) -> io::Result<bool> {
         match self.disk.map_or_else(|| file::exists(self.path), |disk| Ok(disk.kind(self.path)?.is_some())) {
             // A path below a file cannot exist.
@@ -91,9 +88,6 @@ impl<'a> Place<'a> {
     }
 
     /// Returns the names in the folder.
-    ///
-    /// # Errors
-    /// Returns the system's error.
     pub(crate) fn list(&self) -> io::Result<Vec<OsString>> {
         match self.disk.and_then(Disk::root) {
             Some(root) => root.list(self.path),
@@ -158,9 +152,6 @@ impl Disk {
     }
 
     /// Returns the type of the entry at a path, or `None` if there is none. Links are not followed.
-    ///
-    /// # Errors
-    /// Returns the system's error.
     pub fn kind(&self, path: &Path) -> io::Result<Option<FileKind>> {
         match self.entry(path) {
             Ok(entry) => entry.kind(),
@@ -170,9 +161,6 @@ impl Disk {
     }
 
     /// Fails if the entry at a path is a link.
-    ///
-    /// # Errors
-    /// It is one, or the system returns an error.
     pub(crate) fn refuse_link(&self, path: &Path) -> io::Result<()> {
         if self.kind(path)? == Some(FileKind::Link) { Err(is_link(path)) } else { Ok(()) }
     }
@@ -184,17 +172,12 @@ impl Disk {
             return root.create_folder(path);
         }
         fs::create_dir_all(path).map_err(|error| match error.kind() {
-            kind @ (io::ErrorKind::AlreadyExists | io::ErrorKind::NotADirectory) => {
-                io::Error::new(kind, "a part of this path is a file, not a folder; choose another path")
-            }
+            kind @ (io::ErrorKind::AlreadyExists | io::ErrorKind::NotADirectory) => is_file_on_the_way(kind),
             _ => error,
         })
     }
 
     /// Creates a file and replaces any plain file at its path. A link is an error.
-    ///
-    /// # Errors
-    /// Returns the system's error.
     pub fn create(&self, path: &Path) -> io::Result<Output> {
         self.remove(path)?;
         self.create_new(path)
@@ -203,16 +186,13 @@ impl Disk {
     /// Creates a file. Fails if the name is taken.
     pub(crate) fn create_new(&self, path: &Path) -> io::Result<Output> {
         self.check(Operation::Create, path)?;
-        let file = self.entry(path)?.create_new()?;
+        let file = self.entry(path)?.open(OpenAs::New)?;
         Ok(Output { disk: self.clone(), path: path.into(), file })
     }
 
     /// Opens an existing file, truncates it to `length` bytes and continues writing from there. A link is an error.
-    ///
-    /// # Errors
-    /// Returns the system's error.
     pub fn append(&self, path: &Path, length: u64) -> io::Result<Output> {
-        let mut file = self.unshared(path, FolderEntry::write)?;
+        let mut file = self.unshared(path, OpenAs::Write)?;
         self.check(Operation::Truncate, path)?;
         file.set_len(length)?;
         file.seek(SeekFrom::End(0))?;
@@ -220,35 +200,29 @@ impl Disk {
     }
 
     /// Appends bytes to a file, which is created if it is missing. Returns the file, so that the caller can flush it.
-    ///
-    /// # Errors
-    /// Returns the system's error.
     pub fn extend(&self, path: &Path, bytes: &[u8]) -> io::Result<Output> {
         self.check(Operation::Create, path)?;
-        let file = self.unshared(path, FolderEntry::extend)?;
+        let file = self.unshared(path, OpenAs::Append)?;
         let mut output = Output { disk: self.clone(), path: path.into(), file };
         output.write_all(bytes)?;
         Ok(output)
     }
 
     /// Opens a file to change it. A file with other names is copied first, because a backup may consist of hard links.
-    fn unshared(&self, path: &Path, open: fn(&FolderEntry) -> io::Result<File>) -> io::Result<File> {
+    fn unshared(&self, path: &Path, how: OpenAs) -> io::Result<File> {
         let entry = self.entry(path)?;
-        let file = open(&entry)?;
+        let file = entry.open(how)?;
         if entry.links(&file)? <= 1 {
             return Ok(file);
         }
         let mut content = self.read(path)?;
         self.replace_shared(path, |output| io::copy(&mut content, output).map(drop), || Ok(()))?;
-        open(&self.entry(path)?)
+        self.entry(path)?.open(how)
     }
 
     /// Replaces the content of a file. After a crash at any moment, the file has either all of the old content or all
     /// of the new. The new content is certain after [`Disk::sync_folder`], which is called once for all files of a
     /// folder. Only one process at a time may replace a file.
-    ///
-    /// # Errors
-    /// Returns the system's error.
     pub fn replace(&self, path: &Path, content: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> io::Result<()> {
         // A killed process may have left a temporary file, which is replaced.
         let open = |temporary: &Path| self.create(temporary);
@@ -259,9 +233,6 @@ impl Disk {
     /// after the new content is on the disk and before the file gets its name.
     ///
     /// On Linux the new content has no name until it is complete, so that nothing is left of an interrupted process.
-    ///
-    /// # Errors
-    /// Returns the error of the system or of `before`.
     pub(crate) fn replace_shared(
         &self,
         path: &Path,
@@ -344,7 +315,7 @@ impl Disk {
         if self.root.is_some() && self.kind(path)? != Some(FileKind::Other) {
             if self.kind(path)?.is_some() {
                 // A link must not be replaced, nor a file without write permission.
-                self.entry(path)?.write()?;
+                self.entry(path)?.open(OpenAs::Write)?;
             }
             return self.replace_shared(path, content, || Ok(()));
         }
@@ -367,18 +338,12 @@ impl Disk {
     }
 
     /// Renames a file.
-    ///
-    /// # Errors
-    /// Returns the system's error.
     pub(crate) fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
         self.check(Operation::Rename, to)?;
         self.entry(from)?.rename(&self.entry(to)?)
     }
 
     /// Removes a file if it exists.
-    ///
-    /// # Errors
-    /// The entry is not a plain file, or the system returns an error.
     pub fn remove(&self, path: &Path) -> io::Result<()> {
         if self.kind(path)?.is_none() {
             return Ok(());
@@ -388,11 +353,8 @@ impl Disk {
     }
 
     /// Opens a plain file for reading. A link is an error.
-    ///
-    /// # Errors
-    /// Returns the system's error.
     pub fn read(&self, path: &Path) -> io::Result<File> {
-        self.entry(path)?.read()
+        self.entry(path)?.open(OpenAs::Read)
     }
 
     /// Opens and locks a file, which is created if it is missing. The lock lasts while the file is open. Returns `None` if
@@ -403,7 +365,7 @@ impl Disk {
     pub(crate) fn lock(&self, path: &Path) -> io::Result<Option<File>> {
         self.check(Operation::Create, path)?;
         for attempt in 0.. {
-            let file = self.entry(path)?.extend()?;
+            let file = self.entry(path)?.open(OpenAs::Append)?;
             match file.try_lock() {
                 Ok(()) => {}
                 Err(TryLockError::WouldBlock) => return Err(io::ErrorKind::WouldBlock.into()),
@@ -468,9 +430,6 @@ pub struct Output {
 
 impl Output {
     /// Waits until all written bytes are on the disk.
-    ///
-    /// # Errors
-    /// Returns the system's error.
     pub fn sync(&self) -> io::Result<()> {
         self.disk.check(Operation::Flush, &self.path)?;
         self.file.sync_all()
@@ -482,9 +441,6 @@ impl Output {
     }
 
     /// Returns a second handle of the same file, so that another thread can flush it.
-    ///
-    /// # Errors
-    /// Returns the system's error.
     pub fn share(&self) -> io::Result<Output> {
         Ok(Output { disk: self.disk.clone(), path: self.path.clone(), file: self.file.try_clone()? })
     }

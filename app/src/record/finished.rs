@@ -15,15 +15,9 @@ use flotilla::trainer::{Ending, Row, Snapshot};
 /// The place that the files of a run are written to: a folder or an archive.
 pub trait Storage {
     /// Writes a file, whole or not at all. `name` is its path in the run's folder, with `/` as separator.
-    ///
-    /// # Errors
-    /// The file cannot be written.
     fn put(&mut self, name: &str, content: Content<'_>) -> Result<(), RecordError>;
 
     /// Writes a picture of the run, and lists it as made by flotilla. It is the last file of the run.
-    ///
-    /// # Errors
-    /// The file cannot be written.
     fn publish(&mut self, name: &str, content: &[u8]) -> Result<(), RecordError> {
         self.put(name, &mut |output| output.write_all(content))?;
         let line = ownership::line(&hex(&Sha256::digest(content)), Path::new(name));
@@ -64,9 +58,6 @@ pub struct Finished<'a> {
 
 impl Finished<'_> {
     /// Writes all files, `run.json` last. Returns the run's digest.
-    ///
-    /// # Errors
-    /// A file cannot be written.
     pub fn write(self, storage: &mut dyn Storage) -> Result<String, RecordError> {
         let Finished { config, rows, policies, ending, run } = self;
         let last = config.learning.generations;

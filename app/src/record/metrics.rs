@@ -13,7 +13,7 @@ use std::path::Path;
 use sha2::{Digest, Sha256};
 
 use super::disk::{Disk, Output, Place};
-use super::{RecordError, hex};
+use super::{RecordError, hash_rest, hex};
 use flotilla::config::{Config, MAX_GENERATIONS, MAX_TRIALS};
 use flotilla::trainer::Row;
 pub use flotilla::trainer::digest::digest;
@@ -79,9 +79,6 @@ pub struct Writer {
 
 impl Writer {
     /// Creates a file with its header and replaces any other file.
-    ///
-    /// # Errors
-    /// Returns the system's error.
     pub fn create(disk: &Disk, path: &Path, config: &Config) -> io::Result<Writer> {
         let output = BufWriter::new(disk.create(path)?);
         let mut writer = Writer { output, bytes: 0, hash: Sha256::new(), lines: Lines::of(config) };
@@ -92,9 +89,6 @@ impl Writer {
 
     /// Continues a file at a mark and drops everything after it. Returns `None` if the file is missing or its content
     /// up to the mark has changed.
-    ///
-    /// # Errors
-    /// Returns the system's error.
     pub fn resume(disk: &Disk, path: &Path, mark: &Extent, config: &Config) -> io::Result<Option<Writer>> {
         let Some((first, hash)) = before(disk.at(path), mark)? else { return Ok(None) };
         // A run that was shortened to end before its later stages keeps the column `stage`.
@@ -110,25 +104,16 @@ impl Writer {
     }
 
     /// Adds rows that became complete after `seconds` of training.
-    ///
-    /// # Errors
-    /// Returns the system's error.
     pub fn add(&mut self, rows: &[Row], seconds: f64) -> io::Result<()> {
         rows.iter().try_for_each(|row| self.write(&self.lines.line(row, seconds)))
     }
 
     /// Passes all lines to the system, so that other processes can read them.
-    ///
-    /// # Errors
-    /// Returns the system's error.
     pub fn flush(&mut self) -> io::Result<()> {
         self.output.flush()
     }
 
     /// Returns the current extent, and the file, so that the caller can flush this part to the disk.
-    ///
-    /// # Errors
-    /// Returns the system's error.
     pub fn mark(&mut self) -> io::Result<(Extent, Output)> {
         self.output.flush()?;
         let sha256 = hex(&self.hash.clone().finalize());
@@ -146,13 +131,7 @@ fn before(place: Place<'_>, mark: &Extent) -> io::Result<Option<(Vec<u8>, Sha256
     let (mut first, mut hash) = (Vec::new(), Sha256::new());
     file.by_ref().take(MAX_LINE).read_until(b'\n', &mut first)?;
     hash.update(&first);
-    let mut chunk = [0; 1 << 14];
-    loop {
-        match file.read(&mut chunk)? {
-            0 => break,
-            read => hash.update(&chunk[..read]),
-        }
-    }
+    hash_rest(&mut file, &mut hash)?;
     let same = file.limit() == 0 && hex(&hash.clone().finalize()) == mark.sha256;
     Ok(same.then_some((first, hash)))
 }
@@ -163,9 +142,6 @@ pub(crate) fn has_extent<'a>(place: impl Into<Place<'a>>, mark: &Extent) -> bool
 }
 
 /// Reports whether a file starts like a metrics file. The header may be incomplete.
-///
-/// # Errors
-/// Returns the system's error.
 pub(crate) fn begins(place: Place<'_>) -> io::Result<bool> {
     let mut start = Vec::new();
     place.open()?.take("trial,generation,".len() as u64).read_to_end(&mut start)?;
@@ -204,9 +180,6 @@ pub struct Rows<R> {
 
 impl<R: BufRead> Rows<R> {
     /// Reads the header of a metrics file.
-    ///
-    /// # Errors
-    /// The first line is not the header.
     pub fn new(source: R) -> Result<Rows<R>, RowsError> {
         let mut rows = Rows { source, line: 0, done: false, staged: false, hash: Sha256::new() };
         match rows.line() {
@@ -292,11 +265,55 @@ impl<R: BufRead> Iterator for Rows<R> {
 }
 
 /// Opens the metrics of a run.
-///
-/// # Errors
-/// The file is missing or has another header.
 pub fn open<'a>(place: impl Into<Place<'a>>) -> Result<Rows<BufReader<File>>, RecordError> {
     let place = place.into();
     let file = place.open().map_err(RecordError::read(place.path()))?;
     Rows::new(BufReader::new(file)).map_err(|reason| RecordError::damaged(place.path(), reason))
+}
+
+/// What a file of metrics held.
+pub(crate) struct Extracted {
+    /// Number of rows.
+    pub rows: usize,
+    /// Whether an incomplete line follows them. It belongs to a run that is still training or was killed.
+    pub is_torn: bool,
+    /// SHA-256 of the rows without their seconds and stages.
+    pub digest: Sha256,
+}
+
+/// Calls `each` with every complete row of a run's metrics. The rows of each trial must be in order, from generation 0.
+pub(crate) fn visit(place: Place<'_>, config: &Config, mut each: impl FnMut(&Row)) -> Result<Extracted, RecordError> {
+    let path = place.path();
+    let mut rows = open(place)?;
+    let (mut count, mut is_torn, mut next) = (0, false, vec![0; config.learning.trials]);
+    for row in &mut rows {
+        let row = match row {
+            Ok((row, _)) => row,
+            Err(RowsError::CutShort(_)) => {
+                is_torn = true;
+                break;
+            }
+            Err(RowsError::Read(error)) => return Err(RecordError::read(path)(error)),
+            Err(wrong) => return Err(RecordError::damaged(path, wrong)),
+        };
+        let Row { trial, generation, .. } = row;
+        count += 1;
+        if trial >= next.len() || generation > config.learning.generations {
+            let line = count + 1;
+            let text = format!(
+                "line {line} is trial {trial}, generation {generation}, which the run's config.toml does not have"
+            );
+            return Err(RecordError::damaged(path, text));
+        }
+        if generation != next[trial] {
+            let text = format!(
+                "trial {trial} of generation {generation} is out of order; it must have one row per trial and generation, \
+                 in order"
+            );
+            return Err(RecordError::damaged(path, text));
+        }
+        next[trial] += 1;
+        each(&row);
+    }
+    Ok(Extracted { rows: count, is_torn, digest: rows.digest() })
 }

@@ -17,16 +17,19 @@
 //! Every file that is read is untrusted. Its size is checked before memory is allocated, and its values are checked
 //! before they are used. Nothing in it can name another file.
 
+use std::collections::BTreeMap;
 use std::fmt::Display;
-use std::io;
+use std::io::{self, ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
 
 use sha2::{Digest, Sha256};
 
+use crate::shell;
 use disk::Place;
 use flotilla::config::{self, Config, ConfigError};
 use flotilla::escape::{self, PathExt};
 use flotilla::file::{self, TextError};
+use ownership::CONFIG;
 
 pub use flotilla::trainer::digest::hex;
 
@@ -42,10 +45,16 @@ pub(crate) mod rooted_folder;
 pub mod runs;
 pub mod tensors;
 
+/// `EMFILE`: the process has too many open files. The number is the same on every Unix, and the standard library has no
+/// name for it.
+const TOO_MANY_FILES: i32 = 24;
+/// `EIO`: a device failed to read or write. The number is the same on every Unix.
+const INPUT_OUTPUT: i32 = 5;
+
 /// Reason why the files of a run could not be written, read or used.
 #[derive(Debug, thiserror::Error)]
 pub enum RecordError {
-    /// A write failed. The command adds what the user can do.
+    /// A write failed.
     #[error("{path}: cannot be written: {error}", path = path.escaped())]
     Write {
         /// Path of the file or folder.
@@ -78,29 +87,17 @@ pub enum RecordError {
         reason: String,
     },
     /// The folder already holds a run, which would be overwritten.
-    #[error("{path} holds a run already", path = path.escaped())]
-    Exists {
-        /// Path of the folder.
-        path: PathBuf,
-    },
+    #[error("{} holds a run already", .0.escaped())]
+    Exists(PathBuf),
     /// A file that flotilla did not create would be overwritten.
-    #[error("{path} was not made by flotilla and would be overwritten", path = path.escaped())]
-    NotOurs {
-        /// Path of the file.
-        path: PathBuf,
-    },
+    #[error("{} was not made by flotilla and would be overwritten", .0.escaped())]
+    NotOurs(PathBuf),
     /// The folder belongs to another user, and the user did not name it as the output folder.
-    #[error("{path} belongs to another user, so nothing is written there", path = path.escaped())]
-    OfAnotherUser {
-        /// Path of the folder.
-        path: PathBuf,
-    },
+    #[error("{} belongs to another user, so nothing is written there", .0.escaped())]
+    OfAnotherUser(PathBuf),
     /// A file has the path of the folder.
-    #[error("{path} is a file", path = path.escaped())]
-    NoFolder {
-        /// Path of the file.
-        path: PathBuf,
-    },
+    #[error("{} is a file", .0.escaped())]
+    NoFolder(PathBuf),
     /// The run has more generations than requested.
     #[error("{path} is a run of {existing} generations, which cannot become one of {requested}", path = path.escaped())]
     Shorter {
@@ -112,11 +109,8 @@ pub enum RecordError {
         requested: usize,
     },
     /// Another process already trains in the folder.
-    #[error("another process is training in {path}", path = path.escaped())]
-    Locked {
-        /// Path of the folder.
-        path: PathBuf,
-    },
+    #[error("another process is training in {}", .0.escaped())]
+    Locked(PathBuf),
     /// The run started from other policies than those given, so it cannot be resumed with them.
     #[error("{path} {}, so it cannot continue as a run {}", started(existing), started_from(requested), path = path.escaped())]
     InitDiffers {
@@ -136,31 +130,20 @@ pub enum RecordError {
         existing: String,
     },
     /// It is not known which policies the run started from.
-    #[error("{path}: its run.json is missing or damaged, so it is not known what policies this run started from")]
-    OriginUnknown {
-        /// Path of the folder.
-        path: PathBuf,
-    },
+    #[error("{}: its run.json is missing or damaged, so it is not known what policies this run started from", .0.escaped())]
+    OriginUnknown(PathBuf),
     /// Only the program that trained the run knows its fitness.
     #[error(
-        "{path}: its fitness is not the config's, but came from the program that trained it, so it cannot be extended"
+        "{}: its fitness is not the config's, but came from the program that trained it, so it cannot be extended",
+        .0.escaped()
     )]
-    OwnFitness {
-        /// Path of the folder.
-        path: PathBuf,
-    },
+    OwnFitness(PathBuf),
     /// The config was changed after the run was started.
-    #[error("{path}: it is not the config that this run was started with (run.json has another digest)")]
-    Edited {
-        /// Path of the file.
-        path: PathBuf,
-    },
+    #[error("{}: it is not the config that this run was started with (run.json has another digest)", .0.escaped())]
+    Edited(PathBuf),
     /// The file has changed since the run wrote it.
-    #[error("{path}: it has changed since the run wrote it (run.json has another digest)")]
-    Differs {
-        /// Path of the file.
-        path: PathBuf,
-    },
+    #[error("{}: it has changed since the run wrote it (run.json has another digest)", .0.escaped())]
+    Differs(PathBuf),
     /// A newer version of the program wrote the file.
     #[error(
         "{path}: it was written by {}, in a format that is newer than this version ({}) reads",
@@ -221,6 +204,97 @@ impl RecordError {
     fn damaged(path: &Path, reason: impl Display) -> RecordError {
         RecordError::Damaged { path: path.into(), reason: reason.to_string() }
     }
+
+    /// Returns what the user can do about it. `next` follows the remedy of a full disk, such as "run it again".
+    pub fn help(&self, next: &str) -> Option<String> {
+        Some(match self {
+            RecordError::Write { error, .. } | RecordError::Read { error, .. }
+                if cfg!(unix) && error.raw_os_error() == Some(TOO_MANY_FILES) =>
+            {
+                format!("the system allows no more open files here (see `ulimit -n`): raise that, then {next}")
+            }
+            RecordError::Write { error, .. } => match error.kind() {
+                ErrorKind::StorageFull | ErrorKind::QuotaExceeded => format!("free some space, then {next}"),
+                ErrorKind::FileTooLarge => {
+                    format!("the system allows no larger file here (see `ulimit -f`): raise that, then {next}")
+                }
+                ErrorKind::PermissionDenied | ErrorKind::ReadOnlyFilesystem => "choose a place you may write to".into(),
+                _ if cfg!(unix) && error.raw_os_error() == Some(INPUT_OUTPUT) => {
+                    format!("check the disk, then {next}")
+                }
+                _ => return None,
+            },
+            RecordError::Read { error, .. } => match error.kind() {
+                ErrorKind::NotFound | ErrorKind::NotADirectory => "check the path".into(),
+                ErrorKind::PermissionDenied => "ask its owner for permission to read it".into(),
+                _ => return None,
+            },
+            RecordError::Exists { .. } => {
+                "pass --resume to continue it or --force to overwrite it, or choose another --out".into()
+            }
+            RecordError::NotOurs { .. } => "move it away, or choose another --out".into(),
+            RecordError::OfAnotherUser { .. } => "to write there all the same, name it with --out".into(),
+            RecordError::NoFolder { .. } => "choose a folder with --out".into(),
+            RecordError::Shorter { existing, .. } => {
+                format!("resume with --generations {existing} or more, or choose another --out")
+            }
+            RecordError::Locked { .. } => "wait for it, stop it, or choose another --out".into(),
+            RecordError::ConfigDiffers { path, .. } => format!(
+                "resume with the config it was started with ({}/{CONFIG}), or choose another --out",
+                path.escaped()
+            ),
+            RecordError::InitDiffers { existing, .. } => {
+                let file = if existing.is_some() { " or with that file" } else { "" };
+                format!("resume without --init{file}, or choose another --out")
+            }
+            RecordError::InitNeeded { .. } => "pass that file with --init".into(),
+            RecordError::OriginUnknown { .. } => {
+                "pass the policies that it started from with --init, or start over with --force".into()
+            }
+            RecordError::OwnFitness { .. } => {
+                "start a new run from its policies with --init, or choose another --out".into()
+            }
+            RecordError::Edited(path) => format!(
+                "restore what it was, or move {} away and name the run's own config, or choose another --out",
+                path.display()
+            ),
+            RecordError::Differs(path) => {
+                let folder = file::folder(path);
+                let words = [folder.join(CONFIG), "--out".into(), folder.into(), "--resume".into()];
+                let command = shell::command([PathBuf::from("flotilla"), "train".into()].into_iter().chain(words));
+                let again = match path.ends_with(CONFIG) {
+                    true => String::new(),
+                    false => format!(", make it again with `{command}`"),
+                };
+                format!("restore it{again}, or read it all the same with --unverified")
+            }
+            RecordError::Newer { .. } => "use that version, or choose another --out".into(),
+            RecordError::Damaged { .. } | RecordError::NoTrial { .. } => return None,
+        })
+    }
+}
+
+/// Passes bytes on, and hashes them.
+struct Hashing<'a> {
+    output: &'a mut dyn Write,
+    hash: &'a mut Sha256,
+}
+
+impl Write for Hashing<'_> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let written = self.output.write(bytes)?;
+        self.hash.update(&bytes[..written]);
+        Ok(written)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.output.flush()
+    }
+}
+
+/// Hashes everything that is left in a file.
+fn hash_rest(file: &mut impl Read, hash: &mut Sha256) -> io::Result<()> {
+    io::copy(file, &mut Hashing { output: &mut io::sink(), hash }).map(drop)
 }
 
 /// Reads a text file of at most `most` bytes.
@@ -271,4 +345,22 @@ pub fn config_digest(config: &Config) -> String {
 /// Returns the config with the default `[checkpoint]`, because that section may differ between sessions of a run.
 pub(crate) fn without_checkpoint(config: &Config) -> Config {
     Config { checkpoint: config::CheckpointConfig::default(), ..config.clone() }
+}
+
+/// Returns the values of a config by their dotted keys. Each stage is one value.
+pub(crate) fn values_by_key(config: &Config) -> BTreeMap<String, toml::Value> {
+    let mut values = BTreeMap::new();
+    for (section, content) in toml::Table::try_from(config).unwrap_or_default() {
+        match content {
+            toml::Value::Table(keys) => {
+                values.extend(keys.into_iter().map(|(key, value)| (format!("{section}.{key}"), value)));
+            }
+            toml::Value::Array(stages) => {
+                let stages = stages.into_iter().enumerate();
+                values.extend(stages.map(|(index, stage)| (format!("{section}[{index}]"), stage)));
+            }
+            value => drop(values.insert(section, value)),
+        }
+    }
+    values
 }

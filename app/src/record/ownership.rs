@@ -19,7 +19,8 @@ use serde::Deserialize;
 use sha2::{Digest, Sha256};
 
 use super::disk::{Disk, Place};
-use super::{RecordError, checkpoint, hex, load_config, metrics, policies, read_text, tensors, without_checkpoint};
+use super::without_checkpoint;
+use super::{Hashing, RecordError, checkpoint, hash_rest, hex, load_config, metrics, policies, read_text, tensors};
 use flotilla::config::Config;
 use flotilla::file;
 
@@ -60,16 +61,11 @@ const NEW_LINES: usize = 50;
 
 /// Prepares a folder for writing. No symbolic link below it is followed. `named` is true if the user named the folder
 /// as the output folder.
-///
-/// # Errors
-/// The folder cannot be opened, or it belongs to another user and was not named.
 pub(crate) fn open_output_folder(disk: &Disk, folder: &Path, named: bool) -> Result<Disk, RecordError> {
     let inside = disk.within(folder).map_err(RecordError::write(folder))?;
     let owners = inside.root().map_or(Ok(None), |root| root.owners()).map_err(RecordError::write(folder))?;
     match owners {
-        Some([owner, user]) if !may_write(owner, user, named) => {
-            Err(RecordError::OfAnotherUser { path: folder.into() })
-        }
+        Some([owner, user]) if !may_write(owner, user, named) => Err(RecordError::OfAnotherUser(folder.into())),
         _ => Ok(inside),
     }
 }
@@ -111,7 +107,7 @@ pub(crate) fn holds_run(folder: Place<'_>, config: &Config) -> Result<bool, Reco
         let exists = folder.at(&path).exists().map_err(RecordError::read(&path))?;
         Ok::<_, RecordError>(exists.then_some(path))
     };
-    let refuse = |path: PathBuf| Err(RecordError::NotOurs { path });
+    let refuse = |path: PathBuf| Err(RecordError::NotOurs(path));
     let run = find(RUN)?;
     if let Some(path) = &run {
         match read_text(folder.at(path), MAX_RUN_BYTES) {
@@ -154,9 +150,6 @@ pub(crate) fn holds_run(folder: Place<'_>, config: &Config) -> Result<bool, Reco
 }
 
 /// Fails if one of the run's own files is a link. Callers check this before they change anything.
-///
-/// # Errors
-/// A file of the run is a link, or the folder cannot be read.
 pub(crate) fn refuse_links(disk: &Disk, folder: &Path) -> Result<(), RecordError> {
     for path in [RUN, CONFIG, METRICS, POLICIES, CHECKPOINTS].map(|name| folder.join(name)) {
         disk.refuse_link(&path).map_err(RecordError::write(&path))?;
@@ -165,9 +158,6 @@ pub(crate) fn refuse_links(disk: &Disk, folder: &Path) -> Result<(), RecordError
 }
 
 /// Fails if one of the files exists and flotilla did not create it, or its content has changed.
-///
-/// # Errors
-/// A file may not be replaced, or a folder cannot be read.
 pub fn check<P: AsRef<Path>>(disk: &Disk, paths: impl IntoIterator<Item = P>) -> Result<(), RecordError> {
     let mut lists = BTreeMap::new();
     for path in paths {
@@ -178,7 +168,7 @@ pub fn check<P: AsRef<Path>>(disk: &Disk, paths: impl IntoIterator<Item = P>) ->
             lists.insert(folder.to_path_buf(), listed(disk, folder)?);
         }
         if !lists[folder].contains(&line(&digest, path)) {
-            return Err(RecordError::NotOurs { path: path.into() });
+            return Err(RecordError::NotOurs(path.into()));
         }
     }
     Ok(())
@@ -215,9 +205,6 @@ pub fn publish(
 }
 
 /// Deletes a file made from runs. A file that flotilla did not create, or that has changed, is kept.
-///
-/// # Errors
-/// The file cannot be read or deleted.
 pub fn remove_published(disk: &Disk, path: &Path) -> Result<(), RecordError> {
     match check(disk, [path]) {
         Ok(()) => disk.remove(path).map_err(RecordError::write(path)),
@@ -292,29 +279,6 @@ fn digest(disk: &Disk, path: &Path) -> Result<Option<String>, RecordError> {
     // A link, a folder or a pipe is an error, because it could not be replaced either.
     let mut file = disk.read(path).map_err(RecordError::write(path))?;
     let mut hash = Sha256::new();
-    let mut chunk = vec![0; 1 << 16];
-    loop {
-        match file.read(&mut chunk).map_err(RecordError::read(path))? {
-            0 => return Ok(Some(hex(&hash.finalize()))),
-            read => hash.update(&chunk[..read]),
-        }
-    }
-}
-
-/// Writer that also hashes all bytes it writes.
-struct Hashing<'a> {
-    output: &'a mut dyn Write,
-    hash: &'a mut Sha256,
-}
-
-impl Write for Hashing<'_> {
-    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        let written = self.output.write(bytes)?;
-        self.hash.update(&bytes[..written]);
-        Ok(written)
-    }
-
-    fn flush(&mut self) -> io::Result<()> {
-        self.output.flush()
-    }
+    hash_rest(&mut file, &mut hash).map_err(RecordError::read(path))?;
+    Ok(Some(hex(&hash.finalize())))
 }

@@ -72,9 +72,6 @@ pub(crate) fn digests_in(place: Place<'_>) -> (Option<String>, Option<String>) {
 }
 
 /// Writes the content of such a file to a stream. Returns its checksum.
-///
-/// # Errors
-/// Returns the stream's error.
 pub fn put(output: &mut dyn Write, config: &Config, trials: &[impl AsRef<[f32]>]) -> io::Result<String> {
     let shape = vec![config.populations(), config.learning.population, config.parameters()];
     let of_trial = |(trial, weights)| Tensor::floats(tensor(trial), shape.clone(), [weights]);
@@ -86,9 +83,6 @@ pub fn put(output: &mut dyn Write, config: &Config, trials: &[impl AsRef<[f32]>]
 
 /// Reads the policies of one trial for teams of a config. Trial N is read from the tensor `weights.N`. Without a trial,
 /// the tensor is `weights`, or else `weights.0`. A policy that all leaders share fits any number of leaders.
-///
-/// # Errors
-/// The file is missing or damaged, its shape does not match the config, or its weights are not allowed.
 pub fn read<'a>(place: impl Into<Place<'a>>, config: &Config, trial: Option<usize>) -> Result<Policies, RecordError> {
     let place = place.into();
     let path = place.path();
@@ -112,15 +106,11 @@ pub struct Init {
 
 /// Reads the initial policies of all trials of a config. Trial i is read from the tensor `weights.i`, or from `weights`
 /// if there is no `weights.i`.
-///
-/// # Errors
-/// See [`read`].
 pub fn read_init<'a>(place: impl Into<Place<'a>>, config: &Config) -> Result<Init, RecordError> {
     let place = place.into();
     let path = place.path();
     let mut hash = Sha256::new();
-    io::copy(&mut place.open().map_err(RecordError::read(path))?, &mut HashWriter(&mut hash))
-        .map_err(RecordError::read(path))?;
+    place.open().and_then(|mut file| super::hash_rest(&mut file, &mut hash)).map_err(RecordError::read(path))?;
     let mut file = tensors::open(place)?;
     let trial = |trial| {
         let own = file.info(&tensor(trial)).is_some() || file.info(ALL).is_none();
@@ -129,20 +119,6 @@ pub fn read_init<'a>(place: impl Into<Place<'a>>, config: &Config) -> Result<Ini
     let trials = (0..config.learning.trials).map(trial).collect::<Result<_, String>>();
     let trials = trials.map_err(|reason| RecordError::damaged(path, reason))?;
     Ok(Init { digest: super::hex(&hash.finalize()), trials })
-}
-
-/// Writer that only hashes what is written.
-struct HashWriter<'a>(&'a mut Sha256);
-
-impl Write for HashWriter<'_> {
-    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        self.0.update(bytes);
-        Ok(bytes.len())
-    }
-
-    fn flush(&mut self) -> io::Result<()> {
-        Ok(())
-    }
 }
 
 /// Reads the policies of all trials that a run of this config wrote.
@@ -167,17 +143,11 @@ pub fn read_all<'a>(place: impl Into<Place<'a>>, config: &Config) -> Result<Vec<
 }
 
 /// Reads like [`read`], from any source.
-///
-/// # Errors
-/// Returns a description of the problem.
 pub fn from_source(source: impl Read + Seek, config: &Config, trial: Option<usize>) -> Result<Policies, String> {
     from_file(&mut TensorFile::open(source)?, config, &[config.learners(), 1], trial)
 }
 
 /// Reads like [`read`], from an open file. `populations` lists the accepted numbers of populations.
-///
-/// # Errors
-/// Returns a description of the problem.
 pub(crate) fn from_file(
     file: &mut TensorFile<impl Read + Seek>,
     config: &Config,

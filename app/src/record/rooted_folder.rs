@@ -55,44 +55,38 @@ impl RootedFolder {
         system::owners(&self.handle)
     }
 
-    /// Returns the entry of a path, which must begin with the path of this folder.
-    ///
-    /// # Errors
-    /// A folder on the way is a link or is missing, or the path is not below this folder.
+    /// Returns the entry of a path, which must begin with the path of this folder. Fails if a folder on the way is a link
+    /// or is missing.
     pub(crate) fn entry(&self, path: &Path) -> io::Result<FolderEntry> {
+        self.walk(path, |_| Ok(()))
+    }
+
+    /// Creates a folder and its missing parents, starting from this folder.
+    pub(crate) fn create_folder(&self, path: &Path) -> io::Result<()> {
+        let create = |folder: &FolderEntry| match system::create_folder(folder) {
+            Err(error) if error.kind() != ErrorKind::AlreadyExists => Err(error),
+            _ => Ok(()),
+        };
+        self.walk(&path.join("x"), create).map(drop)
+    }
+
+    /// Returns the entry of a path. Calls `prepare` with every folder on the way before it is opened.
+    fn walk(&self, path: &Path, prepare: impl Fn(&FolderEntry) -> io::Result<()>) -> io::Result<FolderEntry> {
         let (folders, name) = self.names(path)?;
         let mut parent = system::copy(&self.handle)?;
         let mut at = self.path.clone();
         for folder in folders {
             at.push(folder);
-            parent = system::step(&parent, folder, &at)?;
+            let folder = FolderEntry { parent, name: folder.into(), path: at.clone() };
+            prepare(&folder)?;
+            parent = system::step(&folder)?;
         }
         Ok(FolderEntry { parent, name: name.into(), path: path.into() })
     }
 
-    /// Creates a folder and its missing parents, starting from this folder.
-    ///
-    /// # Errors
-    /// Another file or a link has one of the names, or the system returns an error.
-    pub(crate) fn create_folder(&self, path: &Path) -> io::Result<()> {
-        if path == self.path {
-            return Ok(());
-        }
-        let (folders, name) = self.names(path)?;
-        let (mut parent, mut at) = (system::copy(&self.handle)?, self.path.clone());
-        for folder in folders.into_iter().chain([name]) {
-            at.push(folder);
-            match system::create_folder(&parent, folder, &at) {
-                Err(error) if error.kind() != ErrorKind::AlreadyExists => return Err(error),
-                _ => parent = system::step(&parent, folder, &at)?,
-            }
-        }
-        Ok(())
-    }
-
     /// Returns the names in a folder, which is this one or below it.
     pub(crate) fn list(&self, folder: &Path) -> io::Result<Vec<OsString>> {
-        system::list(&self.entry(&folder.join("x"))?.parent, folder)
+        system::list(&self.entry(&folder.join("x"))?, folder)
     }
 
     /// Splits a path below this folder into the folders on the way and the last name.
@@ -111,20 +105,29 @@ impl RootedFolder {
     }
 }
 
+/// How a file is opened.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(crate) enum OpenAs {
+    /// An existing file, for reading.
+    Read,
+    /// An existing file, for writing. Its content is kept.
+    Write,
+    /// A file for appending, which is created if it is missing.
+    Append,
+    /// A file that must not exist yet.
+    New,
+}
+
 impl FolderEntry {
     /// Returns the type of the entry, or `None` if it does not exist.
     pub fn kind(&self) -> io::Result<Option<FileKind>> {
-        system::kind(&self.parent, &self.name, &self.path)
+        system::kind(self)
     }
 
-    /// Returns `Some` for a plain file and `None` if nothing has the name.
-    ///
-    /// # Errors
-    /// The entry is not a plain file, or the system returns an error.
-    pub(crate) fn only_file(&self) -> io::Result<Option<()>> {
+    /// Fails if the entry exists and is not a plain file.
+    fn only_file(&self) -> io::Result<()> {
         match self.kind()? {
-            None => Ok(None),
-            Some(FileKind::File) => Ok(Some(())),
+            None | Some(FileKind::File) => Ok(()),
             Some(FileKind::Link) => Err(is_link(&self.path)),
             Some(FileKind::Folder) => Err(io::Error::new(ErrorKind::IsADirectory, "it is a folder, not a file")),
             Some(FileKind::Other) => {
@@ -133,71 +136,41 @@ impl FolderEntry {
         }
     }
 
-    /// Creates a file. Fails if the name is taken.
-    pub(crate) fn create_new(&self) -> io::Result<File> {
-        system::create_new(&self.parent, &self.name, &self.path)
+    /// Opens a plain file. Fails for a link and for anything else that is not a plain file.
+    pub(crate) fn open(&self, how: OpenAs) -> io::Result<File> {
+        if how != OpenAs::New {
+            self.only_file()?;
+        }
+        system::open_file(self, how)
     }
 
     /// Creates a file without a name in the entry's folder. It disappears with its process, unless [`FolderEntry::link`]
     /// names it. Returns `None` if the system cannot do this.
     pub(crate) fn create_unnamed(&self) -> Option<File> {
-        system::create_unnamed(&self.parent)
+        system::create_unnamed(self)
     }
 
     /// Gives a file of [`FolderEntry::create_unnamed`] this name. Fails if the name is taken.
     pub(crate) fn link(&self, file: &File) -> io::Result<()> {
-        system::link(&self.parent, &self.name, file)
-    }
-
-    /// Opens a plain file for reading.
-    ///
-    /// # Errors
-    /// The file is missing or not a plain file, or the system returns an error.
-    pub fn read(&self) -> io::Result<File> {
-        self.only_file()?.ok_or(ErrorKind::NotFound)?;
-        system::read(&self.parent, &self.name, &self.path)
-    }
-
-    /// Opens an existing plain file for writing and keeps its content.
-    ///
-    /// # Errors
-    /// The file is missing or not a plain file, or the system returns an error.
-    pub fn write(&self) -> io::Result<File> {
-        self.only_file()?;
-        system::write(&self.parent, &self.name, &self.path)
-    }
-
-    /// Opens a plain file for appending, and creates it if it is missing.
-    ///
-    /// # Errors
-    /// The entry is not a plain file, or the system returns an error.
-    pub fn extend(&self) -> io::Result<File> {
-        self.only_file()?;
-        system::extend(&self.parent, &self.name, &self.path)
+        system::link(self, file)
     }
 
     /// Returns the number of names of an open file, or 0 if it does not have this one, because another file replaced
     /// it.
     pub(crate) fn links(&self, file: &File) -> io::Result<u64> {
-        system::links(&self.parent, &self.name, file)
+        system::links(self, file)
     }
 
     /// Removes a plain file.
-    ///
-    /// # Errors
-    /// The entry is not a plain file, or the system returns an error.
     pub fn remove(&self) -> io::Result<()> {
         self.only_file()?;
-        system::remove(&self.parent, &self.name, &self.path)
+        system::remove(self)
     }
 
     /// Renames a file and replaces any plain file that has the new name.
-    ///
-    /// # Errors
-    /// The new name belongs to something other than a plain file, or the system returns an error.
     pub(crate) fn rename(&self, to: &FolderEntry) -> io::Result<()> {
         to.only_file()?;
-        system::rename((&self.parent, &self.name, &self.path), (&to.parent, &to.name, &to.path))
+        system::rename(self, to)
     }
 
     /// Flushes the names in the parent folder to the disk, if the system can.
@@ -217,35 +190,22 @@ pub(crate) fn is_link(path: &Path) -> io::Error {
     io::Error::new(ErrorKind::InvalidInput, text)
 }
 
-/// Returns the error for a path that should be a folder, given the type of the entry found there.
-fn not_a_folder(kind: Option<FileKind>, path: &Path, error: io::Error) -> io::Error {
-    match kind {
-        Some(FileKind::Link) => is_link(path),
-        Some(FileKind::File | FileKind::Other) => {
-            io::Error::new(ErrorKind::NotADirectory, "a part of this path is a file, not a folder; choose another path")
-        }
+/// Returns the error for an entry that should be a folder, or `error` if it is one or is missing.
+fn not_a_folder(entry: &FolderEntry, error: io::Error) -> io::Error {
+    match entry.kind().ok().flatten() {
+        Some(FileKind::Link) => is_link(&entry.path),
+        Some(FileKind::File | FileKind::Other) => is_file_on_the_way(ErrorKind::NotADirectory),
         Some(FileKind::Folder) | None => error,
     }
 }
 
+/// Returns the error for a file in the path of a folder.
+pub(crate) fn is_file_on_the_way(kind: ErrorKind) -> io::Error {
+    io::Error::new(kind, "a part of this path is a file, not a folder; choose another path")
+}
+
 /// An open folder. Empty on systems without such handles.
 struct Handle(#[cfg(unix)] std::os::fd::OwnedFd);
-
-#[cfg(not(target_os = "linux"))]
-mod without_unnamed_files {
-    use super::Handle;
-    use std::ffi::OsStr;
-    use std::fs::File;
-    use std::io::{ErrorKind, Result};
-
-    pub(crate) fn create_unnamed(_: &Handle) -> Option<File> {
-        None
-    }
-
-    pub(crate) fn link(_: &Handle, _: &OsStr, _: &File) -> Result<()> {
-        Err(ErrorKind::Unsupported.into())
-    }
-}
 
 #[cfg(unix)]
 mod system {
@@ -257,7 +217,7 @@ mod system {
 
     use rustix::fs::{self, AtFlags, FileType, Mode, OFlags};
 
-    use super::{FileKind, Handle, not_a_folder};
+    use super::{FileKind, FolderEntry, Handle, OpenAs, not_a_folder};
 
     const FOLDER: OFlags = OFlags::RDONLY.union(OFlags::DIRECTORY).union(OFlags::CLOEXEC);
     /// `NONBLOCK` prevents a hang if a pipe replaces a file between the check and the open.
@@ -283,17 +243,17 @@ mod system {
         Ok(Some([fs::fstat(&handle.0)?.st_uid, rustix::process::geteuid().as_raw()]))
     }
 
-    pub fn step(parent: &Handle, name: &OsStr, path: &Path) -> io::Result<Handle> {
-        let opened = fs::openat(&parent.0, name, FOLDER | OFlags::NOFOLLOW, Mode::empty());
-        opened.map(Handle).map_err(|error| not_a_folder(kind(parent, name, path).ok().flatten(), path, error.into()))
+    pub(crate) fn step(entry: &FolderEntry) -> io::Result<Handle> {
+        let opened = fs::openat(&entry.parent.0, &entry.name, FOLDER | OFlags::NOFOLLOW, Mode::empty());
+        opened.map(Handle).map_err(|error| not_a_folder(entry, error.into()))
     }
 
-    pub(crate) fn create_folder(parent: &Handle, name: &OsStr, _: &Path) -> io::Result<()> {
-        Ok(fs::mkdirat(&parent.0, name, FOLDER_MODE)?)
+    pub(crate) fn create_folder(entry: &FolderEntry) -> io::Result<()> {
+        Ok(fs::mkdirat(&entry.parent.0, &entry.name, FOLDER_MODE)?)
     }
 
-    pub fn kind(parent: &Handle, name: &OsStr, _: &Path) -> io::Result<Option<FileKind>> {
-        match fs::statat(&parent.0, name, AtFlags::SYMLINK_NOFOLLOW).map_err(io::Error::from) {
+    pub(crate) fn kind(entry: &FolderEntry) -> io::Result<Option<FileKind>> {
+        match fs::statat(&entry.parent.0, &entry.name, AtFlags::SYMLINK_NOFOLLOW).map_err(io::Error::from) {
             Ok(there) => Ok(Some(match FileType::from_raw_mode(there.st_mode) {
                 FileType::RegularFile => FileKind::File,
                 FileType::Directory => FileKind::Folder,
@@ -305,22 +265,27 @@ mod system {
         }
     }
 
-    pub(crate) fn create_new(parent: &Handle, name: &OsStr, _: &Path) -> io::Result<File> {
-        let flags = FILE | OFlags::WRONLY | OFlags::CREATE | OFlags::EXCL;
-        Ok(fs::openat(&parent.0, name, flags, FILE_MODE)?.into())
+    pub(crate) fn open_file(entry: &FolderEntry, how: OpenAs) -> io::Result<File> {
+        let flags = match how {
+            OpenAs::Read => OFlags::RDONLY,
+            OpenAs::Write => OFlags::WRONLY,
+            OpenAs::Append => OFlags::WRONLY | OFlags::CREATE | OFlags::APPEND,
+            OpenAs::New => OFlags::WRONLY | OFlags::CREATE | OFlags::EXCL,
+        };
+        Ok(fs::openat(&entry.parent.0, &entry.name, FILE | flags, FILE_MODE)?.into())
     }
 
     #[cfg(target_os = "linux")]
-    pub(crate) fn create_unnamed(parent: &Handle) -> Option<File> {
+    pub(crate) fn create_unnamed(entry: &FolderEntry) -> Option<File> {
         let flags = OFlags::TMPFILE | OFlags::WRONLY | OFlags::CLOEXEC;
-        let file = File::from(fs::openat(&parent.0, c".", flags, FILE_MODE).ok()?);
+        let file = File::from(fs::openat(&entry.parent.0, c".", flags, FILE_MODE).ok()?);
         // Naming it needs /proc.
         Path::new(&path_of(&file)).exists().then_some(file)
     }
 
     #[cfg(target_os = "linux")]
-    pub(crate) fn link(parent: &Handle, name: &OsStr, file: &File) -> io::Result<()> {
-        Ok(fs::linkat(fs::CWD, path_of(file), &parent.0, name, AtFlags::SYMLINK_FOLLOW)?)
+    pub(crate) fn link(entry: &FolderEntry, file: &File) -> io::Result<()> {
+        Ok(fs::linkat(fs::CWD, path_of(file), &entry.parent.0, &entry.name, AtFlags::SYMLINK_FOLLOW)?)
     }
 
     #[cfg(target_os = "linux")]
@@ -331,41 +296,28 @@ mod system {
     #[cfg(not(target_os = "linux"))]
     pub(crate) use super::without_unnamed_files::{create_unnamed, link};
 
-    pub fn read(parent: &Handle, name: &OsStr, _: &Path) -> io::Result<File> {
-        Ok(fs::openat(&parent.0, name, FILE | OFlags::RDONLY, Mode::empty())?.into())
+    pub(crate) fn remove(entry: &FolderEntry) -> io::Result<()> {
+        Ok(fs::unlinkat(&entry.parent.0, &entry.name, AtFlags::empty())?)
     }
 
-    pub fn write(parent: &Handle, name: &OsStr, _: &Path) -> io::Result<File> {
-        Ok(fs::openat(&parent.0, name, FILE | OFlags::WRONLY, Mode::empty())?.into())
-    }
-
-    pub fn extend(parent: &Handle, name: &OsStr, _: &Path) -> io::Result<File> {
-        let flags = FILE | OFlags::WRONLY | OFlags::CREATE | OFlags::APPEND;
-        Ok(fs::openat(&parent.0, name, flags, FILE_MODE)?.into())
-    }
-
-    pub fn remove(parent: &Handle, name: &OsStr, _: &Path) -> io::Result<()> {
-        Ok(fs::unlinkat(&parent.0, name, AtFlags::empty())?)
-    }
-
-    pub(crate) fn rename(from: (&Handle, &OsStr, &Path), to: (&Handle, &OsStr, &Path)) -> io::Result<()> {
-        Ok(fs::renameat(&from.0.0, from.1, &to.0.0, to.1)?)
+    pub(crate) fn rename(from: &FolderEntry, to: &FolderEntry) -> io::Result<()> {
+        Ok(fs::renameat(&from.parent.0, &from.name, &to.parent.0, &to.name)?)
     }
 
     pub fn sync(handle: &Handle) -> io::Result<()> {
         Ok(fs::fsync(&handle.0)?)
     }
 
-    pub fn list(handle: &Handle, _: &Path) -> io::Result<Vec<OsString>> {
+    pub(crate) fn list(entry: &FolderEntry, _: &Path) -> io::Result<Vec<OsString>> {
         let name =
             |entry: rustix::io::Result<fs::DirEntry>| Ok(OsStr::from_bytes(entry?.file_name().to_bytes()).into());
-        let names = fs::Dir::read_from(&handle.0)?.map(name).collect::<io::Result<Vec<OsString>>>()?;
+        let names = fs::Dir::read_from(&entry.parent.0)?.map(name).collect::<io::Result<Vec<OsString>>>()?;
         Ok(names.into_iter().filter(|name| name != "." && name != "..").collect())
     }
 
-    pub fn links(parent: &Handle, name: &OsStr, file: &File) -> io::Result<u64> {
+    pub(crate) fn links(entry: &FolderEntry, file: &File) -> io::Result<u64> {
         let open = fs::fstat(file)?;
-        let there = match fs::statat(&parent.0, name, AtFlags::SYMLINK_NOFOLLOW) {
+        let there = match fs::statat(&entry.parent.0, &entry.name, AtFlags::SYMLINK_NOFOLLOW) {
             Err(error) if io::Error::from(error).kind() == ErrorKind::NotFound => return Ok(0),
             there => there?,
         };
@@ -375,14 +327,31 @@ mod system {
     }
 }
 
+#[cfg(not(target_os = "linux"))]
+mod without_unnamed_files {
+    use super::FolderEntry;
+    use std::fs::File;
+    use std::io::{ErrorKind, Result};
+
+    pub(crate) fn create_unnamed(_: &FolderEntry) -> Option<File> {
+        None
+    }
+
+    pub(crate) fn link(_: &FolderEntry, _: &File) -> Result<()> {
+        Err(ErrorKind::Unsupported.into())
+    }
+}
+
 #[cfg(not(unix))]
 mod system {
-    use std::ffi::{OsStr, OsString};
+    use std::ffi::OsString;
     use std::fs::{self, File, OpenOptions};
     use std::io::{self, ErrorKind};
     use std::path::Path;
 
-    use super::{FileKind, Handle, not_a_folder};
+    use super::{FileKind, FolderEntry, Handle, OpenAs, not_a_folder};
+
+    pub(crate) use super::without_unnamed_files::{create_unnamed, link};
 
     pub fn open(path: &Path) -> io::Result<Handle> {
         match fs::metadata(path)?.is_dir() {
@@ -403,19 +372,19 @@ mod system {
         Ok(None)
     }
 
-    pub fn step(parent: &Handle, name: &OsStr, path: &Path) -> io::Result<Handle> {
-        match kind(parent, name, path)? {
+    pub(crate) fn step(entry: &FolderEntry) -> io::Result<Handle> {
+        match kind(entry)? {
             Some(FileKind::Folder) => Ok(Handle()),
-            there => Err(not_a_folder(there, path, ErrorKind::NotFound.into())),
+            _ => Err(not_a_folder(entry, ErrorKind::NotFound.into())),
         }
     }
 
-    pub(crate) fn create_folder(_: &Handle, _: &OsStr, path: &Path) -> io::Result<()> {
-        fs::create_dir(path)
+    pub(crate) fn create_folder(entry: &FolderEntry) -> io::Result<()> {
+        fs::create_dir(&entry.path)
     }
 
-    pub fn kind(_: &Handle, _: &OsStr, path: &Path) -> io::Result<Option<FileKind>> {
-        match fs::symlink_metadata(path) {
+    pub(crate) fn kind(entry: &FolderEntry) -> io::Result<Option<FileKind>> {
+        match fs::symlink_metadata(&entry.path) {
             Ok(there) if there.is_symlink() => Ok(Some(FileKind::Link)),
             Ok(there) if there.is_dir() => Ok(Some(FileKind::Folder)),
             Ok(there) if there.is_file() => Ok(Some(FileKind::File)),
@@ -425,41 +394,34 @@ mod system {
         }
     }
 
-    pub(crate) fn create_new(_: &Handle, _: &OsStr, path: &Path) -> io::Result<File> {
-        OpenOptions::new().write(true).create_new(true).open(path)
+    pub(crate) fn open_file(entry: &FolderEntry, how: OpenAs) -> io::Result<File> {
+        let mut options = OpenOptions::new();
+        match how {
+            OpenAs::Read => options.read(true),
+            OpenAs::Write => options.write(true),
+            OpenAs::Append => options.append(true).create(true),
+            OpenAs::New => options.write(true).create_new(true),
+        };
+        options.open(&entry.path)
     }
 
-    pub(crate) use super::without_unnamed_files::{create_unnamed, link};
-
-    pub fn read(_: &Handle, _: &OsStr, path: &Path) -> io::Result<File> {
-        File::open(path)
+    pub(crate) fn remove(entry: &FolderEntry) -> io::Result<()> {
+        fs::remove_file(&entry.path)
     }
 
-    pub fn write(_: &Handle, _: &OsStr, path: &Path) -> io::Result<File> {
-        OpenOptions::new().write(true).open(path)
-    }
-
-    pub fn extend(_: &Handle, _: &OsStr, path: &Path) -> io::Result<File> {
-        OpenOptions::new().append(true).create(true).open(path)
-    }
-
-    pub fn remove(_: &Handle, _: &OsStr, path: &Path) -> io::Result<()> {
-        fs::remove_file(path)
-    }
-
-    pub(crate) fn rename(from: (&Handle, &OsStr, &Path), to: (&Handle, &OsStr, &Path)) -> io::Result<()> {
-        fs::rename(from.2, to.2)
+    pub(crate) fn rename(from: &FolderEntry, to: &FolderEntry) -> io::Result<()> {
+        fs::rename(&from.path, &to.path)
     }
 
     pub fn sync(_: &Handle) -> io::Result<()> {
         Ok(())
     }
 
-    pub fn list(_: &Handle, path: &Path) -> io::Result<Vec<OsString>> {
+    pub(crate) fn list(_: &FolderEntry, path: &Path) -> io::Result<Vec<OsString>> {
         fs::read_dir(path)?.map(|entry| Ok(entry?.file_name())).collect()
     }
 
-    pub fn links(_: &Handle, _: &OsStr, _: &File) -> io::Result<u64> {
+    pub(crate) fn links(_: &FolderEntry, _: &File) -> io::Result<u64> {
         Ok(1)
     }
 }

@@ -1,14 +1,16 @@
 //! Reads the configs and metrics of finished and unfinished runs.
 
+use std::ffi::OsString;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use super::RecordError;
 use super::digests::{Digests, Verification};
 use super::disk::Place;
-use super::folder::{self, CONFIG, METRICS, POLICIES};
-use super::metrics::{self, RowsError};
+use super::folder::{self, CONFIG, METRICS, POLICIES, RUNS};
+use super::metrics;
 use super::{finished, policies};
+use crate::shell;
 use flotilla::config::{Config, ConfigError};
 use flotilla::escape::PathExt;
 use flotilla::file;
@@ -63,10 +65,36 @@ pub enum ReadError {
     Record(#[from] RecordError),
 }
 
+impl ReadError {
+    /// Returns what the user can do about it.
+    pub fn help(&self) -> Option<String> {
+        Some(match self {
+            ReadError::Missing(folder) if Path::new(RUNS).join(folder).is_dir() => {
+                format!("did you mean {}?", Path::new(RUNS).join(folder).escaped())
+            }
+            ReadError::Missing(folder) => {
+                let words = ["flotilla", "train", "CONFIG", "--out"].map(OsString::from);
+                format!("`{}` makes a run there", shell::command(words.into_iter().chain([shell::argument(folder)])))
+            }
+            ReadError::NoFolder(path) if file::is_zip(path) => {
+                format!("unpack it with `{}`", shell::command(["unzip".into(), shell::argument(path)]))
+            }
+            ReadError::NoFolder(_) | ReadError::Foreign { .. } => "`flotilla train CONFIG --out DIR` makes one".into(),
+            ReadError::Config { .. } => {
+                "find a config that is whole, and repeat the run with `flotilla train CONFIG --out DIR`".into()
+            }
+            ReadError::Unfinished { folder, .. } => {
+                let [config, out] = [&folder.join(CONFIG), folder].map(|path| shell::argument(path));
+                let words = ["flotilla".into(), "train".into(), config, "--out".into(), out, "--resume".into()];
+                format!("finish the run with `{}`", shell::command(words))
+            }
+            ReadError::Record(error) => return error.help("try again"),
+            ReadError::Collection { .. } => return None,
+        })
+    }
+}
+
 /// Reads a run's config.
-///
-/// # Errors
-/// The folder does not exist, is not a run, or its config is damaged or was changed after the run.
 pub fn config(folder: &Path, verification: Verification) -> Result<Config, ReadError> {
     let kind = std::fs::metadata(folder).map_err(|error| match error.kind() {
         ErrorKind::NotFound => ReadError::Missing(folder.into()),
@@ -103,7 +131,7 @@ pub fn metrics<'a>(
     place: impl Into<Place<'a>>,
     config: &Config,
     verification: Verification,
-    mut each: impl FnMut(&Row),
+    each: impl FnMut(&Row),
 ) -> Result<(), ReadError> {
     let place = place.into();
     let (folder, path) = (place.path(), place.path().join(METRICS));
@@ -113,49 +141,16 @@ pub fn metrics<'a>(
     if !place.at(&path).exists().map_err(RecordError::read(&path))? {
         return Err(unfinished(format!("it has no {METRICS} yet")));
     }
-    let damaged = |reason: String| ReadError::Record(RecordError::Damaged { path: path.clone(), reason });
-    let mut count = 0;
-    let mut rows = metrics::open(place.at(&path))?;
-    for row in &mut rows {
-        let row = match row {
-            Ok((row, _)) => row,
-            // A partial last line belongs to a run that is still training or was killed.
-            Err(RowsError::CutShort(_)) => break,
-            Err(error) => return Err(damaged(error.to_string())),
-        };
-        let (trials, generations) = (config.learning.trials, config.learning.generations);
-        if row.trial >= trials || row.generation > generations {
-            let (trial, generation) = (row.trial, row.generation);
-            return Err(damaged(format!(
-                "line {} is trial {trial}, generation {generation}, which the run's {CONFIG} does not have",
-                count + 2
-            )));
-        }
-        each(&row);
-        count += 1;
-    }
-    digests.compare_metrics(&path, rows.digest())?;
-    if count == 0 { Err(unfinished(format!("its {METRICS} has no rows yet"))) } else { Ok(()) }
+    let found = metrics::visit(place.at(&path), config, each)?;
+    digests.compare_metrics(&path, found.digest)?;
+    if found.rows == 0 { Err(unfinished(format!("its {METRICS} has no rows yet"))) } else { Ok(()) }
 }
 
 /// Reads the results of a finished run from its folder.
-///
-/// # Errors
-/// The folder has no finished run, or its files are damaged or were changed after the run.
 pub fn trained(folder: &Path, verification: Verification) -> Result<Trained, ReadError> {
     let config = config(folder, verification)?;
-    let (mut rows, mut next) = (Vec::new(), vec![0; config.learning.trials]);
-    let mut in_order = true;
-    metrics(folder, &config, verification, |row| {
-        in_order &= next[row.trial] == row.generation;
-        next[row.trial] += 1;
-        rows.push(*row);
-    })?;
-    if !in_order {
-        let path = folder.join(METRICS);
-        let reason = "it must have one row per trial and generation, in order".into();
-        return Err(RecordError::Damaged { path, reason }.into());
-    }
+    let mut rows = Vec::new();
+    metrics(folder, &config, verification, |row| rows.push(*row))?;
     let (found, expected) = (rows.len(), config.learning.trials * (config.learning.generations + 1));
     if found != expected {
         let reason = format!("its {} has {found} rows of {expected}", METRICS);
@@ -168,7 +163,7 @@ pub fn trained(folder: &Path, verification: Verification) -> Result<Trained, Rea
     let trained = Trained::new(config, &rows, policies, ending);
     // The config and the metrics match their digests, so the policies must differ.
     match digests.run {
-        Some(digest) if digest != trained.digest() => Err(RecordError::Differs { path }.into()),
+        Some(digest) if digest != trained.digest() => Err(RecordError::Differs(path).into()),
         _ => Ok(trained),
     }
 }

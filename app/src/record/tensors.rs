@@ -48,9 +48,6 @@ impl<'a> Tensor<'a> {
 }
 
 /// Writes the content of a file of a kind (such as "policies 1") to a stream. Returns its checksum.
-///
-/// # Errors
-/// Returns the stream's error.
 pub fn put(
     output: &mut dyn Write,
     kind: &str,
@@ -96,9 +93,6 @@ pub struct TensorFile<R> {
 
 impl<R: Read + Seek> TensorFile<R> {
     /// Opens a file and verifies its checksum.
-    ///
-    /// # Errors
-    /// Returns a description of the problem.
     pub fn open(source: R) -> Result<TensorFile<R>, String> {
         let mut source = BufReader::with_capacity(1 << 16, source);
         let describe = |error: io::Error| match error.kind() {
@@ -184,9 +178,6 @@ impl<R: Read + Seek> TensorFile<R> {
     }
 
     /// Reads the numbers of a tensor, split into `parts` equal parts.
-    ///
-    /// # Errors
-    /// The tensor is missing, has another type or shape, or there is not enough memory.
     pub fn read<T: bytemuck::Pod>(
         &mut self,
         name: &str,
@@ -232,9 +223,6 @@ pub(crate) fn newer(place: Place<'_>) -> Option<Option<String>> {
 }
 
 /// Opens a file.
-///
-/// # Errors
-/// The file is missing, cannot be read or is damaged.
 pub fn open<'a>(place: impl Into<Place<'a>>) -> Result<TensorFile<std::fs::File>, RecordError> {
     let place = place.into();
     let file = place.open().map_err(RecordError::read(place.path()))?;

@@ -9,6 +9,7 @@ use serde::Serialize;
 use super::runs::{self, ReadError};
 use super::table;
 use crate::record::digests::Verification;
+use flotilla::config::Config;
 use flotilla::escape::{self, PathExt};
 use flotilla::statistics::{self, Estimate, Tested, power_of};
 
@@ -38,19 +39,21 @@ pub struct Trial {
 
 impl Cohort {
     /// Reads the trials of some runs, which may be unfinished.
-    ///
-    /// # Errors
-    /// A run cannot be read.
     pub fn read(name: String, folders: Vec<PathBuf>, verification: Verification) -> Result<Cohort, ReadError> {
-        let mut arm = Cohort { name, folders, planned: 0, trials: vec![] };
-        for folder in &arm.folders {
-            let config = runs::config(folder, verification)?;
-            let trials = runs::trials(folder, &config, verification)?.into_iter().enumerate();
-            let from = config.last_from();
-            arm.trials.extend(trials.map(|(trial, scores)| Trial { key: (config.learning.seed, trial), scores, from }));
-            arm.planned = arm.planned.max(config.learning.generations);
-        }
+        let mut arm = Cohort { name, folders: vec![], planned: 0, trials: vec![] };
+        folders.into_iter().try_for_each(|folder| arm.add(folder, verification).map(drop))?;
         Ok(arm)
+    }
+
+    /// Adds the trials of a run, which may be unfinished. Returns its config.
+    pub(crate) fn add(&mut self, folder: PathBuf, verification: Verification) -> Result<Config, ReadError> {
+        let config = runs::config(&folder, verification)?;
+        let trials = runs::trials(&folder, &config, verification)?.into_iter().enumerate();
+        let from = config.last_from();
+        self.trials.extend(trials.map(|(trial, scores)| Trial { key: (config.learning.seed, trial), scores, from }));
+        self.planned = self.planned.max(config.learning.generations);
+        self.folders.push(folder);
+        Ok(config)
     }
 
     /// Returns the arm's name and its directories, for messages.
@@ -331,9 +334,6 @@ pub fn compare(place: &str, arms: &[Cohort], options: &Question) -> Result<Compa
 }
 
 /// Compares two or more arms by given values per measure, `[arms][trials]` each.
-///
-/// # Errors
-/// An arm has fewer than two trials.
 pub fn of_values(
     place: &str,
     generation: usize,
@@ -500,29 +500,13 @@ pub fn latex(all: &[Comparison], options: &Question) -> String {
     text
 }
 
+/// Columns of the comparisons as CSV.
+const COLUMNS: &str = "where,measure,generation,reach,arm,other,trials,other_trials,value,low,high,reached,a,p,p_holm";
+
 /// Writes the comparisons as CSV: one row per measure and arm, then one per measure and pair.
-///
-/// # Errors
-/// The output cannot be written.
 pub fn csv(all: &[Comparison], output: impl io::Write) -> io::Result<()> {
     let mut table = csv::Writer::from_writer(output);
-    table.write_record([
-        "where",
-        "measure",
-        "generation",
-        "reach",
-        "arm",
-        "other",
-        "trials",
-        "other_trials",
-        "value",
-        "low",
-        "high",
-        "reached",
-        "a",
-        "p",
-        "p_holm",
-    ])?;
+    table.write_record(COLUMNS.split(','))?;
     for Comparison { place, generation: last, arms: named, measures, .. } in all {
         for Measured { measure, arms, pairs } in measures {
             let (generation, reach) = match *measure {

@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use serde::de::IntoDeserializer;
 use serde::{Deserialize, Serialize};
 
-use super::scene::{Anchor, BLACK, COLORS, Color, Fill, GREY, LIGHT, Pen, Scene, WHITE, text_width};
+use super::scene::{Anchor, BLACK, COLORS, Color, Fill, GREY, LIGHT, Pen, Scene, WHITE, rounded, text_width};
 use flotilla::statistics::{self, Average};
 
 /// Width of a column of a two-column paper, in millimetres.
@@ -231,7 +231,7 @@ impl Figure {
             let left = edge + (width + GAP) * column as f64;
             let axes = Axes { left, above, width, height, x_max, most: self.y_max };
             scene.bold([left + width / 2.0, above - 1.3], &*panel.title, NORMAL, Anchor::Middle, BLACK);
-            axes.draw(&mut scene, column == 0, self.y_max, self.shares);
+            axes.draw(&mut scene, column == 0, self.shares, COLUMN);
             axes.stages(&mut scene, &panel.stages);
             if column == 0 {
                 let label = match each {
@@ -365,12 +365,13 @@ impl Axes {
         [self.left + self.width * generation / self.x_max, self.above + self.height * (1.0 - y)]
     }
 
-    fn draw(&self, scene: &mut Scene, numbered: bool, y_end: f64, shares: bool) {
+    /// Draws the axes. The y axis has numbers if it is `numbered`: shares, or numbers of POIs. The picture ends at `edge`.
+    pub fn draw(&self, scene: &mut Scene, numbered: bool, shares: bool, edge: f64) {
         let Axes { left, above, width, height, .. } = *self;
         let (right, below) = (left + width, above + height);
         let ticks = match shares {
             true => [0.0, 0.25, 0.5, 0.75, 1.0].to_vec(),
-            false => poi_ticks(y_end as usize).into_iter().map(|tick| tick as f64).collect(),
+            false => poi_ticks(self.most as usize).into_iter().map(|tick| tick as f64).collect(),
         };
         for tick in ticks {
             let [_, y] = self.at(0.0, tick);
@@ -384,7 +385,7 @@ impl Axes {
             let [x, _] = self.at(tick, 0.0);
             scene.line(vec![[x, below], [x, below + 0.9]], Pen::new(BLACK, 0.2));
             let label = number(tick);
-            let inside = COLUMN - 0.3 - text_width(&label, SMALL) / 2.0;
+            let inside = edge - 0.3 - text_width(&label, SMALL) / 2.0;
             scene.text([x.min(inside), below + 3.5], label, SMALL, Anchor::Middle, BLACK);
         }
         scene.line(vec![[left, above], [left, below], [right, below]], Pen::new(BLACK, 0.2));
@@ -506,8 +507,7 @@ pub fn poi_ticks(pois: usize) -> Vec<usize> {
 }
 
 fn number(value: f64) -> String {
-    let text = format!("{value:.3}");
-    text.trim_end_matches('0').trim_end_matches('.').to_string()
+    rounded(value, 3)
 }
 
 /// Shortens labels to a width but keeps them distinct.

@@ -2,7 +2,7 @@
 //! at a time.
 
 use super::curves::{Axes, Band, Curve, Look, NORMAL, SMALL, band_caption, distinct, draw_caption, needs_bars};
-use super::scene::{Anchor, BLACK, Color, Fill, GREY, LIGHT, Pen, Scene, WHITE, text_width};
+use super::scene::{Anchor, BLACK, Color, Fill, GREY, LIGHT, Pen, Scene, WHITE, colors, text_width};
 
 /// Maximum width of a figure in millimetres. Further panels go to the next row.
 const WIDEST: f64 = 180.0;
@@ -10,17 +10,8 @@ const GAP: f64 = 5.0;
 
 /// A sequential palette of decreasing lightness (ColorBrewer's YlGnBu). It keeps its order for colour-blind readers and
 /// in greyscale.
-const PALETTE: [Color; 9] = [
-    [255, 255, 217],
-    [237, 248, 177],
-    [199, 233, 180],
-    [127, 205, 187],
-    [65, 182, 196],
-    [29, 145, 192],
-    [34, 94, 168],
-    [37, 52, 148],
-    [8, 29, 88],
-];
+const PALETTE: [Color; 9] =
+    colors([0xffffd9, 0xedf8b1, 0xc7e9b4, 0x7fcdbb, 0x41b6c4, 0x1d91c0, 0x225ea8, 0x253494, 0x081d58]);
 
 /// Returns the colour of a value in 0..1.
 pub(crate) fn shade(value: f64) -> Color {
@@ -224,7 +215,7 @@ impl Curves {
         let labels = distinct(&self.by.values, WIDEST / 3.0, SMALL);
         let entries: Vec<f64> = labels.iter().map(|value| 9.0 + text_width(value, SMALL)).collect();
         let legend = text_width(&self.by.label, NORMAL) + 6.0;
-        let mut panels = Panels::new(self.panels.len(), least, HEIGHT, LEFT, 12.0);
+        let mut panels = Panels::new(self.panels.len(), least, HEIGHT, LEFT, 15.0);
         if self.columns > 0 {
             panels.columns = panels.columns.min(self.columns);
         }
@@ -248,7 +239,7 @@ impl Curves {
         let all = self.panels.iter().flat_map(|(_, curves)| curves).map(|(_, curve)| curve);
         let banded = band_caption(self.band, bars, all);
         let caption = if banded.is_some() { 4.5 } else { 0.0 };
-        let mut scene = Scene::new(whole, panels.above + panels.height() - 2.0 + caption);
+        let mut scene = Scene::new(whole, panels.above + panels.height() + caption);
         (scene.title, scene.description) = (self.title.clone(), self.description());
         if let Some(caption) = banded {
             let place = [3.0, scene.height - 2.0];
@@ -266,22 +257,8 @@ impl Curves {
         for (index, (title, curves)) in self.panels.iter().enumerate() {
             let [left, above] = panels.place(index);
             let axes = Axes { left, above, width, height: HEIGHT, x_max: last, most: 1.0 };
-            for (tick, label) in [(0.0, "0"), (0.5, "0.5"), (1.0, "1")] {
-                let [_, y] = axes.at(0.0, tick);
-                scene.line(vec![[left, y], [left + width, y]], Pen::new(LIGHT, 0.15));
-                if panels.is_first(index) {
-                    scene.text([left - 1.3, y + 0.9], label, SMALL, Anchor::End, BLACK);
-                }
-            }
-            scene.line(
-                vec![[left, above], [left, above + HEIGHT], [left + width, above + HEIGHT]],
-                Pen::new(BLACK, 0.2),
-            );
-            for (generation, anchor) in [(0.0, Anchor::Middle), (last, Anchor::End)] {
-                let [x, y] = axes.at(generation, 0.0);
-                scene.text([x, y + 3.4], generation.to_string(), SMALL, anchor, BLACK);
-            }
-            scene.text([left + width / 2.0, above + HEIGHT + 3.4], "Generation", SMALL, Anchor::Middle, BLACK);
+            axes.draw(&mut scene, panels.is_first(index), true, whole);
+            scene.text([left + width / 2.0, above + HEIGHT + 7.4], "Generation", SMALL, Anchor::Middle, BLACK);
             scene.text([left + width / 2.0, above - 1.6], &**title, SMALL, Anchor::Middle, BLACK);
             if panels.is_first(index) {
                 scene.upright([4.0, above + HEIGHT / 2.0], &*self.y_label, SMALL, BLACK);

@@ -1,15 +1,17 @@
 //! The learning curves of finished and unfinished runs.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use serde::de::IntoDeserializer;
 use serde::{Deserialize, Serialize};
 
 use super::curves::{Band, Curve, Figure, Panel};
-use crate::record::RecordError;
+use super::map::counted;
 use crate::record::digests::{Digests, UNVERIFIED, Verification};
-use crate::record::folder::{METRICS, OWN_FITNESS, Run};
+use crate::record::folder::{OWN_FITNESS, Run};
 pub use crate::record::runs::{ReadError, config, metrics};
+use crate::record::{values_by_key, without_checkpoint};
 use flotilla::config::Config;
 use flotilla::escape::PathExt;
 use flotilla::statistics::Average;
@@ -74,31 +76,17 @@ impl std::str::FromStr for TeamKind {
     }
 }
 
-/// A run's metrics by generation, as shares of the POIs averaged over trials.
+/// A run's metrics by generation, as shares of the POIs averaged over trials: G of each [`TeamKind`].
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(crate) struct RunMetrics {
-    /// G of the best team.
-    pub best: Vec<Average>,
-    /// G of the mean team.
-    pub mean: Vec<Average>,
-    /// G of the champion.
-    pub champion: Vec<Average>,
-}
+pub(crate) struct RunMetrics([Vec<Average>; TeamKind::ALL.len()]);
 
 impl RunMetrics {
     /// Returns G of one kind of team.
     pub fn of(&self, kind: TeamKind) -> &[Average] {
-        match kind {
-            TeamKind::Best => &self.best,
-            TeamKind::Champion => &self.champion,
-            TeamKind::Mean => &self.mean,
-        }
+        &self.0[kind as usize]
     }
 
     /// Reads a run's metrics. Memory grows only with the number of generations.
-    ///
-    /// # Errors
-    /// See [`metrics()`].
     pub fn read(folder: &Path, config: &Config, verification: Verification) -> Result<RunMetrics, ReadError> {
         let mut run = RunMetrics::default();
         metrics(folder, config, verification, |row| run.add(row))?;
@@ -106,43 +94,26 @@ impl RunMetrics {
     }
 
     pub(crate) fn add(&mut self, row: &Row) {
-        let added = [(&mut self.best, row.best_g), (&mut self.mean, row.mean_g), (&mut self.champion, row.champion_g)];
-        for (averages, g) in added {
+        for (averages, kind) in self.0.iter_mut().zip(TeamKind::ALL) {
             if averages.len() <= row.generation {
                 averages.resize(row.generation + 1, Average::default());
             }
-            averages[row.generation].add(g);
+            averages[row.generation].add(kind.of(row));
         }
     }
 }
 
 /// Reads G of the best team and of the champion, `[trials][generations]`, as far as the run has progressed.
-///
-/// # Errors
-/// See [`metrics()`]. It also fails if a trial's rows are out of order.
 pub fn trials(folder: &Path, config: &Config, verification: Verification) -> Result<Vec<Vec<[f64; 2]>>, ReadError> {
     let mut trials = vec![vec![]; config.learning.trials];
-    let mut skipped = None;
-    metrics(folder, config, verification, |row| match &mut trials[row.trial] {
-        trial if trial.len() == row.generation => trial.push([row.best_g, row.champion_g]),
-        _ => skipped = skipped.or(Some((row.trial, row.generation))),
-    })?;
-    match skipped {
-        None => Ok(trials),
-        Some((trial, generation)) => Err(ReadError::Record(RecordError::Damaged {
-            path: folder.join(METRICS),
-            reason: format!("trial {trial} of generation {generation} is out of order"),
-        })),
-    }
+    metrics(folder, config, verification, |row| trials[row.trial].push([row.best_g, row.champion_g]))?;
+    Ok(trials)
 }
 
 /// Returns the figure of G by generation: of one kind of team in each run, or of all kinds in a single run.
 ///
 /// By default, one run shows all kinds of teams, and several runs show their champions. Several runs are labelled by
 /// the config keys that differ.
-///
-/// # Errors
-/// A run cannot be read.
 pub fn figure(
     folders: &[PathBuf],
     measure: Option<TeamKind>,
@@ -222,9 +193,6 @@ fn figure_of_runs(
 /// Reports whether trials of several runs form pairs, because all runs have the same seed.
 ///
 /// Paired trials share their starts and all random numbers. If sizes agree, they also share their first populations.
-///
-/// # Errors
-/// A run cannot be read.
 pub fn paired(folders: &[PathBuf], verification: Verification) -> Result<bool, ReadError> {
     let seed = |folder: &PathBuf| Ok(config(folder, verification)?.learning.seed);
     let seeds = folders.iter().map(seed).collect::<Result<Vec<_>, ReadError>>()?;
@@ -234,46 +202,30 @@ pub fn paired(folders: &[PathBuf], verification: Verification) -> Result<bool, R
 /// Labels runs by the config keys that differ between them, or by their directories if none differ. A fitness that is
 /// not the config's is labelled [`OWN_FITNESS`].
 pub fn labels(folders: &[PathBuf], configs: &[Config]) -> Vec<String> {
-    let table = |(config, folder): (&Config, &PathBuf)| {
-        let mut table = toml::Table::try_from(config).unwrap_or_default();
-        if let Some(learning) = table.get_mut("learning").filter(|_| Run::has_own_fitness(folder)) {
-            learning["fitness"] = OWN_FITNESS.into();
-        }
-        table
-    };
-    let tables: Vec<toml::Table> = configs.iter().zip(folders).map(table).collect();
-    let Some(first) = tables.first() else { return vec![] };
-    let value = |table: &toml::Table, section: &str, key: &str| {
-        let text = table.get(section).and_then(|section| section.get(key)).map_or("-".into(), toml::Value::to_string);
-        text.trim_matches('"').to_string()
-    };
-    let mut keys = Vec::new();
-    for (section, entries) in first {
+    let values = |(config, folder): (&Config, &PathBuf)| {
         // The checkpoint interval does not affect results.
-        for key in entries.as_table().into_iter().flat_map(toml::Table::keys).filter(|_| section != "checkpoint") {
-            let differs = tables.iter().any(|table| value(table, section, key) != value(first, section, key));
-            if differs {
-                keys.push((section, key));
-            }
+        let mut values = values_by_key(&without_checkpoint(config));
+        if Run::has_own_fitness(folder) {
+            values.insert("learning.fitness".into(), OWN_FITNESS.into());
         }
-    }
+        values
+    };
+    let tables: Vec<BTreeMap<String, toml::Value>> = configs.iter().zip(folders).map(values).collect();
+    let Some(first) = tables.first() else { return vec![] };
+    let differs = |key: &&String| tables.iter().any(|table| table.get(*key) != first.get(*key));
+    let keys: Vec<_> = first.keys().filter(differs).filter_map(|key| Some((key, key.split_once('.')?.1))).collect();
     let staged = configs.iter().any(|config| config.stages != configs[0].stages);
-    let label = |((folder, table), config): ((&PathBuf, &toml::Table), &Config)| {
+    let label = |((folder, table), config): ((&PathBuf, &BTreeMap<String, toml::Value>), &Config)| {
         let stages = match config.stages.len() {
             0 => "no stages".into(),
-            1 => "1 stage".into(),
-            several => format!("{several} stages"),
+            _ => counted(config.stages.len(), "stage"),
         };
-        let parts: Vec<String> = keys
-            .iter()
-            .map(|(section, key)| {
-                let value = value(table, section, key);
-                // Long values such as positions are unreadable in a label.
-                if value.len() > 24 { String::new() } else { format!("{key} {value}") }
-            })
-            .filter(|part| !part.is_empty())
-            .chain(Some(stages).filter(|_| staged))
-            .collect();
+        let part = |&(key, leaf): &(&String, &str)| {
+            let value = table.get(key).map_or("-".into(), toml::Value::to_string);
+            // Long values such as positions are unreadable in a label.
+            Some(value.trim_matches('"')).filter(|value| value.len() <= 24).map(|value| format!("{leaf} {value}"))
+        };
+        let parts: Vec<String> = keys.iter().filter_map(part).chain(Some(stages).filter(|_| staged)).collect();
         if parts.is_empty() { folder.escaped().to_string() } else { parts.join(", ") }
     };
     let labels: Vec<String> = folders.iter().zip(&tables).zip(configs).map(label).collect();

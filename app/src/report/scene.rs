@@ -23,6 +23,17 @@ const MAX_PIXELS: f64 = 8192.0;
 /// Red, green and blue.
 pub type Color = [u8; 3];
 
+/// Returns colours from their codes, such as 0xff8800.
+pub(crate) const fn colors<const N: usize>(codes: [u32; N]) -> [Color; N] {
+    let (mut colors, mut at) = ([[0; 3]; N], 0);
+    while at < N {
+        let [_, red, green, blue] = codes[at].to_be_bytes();
+        colors[at] = [red, green, blue];
+        at += 1;
+    }
+    colors
+}
+
 /// Text.
 pub(crate) const BLACK: Color = [0, 0, 0];
 /// Background.
@@ -34,8 +45,7 @@ pub(crate) const LIGHT: Color = [222, 222, 222];
 
 /// Colours that colour-blind readers can distinguish, after Okabe and Ito. The first ones are also distinct in
 /// greyscale.
-pub(crate) const COLORS: [Color; 7] =
-    [[0, 114, 178], [213, 94, 0], [0, 158, 115], [204, 121, 167], [86, 180, 233], [140, 109, 0], [0, 0, 0]];
+pub(crate) const COLORS: [Color; 7] = colors([0x0072b2, 0xd55e00, 0x009e73, 0xcc79a7, 0x56b4e9, 0x8c6d00, 0x000000]);
 
 /// The style of a line.
 #[derive(Clone, Debug, PartialEq)]
@@ -382,9 +392,6 @@ impl Scene {
 
     /// Returns the picture as a PNG file with the given number of pixels per millimetre. The file states its
     /// resolution, so that it prints at the scene's size.
-    ///
-    /// # Errors
-    /// The encoder fails, which happens only if memory runs out.
     pub fn png(&self, per_mm: f64) -> std::io::Result<Vec<u8>> {
         let pixmap = self.pixels(per_mm);
         let mut file = Vec::new();
@@ -407,9 +414,6 @@ impl Scene {
     }
 
     /// Returns the picture as a file. `per_mm` is the number of pixels per millimetre of a PNG.
-    ///
-    /// # Errors
-    /// An encoder fails, which happens only if memory runs out.
     pub fn file(&self, kind: Format, per_mm: f64) -> std::io::Result<Vec<u8>> {
         match kind {
             Format::Svg => Ok(self.svg().into_bytes()),
@@ -476,13 +480,18 @@ pub(super) fn hex([r, g, b]: Color) -> String {
     format!("#{r:02x}{g:02x}{b:02x}")
 }
 
-/// A number printed with at most two decimals and without trailing zeros.
+/// Returns a number with at most this many decimals, and without trailing zeros.
+pub(super) fn rounded(value: f64, digits: usize) -> String {
+    let text = format!("{value:.digits$}");
+    text.trim_end_matches('0').trim_end_matches('.').to_string()
+}
+
+/// A number printed with at most two decimals.
 struct Rounded(f64);
 
 impl std::fmt::Display for Rounded {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let text = format!("{:.2}", self.0);
-        f.write_str(text.trim_end_matches('0').trim_end_matches('.'))
+        f.write_str(&rounded(self.0, 2))
     }
 }
 

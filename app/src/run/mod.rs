@@ -72,6 +72,22 @@ impl RunError {
             SnapshotError::Backend(error) => RunError::Fetch(error),
         }
     }
+
+    /// Returns what the user can do about it.
+    pub fn help(&self) -> Option<String> {
+        Some(match self {
+            RunError::Record(error) => return error.help("continue with --resume"),
+            RunError::Backend { saved: Err(error), .. } => return error.help(),
+            RunError::Backend { saved: Ok(()), .. } => {
+                "continue with --resume, with --backend cpu to change to the CPU".into()
+            }
+            RunError::TooLittle(_) => {
+                "flotilla check shows what a config needs; `ulimit -v` and limits of a job or container count".into()
+            }
+            RunError::Fetch(_) => "--resume continues from the last checkpoint or the start".into(),
+            RunError::Memory { .. } | RunError::Config(_) => return None,
+        })
+    }
 }
 
 fn after(saved: &Result<(), Box<RunError>>) -> String {

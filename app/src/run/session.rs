@@ -237,9 +237,6 @@ impl Session {
 
     /// Makes the generation that each run plays next its last, unless an earlier one is. Returns the largest of these
     /// last generations. The results are those of a config with that number of generations.
-    ///
-    /// # Errors
-    /// A config or checkpoint cannot be read or written.
     pub fn end(&mut self) -> Result<usize, RunError> {
         let mut last = 0;
         for member in &mut self.members {

@@ -23,9 +23,6 @@ pub struct Twin {
 
 /// Records runs without training them. Each gets the metrics and policies of its twin, under its own config. Runs that
 /// are already recorded are not changed.
-///
-/// # Errors
-/// A folder cannot be used (see [`Folder::open`]), read or written.
 pub fn record_twins(twins: Vec<Twin>, start: Start, disk: &Disk) -> Result<(), RunError> {
     on_threads(twins, |twin| twin.record(start, disk)).map(drop)
 }

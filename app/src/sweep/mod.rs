@@ -111,9 +111,6 @@ pub struct Point {
 
 impl Sweep {
     /// Reads a sweep file. `flags` set config keys of all points, and `skip` skips invalid points.
-    ///
-    /// # Errors
-    /// The file cannot be read, or all problems of it and of its points.
     pub fn load(path: &Path, flags: &[Override], skip: bool) -> Result<Sweep, ConfigError> {
         let mut sweep = Sweep::read(&read_file(path)?, &config::name(path), flags, skip)?;
         if config::is_standard_input(path) {
@@ -123,9 +120,6 @@ impl Sweep {
     }
 
     /// Reads a sweep from its text. `name` is the file in errors.
-    ///
-    /// # Errors
-    /// All problems of the text and of its points.
     pub fn read(text: &str, name: &str, flags: &[Override], skip: bool) -> Result<Sweep, ConfigError> {
         let document = Document::parse(text);
         let Ok(mut base) = text.parse::<Table>() else {

@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use super::results::{Detail, Missing, Outcome};
+use super::results::{Detail, Missing, PointResults};
 use super::{Axis, Point, Sweep};
 use crate::record::RecordError;
 use crate::record::digests::UNVERIFIED;
@@ -22,7 +22,7 @@ const MAX_ROWS: usize = 100;
 const MAX_LABEL_WIDTH: f64 = 36.0;
 
 /// A finished point with its results, or none.
-type PointResult<'a> = Option<(&'a Point, &'a Outcome)>;
+type PointResult<'a> = Option<(&'a Point, &'a PointResults)>;
 
 /// The points by the values of two axes, with one panel for each combination of the other axes.
 struct PanelGrid<'a> {
@@ -43,12 +43,9 @@ pub fn names() -> impl Iterator<Item = String> {
 
 /// Draws the figures of the finished points over one or two axes. Returns the names of the files, or the reason why
 /// there are none.
-///
-/// # Errors
-/// A file cannot be written.
 pub fn draw(
     sweep: &Sweep,
-    outcomes: &[Result<Outcome, Missing>],
+    outcomes: &[Result<PointResults, Missing>],
     options: &Detail,
     axes: &[usize],
     out: &Path,
@@ -85,7 +82,7 @@ pub fn draw(
 
 /// Draws G in the last generation for every value of every varied key, with one panel for each
 /// combination of the grid.
-fn dots(sweep: &Sweep, outcomes: &[Result<Outcome, Missing>], options: &Detail) -> Result<Dots, String> {
+fn dots(sweep: &Sweep, outcomes: &[Result<PointResults, Missing>], options: &Detail) -> Result<Dots, String> {
     let (varied, grid): (Vec<usize>, Vec<usize>) = (0..sweep.axes.len()).partition(|&axis| sweep.axes[axis].varied);
     let rows: usize = varied.iter().map(|&axis| sweep.axes[axis].values.len() - 1).sum();
     let count = grid.iter().fold(1_usize, |count, &axis| count.saturating_mul(sweep.axes[axis].values.len()));
@@ -132,7 +129,7 @@ impl<'a> PanelGrid<'a> {
     /// Arranges the points by the requested axes, or by the first two with more than one value.
     fn new(
         sweep: &'a Sweep,
-        outcomes: &'a [Result<Outcome, Missing>],
+        outcomes: &'a [Result<PointResults, Missing>],
         asked: &[usize],
     ) -> Result<PanelGrid<'a>, String> {
         let varied = (0..sweep.axes.len()).filter(|&axis| sweep.axes[axis].values.len() > 1 && !asked.contains(&axis));
@@ -181,7 +178,7 @@ impl<'a> PanelGrid<'a> {
         &self,
         title: String,
         (key, key_label): (Vec<(f64, String)>, [String; 2]),
-        cell: impl Fn(&Point, &Outcome) -> Cell,
+        cell: impl Fn(&Point, &PointResults) -> Cell,
     ) -> HeatMap {
         let cells = |points: &Vec<PointResult<'_>>| {
             points.iter().map(|at| at.map_or(Cell::Empty, |(point, outcome)| cell(point, outcome))).collect()

@@ -34,7 +34,7 @@ pub struct Detail {
 
 /// The results of a point's trials.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Outcome {
+pub struct PointResults {
     /// The best team's G in the last generation, averaged over trials.
     pub best: Average,
     /// The champion's G in the last generation, averaged over trials.
@@ -46,7 +46,7 @@ pub struct Outcome {
     pub curve: Vec<(usize, Average)>,
 }
 
-impl Outcome {
+impl PointResults {
     /// Returns the average over trials of [`Detail::measure`]'s G in the last generation.
     pub fn measured(&self) -> Average {
         self.curve.last().map_or(Average::default(), |(_, average)| *average)
@@ -95,15 +95,12 @@ pub enum Missing {
 
 /// Writes `results.csv` and `points.csv` of the finished points to a disk in the sweep's folder. The points are read
 /// in `place`. Returns the results of every point.
-///
-/// # Errors
-/// The files cannot be written.
 pub fn write(
     sweep: &Sweep,
     place: Place<'_>,
     options: &Detail,
     disk: &Disk,
-) -> Result<Vec<Result<Outcome, Missing>>, RecordError> {
+) -> Result<Vec<Result<PointResults, Missing>>, RecordError> {
     let out = place.path();
     let mut outcomes = Vec::new();
     let path = out.join(RESULTS);
@@ -143,23 +140,13 @@ fn labels(sweep: &Sweep, point: &Point) -> Vec<String> {
 /// Writes `points.csv`, one row per point.
 fn summary(
     sweep: &Sweep,
-    outcomes: &[Result<Outcome, Missing>],
+    outcomes: &[Result<PointResults, Missing>],
     options: &Detail,
     output: &mut dyn Write,
 ) -> io::Result<()> {
     let mut table = csv::Writer::from_writer(output);
-    let columns = [
-        "point",
-        "trials",
-        "generations",
-        "champion_g",
-        "champion_g_low",
-        "champion_g_high",
-        "best_g",
-        "reach",
-        "reached",
-        "median",
-    ];
+    let columns =
+        "point,trials,generations,champion_g,champion_g_low,champion_g_high,best_g,reach,reached,median".split(',');
     table.write_record(sweep.axes.iter().map(|axis| &*axis.key).chain(columns))?;
     for (point, outcome) in sweep.points.iter().zip(outcomes) {
         let Ok(outcome) = outcome else { continue };
@@ -185,7 +172,7 @@ fn summary(
 }
 
 /// Reads the rows of a finished point for `results.csv`, by trial and generation, and its results.
-fn read(point: &Point, place: Place<'_>, options: &Detail) -> Result<(Vec<Row>, Outcome), Missing> {
+fn read(point: &Point, place: Place<'_>, options: &Detail) -> Result<(Vec<Row>, PointResults), Missing> {
     let folder = point_folder(place.path(), point);
     let damaged = |error: &dyn std::fmt::Display| Missing::Damaged(error.to_string());
     let path = folder.join(METRICS);
@@ -202,29 +189,20 @@ fn read(point: &Point, place: Place<'_>, options: &Detail) -> Result<(Vec<Row>, 
     let (trials, last) = (config.learning.trials, config.learning.generations);
     let mut rows: Vec<Vec<Row>> = vec![Vec::new(); trials];
     let mut reached = vec![None; trials];
-    let mut next = 0;
-    let mut source = metrics::open(place.at(&path)).map_err(|error| damaged(&error))?;
-    for row in &mut source {
-        let (row, _) = row.map_err(|error| damaged(&format!("{}: {error}", path.escaped())))?;
-        let Row { trial, generation, .. } = row;
-        if (generation, trial) != (next / trials, next % trials) || generation > last {
-            return Err(Missing::Damaged(format!(
-                "{}: trial {trial} of generation {generation} is out of order",
-                path.escaped()
-            )));
-        }
-        next += 1;
+    let found = metrics::visit(place.at(&path), &config, |row| {
+        let &Row { trial, generation, .. } = row;
         // G of an easier stage is not comparable.
-        if options.measure.of(&row) >= options.reach && reached[trial].is_none() && generation >= config.last_from() {
+        if options.measure.of(row) >= options.reach && reached[trial].is_none() && generation >= config.last_from() {
             reached[trial] = Some(generation);
         }
         if generation % options.every == 0 || generation == last {
-            rows[trial].push(row);
+            rows[trial].push(*row);
         }
-    }
-    digests.compare_metrics(&path, source.digest()).map_err(|error| damaged(&error))?;
-    if next < trials * (last + 1) {
-        return Err(Missing::Unfinished(next / trials, last));
+    });
+    let found = found.map_err(|error| damaged(&error))?;
+    digests.compare_metrics(&path, found.digest).map_err(|error| damaged(&error))?;
+    if found.rows < trials * (last + 1) {
+        return Err(Missing::Unfinished(found.rows / trials, last));
     }
     let ends = || rows.iter().filter_map(|rows| rows.last());
     let curve = (0..rows[0].len()).map(|at| {
@@ -232,7 +210,7 @@ fn read(point: &Point, place: Place<'_>, options: &Detail) -> Result<(Vec<Row>, 
         rows.iter().for_each(|rows| average.add(options.measure.of(&rows[at])));
         (rows[0][at].generation, average)
     });
-    let outcome = Outcome {
+    let outcome = PointResults {
         best: ends().map(|row| &row.best_g).collect(),
         champion: ends().map(|row| &row.champion_g).collect(),
         reached,

@@ -30,6 +30,8 @@ pub use resume::{FirstAndLastRows, differences};
 pub(crate) use run::RunSums;
 pub use run::{FileSums, OWN_FITNESS, Origin, Run, Status, now};
 
+/// The folder for runs whose folder is not named.
+pub const RUNS: &str = "runs";
 /// Exists while a run from given policies starts in a folder, until `run.json` records those policies.
 const INIT_MARK: &str = ".init";
 /// Locked by the process that trains in the folder. The system releases the lock when the process ends, even after a
@@ -164,12 +166,12 @@ impl Folder {
         disk: Disk,
     ) -> Result<(Folder, Resumed), RecordError> {
         if path.is_file() {
-            return Err(RecordError::NoFolder { path: path.into() });
+            return Err(RecordError::NoFolder(path.into()));
         }
         let disk = ownership::create_output_folder(&disk, path, true)?;
         ownership::refuse_links(&disk, path)?;
         let holds_run = || match ownership::holds_run(disk.at(path), config)? {
-            true if start == Start::Fresh => Err(RecordError::Exists { path: path.into() }),
+            true if start == Start::Fresh => Err(RecordError::Exists(path.into())),
             holds => Ok(holds),
         };
         holds_run()?;
@@ -298,9 +300,6 @@ impl Folder {
     }
 
     /// Writes `run.json`.
-    ///
-    /// # Errors
-    /// The file cannot be written.
     pub fn write_run(&self, run: &Run) -> Result<(), RecordError> {
         self.write_text(RUN, &run.to_json())
     }
@@ -339,9 +338,6 @@ fn numbered_config(number: usize) -> String {
 
 /// Checks whether runs may be started in folders, without changing them. With `Start::Fresh`, no folder may hold a run.
 /// Otherwise no other process may train in them.
-///
-/// # Errors
-/// One of the folders may not be used or cannot be read.
 pub fn check<'a>(
     disk: &Disk,
     folders: impl IntoIterator<Item = (&'a Path, &'a Config)>,
@@ -354,7 +350,7 @@ pub fn check<'a>(
             disk => disk.map_err(RecordError::write(path))?,
         };
         if ownership::holds_run(disk.at(path), config)? && start == Start::Fresh {
-            return Err(RecordError::Exists { path: path.into() });
+            return Err(RecordError::Exists(path.into()));
         }
         // Without a lock file, no process trains in the folder.
         let name = path.join(LOCK);
@@ -392,7 +388,7 @@ fn is_read_only(error: &io::Error) -> bool {
 pub fn lock(disk: &Disk, path: &Path) -> Result<Option<File>, RecordError> {
     let name = path.join(LOCK);
     disk.lock(&name).map_err(|error| match error.kind() {
-        ErrorKind::WouldBlock => RecordError::Locked { path: path.into() },
+        ErrorKind::WouldBlock => RecordError::Locked(path.into()),
         _ => RecordError::write(&name)(error),
     })
 }

@@ -25,30 +25,37 @@ pub fn collection(path: &Path) -> Option<&'static str> {
     all.into_iter().find(|(name, _)| path.join(name).exists()).map(|(_, what)| what)
 }
 
+/// Reports whether a folder contains one of these names.
+fn has(folder: &Path, names: &[&str]) -> bool {
+    names.iter().any(|name| folder.join(name).exists())
+}
+
+fn is_run(folder: &Path) -> bool {
+    has(folder, &[CONFIG]) && has(folder, &[RUN, METRICS, CHECKPOINTS])
+}
+
 /// Returns the folder of the run, sweep or paper that needs a file. Pictures and pages are not needed.
 pub fn owner(path: &Path) -> Option<PathBuf> {
     let path = file::resolved(path);
     let (folder, name) = (file::folder(&path), path.file_name()?.to_str()?);
-    let has = |folder: &Path, names: &[&str]| names.iter().any(|name| folder.join(name).exists());
-    let is_run = |folder: &Path| has(folder, &[CONFIG]) && has(folder, &[RUN, METRICS, CHECKPOINTS]);
-    let of_run = [CONFIG, RUN, METRICS, POLICIES, LOCK].contains(&name) && is_run(folder);
-    let of_sweep = [SWEEP, RESULTS, POINTS].contains(&name) && has(folder, &[SWEEP]);
-    let of_paper = name == PAPER && has(folder, &[ARMS]);
-    let checkpoint = folder.ends_with(CHECKPOINTS) && is_run(file::folder(folder));
-    match (of_run || of_sweep || of_paper, checkpoint) {
-        (true, _) => Some(folder.into()),
-        (_, true) => Some(file::folder(folder).into()),
-        _ => None,
+    if folder.ends_with(CHECKPOINTS) && is_run(file::folder(folder)) {
+        return Some(file::folder(folder).into());
     }
+    let is_needed = match name {
+        CONFIG | RUN | METRICS | POLICIES | LOCK => is_run(folder),
+        SWEEP | RESULTS | POINTS => has(folder, &[SWEEP]),
+        PAPER => has(folder, &[ARMS]),
+        _ => false,
+    };
+    is_needed.then(|| folder.into())
 }
 
 /// Returns the outermost folder of a run, sweep or paper that a path lies in, as the path names it.
 pub fn around(path: &Path) -> Option<&Path> {
     let is_ours = |folder: &Path| {
-        let has = |name: &str| folder.join(name).exists();
-        has(CONFIG) && [RUN, METRICS, CHECKPOINTS].into_iter().any(has)
-            || has(SWEEP) && has("points")
-            || has(PAPER) && has(ARMS)
+        is_run(folder)
+            || has(folder, &[SWEEP]) && has(folder, &["points"])
+            || has(folder, &[PAPER]) && has(folder, &[ARMS])
     };
     let descends = |folder: &&Path| {
         let below = path.strip_prefix(folder).unwrap_or(path);
@@ -60,9 +67,6 @@ pub fn around(path: &Path) -> Option<&Path> {
 }
 
 /// Creates the next folder after the last existing one of `stem`, `stem-2`, `stem-3`, … and returns its path.
-///
-/// # Errors
-/// The folder cannot be created.
 pub fn next_free(parent: &Path, stem: &str) -> Result<PathBuf, RecordError> {
     fs::create_dir_all(parent).map_err(RecordError::write(parent))?;
     let mut number = newest(parent, stem) + 1;

@@ -1,17 +1,20 @@
 //! Where a run in a folder resumes, and whether it is finished.
 
+use std::collections::BTreeSet;
 use std::io::ErrorKind;
 use std::path::Path;
 
-use sha2::{Digest, Sha256};
+use sha2::Digest;
 
 use super::{
     CHECKPOINTS, CONFIG, Checkpoint, Folder, INIT_MARK, METRICS, Note, Origin, POLICIES, RUN, Resumed, Run, RunSums,
 };
 use super::{StartFrom, Status};
-use crate::record::metrics::{self, RowsError};
-use crate::record::{RecordError, checkpoint, config_digest, hex, policies, tensors, without_checkpoint};
-use flotilla::config::{Config, MAX_STAGES};
+use crate::record::metrics;
+use crate::record::{
+    RecordError, checkpoint, config_digest, hex, policies, tensors, values_by_key, without_checkpoint,
+};
+use flotilla::config::Config;
 use flotilla::escape::PathExt;
 use flotilla::trainer::Row;
 
@@ -38,7 +41,7 @@ impl Folder {
             return Ok(());
         }
         if found.run.as_ref().is_some_and(|run| run.own_fitness) {
-            return Err(RecordError::OwnFitness { path: self.path.clone() });
+            return Err(RecordError::OwnFitness(self.path.clone()));
         }
         let mut kept = checkpoint::remove_temporary_files(&self.disk, &checkpoints)?;
         let origin_error = self.origin_error(config, found.run.as_ref(), before.is_some());
@@ -95,7 +98,7 @@ impl Folder {
         let (path, existing, requested) = (self.path.clone(), origin.generations, config.learning.generations);
         Some(match existing > requested {
             true => RecordError::Shorter { path, existing, requested },
-            false if has_config => RecordError::Edited { path: self.file(CONFIG) },
+            false if has_config => RecordError::Edited(self.file(CONFIG)),
             false => {
                 let differences = vec![format!("  {} has another digest", self.file(RUN).display())];
                 RecordError::ConfigDiffers { path, differences }
@@ -168,7 +171,7 @@ impl Folder {
                     || self.has(METRICS)?
                     || self.has(POLICIES)?)
             {
-                return Err(RecordError::OriginUnknown { path });
+                return Err(RecordError::OriginUnknown(path));
             }
             return Ok(());
         };
@@ -245,32 +248,21 @@ impl Folder {
         policies: &[impl AsRef<[f32]>],
     ) -> Result<(FirstAndLastRows, RunSums), RecordError> {
         let path = self.file(METRICS);
-        let damaged = |reason: String| RecordError::damaged(&path, reason);
-        let mut rows = metrics::open(self.disk.at(&path))?;
         let (trials, last) = (config.learning.trials, config.learning.generations);
         let mut ends = FirstAndLastRows { first: vec![], last: vec![] };
-        let mut count = 0;
-        for row in &mut rows {
-            let (row, _) = row.map_err(|error| match error {
-                RowsError::Read(error) => RecordError::read(&path)(error),
-                wrong => RecordError::damaged(&path, wrong),
-            })?;
-            if (row.generation, row.trial) != (count / trials, count % trials) {
-                let (generation, trial) = (count / trials, count % trials);
-                return Err(damaged(format!("line {} is not trial {trial}, generation {generation}", count + 2)));
-            }
+        let found = metrics::visit(self.disk.at(&path), config, |row| {
             if row.generation == 0 {
-                ends.first.push(row);
+                ends.first.push(*row);
             }
             if row.generation == last {
-                ends.last.push(row);
+                ends.last.push(*row);
             }
-            count += 1;
+        })?;
+        let (count, mut hash) = (found.rows, found.digest);
+        if count != trials * (last + 1) || found.is_torn {
+            let reason = format!("it has {count} whole rows, not {}", trials * (last + 1));
+            return Err(RecordError::damaged(&path, reason));
         }
-        if count != trials * (last + 1) {
-            return Err(damaged(format!("it has {count} rows, not {}", trials * (last + 1))));
-        }
-        let mut hash: Sha256 = rows.digest();
         let metrics = hex(&hash.clone().finalize());
         policies.iter().for_each(|weights| hash.update(bytemuck::cast_slice::<f32, u8>(weights.as_ref())));
         Ok((ends, RunSums { run: hex(&hash.finalize()), metrics }))
@@ -310,34 +302,13 @@ impl Folder {
 
 /// Returns a line for each key in which two configs differ. Keys without influence on the results are ignored.
 pub fn differences(old: &Config, new: &Config) -> Vec<String> {
-    let table = |config: &Config| toml::Table::try_from(without_checkpoint(config)).unwrap_or_default();
-    let (old, new) = (table(old), table(new));
-    let mut differences = Vec::new();
-    for (section, keys) in &new {
-        for (key, value) in keys.as_table().into_iter().flatten() {
-            let before = old.get(section).and_then(|keys| keys.get(key));
-            if before != Some(value) {
-                let before = before.map_or("nothing".to_string(), shorten);
-                differences.push(format!("  {section}.{key}: {before} there, {} here", shorten(value)));
-            }
-        }
-    }
-    let stage = |table: &toml::Table, index: usize| table.get("stages")?.as_array()?.get(index).cloned();
-    for index in 0..MAX_STAGES {
-        match [stage(&old, index), stage(&new, index)] {
-            [None, None] => break,
-            [existing, requested] if existing == requested => {}
-            [existing, requested] => {
-                let describe = |stage: Option<toml::Value>| stage.as_ref().map_or("nothing".into(), shorten);
-                differences.push(format!(
-                    "  stages[{index}]: {} there, {} here",
-                    describe(existing),
-                    describe(requested)
-                ));
-            }
-        }
-    }
-    differences
+    let [old, new] = [old, new].map(|config| values_by_key(&without_checkpoint(config)));
+    let keys: BTreeSet<_> = old.keys().chain(new.keys()).collect();
+    let line = |key: &String| {
+        let [there, here] = [&old, &new].map(|values| values.get(key).map_or("nothing".into(), shorten));
+        format!("  {key}: {there} there, {here} here")
+    };
+    keys.into_iter().filter(|key| old.get(*key) != new.get(*key)).map(line).collect()
 }
 
 fn shorten(value: &toml::Value) -> String {

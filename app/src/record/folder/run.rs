@@ -13,7 +13,7 @@ use flotilla::config::Config;
 use flotilla::host;
 
 /// Content of `run.json`: the machine of a run and its progress.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Run {
     /// Version of the program.
     pub version: String,
@@ -69,7 +69,7 @@ pub struct Run {
 }
 
 /// Identity of the config that a run was started with. A resumed run keeps it.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Origin {
     /// [`config_digest`] of the config.
     pub config: String,
@@ -114,10 +114,11 @@ pub struct RunSums {
 }
 
 /// Progress of a run.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Status {
     /// The run is training, or its process was killed.
+    #[default]
     Running,
     /// The run stopped because of a signal or an error, after an attempt to save its state.
     Stopped,
@@ -130,36 +131,10 @@ pub enum Status {
 impl Run {
     /// Creates the record of a run that has not started yet.
     pub fn new(config: &Config) -> Run {
-        Run {
-            version: String::new(),
-            state: Status::Running,
-            seed: config.learning.seed,
-            backend: String::new(),
-            description: String::new(),
-            adapter: None,
-            driver: None,
-            adapter_index: None,
-            adapter_pci: None,
-            threads: 0,
-            started: now(),
-            updated: String::new(),
-            seconds: 0.0,
-            sessions: 0,
-            generations: 0,
-            digest: None,
-            origin: Origin::of(config),
-            files: None,
-            init: None,
-            own_fitness: false,
-            command: String::new(),
-            commit: None,
-        }
+        Run { seed: config.learning.seed, started: now(), origin: Origin::of(config), ..Run::default() }
     }
 
     /// Reads `run.json`.
-    ///
-    /// # Errors
-    /// The file cannot be read, has invalid content, or a newer version wrote it.
     pub fn read<'a>(place: impl Into<Place<'a>>) -> Result<Run, RecordError> {
         let place = place.into();
         let text = read_text(place, MAX_RUN_BYTES)?;
@@ -175,9 +150,6 @@ impl Run {
     }
 
     /// Parses the text of `run.json`.
-    ///
-    /// # Errors
-    /// Returns a description of the problem.
     pub fn parse(text: &str) -> Result<Run, String> {
         let run: Run = serde_json::from_str(text).map_err(|error| format!("not the record of a run: {error}"))?;
         match run.state == Status::Done && (run.digest.is_none() || run.files.is_none()) {

@@ -222,9 +222,6 @@ impl<'a> Frames<'a> {
 }
 
 /// Returns the episodes side by side as a GIF that repeats.
-///
-/// # Errors
-/// The encoder fails, which happens only if memory runs out.
 pub fn gif(config: &Config, played: &[Replayed], motion: Film) -> std::io::Result<Vec<u8>> {
     let frames = Frames::new(config, played, motion);
     let places = &frames.places;

@@ -193,55 +193,17 @@ pub struct Replayed {
     pub given: bool,
 }
 
-/// The metrics of one trial.
-pub(crate) struct History {
-    /// G of the best team and of the champion, `[generations]`.
-    rows: Vec<[f64; 2]>,
-}
-
-impl History {
-    /// Reads one trial's G by generation.
-    ///
-    /// # Errors
-    /// The metrics cannot be read.
-    pub fn read(
-        folder: &Path,
-        config: &Config,
-        trial: usize,
-        verification: Verification,
-    ) -> Result<History, ReadError> {
-        let all = History::all(folder, config, verification)?;
-        Ok(all.into_iter().nth(trial).unwrap_or(History { rows: vec![] }))
-    }
-
-    /// Reads every trial's G by generation, `[trials]`.
-    ///
-    /// # Errors
-    /// The metrics cannot be read.
-    pub fn all(folder: &Path, config: &Config, verification: Verification) -> Result<Vec<History>, ReadError> {
-        let all = runs::trials(folder, config, verification)?;
-        Ok(all.into_iter().map(|rows| History { rows }).collect())
-    }
-
-    /// Returns the newest generation that has a row.
-    pub fn newest(&self) -> Option<usize> {
-        self.rows.len().checked_sub(1)
-    }
-
-    /// Returns a generation's G of the champion if `which` requests it, otherwise of the best team. None without a row.
-    pub fn get(&self, generation: usize, which: Which) -> Option<f64> {
-        let &[best, champion] = self.rows.get(generation)?;
-        Some(if which == Which::Champion { champion } else { best })
-    }
+/// Returns G of the champion in a generation of a trial if `which` requests it, otherwise of the best team. None without
+/// a row. `trial` is G of the best team and of the champion, `[generations]`.
+fn g_of(trial: &[[f64; 2]], generation: usize, which: Which) -> Option<f64> {
+    let &[best, champion] = trial.get(generation)?;
+    Some(if which == Which::Champion { champion } else { best })
 }
 
 /// Returns the trials with the largest and the smallest G of a generation. Ties go to the lower index.
 ///
 /// G is the champion's if `which` requests it, otherwise the best team's. Without a generation, the newest that all
 /// trials have is used.
-///
-/// # Errors
-/// The run cannot be read or lacks the generation.
 pub(crate) fn extreme_trials(
     folder: &Path,
     config: &Config,
@@ -249,14 +211,14 @@ pub(crate) fn extreme_trials(
     which: Which,
     verification: Verification,
 ) -> Result<[usize; 2], ReplayError> {
-    let all = History::all(folder, config, verification)?;
-    let newest = all.iter().map(History::newest).min().flatten();
+    let all = runs::trials(folder, config, verification)?;
+    let newest = all.iter().map(|trial| trial.len().saturating_sub(1)).min();
     let generation = generation.or(newest).unwrap_or(0);
-    let g = all.iter().map(|history| history.get(generation, which)).collect::<Option<Vec<f64>>>();
+    let g = all.iter().map(|trial| g_of(trial, generation, which)).collect::<Option<Vec<f64>>>();
     let Some(g) = g else {
-        let trial = all.iter().position(|history| history.get(generation, which).is_none()).unwrap_or(0);
-        let folder = folder.escaped().to_string();
-        return Err(ReplayError::NoGeneration { folder, trial, generation, newest: all[trial].newest() });
+        let trial = all.iter().position(|trial| trial.len() <= generation).unwrap_or(0);
+        let (folder, newest) = (folder.escaped().to_string(), all[trial].len().checked_sub(1));
+        return Err(ReplayError::NoGeneration { folder, trial, generation, newest });
     };
     let first = |better: fn(f64, f64) -> bool| (0..g.len()).reduce(|a, b| if better(g[b], g[a]) { b } else { a });
     Ok([first(|b, a| b > a), first(|b, a| b < a)].map(|trial| trial.unwrap_or(0)))
@@ -289,12 +251,10 @@ pub fn replay(
     {
         return Err(ReplayError::NoTeam { team, teams });
     }
-    let rows = History::read(folder, &config, trial, verification)?;
-    let newest = rows.newest();
-    for &generation in generations {
-        if rows.get(generation, which).is_none() {
-            return Err(ReplayError::NoGeneration { folder: name(), trial, generation, newest });
-        }
+    let rows = runs::trials(folder, &config, verification)?.swap_remove(trial);
+    if let Some(&generation) = generations.iter().find(|&&generation| generation >= rows.len()) {
+        let newest = rows.len().checked_sub(1);
+        return Err(ReplayError::NoGeneration { folder: name(), trial, generation, newest });
     }
     let mut order: Vec<usize> = (0..generations.len()).collect();
     order.sort_by_key(|&index| generations[index]);
@@ -330,7 +290,7 @@ pub fn replay(
             }
             _ => team(config.at(generation), &mut trainer, trial, which, backend)?,
         };
-        let expected = rows.get(generation, which).unwrap_or(f64::NAN);
+        let expected = g_of(&rows, generation, which).unwrap_or(f64::NAN);
         if g != expected {
             let who = if which == Which::Champion { "champion" } else { "best team" };
             return Err(ReplayError::Differs { folder: name(), who, trial, generation, found: g, expected });
@@ -371,9 +331,6 @@ fn nearest(
 }
 
 /// Plays the current generation of a trainer with a single trial, and traces its best team.
-///
-/// # Errors
-/// The backend fails.
 pub fn best(
     config: &Config,
     trainer: &mut Trainer,
@@ -484,9 +441,6 @@ impl<'a> Episodes<'a> {
 }
 
 /// Plays and traces a group of a single team. `led` is filled only if Dt is among the group's fitnesses.
-///
-/// # Errors
-/// The backend fails.
 pub fn one(group: &Group<'_>, backend: &mut dyn Backend) -> Result<Replayed, BackendError> {
     let (world, trace) = (group.world, backend.trace(group)?);
     let episode = trace.episode(world, 0);

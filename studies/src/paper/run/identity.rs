@@ -30,7 +30,7 @@ impl Identity {
     /// The folder holds something else, or a paper that `start` does not allow to be resumed or replaced.
     pub(super) fn check(&self, out: &Path, start: Start) -> Result<(), Error> {
         if out.is_file() {
-            return Err(RecordError::NoFolder { path: out.into() }.into());
+            return Err(RecordError::NoFolder(out.into()).into());
         }
         let name = out.escaped();
         let holds = |file: &str| out.join(file).exists();
@@ -67,7 +67,7 @@ impl Identity {
         let has_keys = existing.is_some_and(|existing| self.0.iter().all(|(key, _)| existing.contains_key(*key)));
         match has_keys || out.join(ARMS).is_dir() {
             true => Ok(()),
-            false => Err(RecordError::NotOurs { path }.into()),
+            false => Err(RecordError::NotOurs(path).into()),
         }
     }
 

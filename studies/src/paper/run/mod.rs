@@ -13,7 +13,7 @@ use flotilla::escape::PathExt;
 use flotilla::memory;
 use flotilla::parallel::current_num_threads;
 use flotilla_app::choice::Work;
-use flotilla_app::ops::{BackendSource, Context, Error, Event, Processor};
+use flotilla_app::ops::{BackendSource, Context, Error, Event, ProcessorInfo};
 use flotilla_app::record::disk::Disk;
 use flotilla_app::record::folder::{self, Start};
 use flotilla_app::record::{RecordError, ownership};
@@ -120,7 +120,7 @@ pub struct Outcome {
     pub generations: usize,
     /// The processor of the last session.
     #[serde(flatten)]
-    pub processor: Processor,
+    pub processor: ProcessorInfo,
     /// Training time in seconds, including earlier sessions.
     pub seconds: f64,
     /// The experiments.
@@ -210,7 +210,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         seed: learning.seed,
         trials: learning.trials,
         generations: learning.generations,
-        processor: Processor::of_run(session.run(0)),
+        processor: ProcessorInfo::of_run(session.run(0)),
         seconds,
         arms: (0..experiments.all.len()).map(outcome).collect(),
         files: Files { claims: path(CLAIMS), summary: path(SUMMARY), figures: FIGURES.map(path).to_vec() },
