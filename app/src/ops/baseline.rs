@@ -45,6 +45,12 @@ pub struct Outcome {
     pub action: Found,
     /// The best random networks.
     pub network: Found,
+    /// The best random networks that all leaders share.
+    pub shared: Found,
+    /// Open-loop actions, by hill climbing.
+    pub segments: Found,
+    /// Whole teams of networks, by hill climbing.
+    pub climber: Found,
     /// The processor.
     #[serde(flatten)]
     pub processor: Processor,
@@ -127,6 +133,9 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         constant: found(observed(&|outcome| outcome.constants[outcome.best_constant]), moves),
         action: found(observed(&|outcome| outcome.action), true),
         network: found(observed(&|outcome| outcome.network), true),
+        shared: found(observed(&|outcome| outcome.shared), true),
+        segments: found(observed(&|outcome| outcome.segments), true),
+        climber: found(observed(&|outcome| outcome.climber), true),
         processor: Processor::of(machine, &backend.describe()),
         actions,
         moves,

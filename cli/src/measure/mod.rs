@@ -241,8 +241,11 @@ fn rollout(
     }
     // Teams with past champions take as long as others, which stand in for them.
     let count = config.max_teams() - 1;
-    let teams: Vec<u32> =
-        contemporary_teams(&config.learning, 0, 0, leaders).into_iter().cycle().take(count * leaders).collect();
+    let teams: Vec<u32> = contemporary_teams(&config.learning, 0, 0, &world.populations)
+        .into_iter()
+        .cycle()
+        .take(count * leaders)
+        .collect();
     // If generations play from the device's memory, so do these rollouts.
     let held = backend.hold(&weights, [config.populations(), population, world.parameters()])?;
     let played = held.as_deref().map_or(weights[..].into(), Weights::OnDevice);
@@ -251,7 +254,7 @@ fn rollout(
         starts: &world.starts,
         weights: played,
         policies: population,
-        sharing: config.learning.sharing,
+        populations: &world.populations,
         teams: &teams,
         fitnesses: std::slice::from_ref(&config.learning.fitness),
     };

@@ -154,15 +154,13 @@ impl Kernels {
         (jobs, part): (&wgpu::Buffer, usize),
         job: &GatherJob,
         choices: &wgpu::Buffer,
-        population: &Population,
+        (population, populations): (&Population, &[u32]),
         weights: &wgpu::Buffer,
     ) -> Result<Dispatch, DeviceError> {
         // With fewer leaders, the remaining bindings are not read.
-        let last = population.sizes[0] - 1;
         let leader = |index: u32| {
             let leader = (job.first + index.min(job.count - 1)) as usize;
-            // All leaders may share one population.
-            &population.buffers[leader.min(last)]
+            &population.buffers[populations[leader] as usize]
         };
         let [first, second, third, fourth] = [0, 1, 2, 3].map(|index| leader(index).as_entire_buffer_binding());
         let (choices, weights) = (choices.as_entire_buffer_binding(), weights.as_entire_buffer_binding());

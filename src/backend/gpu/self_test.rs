@@ -12,7 +12,7 @@ use super::exact::Pass;
 use crate::backend::compare::{compare_breeding, compare_traces};
 use crate::backend::cpu::Cpu;
 use crate::backend::{Backend, BackendError, Group, Weights};
-use crate::config::{Config, Fitness, Learning, Sharing};
+use crate::config::{Config, Fitness, Learning};
 use crate::config_enum::Choice;
 use crate::credit::{Episode, Seen};
 use crate::model::sense::Density;
@@ -186,7 +186,7 @@ fn episode(gpu: &Gpu) -> Result<Option<String>, BackendError> {
             weights: weights[..].into(),
             policies: TEAMS,
             teams: &teams,
-            sharing: Sharing::PerLeader,
+            populations: &world.populations,
             fitnesses: &[],
         };
         if let Some(mismatch) = compare_traces(&group, &mut Cpu::default(), &mut backend)? {
@@ -218,7 +218,7 @@ fn training(gpu: &Gpu) -> Result<Option<String>, BackendError> {
         starts: &starts,
         weights: weights[..].into(),
         policies: TEAMS,
-        sharing: Sharing::PerLeader,
+        populations: &world.populations,
         teams: &teams,
         fitnesses: &[Fitness::D, Fitness::Df, Fitness::Dpp],
     };

@@ -31,9 +31,11 @@ const READ_BACK: Usage = Usage::COPY_DST.union(Usage::MAP_READ);
 /// The name of the buffer that the whole record is copied to.
 const RECORD_BACK: &str = "record, read back";
 
+/// Populations on the device, and which of them each leader chooses from.
+type HeldPolicies<'a> = (&'a Population, &'a [u32]);
 /// Jobs to gather from populations on the device, and the policies of the teams, one slice `[teams][leaders]` per
 /// group. The slices are adjacent on the device.
-type Gathering<'a> = (Vec<(GatherJob, &'a Population)>, Vec<&'a [u32]>);
+type Gathering<'a> = (Vec<(GatherJob, HeldPolicies<'a>)>, Vec<&'a [u32]>);
 
 /// Buffers and stopwatches that later batches reuse.
 #[derive(Default)]
@@ -280,8 +282,8 @@ impl GpuBackend {
                 offset += size_of_val(*slice) as u64;
             }
         })?;
-        let dispatch = |(part, (job, population)): (usize, &(GatherJob, &Population))| {
-            kernels.gather((&structs, part), job, &buffer, population, weights)
+        let dispatch = |(part, (job, held)): (usize, &(GatherJob, HeldPolicies<'_>))| {
+            kernels.gather((&structs, part), job, &buffer, *held, weights)
         };
         jobs.iter().enumerate().map(dispatch).collect()
     }
@@ -293,7 +295,7 @@ impl GpuBackend {
         batch: &BatchPlan,
         kernels: &'a KernelBuffers,
         packed: Option<PackedReadback>,
-        jobs: &[(GatherJob, &'a Population)],
+        jobs: &[(GatherJob, HeldPolicies<'a>)],
         trace: bool,
     ) -> Result<(ReadbackBuffers, Vec<BufferCopy<'a>>), DeviceError> {
         let (gpu, buffers) = (&self.gpu, &mut self.flights[flight].buffers);
@@ -305,10 +307,10 @@ impl GpuBackend {
             readback.moments = Some(back);
         }
         if !jobs.is_empty() {
-            let expected: Vec<u32> = jobs.iter().flat_map(|(_, population)| population.status().1).copied().collect();
+            let expected: Vec<u32> = jobs.iter().flat_map(|(_, held)| held.0.status().1).copied().collect();
             let back = buffers.sized(gpu, "status, read back", size_of_val(&expected[..]) as u64, READ_BACK)?;
             let mut offset = 0;
-            for (status, words) in jobs.iter().map(|(_, population)| population.status()) {
+            for (status, words) in jobs.iter().map(|(_, held)| held.0.status()) {
                 copies.push((status, back.clone(), offset, size_of_val(words) as u64));
                 offset += size_of_val(words) as u64;
             }
@@ -449,7 +451,7 @@ impl GpuBackend {
             let ours = |population: &&Population| self.kernels.as_ref().is_some_and(|k| population.is_of(k));
             let population = (held as &dyn Any).downcast_ref().filter(ours).ok_or(BackendError::HeldElsewhere)?;
             let leaders = group.world.leaders();
-            population.check([group.populations(), group.policies, group.world.parameters()])?;
+            population.check([group.population_count(), group.policies, group.world.parameters()])?;
             let teams: u32 = tasks.iter().map(|planned| planned.task.teams).sum();
             for first in (0..leaders).step_by(LEADERS_PER_GATHER) {
                 let job = GatherJob {
@@ -462,7 +464,7 @@ impl GpuBackend {
                     choices: chosen as u32,
                     weights: tasks[0].task.weights,
                 };
-                jobs.push((job, population));
+                jobs.push((job, (population, group.populations)));
             }
             choices.push(&group.teams[tasks[0].first_team * leaders..][..teams as usize * leaders]);
             chosen += teams as usize * leaders;

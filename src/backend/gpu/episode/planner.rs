@@ -423,7 +423,7 @@ mod tests {
             weights: Weights::OnHost(&policies),
             policies: 1,
             teams: &vec![0; population],
-            sharing: crate::config::Sharing::PerLeader,
+            populations: &world.populations,
             fitnesses: &[crate::config::Fitness::Df],
         };
         for buffer in [128 << 20, 1 << 20, 1 << 14] {
@@ -453,7 +453,7 @@ mod tests {
             weights: Weights::OnHost(&policies),
             policies: 1,
             teams: &[0],
-            sharing: crate::config::Sharing::PerLeader,
+            populations: &world.populations,
             fitnesses: &[crate::config::Fitness::Df],
         };
         let (groups, buffer) = (vec![group; 1000], 1 << 20);
