@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 use fearless_simd::Level;
 use flotilla::backend::cpu::{Cpu, level_name};
 use flotilla::backend::{Backend, Group};
-use flotilla::config::{Config, Sharing};
+use flotilla::config::{Config, own_populations};
 use flotilla::evolve::{Key, Purpose, random_policy};
 use flotilla::stepping::{Recording, Stepper};
 use flotilla::world::{OUTPUTS, World};
@@ -46,7 +46,7 @@ fn measure(config: &Config, level: Level, teams: usize, rounds: usize) -> Result
         starts: &world.starts,
         weights,
         policies: teams,
-        sharing: Sharing::PerLeader,
+        populations: own_populations(leaders),
         teams: &order,
         fitnesses: &[],
     };

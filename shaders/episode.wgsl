@@ -92,15 +92,15 @@ fn lead(task: Task, first: u32, me: ptr<function, Agent>) {
     let y = (*me).y;
     let hx = (*me).hx;
     let hy = (*me).hy;
-    var of_pois = vec4(0.0);
+    var of_pois = Quadrants();
     for (var poi = 0u; poi < shape.pois; poi++) {
         let place = places[task.pois + poi];
         let dx = place.x - x;
         let dy = place.y - y;
         let sensed = select(0.0, density(dx, dy), within(dx, dy, world.poi_range2));
-        sense(sensed, dx, dy, hx, hy, &of_pois);
+        add_sensed(sensed, dx, dy, hx, hy, &of_pois);
     }
-    var of_agents = vec4(0.0);
+    var of_agents = Quadrants();
     for (var word = 0u; word < shape.words; word++) {
         // The first loop finds the agents in reach, and the second iterates over these only. A warp then takes as many
         // iterations as its busiest thread, not as many as there are agents in reach of any thread.
@@ -111,7 +111,7 @@ fn lead(task: Task, first: u32, me: ptr<function, Agent>) {
             let place = positions[first + (base + firstTrailingBit(near)) * shape.teams];
             let dx = place.x - x;
             let dy = place.y - y;
-            sense(density(dx, dy), dx, dy, hx, hy, &of_agents);
+            add_sensed(density(dx, dy), dx, dy, hx, hy, &of_agents);
             near &= near - 1u;
         }
     }

@@ -104,8 +104,8 @@
 //! | [`statistics`] | confidence intervals and tests |
 //! | [`evaluate`] | evaluation of trained teams from held-out starts |
 //! | [`verify`] | check that two backends agree bit for bit |
-//! | [`baseline`] | baselines without learning |
 //! | [`stepping`] | stepping of teams with given actions |
+//! | [`baseline`] | baselines without coevolution |
 //! | [`memory`] | a run's peak memory |
 //! | [`front`] | the functions that most programs need |
 //!

@@ -253,7 +253,12 @@ fn plain_world(seed: u64) -> Config {
         },
         learning: Learning {
             paradigm: if rng.random_bool(0.25) { Paradigm::AllLeaders } else { Paradigm::LeaderFollower },
-            sharing: if later.random_bool(0.2) { Sharing::Shared } else { Sharing::PerLeader },
+            groups: vec![],
+            sharing: match later.random_bool(0.2) {
+                true => Sharing::Shared,
+                false if seed % 4 == 1 => Sharing::Group,
+                false => Sharing::PerLeader,
+            },
             fitness: word(rng),
             population: rng.random_range(2..=20),
             partners: 1,

@@ -9,7 +9,7 @@ use glam::Vec2;
 
 use crate::backend::compare::{compare_breeding, compare_traces, first_difference};
 use crate::backend::{Backend, BackendError, Group};
-use crate::config::{Config, Fitness, Sharing, StageConfig, ValidConfig};
+use crate::config::{Config, Fitness, StageConfig, ValidConfig};
 use crate::credit::RecordRequest;
 use crate::evaluate::{SCORES, SCORES_AND_DT};
 use crate::evolve::{self, Key, Purpose};
@@ -61,7 +61,6 @@ struct Teams {
     choice: Vec<u32>,
     /// Start positions, see [`Group::starts`].
     places: Vec<Vec2>,
-    sharing: Sharing,
     /// Every other world is also scored by Dt, which needs a record of sightings and so kernels of its own.
     fitnesses: &'static [Fitness],
 }
@@ -84,12 +83,13 @@ impl Teams {
         let learning = &config.learning;
         evolve::jitter_pois(Key::new(seed, 0, Purpose::Pois), 0, 0, &world, learning.poi_jitter, &mut places);
         let fitnesses = if sights { SCORES_AND_DT } else { SCORES };
-        Teams { policies, weights, choice, places, sharing: learning.sharing, fitnesses, world }
+        Teams { policies, weights, choice, places, fitnesses, world }
     }
 
     fn group(&self) -> Group<'_> {
-        let &Teams { ref world, policies, ref weights, ref choice, ref places, sharing, fitnesses } = self;
-        Group { world, starts: places, weights: weights[..].into(), policies, sharing, teams: choice, fitnesses }
+        let &Teams { ref world, policies, ref weights, ref choice, ref places, fitnesses } = self;
+        let populations = &world.populations;
+        Group { world, starts: places, weights: weights[..].into(), policies, populations, teams: choice, fitnesses }
     }
 }
 

@@ -41,6 +41,8 @@ pub struct WorldParts {
     pub rule: Rule,
     /// The rule by which leaders lead followers, for Dt.
     pub led: Led,
+    /// The population that each leader chooses its policy from, `[leaders]`.
+    pub populations: Vec<u32>,
 }
 
 /// The rule by which leaders lead a follower at a step, for [`Dt`](crate::config::Fitness::Dt).
@@ -96,6 +98,7 @@ impl World {
             headings: world.headings().into_iter().map(unit).collect(),
             pois: points(&world.pois),
             coupling: world.coupling.of_each(pois),
+            populations: config.as_ref().population_of_each(),
             led: Led { within: learning.led_within, by: learning.led_by },
             rule: Rule::new(world.observers.among(leaders, agents - leaders), agents, &world.windows, &world.after),
         })

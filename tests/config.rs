@@ -61,6 +61,7 @@ fn every_key_but_leaders_and_pois_has_its_default() {
         learning: Learning {
             paradigm: Paradigm::LeaderFollower,
             sharing: Sharing::PerLeader,
+            groups: vec![],
             fitness: Fitness::Df,
             population: 50,
             partners: 1,
@@ -316,6 +317,7 @@ fn configs() -> impl Strategy<Value = Config> {
             Learning {
                 paradigm,
                 sharing,
+                groups: vec![],
                 fitness,
                 population,
                 partners: if sharing == Sharing::Shared { 1 } else { partners },
@@ -355,7 +357,7 @@ fn configs() -> impl Strategy<Value = Config> {
                 world.observers = Observers::Leaders;
             }
             let mut config = Config { world, motion, follow, sense, policy, learning, checkpoint, stages: vec![] };
-            if config.learners() == 1 {
+            if config.populations() == 1 {
                 config.learning.hall_of_fame = 0;
             }
             config
@@ -370,6 +372,31 @@ fn token() -> impl Strategy<Value = String> {
                  world.dt leaders pois coupling hidden = [] [[1,2],[3]] é \u{1f6a2}";
     let known: Vec<String> = known.split(' ').map(str::to_string).chain(["\n".into(), "\\u0000".into()]).collect();
     prop_oneof![4 => (0..known.len()).prop_map(move |index| known[index].clone()), 1 => "\\PC{0,6}"]
+}
+
+#[test]
+fn learners_share_the_population_of_their_group() {
+    let text = "[world]\nleaders = [[10, 5], [20, 5]]\nfollowers = [[21, 2], [11, 2], [15, 5]]\npois = [[9, 9]]\n\
+                coupling = 1\n[learning]\n";
+    let populations = |keys: &str| {
+        let config = Config::parse(&format!("{text}{keys}"), "groups.toml").unwrap();
+        assert_eq!(Config::parse(&config.to_toml(), "again.toml").unwrap(), config);
+        (config.populations(), config.population_of_each())
+    };
+    let all = "paradigm = 'all-leaders'\n";
+    assert_eq!(populations(all), (5, vec![0, 1, 2, 3, 4]));
+    assert_eq!(populations(&format!("{all}sharing = 'all'")), (1, vec![0; 5]));
+    // The last follower's place is as far from both leaders.
+    assert_eq!(populations(&format!("{all}sharing = 'group'")), (2, vec![0, 1, 1, 0, 0]));
+    assert_eq!(populations("sharing = 'group'"), (2, vec![0, 1]));
+    assert_eq!(populations("sharing = 'group'\ngroups = [[1, 0]]"), (1, vec![0, 0]));
+    assert_eq!(
+        populations(&format!("{all}sharing = 'group'\ngroups = [[4], [1, 0], [3, 2]]")),
+        (3, vec![1, 1, 2, 2, 0])
+    );
+    let config = Config::parse(&format!("{text}{all}sharing = 'group'"), "groups.toml").unwrap();
+    let of = |populations| config.population_of_each_of(populations);
+    assert_eq!([of(1), of(2), of(3), of(5)].map(|of| of.map(|of| of[2])), [Some(0), Some(1), None, Some(2)]);
 }
 
 proptest! {

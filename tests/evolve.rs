@@ -12,6 +12,7 @@ use flotilla::backend::cpu::{Cpu, level_name};
 use flotilla::backend::{Backend, Group};
 use flotilla::config::{
     Actions, Config, Elites, Fitness, Learning, Leniency, Method, Mutation, Paradigm, Parents, Sharing, ValidConfig,
+    own_populations,
 };
 use flotilla::credit::Credit;
 use flotilla::evolve::{self, Key, MAX_WEIGHT, MIN_WEIGHT, Purpose, Selection, UNCHANGED};
@@ -210,15 +211,20 @@ fn a_tournament_draws_every_pair_of_policies_with_the_same_probability() {
 #[test]
 fn a_policy_has_different_partners_in_every_round() {
     let learning = config(CHAOTIC, |config| (config.learning.partners, config.learning.population) = (3, 20)).learning;
-    let single = Learning { partners: 1, ..learning.clone() };
+    let (single, own) = (Learning { partners: 1, ..learning.clone() }, own_populations(4));
     let (all_rounds, first_round) =
-        (evolve::contemporary_teams(&learning, 1, 5, 4), evolve::contemporary_teams(&single, 1, 5, 4));
+        (evolve::contemporary_teams(&learning, 1, 5, own), evolve::contemporary_teams(&single, 1, 5, own));
     assert_eq!((all_rounds.len(), learning.teams()), (3 * 20 * 4, 60));
     assert_eq!(all_rounds[..20 * 4], first_round, "the first round equals that with a single partner");
     let mut teams: Vec<&[u32]> = all_rounds.chunks(4).collect();
     teams.sort_unstable();
     teams.dedup();
     assert_eq!(teams.len(), 60, "no team plays twice");
+    // Leaders that share a population play the same policy, that of the population's own schedule.
+    let of_two = evolve::contemporary_teams(&learning, 1, 5, own_populations(2));
+    let grouped = evolve::contemporary_teams(&learning, 1, 5, &[1, 0, 1]);
+    let expected = of_two.chunks(2).flat_map(|team| [team[1], team[0], team[1]]);
+    assert!(grouped.into_iter().eq(expected));
 }
 
 #[test]
@@ -613,6 +619,19 @@ fn experiments() -> Vec<Config> {
         }),
         config(GENERALLY_FORWARD, |config| {
             small(config, 9, 5, 2);
+            (config.learning.sharing, config.learning.paradigm) = (Sharing::Group, Paradigm::AllLeaders);
+            (config.learning.hall_of_fame, config.learning.fitness) = (2, Fitness::D);
+            (config.learning.start_jitter, config.learning.episodes_per_team) = (0.5, 2);
+            config.world.coupling = flotilla::config::Coupling::Same(2);
+        }),
+        config(CHAOTIC, |config| {
+            small(config, 9, 4, 1);
+            (config.learning.sharing, config.learning.groups) = (Sharing::Group, vec![vec![3, 1], vec![0, 2]]);
+            (config.learning.partners, config.learning.leniency) = (2, Leniency::Max);
+            config.world.coupling = flotilla::config::Coupling::Same(2);
+        }),
+        config(GENERALLY_FORWARD, |config| {
+            small(config, 9, 5, 2);
             (config.learning.method, config.learning.fitness) = (Method::OpenAiEs, Fitness::D);
             config.world.coupling = flotilla::config::Coupling::Same(2);
         }),
@@ -750,6 +769,8 @@ struct PlainTrial<'a> {
     config: &'a Config,
     world: World,
     trial: usize,
+    /// The population of each leader.
+    populations: Vec<usize>,
     /// `[populations][policies][parameters]`.
     policies: Vec<Vec<Vec<f32>>>,
 }
@@ -764,7 +785,7 @@ impl PlainTrial<'_> {
     fn play(&self, generation: usize, stage: &Config, team: &[usize]) -> (f64, Vec<f32>) {
         let Learning { fitness, episodes_per_team, start_jitter, poi_jitter, .. } = stage.learning;
         let world = World::new(&stage.validate().unwrap());
-        let population = |leader: usize| &self.policies[if self.policies.len() == 1 { 0 } else { leader }];
+        let population = |leader: usize| &self.policies[self.populations[leader]];
         let weights: Vec<f32> =
             team.iter().enumerate().flat_map(|(leader, &policy)| population(leader)[policy].clone()).collect();
         let (mut observed, mut totals) = (0, vec![0.0; team.len()]);
@@ -779,7 +800,7 @@ impl PlainTrial<'_> {
                 starts: &starts,
                 weights: weights[..].into(),
                 policies: 1,
-                sharing: Sharing::PerLeader,
+                populations: own_populations(world.leaders()),
                 teams: &teams,
                 fitnesses: &[Fitness::Dt],
             };
@@ -811,7 +832,14 @@ impl PlainTrial<'_> {
             Elites::Count(count) => count,
             Elites::Percentage(percentage) => ((population as f64 * percentage / 100.0).round() as usize).max(1),
         };
-        let leaders = self.world.leaders();
+        let of_each = self.populations.clone();
+        let count = self.policies.len();
+        // The mean score of a population's leaders.
+        let mean_score = |scores: &[f32], population: usize| {
+            let members = scores.iter().zip(&of_each).filter(|&(_, &of)| of == population);
+            let members: Vec<f64> = members.map(|(&score, _)| f64::from(score)).collect();
+            members.iter().sum::<f64>() / members.len() as f64
+        };
         let mut rows = Vec::new();
         // The champions of all past generations.
         let mut past: Vec<Vec<Vec<f32>>> = Vec::new();
@@ -819,50 +847,38 @@ impl PlainTrial<'_> {
         for generation in 0..=generations {
             let stage = config.at(generation);
             let Learning { partners, leniency, hall_of_fame, .. } = stage.learning;
-            let mut teams = vec![0; partners * population * leaders];
-            for (round, teams) in teams.chunks_mut(population * leaders).enumerate() {
-                evolve::form_teams(self.key(Purpose::Teams), generation, round, leaders, teams);
+            let mut chosen = vec![0; partners * population * count];
+            for (round, chosen) in chosen.chunks_mut(population * count).enumerate() {
+                evolve::form_teams(self.key(Purpose::Teams), generation, round, count, chosen);
             }
-            let shared = self.config.learning.sharing == Sharing::Shared;
-            let (mut observed, mut fitness) = (Vec::new(), vec![vec![0.0; population]; self.policies.len()]);
-            let mut scored = vec![vec![Vec::new(); population]; self.policies.len()];
-            for (index, team) in teams.chunks(leaders).enumerate() {
-                let team: Vec<usize> =
-                    team.iter().map(|&policy| if shared { index } else { policy as usize }).collect();
+            let (mut observed, mut fitness) = (Vec::new(), vec![vec![0.0; population]; count]);
+            let mut scored = vec![vec![Vec::new(); population]; count];
+            for chosen in chosen.chunks(count) {
+                let team: Vec<usize> = of_each.iter().map(|&of| chosen[of] as usize).collect();
                 let (share, scores) = self.play(generation, stage, &team);
                 observed.push(share);
-                if shared {
-                    let sum = scores.iter().fold(0.0, |sum, &score| sum + f64::from(score));
-                    fitness[0][index] = (sum / leaders as f64) as f32;
-                    continue;
+                for (population, &policy) in chosen.iter().enumerate() {
+                    scored[population][policy as usize].push(mean_score(&scores, population));
                 }
-                team.iter()
-                    .zip(scores)
-                    .enumerate()
-                    .for_each(|(leader, (&policy, score))| scored[leader][policy].push(score));
             }
             let hall = hall_of_fame.min(generation);
             if hall > 0 {
                 let word = self.key(Purpose::HallOfFame).at(generation, 0, 0).draw(0)[0];
                 let champions = &past[generation - 1 - (uniform(word) * hall as f64) as usize];
                 self.policies.iter_mut().zip(champions).for_each(|(policies, past)| policies.push(past.clone()));
-                for (leader, policy) in
-                    (0..leaders).flat_map(|leader| (0..population).map(move |policy| (leader, policy)))
-                {
-                    let mut team = vec![population; leaders];
-                    team[leader] = policy;
-                    scored[leader][policy].push(self.play(generation, stage, &team).1[leader]);
+                for (plays, policy) in (0..count).flat_map(|plays| (0..population).map(move |policy| (plays, policy))) {
+                    let team: Vec<usize> =
+                        of_each.iter().map(|&of| if of == plays { policy } else { population }).collect();
+                    scored[plays][policy].push(mean_score(&self.play(generation, stage, &team).1, plays));
                 }
                 self.policies.iter_mut().for_each(|policies| policies.truncate(population));
             }
             let scores_per_policy = partners + usize::from(hall > 0);
-            for (fitness, scores) in fitness.iter_mut().flatten().zip(scored.iter().flatten()).filter(|_| !shared) {
+            for (fitness, scores) in fitness.iter_mut().flatten().zip(scored.iter().flatten()) {
                 assert_eq!(scores.len(), scores_per_policy);
                 *fitness = match leniency {
-                    Leniency::Mean => {
-                        (scores.iter().map(|&score| f64::from(score)).sum::<f64>() / scores_per_policy as f64) as f32
-                    }
-                    Leniency::Max => scores.iter().copied().reduce(f32::max).unwrap(),
+                    Leniency::Mean => (scores.iter().sum::<f64>() / scores_per_policy as f64) as f32,
+                    Leniency::Max => scores.iter().copied().reduce(f64::max).unwrap() as f32,
                 };
             }
             let ranked: Vec<Vec<usize>> = (fitness.iter())
@@ -886,9 +902,8 @@ impl PlainTrial<'_> {
                 }
             }
             // The champion plays together with the next generation, so it has that generation's starts.
-            let champion: Vec<usize> = (0..leaders).map(|leader| ranked[if shared { 0 } else { leader }][0]).collect();
-            let of_leader = |leader: usize| self.policies[if shared { 0 } else { leader }][champion[leader]].clone();
-            past.push((0..leaders).map(of_leader).collect());
+            past.push((0..count).map(|of| self.policies[of][ranked[of][0]].clone()).collect());
+            let champion: Vec<usize> = of_each.iter().map(|&of| ranked[of][0]).collect();
             let (champion, _) = self.play(generation + 1, stage, &champion);
             rows.push(Row {
                 experiment: 0,
@@ -956,7 +971,7 @@ fn a_shared_policy_scores_the_mean_of_its_leaders() {
     let (world, leaders) = (World::new(&config.validate().unwrap()), config.learners());
     let mut trainer = Trainer::new([config.validate().unwrap()]);
     let weights = trainer.weights(0, 0).unwrap().chunks(world.parameters()).map(<[f32]>::to_vec).collect();
-    let plain = PlainTrial { config: &config, world, trial: 0, policies: vec![weights] };
+    let plain = PlainTrial { config: &config, world, trial: 0, populations: vec![0; leaders], policies: vec![weights] };
     trainer.advance(&mut Cpu::default()).unwrap();
     let fitness = trainer.snapshot(0).unwrap().fitness.remove(0);
     let mut different = 0;
@@ -1020,7 +1035,9 @@ fn the_trainer_equals_algorithm_1() {
             };
             let population = |leader| (0..config.learning.population).map(|slot| policy(leader, slot)).collect();
             let fresh = (0..config.populations()).map(population).collect();
-            let (expected, weights) = PlainTrial { config, world, trial, policies: fresh }.train();
+            let populations = config.population_of_each().into_iter().map(|of| of as usize).collect();
+            let plain = PlainTrial { config, world, trial, populations, policies: fresh };
+            let (expected, weights) = plain.train();
             let rows: Vec<Row> =
                 rows.iter().filter(|row| row.trial == trial).map(|&row| Row { experiment: 0, ..row }).collect();
             assert_eq!(rows, expected, "experiment {experiment}, trial {trial}");

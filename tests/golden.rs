@@ -70,7 +70,7 @@ fn trace(backend: &mut dyn Backend, config: &Config, world: &World, weights: &[f
         starts: &world.starts,
         weights: weights.into(),
         policies,
-        sharing: config.learning.sharing,
+        populations: &world.populations,
         teams: &teams,
         fitnesses: &[],
     };

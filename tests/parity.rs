@@ -10,7 +10,7 @@ use flotilla::backend::gpu::episode::{GpuBackend, Kernel, Records, ResidencyPoli
 use flotilla::backend::gpu::exact::{self, Pass};
 use flotilla::backend::gpu::source::{BreedJob, GatherJob, State, Task};
 use flotilla::backend::{Backend, Group, Moment, Weights};
-use flotilla::config::{Config, Coupling, Fitness, Observers, Sharing, ValidConfig};
+use flotilla::config::{Config, Coupling, Fitness, Observers, ValidConfig, one_population, own_populations};
 use flotilla::evaluate::{SCORES_AND_DT, Starts, evaluate};
 use flotilla::evolve::{Breeding, Key, Purpose};
 use flotilla::gpu_struct::GpuStruct;
@@ -34,8 +34,8 @@ fn open(request: &Request, pass: Pass, kernel: Kernel) -> GpuBackend {
 
 /// Returns a group of teams with separate policies per leader, scored by every fitness.
 fn group_of_teams<'a>(world: &'a World, weights: &'a [f32], policies: usize, teams: &'a [u32]) -> Group<'a> {
-    let (starts, sharing, fitnesses) = (&world.starts, Sharing::PerLeader, SCORES_AND_DT);
-    Group { world, starts, weights: weights.into(), policies, sharing, teams, fitnesses }
+    let (starts, populations, fitnesses) = (&world.starts, own_populations(world.leaders()), SCORES_AND_DT);
+    Group { world, starts, weights: weights.into(), policies, populations, teams, fitnesses }
 }
 
 fn check(plan: &Plan, mut backend: GpuBackend) -> Agreement {
@@ -279,12 +279,13 @@ fn inconsistent_input_is_an_error_on_every_backend() {
     let mut wrong = teams.clone();
     wrong[leaders + 2] = 3;
     let few = &weights[1..];
-    let bad: [(Group<'_>, &str); 5] = [
+    let bad: [(Group<'_>, &str); 6] = [
         (Group { teams: &wrong, ..good }, "leader 2 of team 1 plays policy 3 of 3"),
         (Group { teams: &teams[1..], ..good }, "7 choices"),
         (Group { starts: &world.starts[1..], ..good }, "11 start positions for 12 agents"),
         (Group { weights: few.into(), ..good }, "weights"),
-        (Group { sharing: Sharing::Shared, ..good }, "1 populations of 3 have 336"),
+        (Group { populations: one_population(world.leaders()), ..good }, "1 populations of 3 have 336"),
+        (Group { populations: &[0], ..good }, "populations of 1 leaders for"),
     ];
     let mut backends: Vec<Box<dyn Backend>> = vec![Box::new(Cpu::default())];
     for (request, _) in support::adapters("inconsistent_input_is_an_error_on_every_backend") {

@@ -7,7 +7,7 @@ use crate::support;
 use fearless_simd::Level;
 use flotilla::backend::cpu::{Cpu, level_name};
 use flotilla::backend::{Backend, Group, Moment, Trace};
-use flotilla::config::{Fitness, MAX_POPULATION, Sharing};
+use flotilla::config::{Fitness, MAX_POPULATION, own_populations};
 use flotilla::credit::{self, Credit, Scores};
 use flotilla::evaluate::Starts;
 use flotilla::sample;
@@ -37,7 +37,7 @@ impl Played {
             starts: &starts,
             weights,
             policies: teams,
-            sharing: Sharing::PerLeader,
+            populations: own_populations(world.leaders()),
             teams: &order,
             fitnesses: &[Fitness::Dt],
         };

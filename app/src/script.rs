@@ -8,6 +8,7 @@ use std::f32::consts::PI;
 use serde::{Deserialize, Serialize};
 
 use flotilla::config::{Config, StageConfig};
+use flotilla::evaluate::Starts;
 use flotilla::stepping::{Recording, StepError, Stepper};
 use flotilla::world::World;
 
@@ -63,13 +64,27 @@ impl Script {
         Ok(())
     }
 
-    /// Plays one team from the start in the config's own keys, without stages or jitter. Returns the step at which each
-    /// POI was first observed, `[pois]`.
+    /// Plays one team from the start in the config's own keys, without stages or jitter, see [`Script::play_from`].
+    ///
+    /// # Errors
+    /// See [`Script::play_from`].
+    pub fn play(&self, config: &StageConfig) -> Result<Vec<Option<u32>>, StepError> {
+        self.play_from(config, &Starts::Own, 0)
+    }
+
+    /// Plays one team from the start of an episode. Returns the step at which each POI was first observed, `[pois]`.
     ///
     /// # Errors
     /// There is too little memory, or a target is not finite, see [`Script::check`].
-    pub fn play(&self, config: &StageConfig) -> Result<Vec<Option<u32>>, StepError> {
+    pub fn play_from(
+        &self,
+        config: &StageConfig,
+        starts: &Starts,
+        episode: usize,
+    ) -> Result<Vec<Option<u32>>, StepError> {
         let mut stepper = Stepper::new(World::new(config), 1, Recording::None)?;
+        let places = starts.of(episode, stepper.world());
+        stepper.reset_to(&places.iter().flat_map(|place| place.to_array()).collect::<Vec<_>>())?;
         let (leaders, max_speed) = (config.learners(), config.motion.max_speed as f32);
         let mut first = vec![None; config.world.pois.len()];
         while !stepper.is_over(0) {

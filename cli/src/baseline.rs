@@ -3,7 +3,7 @@
 use super::console::Console;
 use super::{ConfigFile, Error, Overrides, Printed, RunOptions, SetKeys, between, number};
 use clap::builder::PossibleValuesParser as Words;
-use flotilla::baseline::SPEEDS;
+use flotilla::baseline::{SEGMENTS, SPEEDS};
 use flotilla::config::{Actions, Choice, Paradigm};
 use flotilla::evaluate::MAX_EPISODES;
 use flotilla_app::ops::baseline::{self, BaselineOutcome, BaselineRequest};
@@ -47,7 +47,7 @@ pub fn run(args: Args) -> Result<(), Error> {
 }
 
 fn in_words(found: &BaselineOutcome) -> String {
-    let &BaselineOutcome { pois, seeds, teams, paradigm, actions, ref constant, ref action, ref network, .. } = found;
+    let &BaselineOutcome { pois, seeds, teams, paradigm, actions, .. } = found;
     let head = [&format!("POIs observed, of {pois}"), "mean [95 % interval]", "lowest", "highest"];
     let mut rows = vec![head.map(|head| head.to_string()).to_vec()];
     let constants = match actions {
@@ -55,9 +55,12 @@ fn in_words(found: &BaselineOutcome) -> String {
         Actions::Behaviours => "best constant behaviour".into(),
     };
     for (name, found) in [
-        (constants, constant),
-        (format!("best of {teams} random constant actions"), action),
-        (format!("best of {teams} random networks"), network),
+        (constants, &found.constant),
+        (format!("best of {teams} random constant actions"), &found.action),
+        (format!("best of {teams} random networks"), &found.network),
+        (format!("best of {teams} random networks, the same for all leaders"), &found.shared),
+        (format!("hill climbing, {teams} open-loop teams of {SEGMENTS} actions per leader"), &found.segments),
+        (format!("hill climbing, {teams} teams of networks"), &found.climber),
     ] {
         let interval = found.interval_95.map_or(String::new(), |[low, high]| format!(" [{low:.2}, {high:.2}]"));
         let (low, high) = found.seeds.iter().fold((f64::MAX, f64::MIN), |(l, h), &o| (l.min(o), h.max(o)));
@@ -69,7 +72,7 @@ fn in_words(found: &BaselineOutcome) -> String {
     };
     let all: Vec<bool> = found.constants.iter().map(|constant| constant.pois >= pois as f64).collect();
     format!(
-        "{paradigm}, {seeds} seeds. N = {teams} random teams per seed, as many as one trial of training evaluates. \
+        "{paradigm}, {seeds} seeds. Each search plays {teams} teams per seed, as many as one trial of training. \
          {played}\n\n{}\n{}\n",
         markdown(&rows),
         solved(actions, &all)

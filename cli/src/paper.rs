@@ -11,6 +11,7 @@ use flotilla::escape::PathExt;
 use flotilla_app::record::folder::ARMS;
 use flotilla_app::shell;
 use flotilla_studies::paper::run::{OUT, Request};
+use flotilla_studies::populations::layout;
 use flotilla_studies::questions::letter;
 
 #[derive(clap::Args)]
@@ -22,6 +23,12 @@ pub struct Args {
     #[arg(long, value_name = "LETTERS", num_args = 0..=1, require_equals = true, value_delimiter = ',',
         default_missing_value = "a,b,c,d,e,f,g", value_parser = letter)]
     questions: Vec<char>,
+    /// Vary followers and the number of populations instead, on all layouts or some of generally-forward, strictly-forward,
+    /// chaotic, coupling-6 (docs/results/populations.md)
+    #[arg(long, value_name = "LAYOUTS", num_args = 0..=1, require_equals = true, value_delimiter = ',',
+        default_missing_value = "generally-forward,strictly-forward,chaotic,coupling-6", value_parser = layout,
+        conflicts_with = "questions")]
+    populations: Vec<String>,
     /// Independent repetitions [default: 5, or 30 with --questions]
     #[arg(long, value_name = "N", value_parser = number)]
     trials: Option<String>,
@@ -57,7 +64,9 @@ impl Args {
         let letters: Vec<String> = self.questions.iter().map(char::to_string).collect();
         let questions = (!letters.is_empty()).then(|| format!("--questions={}", letters.join(",")).into());
         let words = ["flotilla", "paper"].map(OsString::from).into_iter().chain(questions);
-        let words = words.chain(["--out".into(), out]);
+        let layouts =
+            (!self.populations.is_empty()).then(|| format!("--populations={}", self.populations.join(",")).into());
+        let words = words.chain(layouts).chain(["--out".into(), out]);
         let machine = recovery::words_of_machine(&self.run);
         shell::command(words.chain(recovery::words_of(&overrides)).chain(["--resume".into()]).chain(machine))
     }
@@ -66,9 +75,21 @@ impl Args {
 pub fn run(args: Args) -> Result<(), Error> {
     let mut console = Console::new(&args.run, args.printed.quiet);
     let (set, start) = (args.overrides(), args.existing.start());
-    let request = Request { out: args.out.clone(), start, set, questions: args.questions.clone() };
+    let (questions, populations) = (args.questions.clone(), args.populations.clone());
+    let request = Request { out: args.out.clone(), start, set, questions, populations };
     let resume = |error: Error| error.or_advise(|| format!("continue with\n  {}", args.command_to_resume()));
     let out = args.out.escaped();
+    if !args.populations.is_empty() {
+        let found = console
+            .run(|backends, context| flotilla_studies::populations::run(&request, backends, context))
+            .map_err(resume)?;
+        return args.printed.outcome(&found, |found| {
+            format!(
+                "{}\nFiles in {out}: populations (.svg, .png, .pdf), cells.csv, pairs.csv, and a run each in {ARMS}/\n",
+                found.text
+            )
+        });
+    }
     if !args.questions.is_empty() {
         let found = console
             .run(|backends, context| flotilla_studies::questions::run::run(&request, backends, context))

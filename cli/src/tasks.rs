@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use super::console::Console;
 use super::{ConfigFile, Error, ExistingResults, Printed, RunOptions, SetKeys, between};
+use flotilla::baseline::NAMES;
 use flotilla::config;
 use flotilla::escape::PathExt;
 use flotilla::file;
@@ -65,13 +66,8 @@ fn read_script(path: &Path) -> Result<Script, Error> {
 }
 
 fn in_words(found: &Outcome) -> String {
-    let teams = SMALL.0 * (SMALL.1 + 1);
-    let mut head = vec![
-        "task".to_string(),
-        "best constant speed".into(),
-        format!("best of {teams} constant actions"),
-        format!("best of {teams} networks"),
-    ];
+    let mut head = vec!["task".to_string()];
+    head.extend(NAMES.map(String::from));
     for population in [SMALL.0, found.population.into()].into_iter().filter(|&policies| policies > 0) {
         head.extend(FITNESSES.map(|fitness| format!("{population} policies, {fitness}")));
     }

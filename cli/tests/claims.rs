@@ -6,7 +6,7 @@ use fearless_simd::Level;
 use flotilla::backend::cpu::Cpu;
 use flotilla::backend::{Backend, Group};
 use flotilla::baseline::{self, Baseline, Baselines};
-use flotilla::config::{Fitness, Override, Paradigm, Sharing, ValidConfig};
+use flotilla::config::{Fitness, Mutation, Override, Paradigm, Sharing, ValidConfig, own_populations};
 use flotilla::evaluate::{self, Starts};
 use flotilla::evolve::{self, Key, Purpose};
 use flotilla::statistics::{self, Average, Estimate, Tested};
@@ -233,16 +233,19 @@ fn random_baselines_equal_the_best_teams_that_a_backend_plays() {
     for (config, found) in configs.iter().zip(&found) {
         let world = World::new(&config.validate().unwrap());
         let (population, parameters) = (config.learning.population, world.parameters());
-        for purpose in [Purpose::Baseline, Purpose::ConstantActions] {
+        for purpose in [Purpose::Baseline, Purpose::SharedBaseline, Purpose::ConstantActions] {
             let mut best = 0.0f64;
             for generation in 0..=2 {
                 let mut weights = Vec::new();
                 for leader in 0..world.leaders() {
                     for slot in 0..population {
                         let mut policy = vec![0.0; parameters];
+                        let leader = if purpose == Purpose::SharedBaseline { 0 } else { leader };
                         let key = Key::new(3, 1, purpose).at(generation, leader, slot);
                         match purpose {
-                            Purpose::Baseline => evolve::random_policy(Level::new(), key, &mut policy),
+                            Purpose::Baseline | Purpose::SharedBaseline => {
+                                evolve::random_policy(Level::new(), key, &mut policy)
+                            }
                             _ => {
                                 let uniform = |of: u32| f64::from(key.draw(of)[0]) / (1u64 << 31) as f64 - 1.0;
                                 baseline::constant_policy(&[uniform(0), uniform(1)], &mut policy);
@@ -253,7 +256,11 @@ fn random_baselines_equal_the_best_teams_that_a_backend_plays() {
                 }
                 let observed = observed(&world, &weights, population);
                 best = best.max(f64::from(observed.into_iter().max().unwrap()) / world.pois.len() as f64);
-                let found = if purpose == Purpose::Baseline { &found.random } else { &found.actions };
+                let found = match purpose {
+                    Purpose::Baseline => &found.random,
+                    Purpose::SharedBaseline => &found.shared,
+                    _ => &found.actions,
+                };
                 assert_eq!(found[1][generation], best, "{purpose:?}, generation {generation}");
             }
         }
@@ -263,8 +270,8 @@ fn random_baselines_equal_the_best_teams_that_a_backend_plays() {
 /// Returns the number of POIs that each team observes. Team j has policy j of every leader.
 fn observed(world: &World, weights: &[f32], policies: usize) -> Vec<u32> {
     let teams = evolve::aligned_teams(policies, world.leaders());
-    let (weights, starts, sharing) = (weights.into(), &world.starts, Sharing::PerLeader);
-    let group = Group { world, starts, weights, policies, sharing, teams: &teams, fitnesses: &[] };
+    let (weights, starts, populations) = (weights.into(), &world.starts, own_populations(world.leaders()));
+    let group = Group { world, starts, weights, policies, populations, teams: &teams, fitnesses: &[] };
     Cpu::default().play(&[group]).unwrap().remove(0).observed
 }
 
@@ -305,8 +312,8 @@ fn baselines_with_moved_pois_are_measured_from_held_out_starts() {
         baseline::constant_policy(&constants[place % policies], policy);
     }
     let teams = evolve::aligned_teams(policies, world.leaders());
-    let (weights, starts, sharing) = (weights[..].into(), &world.starts, Sharing::PerLeader);
-    let group = Group { world: &world, starts, weights, policies, sharing, teams: &teams, fitnesses: &[] };
+    let (weights, starts, populations) = (weights[..].into(), &world.starts, own_populations(world.leaders()));
+    let group = Group { world: &world, starts, weights, policies, populations, teams: &teams, fitnesses: &[] };
     let held_out = Starts::Drawn { episodes: 30, seed: 0, jitter: 0.0, poi_jitter: 5.0 };
     let played =
         evaluate::evaluate(&mut Cpu::default(), &group, &held_out, &mut |_| std::ops::ControlFlow::Continue(()))
@@ -315,7 +322,7 @@ fn baselines_with_moved_pois_are_measured_from_held_out_starts() {
     for (found, g) in outcome.constants.iter().zip(&g) {
         assert!((found - g).abs() < 1e-12, "{:?} is not {g:?}", outcome.constants);
     }
-    assert!(g.iter().any(|&other| other != g[0]) && outcome.network > 0.0 && outcome.action > 0.0, "{outcome:?}");
+    assert!(g.iter().any(|&other| other != g[0]) && outcome.all().iter().all(|&g| g > 0.0), "{outcome:?}");
     // Another trial has the same constant actions, but other random teams.
     let other = self::played(Baselines::of_trial(&config.validate().unwrap(), 6))
         .outcomes(&mut Cpu::default(), 30)
@@ -324,6 +331,69 @@ fn baselines_with_moved_pois_are_measured_from_held_out_starts() {
         .remove(0);
     assert_eq!(other.constants, outcome.constants);
     assert_ne!((other.network, other.action), (outcome.network, outcome.action));
+}
+
+/// Compares both climbers with a plain one that plays team by team.
+#[test]
+fn climbers_keep_the_best_of_sixteen_mutants() {
+    let mut config = paper::baseline_configs(&arms(2, 2))[1].clone();
+    (config.learning.population, config.learning.sharing) = (21, Sharing::Group);
+    let config = config.validate().unwrap();
+    let found = played(Baselines::of_trial(&config, 1)).found().remove(0);
+    let (world, pois) = (World::new(&config), config.world.pois.len());
+    let (leaders, parameters) = (world.leaders(), world.parameters());
+    let networks = |team: &[f32]| observed(&world, team, 1)[0];
+    let segments = |team: &[f32]| {
+        let mut stepper = flotilla::stepper(&config, 1, false).unwrap();
+        for step in 0..world.steps() {
+            let at = step * 4 / world.steps() * 2;
+            let actions: Vec<f32> = team.chunks(8).flat_map(|leader| [leader[at], leader[at + 1]]).collect();
+            stepper.step(&actions).unwrap();
+        }
+        stepper.observed().iter().filter(|&&observed| observed).count() as u32
+    };
+    let play: [(Purpose, usize, &dyn Fn(&[f32]) -> u32, &[f64]); 2] = [
+        (Purpose::Climber, parameters, &networks, &found.climber[0]),
+        (Purpose::OpenLoop, 8, &segments, &found.segments[0]),
+    ];
+    for (purpose, size, observed, found) in play {
+        let (mut parent, mut most) = (vec![], 0);
+        for generation in 0..=2 {
+            for first in [0, 16] {
+                let mut best: Option<(Vec<f32>, u32)> = None;
+                for slot in first..21.min(first + 16) {
+                    let mut team = parent.clone();
+                    team.resize(leaders * size, 0.0);
+                    for (leader, part) in team.chunks_mut(size).enumerate() {
+                        let key = Key::new(3, 1, purpose).at(generation, leader, slot);
+                        let uniform = |of: u32| (f64::from(key.draw(of)[0]) / (1u64 << 31) as f64 - 1.0) as f32;
+                        match (parent.is_empty(), purpose) {
+                            (true, Purpose::Climber) => evolve::random_policy(Level::new(), key, part),
+                            (true, _) => (0..).zip(part).for_each(|(of, number)| *number = uniform(of)),
+                            (false, _) => {
+                                let mut learning = config.learning.clone();
+                                learning.mutation = Mutation::Additive;
+                                (learning.mutation_probability, learning.mutation_sigma) =
+                                    [(0.1, 1.0), (0.3, 0.3), (1.0, 0.1), (1.0, 0.03)][slot % 4];
+                                evolve::mutate(Level::new(), key, &learning, part, &mut vec![]);
+                                if purpose == Purpose::OpenLoop {
+                                    part.iter_mut().for_each(|number| *number = number.clamp(-1.0, 1.0));
+                                }
+                            }
+                        }
+                    }
+                    let count = observed(&team);
+                    if best.as_ref().is_none_or(|(_, most)| count >= *most) {
+                        best = Some((team, count));
+                    }
+                }
+                if let Some((team, count)) = best.filter(|&(_, count)| parent.is_empty() || count >= most) {
+                    (parent, most) = (team, count);
+                }
+            }
+            assert_eq!(found[generation], f64::from(most) / pois as f64, "{purpose:?}, generation {generation}");
+        }
+    }
 }
 
 /// Returns the claims about experiments whose champions have the G that `g` returns, given trial and generation.
@@ -335,7 +405,15 @@ fn judged(trials: u32, generations: u32, g: impl Fn(&Experiment, usize, usize) -
         arm.best.clone_from(&arm.champion);
     }
     let none = vec![vec![0.0; generations as usize + 1]; trials as usize];
-    let baselines = vec![Baseline { constant: none.clone(), actions: none.clone(), random: none }; 8];
+    let baseline = Baseline {
+        constant: none.clone(),
+        actions: none.clone(),
+        random: none.clone(),
+        shared: none.clone(),
+        segments: none.clone(),
+        climber: none,
+    };
+    let baselines = vec![baseline; 8];
     claims(Evidence { arms: &arms, baselines: &baselines })
 }
 

@@ -173,8 +173,8 @@ fn wrong_values_are_reported_with_line_and_range() {
         (3, "leaders = [[1, 2], 3]", "world.leaders[1]: found 3, allowed a list of 2 numbers"),
         (3, "leaders = [[1, 2, 3]]", "world.leaders[0]: found a list of 3, allowed a list of 2 numbers"),
         (3, "leaders = [[1, 'a']]", "world.leaders[0][1]: found 'a', allowed a number, 0 to 40 (the map)"),
-        (19, "density = 3", "sense.density: found 3, allowed \"linear\" or \"inverse\""),
-        (19, "density = 'flat'", "sense.density: found 'flat', allowed \"linear\" or \"inverse\""),
+        (19, "density = 3", "sense.density: found 3, allowed \"linear\" or \"inverse\" or \"mean\""),
+        (19, "density = 'flat'", "sense.density: found 'flat', allowed \"linear\" or \"inverse\" or \"mean\""),
         (23, "fitness = 'x'", "learning.fitness: found 'x', allowed \"G\" or \"D\" or \"Df\" or \"D++\" or \"Dt\""),
         (
             23,
@@ -256,6 +256,23 @@ fn wrong_values_are_reported_with_line_and_range() {
             23,
             "partners = 3\nsharing = \"all\"",
             "learning.partners: found 3 with learning.sharing = \"all\", allowed 1: a team has a single policy",
+        ),
+        (
+            23,
+            "partners = 2\nsharing = \"group\"\ngroups = [[0, 1]]",
+            "learning.partners: found 2 with learning.sharing = \"group\", allowed 1: a team has a single policy",
+        ),
+        (23, "groups = [[0, 1]]", "learning.groups: found with learning.sharing = \"none\", allowed with \"group\""),
+        (
+            23,
+            "groups = [[0, 1], [1]]\nsharing = \"group\"",
+            "learning.groups[1]: learner 1 is in a group already, allowed once",
+        ),
+        (23, "groups = [[1]]\nsharing = \"group\"", "learning.groups[0]: learner 0 is in no group"),
+        (
+            23,
+            "groups = [[0, 1, 2]]\nsharing = \"group\"",
+            "learning.groups[0][2]: found 2, allowed 0 to 1 (the number of learners)",
         ),
         (
             23,
@@ -348,7 +365,7 @@ x.toml:6: world.coupling: found 9, allowed 1 to 6 (the number of agents)
 x.toml:13: motion.max_sped: unknown key, did you mean `motion.max_speed`?
 x.toml:21: policy.hidden[0]: found 65, allowed 1 to 64
 x.toml:24: learning.trials: found 0, allowed 1 to 4096
-x.toml:25: learning.foo: unknown key; [learning] has elites, episodes_per_team, fitness, generations, hall_of_fame, led_by, \
+x.toml:25: learning.foo: unknown key; [learning] has elites, episodes_per_team, fitness, generations, groups, hall_of_fame, led_by, \
          led_within, leniency, method, mutation, mutation_probability, mutation_sigma, paradigm, parents, partners, poi_jitter, population, search_sigma, search_step, seed, sharing, start_jitter, trials
 --population: found 1, allowed 2 to 1048576"
     );

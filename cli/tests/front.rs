@@ -8,7 +8,7 @@ use std::path::Path;
 use flotilla::Config;
 use flotilla::backend::cpu::Cpu;
 use flotilla::backend::{Backend, Group};
-use flotilla::config::Sharing;
+use flotilla::config::own_populations;
 use flotilla::config::{Fitness, MAX_AGENTS, MAX_POPULATION, MAX_STEPS, Stage};
 use flotilla::evaluate::Starts;
 use flotilla::front::{self, Coevolution, Failure, Processor};
@@ -231,7 +231,11 @@ fn training_starts_from_given_policies() {
         flotilla::front::train_from(&config, &mut Cpu::default(), policies, first, |_| Continue(()))
     };
     let warm = train_from(policies, &learned.policies).unwrap();
-    let of_trial = |weights: &Vec<f32>| Policies { policies, sharing: Sharing::PerLeader, weights: weights.clone() };
+    let of_trial = |weights: &Vec<f32>| Policies {
+        policies,
+        populations: own_populations(config.learners()).to_vec(),
+        weights: weights.clone(),
+    };
     let trials = learned.policies.iter().map(of_trial).collect();
     let folder = tempfile::tempdir().unwrap();
     let init = Init { digest: "of no file".into(), trials };
@@ -289,7 +293,7 @@ fn play_and_trace_treat_each_team_separately() {
             starts: &episode_starts,
             weights: weights[..].into(),
             policies: teams,
-            sharing: Sharing::PerLeader,
+            populations: own_populations(world.leaders()),
             teams: &order,
             fitnesses: &[],
         };

@@ -38,6 +38,7 @@ mod recovery;
 mod reference;
 mod report;
 mod rules;
+mod searchers;
 mod stages;
 mod stories;
 mod sweep;

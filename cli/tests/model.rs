@@ -13,7 +13,7 @@ use std::f64::consts::PI;
 
 use flotilla::backend::cpu::{Cpu, level_name};
 use flotilla::backend::{Backend, Group, Moment, Trace};
-use flotilla::config::{Actions, Config, Coupling, Density, Fitness, Paradigm, Sharing};
+use flotilla::config::{Actions, Config, Coupling, Density, Fitness, Paradigm, own_populations};
 use flotilla::sample;
 use flotilla::world::World;
 use flotilla::world::on_grid;
@@ -157,7 +157,7 @@ impl Model {
         let sense = &self.config.sense;
         let here = states[leader];
         let diagonal = 2f64.sqrt() * self.map.max_element();
-        let mut inputs = [0.0; 8];
+        let (mut inputs, mut counts) = ([0.0; 8], [0usize; 8]);
         let mut add_points = |first: usize, points: &[DVec2], range: f64, size: usize| {
             for &point in points {
                 let offset = Offset::new(here.position, point);
@@ -176,9 +176,14 @@ impl Model {
                 };
                 let value = match sense.density {
                     Density::Linear => 1.0 - offset.d / diagonal,
-                    Density::Inverse => 1.0 / offset.d.max(1.0),
+                    Density::Inverse | Density::Mean => 1.0 / offset.d.max(1.0),
                 };
-                inputs[first + quadrant] += value / size as f64;
+                let (input, count) = (&mut inputs[first + quadrant], &mut counts[first + quadrant]);
+                *count += 1;
+                match sense.density {
+                    Density::Mean => *input += (value - *input) / *count as f64,
+                    _ => *input += value / size as f64,
+                }
             }
         };
         add_points(0, &self.pois, sense.poi_range, self.pois.len());
@@ -399,7 +404,7 @@ fn check(cpu: &mut Cpu, world: &Config, model: &Model, seed: u64) -> Tally {
         starts: &places,
         weights: weights[..].into(),
         policies,
-        sharing: Sharing::PerLeader,
+        populations: own_populations(compiled.leaders()),
         teams: &teams,
         fitnesses: &[Fitness::Dt],
     };
@@ -604,7 +609,7 @@ actions = 'behaviours'";
             starts: &world.starts,
             weights: weights[..].into(),
             policies: 1,
-            sharing: Sharing::PerLeader,
+            populations: own_populations(world.leaders()),
             teams: &teams,
             fitnesses: &[],
         };
@@ -624,7 +629,7 @@ actions = 'behaviours'";
         starts: &world.starts,
         weights: weights[..].into(),
         policies: 1,
-        sharing: Sharing::PerLeader,
+        populations: own_populations(world.leaders()),
         teams: &[0, 0],
         fitnesses: &[],
     };
@@ -701,6 +706,7 @@ fn random_worlds_cover_every_kind() {
     assert!(
         at_least_three(|c| c.sense.density == Density::Linear)
             && at_least_three(|c| c.sense.density == Density::Inverse)
+            && at_least_three(|c| c.sense.density == Density::Mean)
     );
     assert!(
         at_least_three(|c| c.sense.poi_range.is_infinite()) && at_least_three(|c| c.sense.agent_range.is_infinite())

@@ -8,7 +8,7 @@ use flotilla::backend::cpu::Cpu;
 use flotilla::backend::gpu::episode::{GpuBackend, Kernel, Records, ResidencyPolicy};
 use flotilla::backend::gpu::{self, device::Request};
 use flotilla::backend::{Backend, Group, GroupScores};
-use flotilla::config::{Config, Coupling, Fitness, Observers, Paradigm, Sharing, ValidConfig};
+use flotilla::config::{Config, Coupling, Fitness, Observers, Paradigm, ValidConfig, own_populations};
 use flotilla::credit::Credit;
 use flotilla::evaluate::SCORES_AND_DT;
 use flotilla::sample;
@@ -35,9 +35,9 @@ impl Teams {
     }
 
     fn group(&self, fitnesses: &'static [Fitness]) -> Group<'_> {
-        let (world, sharing) = (&self.world, Sharing::PerLeader);
+        let (world, populations) = (&self.world, own_populations(self.world.leaders()));
         let (starts, weights, teams) = (&world.starts, self.weights[..].into(), &self.choice[..]);
-        Group { world, starts, weights, policies: 5, sharing, teams, fitnesses }
+        Group { world, starts, weights, policies: 5, populations, teams, fitnesses }
     }
 
     /// Returns the size of the unpacked record in bytes.

@@ -30,7 +30,7 @@ Any number of stages, in order of `from`. Each starts from the file's own keys a
 | key | unit | type | range | default | meaning | paper |
 |---|---|---|---|---|---|---|
 | `from` | generations | whole number | 0 to learning.generations, more than that of the stage before | none: it has to be given | the first generation of the stage; it lasts until that of the next | 2.1 |
-| `set` |  | table of keys | any of the keys above but `policy.*`, `checkpoint.*`, `learning.paradigm`, `sharing`, `population`, `elites`, `parents`, `method`, `search_sigma`, `generations`, `trials` and `seed`; as many leaders learn | `{}` | the keys that differ from the file, `{ \"world.coupling\" = 1 }` | 2.1 |
+| `set` |  | table of keys | any of the keys above but `policy.*`, `checkpoint.*`, `learning.paradigm`, `sharing`, `groups`, `population`, `elites`, `parents`, `method`, `search_sigma`, `generations`, `trials` and `seed`; as many leaders learn | `{}` | the keys that differ from the file, `{ \"world.coupling\" = 1 }` | 2.1 |
 ";
 
 /// Returns text as a cell of a Markdown table.

@@ -208,7 +208,8 @@ def rollout(
     Args:
         config: the world, and the policies' network.
         policies: float32 `[leaders, teams, parameters]`: team `t` is made of every leader's policy `t`; or
-            `[1, teams, parameters]` if the leaders of a team share one. C-contiguous float32 arrays are not copied.
+            `[populations, teams, parameters]` if leaders share policies (`learning.sharing`; 1 if all share one).
+            C-contiguous float32 arrays are not copied.
             A policy's parameters are its layers in order, each as weights `W[in, out]` (row-major), then biases `b[out]`.
         episodes: number of held-out starts that every team plays from. None plays once, from the config's own start.
         seed: seed of these starts, which are the same for all policies.

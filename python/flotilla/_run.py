@@ -45,8 +45,8 @@ class Run:
         metrics: `best_g`, `mean_g` and `champion_g`, each float64 `[trials, generations + 1]`, the random start
             first: the share of POIs observed, 0 to 1, by each generation's best and mean team, and by the team of every
             population's best policy.
-        policies: one float32 array `[leaders, policies, parameters]` per trial, or `[1, policies, parameters]` if leaders
-            share a policy (`learning.sharing`). The best policy is first, so that team 0 of a rollout is the champion.
+        policies: one float32 array `[populations, policies, parameters]` per trial. There is a population per leader, per
+            group, or one for all (`learning.sharing`). The best policy is first, so that team 0 of a rollout is the champion.
             These arrays and those of `metrics` are read-only: copy them to change them.
         digest: a checksum of the results, equal to the command line's for this config and seed.
         backend: the processor that trained it, in words.
@@ -442,7 +442,7 @@ def init_file(init: Any, config: Config, aside: str) -> str:
     trials = int(config["learning.trials"])
     if len(policies) not in (1, trials):
         raise ValueError(f"init has policies of {len(policies)} trials, allowed are {trials}, or one array for all")
-    leaders = config.num_learners if config["learning.sharing"] == "none" else 1
+    leaders = config._native.populations
     population = policies[0].shape[1]
     shape = (leaders, population, config.parameters)
     for trial in policies:

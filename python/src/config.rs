@@ -70,6 +70,11 @@ impl Config {
         self.0.learners()
     }
 
+    #[getter]
+    fn populations(&self) -> usize {
+        self.0.populations()
+    }
+
     /// Numbers of agents, POIs and steps.
     #[getter]
     fn sizes(&self) -> (usize, usize, usize) {

@@ -34,11 +34,11 @@ pub fn drawn(drawn: Option<(u32, u64, f64, f64)>) -> Starts {
     })
 }
 
-/// Returns the number of teams and the policies, `[leaders or 1][teams][parameters]`, without a copy.
+/// Returns the number of teams and the policies, `[populations][teams][parameters]`, without a copy.
 pub fn weights<'a>(config: &Config, policies: &'a PyReadonlyArray3<'_, f32>) -> PyResult<(usize, &'a [f32])> {
     let (&[leaders, teams, parameters], config) = (policies.shape(), &config.0) else { unreachable!("three axes") };
     let (all, expected) = (config.learners(), config.parameters());
-    if parameters != expected || ![1, all].contains(&leaders) || teams == 0 {
+    if parameters != expected || ![1, all, config.populations()].contains(&leaders) || teams == 0 {
         return Err(PyValueError::new_err(format!(
             "policies are [{leaders}, {teams}, {parameters}], allowed is [leaders, teams, parameters] = [{all}, 1 or more, \
              {expected}], or [1, 1 or more, {expected}] if leaders share a policy"

@@ -3,7 +3,7 @@
 use glam::Vec2;
 
 use super::{BackendError, DevicePopulation};
-use crate::config::{Fitness, Sharing};
+use crate::config::{Fitness, population_count};
 use crate::credit::RecordRequest;
 use crate::parallel::*;
 use crate::world::World;
@@ -23,8 +23,9 @@ pub struct Group<'a> {
     pub weights: Weights<'a>,
     /// Policies per population. In training these are its [slots](crate::config::Learning::slots).
     pub policies: usize,
-    /// Whether each leader chooses from a population of its own.
-    pub sharing: Sharing,
+    /// The population that each leader chooses from, `[leaders]`. A config's are its world's; see also
+    /// [`own_populations`](crate::config::own_populations).
+    pub populations: &'a [u32],
     /// The policy of each leader in each team, `[teams][leaders]`.
     pub teams: &'a [u32],
     /// The fitnesses to score every leader by. A trace has sightings only if Dt is among them.
@@ -47,19 +48,15 @@ impl<'a> Group<'a> {
         RecordRequest(self.fitnesses)
     }
 
-    /// Returns the number of populations: one per leader, or one for all.
-    pub fn populations(&self) -> usize {
-        match self.sharing {
-            Sharing::PerLeader => self.world.leaders(),
-            Sharing::Shared => 1,
-        }
+    /// Returns the number of populations.
+    pub fn population_count(&self) -> usize {
+        population_count(self.populations)
     }
 
     /// Returns the index of a policy's first weight.
     #[inline]
     pub(crate) fn place(&self, leader: usize, policy: usize) -> usize {
-        let population = if self.sharing == Sharing::Shared { 0 } else { leader };
-        (population * self.policies + policy) * self.world.parameters()
+        (self.populations[leader] as usize * self.policies + policy) * self.world.parameters()
     }
 
     /// Checks the group. Every backend calls this before it plays. A backend that holds the policies also checks their
@@ -77,7 +74,10 @@ impl<'a> Group<'a> {
         if !teams.len().is_multiple_of(leaders) {
             return invalid(format!("{} choices of policies for teams of {leaders} leaders", teams.len()));
         }
-        let populations = self.populations();
+        if self.populations.len() != leaders {
+            return invalid(format!("populations of {} leaders for {leaders}", self.populations.len()));
+        }
+        let populations = self.population_count();
         let numbers = populations * policies * world.parameters();
         if let Weights::OnHost(weights) = weights
             && weights.len() != numbers

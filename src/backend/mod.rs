@@ -30,9 +30,9 @@ pub use batch::{Group, Weights};
 pub use error::BackendError;
 pub use scores::GroupScores;
 pub(crate) use size::{BATCH_BYTES, PACKED_FROM, held_bytes, state_bytes, weight_bytes};
+pub use size::{HELD_FROM, record_bytes};
 #[cfg(feature = "gpu")]
 use size::{VECTOR, WeightVector, check_sizes, record_words, weight_vectors};
-pub use size::{HELD_FROM, record_bytes};
 pub use trace::{Moment, Trace};
 
 /// Plays episodes and scores them. Every implementation returns the same bits.

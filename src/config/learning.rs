@@ -1,6 +1,6 @@
 //! The sections `[learning]` and `[checkpoint]`: their data and keys.
 
-use super::MAX_STEPS;
+use super::{MAX_AGENTS, MAX_STEPS};
 use crate::config_enum::config_enum;
 use crate::model::{LEAST, LONGEST};
 use crate::reader::{CountOrPercentage, Reader, between, section};
@@ -22,9 +22,12 @@ section! {
     Learning = "learning" {
         /// who learns: the leaders, or every agent
         paradigm: Paradigm = "", "4.1, 4.4",
-        /// leaders that share a policy: none, or all; then there is one population, whose policies are selected by the
-        /// mean of their leaders' scores
+        /// leaders that share a policy: none, those of a group, or all; they share a population, whose policies are
+        /// selected by the mean of their leaders' scores
         sharing: Sharing = "", "2.1",
+        /// for sharing = "group": the learners of each group, counted from 0; without them, a group is a leader and
+        /// the learners in followers' places that start nearest to it
+        groups: Vec<Vec<usize>> = "", "",
         /// what policies are selected by: the team's score G, D without a leader, Df without a leader and its
         /// followers, D++ with copies of a leader, or Dt without a leader and, at each step, the followers that it
         /// leads then
@@ -91,11 +94,13 @@ config_enum! {
 }
 
 config_enum! {
-    /// The leaders that share a policy.
+    /// The leaders that share a policy, which comes from the population that they share.
     Sharing {
         /// No leaders: each has its own population.
         PerLeader = "none",
-        /// All leaders: there is one population, and every leader of a team plays the same policy.
+        /// The leaders of a group, see [`Learning::groups`].
+        Group = "group",
+        /// All leaders: there is one population.
         Shared = "all",
     }
 }
@@ -209,13 +214,17 @@ impl Learning {
         self.population * self.partners
     }
 
-    pub(super) fn read(r: &mut Reader<'_>, paradigm: Paradigm) -> Learning {
+    /// Reads the section. `learners` is the number of agents that learn.
+    pub(super) fn read(r: &mut Reader<'_>, paradigm: Paradigm, learners: usize) -> Learning {
         let population = Learning::population(r).number(between(2, MAX_POPULATION), 50);
         let sharing = Learning::sharing(r).choice(Sharing::PerLeader);
+        let groups = groups(r, sharing, learners);
         let partners = Learning::partners(r).number(between(1, MAX_PARTNERS), 1);
-        if partners > 1 && sharing == Sharing::Shared {
-            let text =
-                format!("found {partners} with learning.sharing = \"all\", allowed 1: a team has a single policy");
+        let single = sharing == Sharing::Shared || groups.len() == 1;
+        if partners > 1 && single {
+            let text = format!(
+                "found {partners} with learning.sharing = \"{sharing}\", allowed 1: a team has a single policy"
+            );
             r.report_key("learning.partners", text);
         } else if population * partners > MAX_POPULATION {
             let teams = population * partners;
@@ -224,9 +233,10 @@ impl Learning {
         }
         let method = Learning::method(r).choice(Method::Tournament);
         let hall_of_fame = Learning::hall_of_fame(r).number(between(0, MAX_HALL_OF_FAME), 0);
-        if hall_of_fame > 0 && sharing == Sharing::Shared {
-            let text =
-                format!("found {hall_of_fame} with learning.sharing = \"all\", allowed 0: a team has a single policy");
+        if hall_of_fame > 0 && single {
+            let text = format!(
+                "found {hall_of_fame} with learning.sharing = \"{sharing}\", allowed 0: a team has a single policy"
+            );
             r.report_key("learning.hall_of_fame", text);
         } else if hall_of_fame > 0 && method != Method::Tournament {
             let text = format!("found {hall_of_fame}, allowed 0 unless learning.method is \"tournament\"");
@@ -243,6 +253,7 @@ impl Learning {
         Learning {
             paradigm,
             sharing,
+            groups,
             fitness: Learning::fitness(r).choice(Fitness::Df),
             population,
             partners,
@@ -266,6 +277,33 @@ impl Learning {
             seed: Learning::seed(r).number(between(0, i64::MAX as u64), 0),
         }
     }
+}
+
+/// Reads the groups of learners that share a population.
+fn groups(r: &mut Reader<'_>, sharing: Sharing, learners: usize) -> Vec<Vec<usize>> {
+    let each_in_one = |groups: &[Vec<usize>]| {
+        let mut group_of = vec![None; learners];
+        for (index, group) in groups.iter().enumerate() {
+            for &learner in group {
+                if group_of[learner].replace(index).is_some() {
+                    return vec![(index, format!("learner {learner} is in a group already, allowed once"))];
+                }
+            }
+        }
+        let missing = group_of.iter().position(Option::is_none);
+        missing.map(|learner| (0, format!("learner {learner} is in no group"))).into_iter().collect()
+    };
+    // Without valid leaders the number of learners is unknown, which is reported already.
+    let places = if learners == 0 { MAX_AGENTS } else { learners };
+    let each_in_one = |groups: &[Vec<usize>]| if learners == 0 { vec![] } else { each_in_one(groups) };
+    let learner = between(0, places - 1).because("the number of learners");
+    let groups =
+        Learning::groups(r).lists("groups of learners", ("there are groups", None), 1..=places, learner, each_in_one);
+    if !groups.is_empty() && sharing != Sharing::Group {
+        r.report_key("learning.groups", format!("found with learning.sharing = \"{sharing}\", allowed with \"group\""));
+        return vec![];
+    }
+    groups
 }
 
 section! {

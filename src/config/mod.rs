@@ -26,6 +26,7 @@ pub use learning::{
 };
 pub use load::name;
 pub use load::{is_standard_input, read_file, read_text};
+pub use populations::{one_population, own_populations, population_count};
 pub use stages::MAX_STAGES;
 pub use stages::{GENERATIONS, STAGES, Stage};
 pub use valid::{StageConfig, ValidConfig};
@@ -33,6 +34,7 @@ pub use world::{MAX_AGENTS, MAX_POIS, MAX_STEPS, WorldConfig};
 
 mod learning;
 mod load;
+mod populations;
 mod stages;
 mod valid;
 mod world;
@@ -170,11 +172,47 @@ impl Config {
         }
     }
 
-    /// Returns the number of populations in a trial: one per learner, or a single one if all leaders share a policy.
+    /// Returns the number of populations in a trial.
     pub fn populations(&self) -> usize {
-        match self.learning.sharing {
-            Sharing::PerLeader => self.learners(),
-            Sharing::Shared => 1,
+        population_count(&self.population_of_each())
+    }
+
+    /// Returns the population of each learner, `[learners]`.
+    pub fn population_of_each(&self) -> Vec<u32> {
+        let (learners, leaders) = (self.learners(), &self.world.leaders);
+        match (self.learning.sharing, &self.learning.groups[..]) {
+            (Sharing::PerLeader, _) => own_populations(learners).to_vec(),
+            (Sharing::Shared, _) => one_population(learners).to_vec(),
+            (Sharing::Group, []) => {
+                let nearest = |place: &[f64; 2]| {
+                    let distance2 = |leader: usize| {
+                        let [x, y] = [0, 1].map(|axis| place[axis] - leaders[leader][axis]);
+                        x * x + y * y
+                    };
+                    (0..leaders.len()).min_by(|&a, &b| distance2(a).total_cmp(&distance2(b))).unwrap_or(0) as u32
+                };
+                let others = self.world.followers.iter().map(nearest);
+                own_populations(leaders.len()).iter().copied().chain(others).take(learners).collect()
+            }
+            (Sharing::Group, groups) => {
+                let mut of_each = vec![0; learners];
+                for (population, group) in (0..).zip(groups) {
+                    group.iter().for_each(|&learner| of_each[learner] = population);
+                }
+                of_each
+            }
+        }
+    }
+
+    /// Returns the population of each learner if there are this many populations, for policies that may be from another
+    /// config: as in this config, or one per learner, or one for all. Returns `None` for other numbers.
+    pub fn population_of_each_of(&self, populations: usize) -> Option<Vec<u32>> {
+        let (own, learners) = (self.population_of_each(), self.learners());
+        match populations {
+            _ if populations == population_count(&own) => Some(own),
+            _ if populations == learners => Some(own_populations(learners).to_vec()),
+            1 => Some(one_population(learners).to_vec()),
+            _ => None,
         }
     }
 
@@ -205,21 +243,28 @@ impl Config {
     fn ask(r: &mut Reader<'_>) -> Config {
         let (motion, start_speed) = Motion::read(r);
         let paradigm = Paradigm::read(r);
+        let world = WorldConfig::read(r, start_speed, paradigm);
+        let learners = match paradigm {
+            _ if world.leaders.is_empty() => 0,
+            Paradigm::LeaderFollower => world.leaders.len(),
+            Paradigm::AllLeaders => world.leaders.len() + world.followers.len(),
+        };
         let config = Config {
-            world: WorldConfig::read(r, start_speed, paradigm),
+            world,
             motion,
             follow: Follow::read(r),
             sense: Sense::read(r),
             policy: Policy::read(r),
-            learning: Learning::read(r, paradigm),
+            learning: Learning::read(r, paradigm, learners),
             checkpoint: CheckpointConfig::read(r),
             stages: vec![],
         };
         let Learning { population, hall_of_fame, .. } = config.learning;
         if r.error_count() == 0 && hall_of_fame > 0 {
             let teams = config.max_teams() - 1;
-            if config.learners() == 1 {
-                let text = format!("found {hall_of_fame} with a single leader, allowed 0: it has no partners");
+            if config.populations() == 1 {
+                let what = if config.learners() == 1 { "leader" } else { "population" };
+                let text = format!("found {hall_of_fame} with a single {what}, allowed 0: it has no partners");
                 r.report_key("learning.hall_of_fame", text);
             } else if teams > MAX_POPULATION {
                 let text =

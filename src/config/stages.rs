@@ -18,11 +18,12 @@ pub const MAX_STAGES: usize = 256;
 /// The key with the length of a run.
 pub const GENERATIONS: &str = "learning.generations";
 /// Keys that stages cannot change. A name that ends with a dot is a whole section.
-const FIXED: [&str; 13] = [
+const FIXED: [&str; 14] = [
     "policy.",
     "checkpoint.",
     "learning.paradigm",
     "learning.sharing",
+    "learning.groups",
     "learning.population",
     "learning.hall_of_fame",
     "learning.elites",

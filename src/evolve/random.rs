@@ -34,6 +34,12 @@ pub enum Purpose {
     Search = 12,
     /// The past champions that policies play with, see [`past_champions`](super::past_champions).
     HallOfFame = 13,
+    /// The weights of random networks that all leaders share, a baseline.
+    SharedBaseline = 14,
+    /// Teams of networks that a baseline climbs to.
+    Climber = 15,
+    /// Open-loop teams that a baseline climbs to.
+    OpenLoop = 16,
 }
 
 /// A key of the counter-based random number generator. [`Key::draw`] returns the words of a counter.

@@ -4,31 +4,35 @@ use fearless_simd::{Level, Simd, dispatch, prelude::*};
 use glam::Vec2;
 
 use super::random::{Key, Purpose, index_below};
-use crate::config::{Learning, Sharing};
+use crate::config::{Learning, population_count};
 use crate::world::{World, on_grid};
 
 /// Forms the teams of one round of a generation: a random permutation per population puts each policy on exactly one
 /// team.
 ///
-/// Writes the policy of each leader, `[teams][leaders]`. `key` is of [`Purpose::Teams`].
-pub fn form_teams(key: Key, generation: usize, round: usize, leaders: usize, teams: &mut [u32]) {
-    let mut order = vec![0; teams.len() / leaders];
-    for leader in 0..leaders {
-        shuffle(Level::new(), key, generation, round, leader, &mut order);
-        teams.iter_mut().skip(leader).step_by(leaders).zip(&order).for_each(|(policy, &shuffled)| *policy = shuffled);
+/// Writes the policy of each population, `[teams][populations]`. `key` is of [`Purpose::Teams`].
+pub fn form_teams(key: Key, generation: usize, round: usize, populations: usize, teams: &mut [u32]) {
+    let mut order = vec![0; teams.len() / populations];
+    for population in 0..populations {
+        shuffle(Level::new(), key, generation, round, population, &mut order);
+        let policies = teams.iter_mut().skip(population).step_by(populations);
+        policies.zip(&order).for_each(|(policy, &shuffled)| *policy = shuffled);
     }
 }
 
-/// Returns the teams of contemporaries in one generation of a trial, `[teams][leaders]`, round by round. With a shared
-/// population, team `t` is policy `t`; otherwise see [`form_teams`].
-pub fn contemporary_teams(learning: &Learning, trial: usize, generation: usize, leaders: usize) -> Vec<u32> {
-    let mut teams = aligned_teams(learning.population, leaders);
-    if learning.sharing == Sharing::PerLeader {
+/// Returns the teams of contemporaries in one generation of a trial, `[teams][leaders]`, round by round. `populations`
+/// are the leaders'. If there is only one, team `t` is policy `t`; otherwise see [`form_teams`].
+pub fn contemporary_teams(learning: &Learning, trial: usize, generation: usize, populations: &[u32]) -> Vec<u32> {
+    let (leaders, count) = (populations.len(), population_count(populations));
+    let mut teams = aligned_teams(learning.population, leaders).repeat(learning.partners);
+    if count > 1 {
         let key = Key::new(learning.seed, trial, Purpose::Teams);
-        let of_round = teams.len();
-        teams.resize(learning.partners * of_round, 0);
-        for (round, teams) in teams.chunks_exact_mut(of_round).enumerate() {
-            form_teams(key, generation, round, leaders, teams);
+        let mut policies = vec![0; learning.population * count];
+        for (round, teams) in teams.chunks_exact_mut(learning.population * leaders).enumerate() {
+            form_teams(key, generation, round, count, &mut policies);
+            for (team, policies) in teams.chunks_exact_mut(leaders).zip(policies.chunks_exact(count)) {
+                team.iter_mut().zip(populations).for_each(|(policy, &of)| *policy = policies[of as usize]);
+            }
         }
     }
     teams

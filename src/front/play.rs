@@ -6,7 +6,7 @@ use std::ops::{ControlFlow, Range};
 use super::Failure;
 use crate::backend::cpu::{Cpu, Noise, StepArrays};
 use crate::backend::{Backend, Group, GroupScores};
-use crate::config::{Config, Fitness, MAX_POPULATION, Sharing};
+use crate::config::{Config, Fitness, MAX_POPULATION};
 use crate::evaluate::{self, Evaluation, MAX_EPISODES, Starts};
 use crate::evolve::{self, Key, Purpose};
 use crate::stepping::{Recording, Stepper};
@@ -214,7 +214,7 @@ struct CheckedTeams<'a> {
     world: World,
     weights: Cow<'a, [f32]>,
     policies: usize,
-    sharing: Sharing,
+    populations: Vec<u32>,
     teams: Vec<u32>,
 }
 
@@ -231,10 +231,11 @@ impl<'a> CheckedTeams<'a> {
             }
         }
         let (leaders, parameters) = (world.leaders(), world.parameters());
-        let shared = weights.len() / teams == parameters;
-        if !weights.len().is_multiple_of(teams) || !(shared || weights.len() / teams == leaders * parameters) {
+        let populations = weights.len() / teams / parameters;
+        let of_each = config.population_of_each_of(populations);
+        let Some(of_each) = of_each.filter(|_| weights.len() == populations * teams * parameters) else {
             return Err(Failure::Weights { found: weights.len(), leaders, teams, parameters });
-        }
+        };
         // Each leader of a team needs an entry of `teams` and several scores.
         let bytes = teams as u128 * leaders as u128 * 28;
         if !usize::try_from(bytes).is_ok_and(|bytes| Vec::<u8>::new().try_reserve_exact(bytes).is_ok()) {
@@ -248,8 +249,7 @@ impl<'a> CheckedTeams<'a> {
             return Err(Failure::Weight { leader: policy / teams, team: policy % teams, parameter, value });
         }
         let order = evaluate::aligned_teams(teams, leaders);
-        let sharing = if shared { Sharing::Shared } else { Sharing::PerLeader };
-        Ok(CheckedTeams { world, weights, policies: teams, sharing, teams: order })
+        Ok(CheckedTeams { world, weights, policies: teams, populations: of_each, teams: order })
     }
 
     /// Plays some episodes and writes their steps, see [`record`].
@@ -275,7 +275,7 @@ impl<'a> CheckedTeams<'a> {
     }
 
     fn group<'b>(&'b self, starts: &'b [glam::Vec2]) -> Group<'b> {
-        let &CheckedTeams { ref world, ref weights, policies, sharing, ref teams } = self;
-        Group { world, starts, weights: weights[..].into(), policies, sharing, teams, fitnesses: &[] }
+        let &CheckedTeams { ref world, ref weights, policies, ref populations, ref teams } = self;
+        Group { world, starts, weights: weights[..].into(), policies, populations, teams, fitnesses: &[] }
     }
 }

@@ -6,15 +6,16 @@ use super::{LONGEST, Lanes};
 use crate::config_enum::{Choice, config_enum};
 use crate::gpu_struct::gpu_struct;
 use crate::kernels::{
-    math::{exact_sqrt, rsqrt},
+    larger,
+    math::{exact_sqrt, recip, rsqrt},
     select, splat, zero_if, zero_unless,
 };
 use crate::reader::{Reader, between, section};
 
 /// The shader of this part.
 pub(crate) const WGSL: &str = include_str!("../../shaders/sense.wgsl");
-// The shader takes every density except the first for the second one.
-const _: () = assert!(Density::ALL.len() == 2, "add the new density to shaders/sense.wgsl, too, and raise this number");
+// The shader takes every density except the first for an inverse one.
+const _: () = assert!(Density::ALL.len() == 3, "add the new density to shaders/sense.wgsl, too, and raise this number");
 
 /// Inputs of a policy: POI and agent density in four quadrants each.
 pub const INPUTS: usize = 8;
@@ -41,7 +42,8 @@ section! {
         /// distance up to which leaders sense other agents; with 0 they sense none
         agent_range: f64 = "units", "3.1",
         /// what something at distance d adds to its quadrant's density: 1 − d/(√2·max(map)) if linear, 1/max(d, 1) if
-        /// inverse
+        /// inverse, and this as a share of all POIs or agents in the world; if mean, the density is the mean of
+        /// 1/max(d, 1) over those sensed in the quadrant, which is the paper's definition
         density: Density = "", "3.1",
         /// multiplies all inputs of the leaders' policies
         gain: f64 = "", "",
@@ -67,6 +69,8 @@ config_enum! {
         Linear = "linear",
         /// `1 / max(d, 1)`.
         Inverse = "inverse",
+        /// The mean of `1 / max(d, 1)` over the quadrant.
+        Mean = "mean",
     }
 }
 
@@ -77,9 +81,9 @@ gpu_struct! {
         pub poi_range2: f32,
         /// The squared range of agents.
         pub agent_range2: f32,
-        /// gain/P: multiplies a sum over POIs; 0 if no POI is sensed.
+        /// Multiplies a sum over POIs: gain/P, or the gain if densities are means; 0 if no POI is sensed.
         pub poi_share: f32,
-        /// gain/N: multiplies a sum over agents; 0 if no agent is sensed.
+        /// The same for sums over agents.
         pub agent_share: f32,
         /// 1/D with D = √2·max(map).
         pub inverse_diagonal: f32,
@@ -90,7 +94,11 @@ impl SenseConstants {
     /// Computes the constants for so many agents and POIs on a map.
     pub fn new(sense: &Sense, agents: usize, pois: usize, map: [f64; 2]) -> SenseConstants {
         // A range of 0 still reaches what is at the same place: that weighs nothing, on every backend alike.
-        let share = |range: f64, count: usize| if range == 0.0 { 0.0 } else { (sense.gain / count as f64) as f32 };
+        let share = |range: f64, count: usize| match sense.density {
+            _ if range == 0.0 => 0.0,
+            Density::Mean => sense.gain as f32,
+            Density::Linear | Density::Inverse => (sense.gain / count as f64) as f32,
+        };
         let range2 = |range: f64| if range.is_infinite() { UNLIMITED } else { (range * range) as f32 };
         SenseConstants {
             poi_range2: range2(sense.poi_range),
@@ -109,17 +117,61 @@ pub(crate) fn density<S: Simd, const DENSITY: u32>(world: &Lanes<S>, dx: S::f32s
     let d2 = dx * dx + dy * dy;
     match const { Density::of(DENSITY) } {
         Density::Linear => one - exact_sqrt::<S>(d2) * world.sense.inverse_diagonal,
-        Density::Inverse => rsqrt::<S>(select::<S>(one, d2, d2.simd_gt(one))),
+        Density::Inverse | Density::Mean => rsqrt::<S>(select::<S>(one, d2, d2.simd_gt(one))),
     }
 }
 
-/// Adds the density of the entity at offset (`dx`, `dy`) to the sum of its quadrant. Quadrants are in the order of the
-/// policy's inputs: back right, front right, front left, back left.
+/// The entities of one class around a leader, by quadrant in the order of the policy's inputs: back right, front right,
+/// front left, back left.
+#[derive(Clone, Copy)]
+pub struct Quadrants<S: Simd> {
+    /// The sums of their densities.
+    sums: [S::f32s; 4],
+    /// The number of entities sensed. Only means need it.
+    counts: [S::f32s; 4],
+}
+
+impl<S: Simd> Quadrants<S> {
+    /// Returns empty quadrants.
+    #[inline(always)]
+    pub fn new(simd: S) -> Quadrants<S> {
+        Quadrants { sums: [splat(simd, 0.0); 4], counts: [splat(simd, 0.0); 4] }
+    }
+
+    /// Adds an entity with this density, which is 0 out of range, at offset (`dx`, `dy`) from a leader with heading
+    /// (`hx`, `hy`).
+    #[inline(always)]
+    pub fn add<const DENSITY: u32>(&mut self, density: S::f32s, dx: S::f32s, dy: S::f32s, hx: S::f32s, hy: S::f32s) {
+        sense::<S>(density, dx, dy, hx, hy, &mut self.sums);
+        if const { matches!(Density::of(DENSITY), Density::Mean) } {
+            let (zero, one) = (splat(dx.token(), 0.0), splat(dx.token(), 1.0));
+            sense::<S>(zero_unless::<S>(one, density.simd_gt(zero)), dx, dy, hx, hy, &mut self.counts);
+        }
+    }
+
+    /// Returns the inputs: the sums, or the means, times a constant.
+    #[inline(always)]
+    fn inputs<const DENSITY: u32>(self, share: S::f32s) -> [S::f32s; 4] {
+        let [sums, counts] = [self.sums, self.counts];
+        std::array::from_fn(
+            #[inline(always)]
+            |quadrant| match const { Density::of(DENSITY) } {
+                Density::Mean => {
+                    let one = splat(share.token(), 1.0);
+                    sums[quadrant] * recip::<S>(larger::<S>(counts[quadrant], one)) * share
+                }
+                Density::Linear | Density::Inverse => sums[quadrant] * share,
+            },
+        )
+    }
+}
+
+/// Adds the density of the entity at offset (`dx`, `dy`) to the sum of its quadrant.
 ///
 /// The signs of the offset along the heading and to its left determine the quadrant. A tie goes to the counterclockwise
 /// quadrant, so that each boundary belongs to exactly one.
 #[inline(always)]
-pub fn sense<S: Simd>(density: S::f32s, dx: S::f32s, dy: S::f32s, hx: S::f32s, hy: S::f32s, sums: &mut [S::f32s; 4]) {
+fn sense<S: Simd>(density: S::f32s, dx: S::f32s, dy: S::f32s, hx: S::f32s, hy: S::f32s, sums: &mut [S::f32s; 4]) {
     let zero = splat(dx.token(), 0.0);
     let fx = dx * hx + dy * hy;
     let fy = dy * hx - dx * hy;
@@ -133,14 +185,14 @@ pub fn sense<S: Simd>(density: S::f32s, dx: S::f32s, dy: S::f32s, hx: S::f32s, h
     sums[3] += zero_if::<S>(density_left, front);
 }
 
-/// Returns the policy's inputs: the sums of both kinds, each multiplied by its constant.
+/// Returns the policy's inputs: the densities of both kinds, each multiplied by its constant.
 #[inline(always)]
-pub(crate) fn scale_inputs<S: Simd>(
+pub(crate) fn scale_inputs<S: Simd, const DENSITY: u32>(
     world: &Lanes<S>,
-    of_pois: [S::f32s; 4],
-    of_agents: [S::f32s; 4],
+    of_pois: Quadrants<S>,
+    of_agents: Quadrants<S>,
 ) -> [S::f32s; INPUTS] {
-    let [p, a] = [world.sense.poi_share, world.sense.agent_share];
-    let ([p0, p1, p2, p3], [a0, a1, a2, a3]) = (of_pois, of_agents);
-    [p0 * p, p1 * p, p2 * p, p3 * p, a0 * a, a1 * a, a2 * a, a3 * a]
+    let [p0, p1, p2, p3] = of_pois.inputs::<DENSITY>(world.sense.poi_share);
+    let [a0, a1, a2, a3] = of_agents.inputs::<DENSITY>(world.sense.agent_share);
+    [p0, p1, p2, p3, a0, a1, a2, a3]
 }

@@ -51,9 +51,7 @@ pub(super) struct TrialState {
 impl ExperimentState {
     pub fn new(config: &ValidConfig, trials: Range<usize>, level: Level) -> ExperimentState {
         let stages = Stages::new(config);
-        let leaders = stages.of(0).world.leaders();
-        let schedule = || TeamSchedule::new(config.learning.population, config.populations(), leaders);
-        let schedules = std::iter::repeat_with(schedule).take(trials.len()).collect();
+        let schedules = std::iter::repeat_with(TeamSchedule::new).take(trials.len()).collect();
         let trials = trials.into_par_iter().map(|index| TrialState::new(&stages, index, level)).collect();
         let residency = Residency::on_host(0);
         ExperimentState { stages, trials, schedules, next_schedules: vec![], residency }
@@ -107,9 +105,7 @@ impl ExperimentState {
         if self.only_champions_left() {
             return;
         }
-        let Stage { config, world, .. } = self.stage();
-        let (population, populations) = (config.learning.population, config.populations());
-        next.resize_with(self.trials.len(), || TeamSchedule::new(population, populations, world.leaders()));
+        next.resize_with(self.trials.len(), TeamSchedule::new);
         let generation = self.residency.generation() + 1;
         let pairs = next.par_iter_mut().zip(&self.trials);
         pairs.for_each(|(schedule, trial)| schedule.draw(level, &self.stages, trial.index, generation));

@@ -9,7 +9,7 @@ use super::experiment::{ExperimentState, TrialState};
 use super::schedule::{MIN_POLICIES_PER_TASK, TeamSchedule, min_populations_per_task};
 use super::stages::Stage;
 use crate::backend::{Backend, BackendError, Group, GroupScores, Weights};
-use crate::config::{Learning, Leniency, Sharing};
+use crate::config::{Learning, Leniency};
 use crate::parallel::*;
 
 /// Teams per rayon task when their G is added up.
@@ -36,7 +36,7 @@ pub(super) fn play<'a>(
                     starts,
                     weights,
                     policies: learning.slots(),
-                    sharing: learning.sharing,
+                    populations: &stage.world.populations,
                     teams: &schedule.teams[range.start * leaders..range.end * leaders],
                     fitnesses: std::slice::from_ref(&learning.fitness),
                 }));
@@ -91,10 +91,7 @@ impl ExperimentState {
                 Some(given_scores) => given_scores[number * size + place],
                 None => mean_score(&trial.scores, place),
             };
-            match config.learning.sharing {
-                Sharing::PerLeader => assign_fitness(score, schedule, hall, &config.learning, &mut trial.fitness),
-                Sharing::Shared => assign_shared_fitness(score, world.leaders(), &mut trial.fitness),
-            }
+            assign_fitness(score, schedule, &world.populations, hall, &config.learning, &mut trial.fitness);
             trial.forget_scores();
         }
         rows
@@ -144,54 +141,50 @@ fn team_g(episodes: &[GroupScores], pois: usize, teams: usize) -> [f64; 2] {
     [best as f64 / whole, total as f64 / (whole * teams as f64)]
 }
 
-/// Assigns each policy its leader's score in its team, or the mean or the largest of its scores in several teams.
-/// `hall` means that the last of these has past champions. `score` takes a place of `[teams][leaders]`, `fitness` is
-/// `[leaders][policies]`.
+/// Assigns each policy the mean score of its leaders in its team, or the mean or the largest over several teams.
+/// `populations` are the leaders', and `hall` means that the last of a policy's teams has past champions. `score` takes
+/// a place of `[teams][leaders]`, `fitness` is `[populations][policies]`.
 ///
-/// The mean adds scores in 64 bits, in the order of the teams, and rounds to 32 bits once.
+/// Means add in 64 bits, in the order of the leaders and of the teams. The fitness is rounded to 32 bits once.
 fn assign_fitness(
     score: impl Fn(usize) -> f32 + Sync,
     schedule: &TeamSchedule,
+    populations: &[u32],
     hall: bool,
     learning: &Learning,
     fitness: &mut [f32],
 ) {
     let Learning { population, partners, leniency, .. } = *learning;
-    let (leaders, played) = (fitness.len() / population, partners + usize::from(hall));
-    let populations = fitness.par_chunks_exact_mut(population).with_min_len(min_populations_per_task(population));
-    populations.enumerate().for_each(|(leader, fitness)| {
-        let policies = schedule.teams[leader..partners * population * leaders].iter().step_by(leaders);
-        let scores = (leader..).step_by(leaders).zip(policies).map(|(place, &policy)| (policy as usize, score(place)));
-        let first = partners * population + leader * population;
-        let with_past = 0..if hall { population } else { 0 };
-        let with_past = with_past.map(|policy| (policy, score((first + policy) * leaders + leader)));
-        let scores = scores.chain(with_past);
+    let (leaders, played) = (populations.len(), partners + usize::from(hall));
+    let of_each = fitness.par_chunks_exact_mut(population).with_min_len(min_populations_per_task(population));
+    of_each.enumerate().for_each(|(index, fitness)| {
+        let members: Vec<usize> = (0..leaders).filter(|&leader| populations[leader] as usize == index).collect();
+        let in_team = |team: usize| {
+            let total: f64 = members.iter().map(|&leader| f64::from(score(team * leaders + leader))).sum();
+            (schedule.teams[team * leaders + members[0]] as usize, total / members.len() as f64)
+        };
+        let contemporary = partners * population;
+        let with_past = contemporary + index * population;
+        let with_past = with_past..with_past + if hall { population } else { 0 };
+        let teams = (0..contemporary).into_par_iter().chain(with_past);
+        let scores: Vec<(usize, f64)> = teams.with_min_len(MIN_POLICIES_PER_TASK).map(in_team).collect();
         match leniency {
-            _ if played == 1 => scores.for_each(|(policy, score)| fitness[policy] = score),
+            _ if played == 1 => scores.into_iter().for_each(|(policy, score)| fitness[policy] = score as f32),
             Leniency::Max => {
                 fitness.fill(f32::NEG_INFINITY);
                 // Not `f32::max`, which may return either of two zeros.
-                scores.for_each(|(policy, score)| {
-                    if score > fitness[policy] {
-                        fitness[policy] = score;
+                scores.into_iter().for_each(|(policy, score)| {
+                    if score as f32 > fitness[policy] {
+                        fitness[policy] = score as f32;
                     }
                 });
             }
             Leniency::Mean => {
                 let mut totals = vec![0.0; population];
-                scores.for_each(|(policy, score)| totals[policy] += f64::from(score));
+                scores.into_iter().for_each(|(policy, score)| totals[policy] += score);
                 fitness.iter_mut().zip(totals).for_each(|(mean, total)| *mean = (total / played as f64) as f32);
             }
         }
-    });
-}
-
-/// Assigns each policy of a shared population the mean of its leaders' scores, summed in the leaders' order.
-fn assign_shared_fitness(score: impl Fn(usize) -> f32 + Sync, leaders: usize, fitness: &mut [f32]) {
-    let min_len = MIN_POLICIES_PER_TASK.div_ceil(leaders);
-    fitness.par_iter_mut().with_min_len(min_len).enumerate().for_each(|(team, fitness)| {
-        let score = |leader| f64::from(score(team * leaders + leader));
-        *fitness = ((0..leaders).map(score).sum::<f64>() / leaders as f64) as f32;
     });
 }
 

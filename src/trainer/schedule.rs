@@ -6,7 +6,7 @@ use fearless_simd::Level;
 use glam::Vec2;
 
 use super::stages::{Stage, Stages};
-use crate::config::{Learning, Sharing};
+use crate::config::{Learning, population_count};
 use crate::evolve::{self, Key, Purpose};
 use crate::parallel::*;
 
@@ -36,15 +36,8 @@ pub(super) struct TeamSchedule {
 
 impl TeamSchedule {
     /// Returns a schedule that is yet to be drawn.
-    pub fn new(population: usize, populations: usize, leaders: usize) -> TeamSchedule {
-        TeamSchedule {
-            drawn_for: None,
-            orders: vec![0; populations * population],
-            // The last team consists of the slot after the policies of every population, which holds the champion.
-            teams: evolve::aligned_teams(population + 1, leaders),
-            starts: vec![],
-            previous_stage_starts: vec![],
-        }
+    pub fn new() -> TeamSchedule {
+        TeamSchedule { drawn_for: None, orders: vec![], teams: vec![], starts: vec![], previous_stage_starts: vec![] }
     }
 
     /// Reports whether this is the schedule of a generation.
@@ -59,7 +52,7 @@ impl TeamSchedule {
         }
         self.drawn_for = Some((generation, stages.index_of(generation)));
         let stage = stages.of(generation);
-        self.form_teams(level, &stage.config.learning, stage.world.leaders(), trial, generation);
+        self.form_teams(level, &stage.config.learning, &stage.world.populations, trial, generation);
         draw_starts(stage, trial, generation, &mut self.starts);
         match stages.ending_before(generation) {
             Some(stage) => draw_starts(stage, trial, generation, &mut self.previous_stage_starts),
@@ -68,36 +61,39 @@ impl TeamSchedule {
     }
 
     /// Writes `teams`.
-    fn form_teams(&mut self, level: Level, learning: &Learning, leaders: usize, trial: usize, generation: usize) {
-        // With a shared population, team t always plays policy t.
-        if learning.sharing == Sharing::Shared {
-            return;
-        }
+    fn form_teams(&mut self, level: Level, learning: &Learning, populations: &[u32], trial: usize, generation: usize) {
+        let (leaders, count) = (populations.len(), population_count(populations));
         let population = learning.population;
-        let of_round = population * leaders;
-        self.orders.resize(learning.partners * of_round, 0);
+        let (of_round, orders_of_round) = (population * leaders, population * count);
+        self.orders.resize(learning.partners * orders_of_round, 0);
         self.teams.resize(learning.partners * of_round, 0);
         let key = Key::new(learning.seed, trial, Purpose::Teams);
         let orders = self.orders.par_chunks_exact_mut(population);
-        orders.with_min_len(min_populations_per_task(population)).enumerate().for_each(|(index, order)| {
-            evolve::shuffle(level, key, generation, index / leaders, index % leaders, order);
+        orders.with_min_len(min_populations_per_task(population)).enumerate().for_each(|(index, order)| match count {
+            // Every order of a single population makes the same teams.
+            1 => order.iter_mut().zip(0..).for_each(|(policy, team)| *policy = team),
+            _ => evolve::shuffle(level, key, generation, index / count, index % count, order),
         });
-        for (teams, orders) in self.teams.chunks_exact_mut(of_round).zip(self.orders.chunks_exact(of_round)) {
+        for (teams, orders) in self.teams.chunks_exact_mut(of_round).zip(self.orders.chunks_exact(orders_of_round)) {
             let teams = teams.par_chunks_exact_mut(leaders).with_min_len(MIN_POLICIES_PER_TASK);
             teams.enumerate().for_each(|(team, policies)| {
-                for (policy, order) in policies.iter_mut().zip(orders.chunks_exact(population)) {
-                    *policy = order[team];
+                for (policy, &of) in policies.iter_mut().zip(populations) {
+                    *policy = orders[of as usize * population + team];
                 }
             });
         }
         if let Some(slot) = evolve::past_champions(learning, trial, generation) {
             let first = self.teams.len();
-            self.teams.resize(first + leaders * of_round, slot as u32);
+            self.teams.resize(first + count * of_round, slot as u32);
             let teams = self.teams[first..].par_chunks_exact_mut(of_round);
-            teams.with_min_len(min_populations_per_task(population)).enumerate().for_each(|(leader, teams)| {
-                teams.iter_mut().skip(leader).step_by(leaders).zip(0..).for_each(|(to, policy)| *to = policy);
+            teams.with_min_len(min_populations_per_task(population)).enumerate().for_each(|(index, teams)| {
+                for (team, policy) in teams.chunks_exact_mut(leaders).zip(0..) {
+                    let members = team.iter_mut().zip(populations).filter(|&(_, &of)| of as usize == index);
+                    members.for_each(|(to, _)| *to = policy);
+                }
             });
         }
+        // The champions are in the slot after the policies.
         self.teams.extend(std::iter::repeat_n(population as u32, leaders));
     }
 }

@@ -1,7 +1,8 @@
 //! Trains the tasks of a suite, and checks that no baseline and no small population solves them.
 //!
-//! A task is admitted if no baseline reaches [`EASY`], if populations of [`SMALL`] policies solve it under no fitness,
-//! and if something solves it: a champion here, or a scripted team from a file next to the config.
+//! A task is admitted if no baseline solves it: no mean reaches [`EASY`], and no seed [`SOLVED`]. Populations of [`SMALL`]
+//! policies may solve it under no fitness. And something has to solve it: a champion here, or a scripted team from a
+//! file next to the config.
 
 use std::path::{Path, PathBuf};
 
@@ -9,8 +10,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::questions::champions;
 use flotilla::backend::{Backend, OpenBackend};
-use flotilla::baseline::Outcome as Played;
-use flotilla::config::{Config, Fitness, Override};
+use flotilla::baseline::NAMES;
+use flotilla::config::{Config, Fitness, Learning, Override};
 use flotilla::evaluate::Starts;
 use flotilla_app::choice::Work;
 use flotilla_app::ops::{BackendSource, ConfigText, Context, Error, Event, baseline, check_memory, with_remedy};
@@ -25,16 +26,18 @@ use flotilla_app::script::Script;
 
 /// Default folder.
 pub const OUT: &str = "tasks";
-/// G that no baseline of a task may reach.
+/// G that no baseline of a task may reach on average.
 pub const EASY: f64 = 0.7;
+/// Teams that each baseline plays, as multiples of those of a small population.
+pub const BUDGET: usize = 10;
 /// Number of policies in the small populations, and their number of generations.
 pub const SMALL: (i64, i64) = (50, 100);
 /// Number of repetitions of the baselines.
 const SEEDS: usize = 10;
 /// Number of held-out episodes per champion, if starts or POIs move.
 const EPISODES: u32 = 200;
-/// G above which a champion solves a task. If starts or POIs move, no team observes all POIs in all episodes.
-const SOLVED: f64 = 0.9;
+/// G above which a team solves a task. If starts or POIs move, no team observes all POIs in all episodes.
+pub const SOLVED: f64 = 0.9;
 /// The fitnesses of both kinds of populations.
 pub const FITNESSES: [Fitness; 4] = [Fitness::G, Fitness::D, Fitness::Df, Fitness::Dpp];
 
@@ -95,13 +98,14 @@ pub struct Found {
     pub name: String,
     /// Number of POIs.
     pub pois: usize,
-    /// G of the best constant action, of the best random constant actions and of the best random networks, per seed.
-    pub baselines: [Vec<f64>; 3],
+    /// G of each baseline of [`NAMES`], per seed.
+    pub baselines: [Vec<f64>; NAMES.len()],
     /// The trainings.
     pub trained: Vec<Trained>,
-    /// G of the scripted team from the config's start, if there is one.
+    /// G of the scripted team, if there is one: from the config's start, or over held-out episodes if starts or POIs
+    /// move.
     pub scripted_g: Option<f64>,
-    /// Whether the scripted team observes every POI.
+    /// Whether the scripted team solves the task: with fixed starts it has to observe every POI.
     pub scripted: bool,
     /// Why the task is not admitted.
     pub refused: Option<String>,
@@ -171,9 +175,10 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         let name = &task.name;
         context.message(format_args!("{name}: playing baselines and training on {on}"));
         let small = &configs[0];
-        let played = baseline::play(&small.validate()?, SEEDS, EPISODES, &mut *backend.0, context.quiet())?;
-        let g = |of: fn(&Played) -> f64| played.iter().map(of).collect();
-        let baselines = [g(|played| played.constants[played.best_constant]), g(|p| p.action), g(|p| p.network)];
+        let mut searched = small.clone();
+        searched.learning.population *= BUDGET;
+        let played = baseline::play(&searched.validate()?, SEEDS, EPISODES, &mut *backend.0, context.quiet())?;
+        let baselines = std::array::from_fn(|index| played.iter().map(|outcome| outcome.all()[index]).collect());
         let mut trained = Vec::new();
         // One training at a time, because large populations take much memory.
         for config in &configs {
@@ -188,8 +193,8 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
             }
         }
         let pois = small.world.pois.len();
-        let refused = reason(&baselines, &trained, scripted_g);
-        let scripted = scripted_g == Some(1.0);
+        let scripted = scripted_g.is_some_and(|g| g >= if moves(small) { SOLVED } else { 1.0 });
+        let refused = reason(&baselines, &trained, scripted_g, scripted);
         found.push(Found { name: name.clone(), pois, baselines, trained, scripted_g, scripted, refused });
     }
     Ok(Outcome { population: request.population, tasks: found })
@@ -199,12 +204,27 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
 fn play_script(script: &Script, name: &str, config: &Config) -> Result<f64, Error> {
     let invalid = |error: String| Error::Usage(format!("{name}: scripted team: {error}").into());
     script.check(config).map_err(invalid)?;
-    let observed = script.play(config.validate()?.as_ref()).map_err(|error| invalid(error.to_string()))?;
-    Ok(observed.iter().flatten().count() as f64 / config.world.pois.len() as f64)
+    let valid = config.validate()?;
+    let Learning { start_jitter: jitter, poi_jitter, .. } = valid.learning;
+    let starts = match moves(config) {
+        true => Starts::Drawn { episodes: EPISODES, seed: 0, jitter, poi_jitter },
+        false => Starts::Own,
+    };
+    let mut observed = 0;
+    for episode in 0..starts.episodes() {
+        let played = script.play_from(valid.as_ref(), &starts, episode).map_err(|error| invalid(error.to_string()))?;
+        observed += played.iter().flatten().count();
+    }
+    Ok(observed as f64 / (config.world.pois.len() * starts.episodes()) as f64)
+}
+
+/// Reports whether starts or POIs move.
+fn moves(config: &Config) -> bool {
+    config.learning.start_jitter > 0.0 || config.learning.poi_jitter > 0.0
 }
 
 /// Trains one run of a task, unless it is finished.
-fn train(
+pub(crate) fn train(
     config: &Config,
     task: &str,
     folder: &Path,
@@ -241,28 +261,41 @@ fn measure(config: &Config, disk: &Disk, folder: &Path, backend: &mut dyn Backen
             (trained.champion_g[row.trial], trained.best_g[row.trial]) = (row.champion_g, row.best_g);
         }
     })?;
-    if learning.start_jitter > 0.0 || learning.poi_jitter > 0.0 {
-        let weights = champions(disk.at(&folder.join(POLICIES)), config)?;
+    if moves(config) {
         let starts = Starts::Drawn {
             episodes: EPISODES,
             seed: 0,
             jitter: learning.start_jitter,
             poi_jitter: learning.poi_jitter,
         };
-        let played = flotilla::front::play(config, backend, learning.trials, &weights, &starts)
-            .map_err(|error| Error::Refused(error.to_string().into()))?;
-        trained.champion_g = played.observed.iter().map(|observed| observed / config.world.pois.len() as f64).collect();
+        trained.champion_g = play_champions(config, disk, folder, &starts, backend)?;
     }
     Ok(trained)
 }
 
+/// Returns G of every trial's champion in a finished run, over all starts.
+pub(crate) fn play_champions(
+    config: &Config,
+    disk: &Disk,
+    folder: &Path,
+    starts: &Starts,
+    backend: &mut dyn Backend,
+) -> Result<Vec<f64>, Error> {
+    let weights = champions(disk.at(&folder.join(POLICIES)), config)?;
+    let played = flotilla::front::play(config, backend, config.learning.trials, &weights, starts)
+        .map_err(|error| Error::Refused(error.to_string().into()))?;
+    Ok(played.observed.iter().map(|observed| observed / config.world.pois.len() as f64).collect())
+}
+
 /// Returns why a task is not admitted.
-fn reason(baselines: &[Vec<f64>; 3], trained: &[Trained], scripted_g: Option<f64>) -> Option<String> {
-    let names = ["the best constant action", "random constant actions", "random networks"];
-    for (name, g) in names.iter().zip(baselines) {
-        let g = mean(g);
+fn reason(baselines: &[Vec<f64>], trained: &[Trained], scripted_g: Option<f64>, scripted: bool) -> Option<String> {
+    for (name, seeds) in NAMES.iter().zip(baselines) {
+        let g = mean(seeds);
         if g >= EASY {
-            return Some(format!("G of {name} is {g:.2}; allowed below {EASY}"));
+            return Some(format!("G of the baseline {name} is {g:.2}; allowed below {EASY}"));
+        }
+        if let Some(g) = seeds.iter().find(|&&g| g >= SOLVED) {
+            return Some(format!("the baseline {name} reaches G {g:.2} from one seed; allowed below {SOLVED}"));
         }
     }
     let small = |found: &&Trained| found.population == SMALL.0 as usize;
@@ -270,7 +303,7 @@ fn reason(baselines: &[Vec<f64>; 3], trained: &[Trained], scripted_g: Option<f64
         return Some(format!("{} policies solve it with fitness {}", SMALL.0, found.fitness));
     }
     match scripted_g {
-        Some(1.0) => None,
+        Some(_) if scripted => None,
         Some(g) => Some(format!("the scripted team has G {g:.2}; it has to observe every POI")),
         None if trained.iter().any(|found| found.solved() > 0) => None,
         None => Some("no champion solves it, and there is no scripted team beside the config".into()),

@@ -24,7 +24,7 @@ coupling = 4
 pub type Case = (&'static str, &'static str, &'static str, &'static [(&'static str, &'static str)]);
 
 /// Together these cases cover every choice in a config, and sizes on both sides of every special case.
-pub const CASES: [Case; 33] = [
+pub const CASES: [Case; 36] = [
     ("generally-forward", "first layout, leader-follower, Df", GENERALLY_FORWARD, &[]),
     ("strictly-forward", "second layout, D++", STRICTLY_FORWARD, &[("learning.fitness", "'D++'")]),
     ("chaotic", "third layout, G", CHAOTIC, &[("learning.fitness", "'G'")]),
@@ -218,6 +218,42 @@ pub const CASES: [Case; 33] = [
             ("world.coupling", "3"),
             ("learning.paradigm", "'all-leaders'"),
             ("learning.fitness", "'D++'"),
+        ],
+    ),
+    (
+        "mean-density",
+        "densities are means of inverse distances, speed 10, all-leaders, D",
+        GENERALLY_FORWARD,
+        &[
+            ("sense.density", "'mean'"),
+            ("motion.max_speed", "10.0"),
+            ("learning.paradigm", "'all-leaders'"),
+            ("learning.fitness", "'D'"),
+        ],
+    ),
+    (
+        "group",
+        "all-leaders, a policy per group, D, two teams per policy, and one with past champions",
+        GENERALLY_FORWARD,
+        &[
+            ("learning.sharing", "'group'"),
+            ("learning.paradigm", "'all-leaders'"),
+            ("learning.fitness", "'D'"),
+            ("learning.partners", "2"),
+            ("learning.hall_of_fame", "2"),
+            ("world.coupling", "2"),
+        ],
+    ),
+    (
+        "listed-groups",
+        "separable natural evolution strategies, leaders 0 and 2 share a policy, as do 1 and 3",
+        CHAOTIC,
+        &[
+            ("learning.sharing", "'group'"),
+            ("learning.groups", "[[2, 0], [1, 3]]"),
+            ("learning.method", "'snes'"),
+            ("learning.fitness", "'Df'"),
+            ("world.coupling", "3"),
         ],
     ),
     (

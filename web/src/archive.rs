@@ -4,7 +4,7 @@ use std::io::{self, Cursor, Read};
 use std::ops::Range;
 
 use flotilla::backend::{Group, cpu::Cpu};
-use flotilla::config::{Config, Sharing};
+use flotilla::config::Config;
 use flotilla::evolve;
 use flotilla::trainer::{Ending, Row};
 use flotilla::world::World;
@@ -200,23 +200,24 @@ fn inside<'a>(path: &'a str, name: &str) -> Option<&'a str> {
 
 /// Plays the champions, the first policy of every leader, in the world of the last generation.
 ///
-/// `weights` are `[leaders][policies][parameters]`, or `[1][policies][parameters]` if all leaders share a policy.
+/// `weights` are `[populations][policies][parameters]`.
 pub fn play(config: &Config, policies: usize, mut weights: Vec<f32>) -> Result<Value, Refusal> {
     let config = config.validate()?;
     let config = config.at(config.learning.generations);
     let world = World::new(config);
-    let (leaders, numbers) = (world.leaders(), policies.saturating_mul(world.parameters()));
-    let fits = policies > 0 && [numbers, numbers.saturating_mul(leaders)].contains(&weights.len());
-    if !fits || evolve::flush_and_validate(&mut weights).is_some() {
+    let numbers = policies.saturating_mul(world.parameters());
+    let populations = weights.len().checked_div(numbers).and_then(|count| config.population_of_each_of(count));
+    let populations = populations.filter(|_| weights.len().is_multiple_of(numbers));
+    let Some(populations) = populations.filter(|_| evolve::flush_and_validate(&mut weights).is_none()) else {
         return Err(refuse("these policies are not for this config"));
-    }
+    };
     let group = Group {
         world: &world,
         starts: &world.starts,
         policies,
-        sharing: if weights.len() == numbers { Sharing::Shared } else { Sharing::PerLeader },
+        populations: &populations,
         weights: weights[..].into(),
-        teams: &vec![0; leaders],
+        teams: &vec![0; world.leaders()],
         fitnesses: std::slice::from_ref(&config.learning.fitness),
     };
     let played = replay::one(&group, &mut Cpu::default()).map_err(refuse)?;

@@ -38,7 +38,7 @@ pub struct Random(Baselines);
 
 impl Random {
     pub fn new(config: &ValidConfig) -> Random {
-        Random(Baselines::new(std::slice::from_ref(config)))
+        Random(Baselines::new(std::slice::from_ref(config)).without_climbers())
     }
 
     /// Plays generations for `time` milliseconds, at least one. Returns G of the best so far per generation, as means

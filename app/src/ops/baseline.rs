@@ -45,6 +45,12 @@ pub struct BaselineOutcome {
     pub action: BaselineScore,
     /// The best random networks.
     pub network: BaselineScore,
+    /// The best random networks that all leaders share.
+    pub shared: BaselineScore,
+    /// Open-loop actions, by hill climbing.
+    pub segments: BaselineScore,
+    /// Whole teams of networks, by hill climbing.
+    pub climber: BaselineScore,
     /// The processor.
     #[serde(flatten)]
     pub processor: ProcessorInfo,
@@ -128,6 +134,9 @@ pub fn run(
         constant: found(observed(&|outcome| outcome.constants[outcome.best_constant]), moves),
         action: found(observed(&|outcome| outcome.action), true),
         network: found(observed(&|outcome| outcome.network), true),
+        shared: found(observed(&|outcome| outcome.shared), true),
+        segments: found(observed(&|outcome| outcome.segments), true),
+        climber: found(observed(&|outcome| outcome.climber), true),
         processor: ProcessorInfo::of(machine, &backend.describe()),
         actions,
         moves,

@@ -164,8 +164,8 @@ pub fn run(
         weights: policies.weights[..].into(),
         policies: policies.policies,
         teams: &teams,
-        // The config may be that of another layout, so the file decides whether its leaders share a policy.
-        sharing: policies.sharing,
+        // The config may be that of another layout, so the file decides which leaders share a policy.
+        populations: &policies.populations,
         fitnesses: if request.scores.is_some() { evaluate::SCORES_AND_DT } else { evaluate::SCORES },
     };
     let playing = format!("playing {}", counted(policies.policies, starts.episodes()));

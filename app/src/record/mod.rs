@@ -316,12 +316,13 @@ pub(crate) fn load_config(place: Place<'_>) -> Result<Config, ConfigError> {
 
 /// Keys of later versions with their default values. A config's digest omits these lines, so that runs of earlier
 /// versions can be resumed.
-const DEFAULTS_ADDED_LATER: [&str; 16] = [
+const DEFAULTS_ADDED_LATER: [&str; 17] = [
     "observers = \"all\"\n",
     "windows = []\n",
     "after = []\n",
     "actions = \"direct\"\n",
     "sharing = \"none\"\n",
+    "groups = []\n",
     "led_within = 0\n",
     "led_by = \"most-seen\"\n",
     "poi_jitter = 0.0\n",

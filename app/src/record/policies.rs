@@ -17,7 +17,7 @@ use sha2::{Digest, Sha256};
 use super::RecordError;
 use super::disk::{Disk, Place};
 use super::tensors::{self, Tensor, TensorFile};
-use flotilla::config::{Config, MAX_POPULATION, Sharing};
+use flotilla::config::{Config, MAX_POPULATION};
 use flotilla::escape;
 use flotilla::evolve::{MAX_WEIGHT, flush_and_validate};
 
@@ -32,9 +32,9 @@ pub(super) const CONFIG: &str = "config";
 pub struct Policies {
     /// Number of policies per population.
     pub policies: usize,
-    /// Whether all leaders share a policy.
-    pub sharing: Sharing,
-    /// Parameters, `[leaders][policies][parameters]`, or `[1][policies][parameters]` if all leaders share a policy.
+    /// The population of each leader, `[leaders]`.
+    pub populations: Vec<u32>,
+    /// Parameters, `[populations][policies][parameters]`.
     pub weights: Vec<f32>,
 }
 
@@ -87,7 +87,7 @@ pub fn read<'a>(place: impl Into<Place<'a>>, config: &Config, trial: Option<usiz
     let place = place.into();
     let path = place.path();
     let mut file = tensors::open(place)?;
-    from_file(&mut file, config, &[config.learners(), 1], trial).map_err(|reason| match trial {
+    from_file(&mut file, config, &[config.learners(), 1, config.populations()], trial).map_err(|reason| match trial {
         Some(trial) if file.kind().is_none_or(|kind| kind == KIND) && file.info(&tensor(trial)).is_none() => {
             RecordError::NoTrial { path: path.into(), reason }
         }
@@ -144,7 +144,7 @@ pub fn read_all<'a>(place: impl Into<Place<'a>>, config: &Config) -> Result<Vec<
 
 /// Reads like [`read`], from any source.
 pub fn from_source(source: impl Read + Seek, config: &Config, trial: Option<usize>) -> Result<Policies, String> {
-    from_file(&mut TensorFile::open(source)?, config, &[config.learners(), 1], trial)
+    from_file(&mut TensorFile::open(source)?, config, &[config.learners(), 1, config.populations()], trial)
 }
 
 /// Reads like [`read`], from an open file. `populations` lists the accepted numbers of populations.
@@ -196,7 +196,6 @@ pub(crate) fn from_file(
             weights[index]
         ));
     }
-    // A single leader shares its policy with nobody.
-    let sharing = if shape[0] == config.learners() { Sharing::PerLeader } else { Sharing::Shared };
-    Ok(Policies { policies: shape[1], sharing, weights })
+    let of_each = config.population_of_each_of(shape[0]).ok_or("populations do not fit the config")?;
+    Ok(Policies { policies: shape[1], populations: of_each, weights })
 }

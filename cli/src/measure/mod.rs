@@ -239,7 +239,7 @@ fn rollout(
     let (policies, leaders) = (config.learning.slots(), world.leaders());
     // Teams with past champions take as long as others, which stand in for them.
     let (count, generation) = (config.max_teams() - 1, trainer.generation(0));
-    let teams = contemporary_teams(&config.learning, 0, generation, leaders);
+    let teams = contemporary_teams(&config.learning, 0, generation, &world.populations);
     let teams: Vec<u32> = teams.into_iter().cycle().take(count * leaders).collect();
     let weights = trainer.weights(0, 0)?;
     // If generations play from the device's memory, so do these rollouts.
@@ -250,7 +250,7 @@ fn rollout(
         starts: &world.starts,
         weights: played,
         policies,
-        sharing: config.learning.sharing,
+        populations: &world.populations,
         teams: &teams,
         fitnesses: std::slice::from_ref(&config.learning.fitness),
     };

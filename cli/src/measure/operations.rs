@@ -142,6 +142,8 @@ fn sense(density: Density) -> u32 {
         Density::Linear => SQRT + 2,
         // An inverse root of at least 1.
         Density::Inverse => RSQRT + 2,
+        // Also a test for the count, its selections and sums.
+        Density::Mean => RSQRT + 2 + 2 + 2 + 4 + 4,
     };
     SQUARED_DISTANCE + ROTATE
         + 2 // the range: a test, a selection
@@ -177,7 +179,7 @@ mod tests {
     use super::*;
     use flotilla::backend::cpu::Cpu;
     use flotilla::backend::{Backend, Group};
-    use flotilla::config::{Config, Sharing};
+    use flotilla::config::Config;
     use flotilla::sample;
 
     fn world(text: &str) -> World {
@@ -192,7 +194,7 @@ mod tests {
             starts: &world.starts,
             weights: weights[..].into(),
             policies: teams,
-            sharing: Sharing::PerLeader,
+            populations: &world.populations,
             teams: &order,
             fitnesses: &[],
         };

@@ -4,7 +4,7 @@ use flotilla::backend::cpu::Cpu;
 use flotilla::backend::gpu::episode::{Kernel, WorkgroupBuffers, workgroup_of};
 use flotilla::backend::gpu::exact::Pass;
 use flotilla::backend::{Backend, Group};
-use flotilla::config::Sharing;
+use flotilla::config::own_populations;
 use flotilla::sample;
 use flotilla::world::World;
 use flotilla_cli::measure::operations::{self, Reach};
@@ -63,7 +63,7 @@ impl Case {
             starts: &world.starts,
             weights: weights[..].into(),
             policies: MAX_TEAMS,
-            sharing: Sharing::PerLeader,
+            populations: own_populations(world.leaders()),
             teams: &choice[..teams * world.leaders()],
             fitnesses: &[],
         };

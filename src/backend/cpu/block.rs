@@ -143,7 +143,7 @@ impl<S: Simd> Block<S> {
         let Block { simd, world, agents, near, inputs, .. } = self;
         for (leader, (agent, inputs)) in agents.iter().zip(inputs).enumerate() {
             let &Agent { x, y, hx, hy, .. } = agent;
-            let mut of_pois = [splat(*simd, 0.0); 4];
+            let mut of_pois = sense::Quadrants::new(*simd);
             let (fours, rest) = pois.as_chunks::<4>();
             for pois in fours {
                 let mut densities = [x; 4];
@@ -155,16 +155,16 @@ impl<S: Simd> Block<S> {
                 for (&density, poi) in densities.iter().zip(pois) {
                     let [px, py] = poi.lanes(*simd);
                     let [dx, dy] = [px - x, py - y];
-                    sense::sense::<S>(density, dx, dy, hx, hy, &mut of_pois);
+                    of_pois.add::<DENSITY>(density, dx, dy, hx, hy);
                 }
             }
             for poi in rest {
                 let [px, py] = poi.lanes(*simd);
                 let [dx, dy] = [px - x, py - y];
                 let density = sensed::<S, DENSITY>(world, world.sense.poi_range2, dx, dy);
-                sense::sense::<S>(density, dx, dy, hx, hy, &mut of_pois);
+                of_pois.add::<DENSITY>(density, dx, dy, hx, hy);
             }
-            let mut of_agents = [splat(*simd, 0.0); 4];
+            let mut of_agents = sense::Quadrants::new(*simd);
             neighbours::each_near(
                 near,
                 agents,
@@ -173,10 +173,10 @@ impl<S: Simd> Block<S> {
                 |_, other| {
                     let (dx, dy) = (other.x - x, other.y - y);
                     let density = sensed::<S, DENSITY>(world, world.sense.agent_range2, dx, dy);
-                    sense::sense::<S>(density, dx, dy, hx, hy, &mut of_agents);
+                    of_agents.add::<DENSITY>(density, dx, dy, hx, hy);
                 },
             );
-            *inputs = sense::scale_inputs::<S>(world, of_pois, of_agents);
+            *inputs = sense::scale_inputs::<S, DENSITY>(world, of_pois, of_agents);
         }
     }
 

@@ -29,14 +29,14 @@ pub(super) struct Held {
 }
 
 impl Held {
-    /// Returns the buffer of a population. All leaders may share one.
+    /// Returns the buffer of a population.
     fn index_of(&self, population: usize) -> usize {
-        (self.turn + population.min(self.sizes[0] - 1)) % (self.sizes[0] + 1)
+        (self.turn + population) % (self.sizes[0] + 1)
     }
 
-    /// Returns the policies of a leader, for a group.
-    pub(super) fn policies_of(&self, group: usize, leader: usize) -> Slice {
-        Slice { buffer: Buffer::GroupPolicies(group, self.index_of(leader)), bytes: 0..self.bytes() }
+    /// Returns the policies of a population, for a group.
+    pub(super) fn policies_of(&self, group: usize, population: usize) -> Slice {
+        Slice { buffer: Buffer::GroupPolicies(group, self.index_of(population)), bytes: 0..self.bytes() }
     }
 
     /// Returns the bytes per buffer.

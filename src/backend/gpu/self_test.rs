@@ -10,7 +10,7 @@ use super::source::Pipeline;
 use crate::backend::compare::{compare_breeding, compare_traces, first_difference};
 use crate::backend::cpu::Cpu;
 use crate::backend::{Backend, BackendError, Group, Weights};
-use crate::config::{Config, Fitness, Learning, Sharing};
+use crate::config::{Config, Fitness, Learning};
 use crate::config_enum::Choice;
 use crate::model::sense::Density;
 use crate::sample;
@@ -124,8 +124,8 @@ fn world(density: Density) -> (World, Config) {
 
 /// Returns a group of teams that play random policies.
 fn group<'a>(world: &'a World, weights: &'a [f32], policies: usize, teams: &'a [u32]) -> Group<'a> {
-    let (starts, weights, sharing) = (&world.starts[..], Weights::OnHost(weights), Sharing::PerLeader);
-    Group { world, starts, weights, policies, teams, sharing, fitnesses: &[] }
+    let (starts, weights, populations) = (&world.starts[..], Weights::OnHost(weights), &world.populations[..]);
+    Group { world, starts, weights, policies, teams, populations, fitnesses: &[] }
 }
 
 /// Tests an episode with each density, stage by stage.

@@ -167,15 +167,26 @@ pub enum Source {
     Actions,
     /// The best so far of as many random networks as evolution evaluated teams.
     Random,
+    /// The same for random networks that all leaders share.
+    Shared,
+    /// Open-loop actions, by hill climbing with as many teams.
+    Segments,
+    /// Whole teams of networks, by hill climbing with as many teams.
+    Climber,
     /// Teams that evolved with this fitness.
     Evolved(Fitness),
 }
 
-/// All sources, those without learning first.
-pub const SOURCES: [Source; 6] = [
+/// Number of baselines among [`SOURCES`].
+pub(crate) const BASELINES: usize = 6;
+/// All sources, the baselines first.
+pub const SOURCES: [Source; BASELINES + FITNESSES.len()] = [
     Source::Constant,
     Source::Actions,
     Source::Random,
+    Source::Shared,
+    Source::Segments,
+    Source::Climber,
     Source::Evolved(FITNESSES[0]),
     Source::Evolved(FITNESSES[1]),
     Source::Evolved(FITNESSES[2]),
@@ -187,6 +198,9 @@ impl std::fmt::Display for Source {
             Source::Constant => f.write_str("constant speed"),
             Source::Actions => f.write_str("constant actions"),
             Source::Random => f.write_str("random networks"),
+            Source::Shared => f.write_str("shared random networks"),
+            Source::Segments => f.write_str("open-loop actions"),
+            Source::Climber => f.write_str("hill climbing"),
             Source::Evolved(fitness) => fitness.fmt(f),
         }
     }
@@ -218,6 +232,9 @@ impl Evidence<'_> {
             Source::Constant => (&baseline?.constant, &baseline?.constant),
             Source::Actions => (&baseline?.actions, &baseline?.actions),
             Source::Random => (&baseline?.random, &baseline?.random),
+            Source::Shared => (&baseline?.shared, &baseline?.shared),
+            Source::Segments => (&baseline?.segments, &baseline?.segments),
+            Source::Climber => (&baseline?.climber, &baseline?.climber),
             Source::Evolved(fitness) => {
                 here.find(|arm| arm.fitness == fitness).map(|arm| (&arm.champion, &arm.best))?
             }
@@ -279,8 +296,8 @@ fn most_so_far(trials: &[Vec<f64>], generation: usize, pois: usize) -> Option<Ve
 /// Returns a figure of the paper: one panel per paradigm, one curve per fitness, and the baselines without learning in
 /// grey.
 pub fn figure(results: Evidence<'_>, layout: usize) -> Figure {
-    let [constant, _, random, evolved @ ..] = SOURCES;
-    let sources = [evolved.as_slice(), &[constant, random]].concat();
+    let (_, evolved) = SOURCES.split_at(BASELINES);
+    let sources = [evolved, &[Source::Constant, Source::Shared]].concat();
     let panel = |(letter, paradigm): (&str, Paradigm)| Panel {
         title: format!("({letter}) {}", title(paradigm)),
         curves: sources
@@ -294,8 +311,8 @@ pub fn figure(results: Evidence<'_>, layout: usize) -> Figure {
     let pois = |paradigm| results.curves(layout, paradigm, evolved[0]).map_or(1.0, |curves| curves.pois as f64);
     Figure {
         panels: ["a", "b"].into_iter().zip(PARADIGMS).map(panel).collect(),
-        legend: evolved.map(|source| source.to_string()).to_vec(),
-        references: vec!["best constant speed".into(), "best of as many random networks".into()],
+        legend: evolved.iter().map(Source::to_string).collect(),
+        references: vec!["best constant speed".into(), "best of as many shared random networks".into()],
         y_label: "POIs observed by the champion".into(),
         y_max: PARADIGMS.into_iter().map(pois).fold(1.0, f64::max),
         shares: false,
@@ -343,7 +360,7 @@ pub(crate) struct Trajectory {
     pub layout: &'static str,
     /// The paradigm.
     pub paradigm: Paradigm,
-    /// `constant speed`, `constant actions`, `random networks`, or the fitness.
+    /// The name of the baseline, or the fitness.
     pub source: String,
     /// The fitness, for evolved teams only.
     #[serde(skip_serializing_if = "Option::is_none")]

@@ -1,7 +1,7 @@
 //! The results as Markdown tables that are also readable as plain text.
 
 use super::claims::{Claim, END, Verdict};
-use super::{Evidence, LAYOUTS, PARADIGMS, SOURCES, Source};
+use super::{BASELINES, Evidence, LAYOUTS, PARADIGMS, SOURCES, Source};
 use flotilla::config::Learning;
 use flotilla::statistics::{self, Average};
 use flotilla_app::report::table::markdown;
@@ -15,12 +15,17 @@ pub fn without_learning(results: Evidence<'_>) -> String {
     let mut sources = vec!["POIs at generation ".to_string() + &last.to_string(), "of".into()];
     sources.extend(SOURCES.map(|source| match source {
         Source::Constant => "best constant speed".into(),
-        Source::Actions | Source::Random => format!("best of {teams} {source}"),
+        Source::Actions | Source::Random | Source::Shared => format!("best of {teams} {source}"),
+        Source::Segments | Source::Climber => format!("{source}, {teams} teams"),
         Source::Evolved(_) => format!("{source}: champion (best of {population} teams)"),
     }));
     let mut rows = vec![sources];
-    let mut races =
-        vec![vec!["Best team so far, evolution less random networks".to_string(), "G".into(), "D".into(), "Df".into()]];
+    let mut races = vec![vec![
+        "Best team so far, evolution less shared random networks".to_string(),
+        "G".into(),
+        "D".into(),
+        "Df".into(),
+    ]];
     let mut solved = Vec::new();
     for (layout, name) in LAYOUTS.iter().enumerate() {
         for paradigm in PARADIGMS {
@@ -41,9 +46,9 @@ pub fn without_learning(results: Evidence<'_>) -> String {
                 champion + &best.unwrap_or_default()
             }));
             rows.push(row);
-            let random = curves(Source::Random).and_then(|curves| curves.observed_by_any(last)).unwrap_or_default();
+            let random = curves(Source::Shared).and_then(|curves| curves.observed_by_any(last)).unwrap_or_default();
             let mut race = vec![name.clone()];
-            race.extend(SOURCES[3..].iter().map(|&source| {
+            race.extend(SOURCES[BASELINES..].iter().map(|&source| {
                 let evolved = curves(source).and_then(|curves| curves.observed_by_any(last)).unwrap_or_default();
                 let lead: Vec<f64> = evolved.iter().zip(&random).map(|(evolved, random)| evolved - random).collect();
                 let within = |mean: statistics::Estimate| mean.within(-(pois as f64), pois as f64);
@@ -150,8 +155,9 @@ pub fn page(without_learning: &str, heading: &str, full: &str) -> String {
 /// Explains the table of baselines.
 pub(crate) const RACE: &str = "\
 Means over trials in POIs, with 95 % intervals. The champion is the team of every population's best policy. In parentheses
-is the best of a generation's teams, a maximum that grows with their number. Random constant actions and random networks
-are as many as evolution evaluates, and their best so far is kept. The second table keeps evolution's best so far, too.
+is the best of a generation's teams, a maximum that grows with their number. Each baseline but the constant speed plays as many
+teams as evolution, and its best so far is kept. Hill climbing mutates a whole team, of networks or of four open-loop actions per
+leader. The second table keeps evolution's best so far, too.
 Trials with one seed are pairs: they have the same starts and, where the sizes agree, the same first populations.
 Differences are over pairs.";
 

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 
 use flotilla::backend::{Backend, BackendError, Group};
 use flotilla::baseline::{self, Baselines};
-use flotilla::config::{Config, ConfigError, Override, Sharing};
+use flotilla::config::{Config, ConfigError, Override, own_populations};
 use flotilla::escape::PathExt;
 use flotilla::evaluate::{self, Starts};
 use flotilla::world::World;
@@ -245,7 +245,7 @@ impl Study {
                     starts: &world.starts,
                     weights: weights[..].into(),
                     policies: trials,
-                    sharing: Sharing::PerLeader,
+                    populations: own_populations(world.leaders()),
                     teams: &teams,
                     fitnesses: evaluate::SCORES,
                 };
@@ -283,10 +283,10 @@ pub fn champions<'a>(place: impl Into<Place<'a>>, config: &Config) -> Result<Vec
     let (leaders, trials, parameters) = (config.learners(), config.learning.trials, config.parameters());
     let mut champions = vec![0.0; leaders * trials * parameters];
     for trial in 0..trials {
-        let Policies { policies, weights, .. } = policies::read(place, config, Some(trial))?;
-        for (leader, population) in weights.chunks(policies * parameters).enumerate() {
-            champions[(leader * trials + trial) * parameters..][..parameters]
-                .copy_from_slice(&population[..parameters]);
+        let Policies { policies, populations, weights } = policies::read(place, config, Some(trial))?;
+        for (leader, population) in populations.into_iter().enumerate() {
+            let champion = &weights[population as usize * policies * parameters..][..parameters];
+            champions[(leader * trials + trial) * parameters..][..parameters].copy_from_slice(champion);
         }
     }
     Ok(champions)

@@ -351,7 +351,7 @@ fn team(
 ) -> Result<(Replayed, f64), BackendError> {
     let learning = &config.learning;
     let (generation, world) = (trainer.generation(0), trainer.world(0).clone());
-    let teams = evolve::contemporary_teams(learning, trial, generation, world.leaders());
+    let teams = evolve::contemporary_teams(learning, trial, generation, &world.populations);
     let episodes = Episodes::new(config, &world, trial, generation, trainer.weights(0, 0)?, &teams);
     let g = episodes.play(backend)?;
     let first_best = (0..g.len()).reduce(|a, b| if g[b] > g[a] { b } else { a }).unwrap_or(0);
@@ -414,7 +414,7 @@ impl<'a> Episodes<'a> {
             starts: &self.starts[episode],
             weights: self.weights.into(),
             policies: learning.slots(),
-            sharing: learning.sharing,
+            populations: &self.world.populations,
             teams,
             fitnesses: std::slice::from_ref(&learning.fitness),
         }

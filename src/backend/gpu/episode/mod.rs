@@ -267,7 +267,7 @@ impl GpuBackend {
         let Weights::OnDevice(held) = group.weights else { return Ok(None) };
         let own = (held as &dyn Any).downcast_ref().filter(|population: &&Population| population.is_of(&self.executor));
         let population = own.ok_or(BackendError::HeldElsewhere)?;
-        population.check([group.populations(), group.policies, group.world.parameters()])?;
+        population.check([group.population_count(), group.policies, group.world.parameters()])?;
         Ok(Some(population))
     }
 

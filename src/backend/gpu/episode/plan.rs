@@ -471,7 +471,9 @@ impl BatchPlan {
                     weights: tasks[0].task.weights,
                 });
                 // With fewer leaders, the remaining bindings are not read.
-                policies.push(std::array::from_fn(|leader| held.policies_of(index, first + leader.min(count - 1))));
+                policies.push(std::array::from_fn(|leader| {
+                    held.policies_of(index, group.populations[first + leader.min(count - 1)] as usize)
+                }));
             }
             recording.upload(Buffer::Choices, words(chosen), choices);
             chosen += choices.len();
@@ -622,7 +624,7 @@ mod tests {
     use super::*;
     use crate::backend::BATCH_BYTES;
     use crate::backend::gpu::recording::iterations;
-    use crate::config::{Config, Fitness, Sharing};
+    use crate::config::{Config, Fitness};
 
     /// Returns a world of one leader, 255 followers and one POI. Episodes of more than about 40 steps take several
     /// dispatches.
@@ -644,13 +646,14 @@ mod tests {
     ) -> [usize; 3] {
         let held = Held { sizes: [1, 1, groups[0].1.parameters()], turn: 1, status: vec![7, 8] };
         let (weights, choices) = (vec![0.0; groups[0].1.parameters()], vec![0; 30_000]);
+        let shared = &choices[..];
         let group = |&(teams, world): &(usize, _)| Group {
             world,
             starts: &world.starts,
             weights: Weights::OnHost(&weights),
             policies: 1,
             teams: &choices[..teams],
-            sharing: Sharing::PerLeader,
+            populations: &shared[..world.leaders()],
             fitnesses: &[Fitness::Df],
         };
         let groups: Vec<Group<'_>> = groups.iter().map(group).collect();

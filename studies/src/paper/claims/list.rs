@@ -1,6 +1,6 @@
 //! The paper's claims, layout by layout, as data: a sentence, what represents it, and the criterion.
 
-use super::{ALMOST_NEVER, Band, Criterion, END, Lookup, SMALL, SOURCES, Source, Test, TrialCurves, less};
+use super::{ALMOST_NEVER, BASELINES, Band, Criterion, END, Lookup, SMALL, SOURCES, Source, Test, TrialCurves, less};
 use flotilla::statistics;
 
 const ABOVE_0: Band = [f64::MIN_POSITIVE, f64::INFINITY];
@@ -37,11 +37,11 @@ impl Test {
 }
 
 /// The sources for claims about all-leaders teams. Df is omitted because it equals D without followers.
-const ALONE: &[Source] = SOURCES.split_at(5).0;
-pub(super) const EVOLVED: &[Source] = SOURCES.split_at(3).1;
-pub(super) const G: Source = SOURCES[3];
-pub(super) const D: Source = SOURCES[4];
-pub(super) const DF: Source = SOURCES[5];
+const ALONE: &[Source] = SOURCES.split_at(BASELINES + 2).0;
+pub(super) const EVOLVED: &[Source] = SOURCES.split_at(BASELINES).1;
+pub(super) const G: Source = EVOLVED[0];
+pub(super) const D: Source = EVOLVED[1];
+pub(super) const DF: Source = EVOLVED[2];
 
 /// Sources for comparisons with all-leaders teams that choose among behaviours, each with the same fitness. The order
 /// must differ from [`EVOLVED`], because [`Test::finding`] treats that slice as comparisons between fitnesses.

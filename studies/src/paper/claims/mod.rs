@@ -12,7 +12,7 @@
 
 use serde::Serialize;
 
-use super::{Evidence, LAYOUTS, SOURCES, Source, TrialCurves};
+use super::{BASELINES, Evidence, LAYOUTS, SOURCES, Source, TrialCurves};
 use flotilla::config::Paradigm;
 use flotilla::statistics::{self, Estimate};
 

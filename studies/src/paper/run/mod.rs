@@ -48,6 +48,9 @@ pub struct Request {
     /// Letters of the open questions. Only [`crate::questions`] uses them.
     #[serde(default)]
     pub questions: Vec<char>,
+    /// Names of layouts. Only [`crate::populations`] uses them.
+    #[serde(default)]
+    pub populations: Vec<String>,
 }
 
 impl Request {

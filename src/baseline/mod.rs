@@ -1,17 +1,23 @@
-//! Baselines without learning: the best constant action, the best of many random constant actions, and the best of as
-//! many random networks as evolution evaluates.
+//! Baselines without coevolution: the best constant action, and the best of as many teams as evolution evaluates of
+//! each kind: random constant actions, random networks of each population, and random networks that all leaders share.
+//! Two more [climb](self::climb) from random teams: open-loop teams, which sense nothing, and whole teams of networks.
 //!
 //! A backend plays baselines like any team. A constant action is a policy whose only weights are biases of its last
-//! layer.
+//! layer. Open-loop teams play on the CPU.
 //!
 //! Random teams have purposes of their own for random numbers, so training results do not change. Generation `g` of
 //! trial `t` plays from the same starts as in training.
 
+mod climb;
+
+pub use climb::SEGMENTS;
+
+use climb::{Climber, Genome, ROUND, by_population, play_segments};
 use fearless_simd::Level;
 use glam::Vec2;
 
 use crate::backend::{Backend, BackendError, Group};
-use crate::config::{Actions, Config, Learning, Sharing, ValidConfig};
+use crate::config::{Actions, Config, Learning, ValidConfig};
 use crate::evaluate::Starts;
 use crate::evolve::{self, Key, MIN_WEIGHT, Purpose};
 use crate::model::policy::BEHAVIOURS;
@@ -36,6 +42,12 @@ pub struct Baseline {
     pub actions: Vec<Vec<f64>>,
     /// The best random network so far, with as many drawn in each generation as training plays teams.
     pub random: Vec<Vec<f64>>,
+    /// The best random network that all leaders share, so far, with as many drawn.
+    pub shared: Vec<Vec<f64>>,
+    /// The open-loop team of [`SEGMENTS`] actions per leader that was climbed to, with as many played.
+    pub segments: Vec<Vec<f64>>,
+    /// The team of networks that was climbed to, with as many played.
+    pub climber: Vec<Vec<f64>>,
 }
 
 /// G of one trial's baselines. Each is chosen by the episodes that training plays. If starts or POIs move, selection
@@ -50,7 +62,25 @@ pub struct Outcome {
     pub action: f64,
     /// G of the random network that was chosen.
     pub network: f64,
+    /// G of the shared random network that was chosen.
+    pub shared: f64,
+    /// G of the open-loop team that was climbed to.
+    pub segments: f64,
+    /// G of the team of networks that was climbed to.
+    pub climber: f64,
 }
+
+impl Outcome {
+    /// Returns G of every baseline, in the order of [`NAMES`].
+    pub fn all(&self) -> [f64; NAMES.len()] {
+        let constant = self.constants[self.best_constant];
+        [constant, self.action, self.network, self.shared, self.segments, self.climber]
+    }
+}
+
+/// The baselines' names.
+pub const NAMES: [&str; 6] =
+    ["constant action", "random actions", "random networks", "shared networks", "open-loop actions", "hill climbing"];
 
 /// Returns the outputs of each constant action: straight ahead at each of [`SPEEDS`] speeds, or each behaviour. All
 /// leaders of a team have the same.
@@ -96,10 +126,16 @@ enum Team {
     Action(usize, usize),
     /// A random network, by its generation and slot.
     Network(usize, usize),
+    /// A random network that all leaders share, by its generation and slot.
+    Shared(usize, usize),
+    /// The team that was climbed to.
+    Climbed,
 }
 
 /// Creates a random team from its generation and slot.
 type MakeTeam = fn(usize, usize) -> Team;
+/// The kinds of random teams, in the order in which they play.
+const RANDOM: [MakeTeam; 3] = [Team::Action, Team::Network, Team::Shared];
 
 /// One config and its trials.
 struct Setting {
@@ -117,15 +153,24 @@ struct Trial {
     weights: Vec<f32>,
     /// `[episodes][agents]`, with POIs if they move.
     starts: Vec<Vec<Vec2>>,
-    /// POIs observed in all episodes of the current generation: by the constants that play, then random actions, then
-    /// random networks.
+    /// POIs observed in all episodes of the current generation: by the constants that play, then by each kind of
+    /// [`RANDOM`] teams.
     observed: Vec<u32>,
     /// POIs that each constant observed when it last played.
     last_constants: Vec<u32>,
     /// POIs that each constant observed in all generations.
     constants: Vec<u64>,
-    /// The random actions and networks that observed most, best first.
-    finalists: [Vec<(u32, Team)>; 2],
+    /// The random teams of each kind that observed most, best first.
+    finalists: [Vec<(u32, Team)>; RANDOM.len()],
+    /// `None` if only random teams are wanted.
+    climbers: Option<Climbers>,
+}
+
+/// The searches by hill climbing of one trial.
+#[derive(Clone)]
+struct Climbers {
+    segments: Climber,
+    networks: Climber,
 }
 
 impl Baselines {
@@ -139,9 +184,15 @@ impl Baselines {
     /// Prepares the baselines of all trials of a config as [`Baselines::new`] does, but with as few random teams as
     /// possible, because only the constant actions matter.
     pub fn of_constants(config: &ValidConfig) -> Baselines {
-        let mut baselines = Baselines::new(std::slice::from_ref(config));
+        let mut baselines = Baselines::new(std::slice::from_ref(config)).without_climbers();
         baselines.settings[0].config.learning.population = 2;
         baselines
+    }
+
+    /// Leaves out the baselines that climb. Their results are empty or 0.
+    pub fn without_climbers(mut self) -> Baselines {
+        self.settings.iter_mut().flat_map(|setting| &mut setting.trials).for_each(|trial| trial.climbers = None);
+        self
     }
 
     /// Prepares the baselines of one trial. The trial may be beyond the config's number of trials.
@@ -184,6 +235,15 @@ impl Baselines {
                 });
             }
         }
+        let climbing = playing.iter().map(|setting| setting.config.learning.teams()).max().unwrap_or(0);
+        let trials = playing.iter_mut().flat_map(|setting| &mut setting.trials);
+        let before: Vec<_> = trials.map(|trial| trial.climbers.clone()).collect();
+        let mut rounds = (0..climbing).step_by(ROUND);
+        if let Err(error) = rounds.try_for_each(|first| climb(&mut playing, generation, first, backend)) {
+            let trials = playing.iter_mut().flat_map(|setting| &mut setting.trials);
+            trials.zip(before).for_each(|(trial, before)| trial.climbers = before);
+            return Err(error);
+        }
         playing.iter_mut().for_each(|setting| setting.collect_results(generation));
         self.generation += 1;
         Ok(())
@@ -217,13 +277,45 @@ impl Baselines {
     }
 }
 
+/// Plays a round of every climber of some settings: the teams of a generation from slot `first` on.
+fn climb(
+    playing: &mut [&mut Setting],
+    generation: usize,
+    first: usize,
+    backend: &mut dyn Backend,
+) -> Result<(), BackendError> {
+    let (mut observed, mut rounds) = (Vec::new(), Vec::new());
+    for setting in &mut *playing {
+        setting.draw_round(generation, first);
+    }
+    for setting in &*playing {
+        let teams = setting.round_size(first);
+        let climbing = setting.trials.iter().filter_map(|trial| Some((trial, trial.climbers.as_ref()?)));
+        let climbing: Vec<_> = climbing.filter(|_| teams > 0).collect();
+        rounds.extend(climbing.iter().map(|(trial, _)| setting.round(trial, teams)));
+        let open_loop = climbing
+            .iter()
+            .flat_map(|(trial, climbers)| climbers.segments.teams().map(|team| (team, &trial.starts[..])));
+        observed.extend(
+            play_segments(&setting.world, &open_loop.collect::<Vec<_>>())?.chunks(teams.max(1)).map(<[u32]>::to_vec),
+        );
+    }
+    let networks = play(backend, &rounds)?;
+    let climbers = playing.iter_mut().filter(|setting| setting.round_size(first) > 0);
+    let climbers = climbers.flat_map(|setting| &mut setting.trials).filter_map(|trial| trial.climbers.as_mut());
+    for (climbers, (networks, segments)) in climbers.zip(networks.iter().zip(&observed)) {
+        climbers.networks.select(networks);
+        climbers.segments.select(segments);
+    }
+    Ok(())
+}
+
 /// Teams to play from some starts.
 struct Round<'a> {
     world: &'a World,
     teams: usize,
     /// `[populations][teams][parameters]`
     weights: &'a [f32],
-    sharing: Sharing,
     starts: &'a [Vec<Vec2>],
 }
 
@@ -239,7 +331,7 @@ fn play(backend: &mut dyn Backend, rounds: &[Round<'_>]) -> Result<Vec<Vec<u32>>
             starts,
             weights: round.weights.into(),
             policies: round.teams,
-            sharing: round.sharing,
+            populations: &round.world.populations,
             teams,
             fitnesses: &[],
         }));
@@ -261,15 +353,28 @@ impl Setting {
         let constants = constants(config.policy.actions);
         let Learning { episodes_per_team, generations, .. } = config.learning;
         let none = || vec![Vec::with_capacity(generations + 1); trials.len()];
-        let found = Baseline { constant: none(), actions: none(), random: none() };
+        let found = Baseline {
+            constant: none(),
+            actions: none(),
+            random: none(),
+            shared: none(),
+            segments: none(),
+            climber: none(),
+        };
+        let (populations, parameters) = (config.populations(), world.parameters());
+        let climbers = || Climbers {
+            segments: Climber::new(Genome::Segments { leaders: world.leaders() }),
+            networks: Climber::new(Genome::Networks { populations, parameters }),
+        };
         let trial = |index| Trial {
             index,
             weights: vec![],
             starts: vec![vec![]; episodes_per_team],
-            observed: Vec::with_capacity(constants.len() + 2 * config.learning.teams()),
+            observed: Vec::with_capacity(constants.len() + RANDOM.len() * config.learning.teams()),
             last_constants: vec![],
             constants: vec![0; constants.len()],
-            finalists: [vec![], vec![]],
+            finalists: Default::default(),
+            climbers: Some(climbers()),
         };
         Setting { trials: trials.map(trial).collect(), found, constants, config, world }
     }
@@ -288,13 +393,31 @@ impl Setting {
 
     /// Returns the number of teams of a trial that play in a generation.
     fn teams(&self, generation: usize) -> usize {
-        self.played_constants(generation) + 2 * self.config.learning.teams()
+        self.played_constants(generation) + RANDOM.len() * self.config.learning.teams()
+    }
+
+    /// Returns the number of teams of a climber's round that begins at slot `first` of a generation.
+    fn round_size(&self, first: usize) -> usize {
+        self.config.learning.teams().saturating_sub(first).min(ROUND)
+    }
+
+    /// Draws the teams of each climber's round.
+    fn draw_round(&mut self, generation: usize, first: usize) {
+        // Other starts make other results, so the best team plays again.
+        let (count, again) = (self.round_size(first), generation > 0 && first == 0 && self.moves());
+        for Trial { index, climbers, weights, .. } in self.trials.iter_mut().filter(|_| count > 0) {
+            if let Some(Climbers { segments, networks }) = climbers {
+                for climber in [segments, &mut *networks] {
+                    climber.draw(&self.config.learning, *index, generation, (first, count), again);
+                }
+                by_population(networks, self.world.parameters(), weights);
+            }
+        }
     }
 
     /// Returns the round of a trial's teams whose policies are written.
     fn round<'a>(&'a self, trial: &'a Trial, teams: usize) -> Round<'a> {
-        let Setting { world, config, .. } = self;
-        Round { world, teams, weights: &trial.weights, sharing: config.learning.sharing, starts: &trial.starts }
+        Round { world: &self.world, teams, weights: &trial.weights, starts: &trial.starts }
     }
 
     /// Returns the team at a place among a generation's teams.
@@ -302,14 +425,13 @@ impl Setting {
         let (constants, teams) = (self.played_constants(generation), self.config.learning.teams());
         match place.checked_sub(constants) {
             None => Team::Constant(place),
-            Some(slot) if slot < teams => Team::Action(generation, slot),
-            Some(slot) => Team::Network(generation, slot - teams),
+            Some(slot) => RANDOM[slot / teams](generation, slot % teams),
         }
     }
 
     /// Writes a team's policy for one population.
-    fn write_policy(&self, level: Level, trial: usize, team: Team, population: usize, policy: &mut [f32]) {
-        let key = |purpose| Key::new(self.config.learning.seed, trial, purpose);
+    fn write_policy(&self, level: Level, trial: &Trial, team: Team, population: usize, policy: &mut [f32]) {
+        let key = |purpose| Key::new(self.config.learning.seed, trial.index, purpose);
         match team {
             Team::Constant(index) => constant_policy(&self.constants[index], policy),
             Team::Action(generation, slot) => {
@@ -319,11 +441,17 @@ impl Setting {
             Team::Network(generation, slot) => {
                 evolve::random_policy(level, key(Purpose::Baseline).at(generation, population, slot), policy);
             }
+            Team::Shared(generation, slot) => {
+                evolve::random_policy(level, key(Purpose::SharedBaseline).at(generation, 0, slot), policy);
+            }
+            Team::Climbed => {
+                trial.climbers.iter().for_each(|climbers| climbers.networks.write_policy(population, policy));
+            }
         }
     }
 
     /// Writes teams' policies, `[populations][teams][parameters]`.
-    fn write_policies(&self, trial: usize, teams: &[Team], weights: &mut Vec<f32>) {
+    fn write_policies(&self, trial: &Trial, teams: &[Team], weights: &mut Vec<f32>) {
         let (level, parameters) = (Level::new(), self.world.parameters());
         weights.clear();
         weights.resize(self.config.populations() * teams.len() * parameters, 0.0);
@@ -349,9 +477,11 @@ impl Setting {
         if teams.is_empty() {
             return;
         }
-        let mut trials = std::mem::take(&mut self.trials);
-        trials.iter_mut().for_each(|trial| self.write_policies(trial.index, &teams, &mut trial.weights));
-        self.trials = trials;
+        for index in 0..self.trials.len() {
+            let mut weights = std::mem::take(&mut self.trials[index].weights);
+            self.write_policies(&self.trials[index], &teams, &mut weights);
+            self.trials[index].weights = weights;
+        }
     }
 
     /// Adds the results of a generation.
@@ -368,12 +498,14 @@ impl Setting {
             trial.constants.iter_mut().zip(constants).for_each(|(sum, &observed)| *sum += u64::from(observed));
             let most = constants.iter().copied().max().unwrap_or(0);
             self.found.constant[place].push(f64::from(most) / whole);
-            let (actions, networks) = random.split_at(self.config.learning.teams());
-            let kinds = [
-                (actions, &mut self.found.actions[place], Team::Action as MakeTeam),
-                (networks, &mut self.found.random[place], Team::Network),
-            ];
-            for ((observed, best, team), finalists) in kinds.into_iter().zip(&mut trial.finalists) {
+            let Baseline { actions, random: networks, shared, segments, climber, .. } = &mut self.found;
+            if let Some(climbers) = &trial.climbers {
+                segments[place].push(f64::from(climbers.segments.observed()) / whole);
+                climber[place].push(f64::from(climbers.networks.observed()) / whole);
+            }
+            let kinds = random.chunks_exact(self.config.learning.teams()).zip([actions, networks, shared]).zip(RANDOM);
+            for (((observed, best), team), finalists) in kinds.zip(&mut trial.finalists) {
+                let best = &mut best[place];
                 for (slot, &observed) in observed.iter().enumerate() {
                     // Ties go to the team that was drawn first.
                     let rank = finalists.partition_point(|(other, _)| *other >= observed);
@@ -392,13 +524,16 @@ impl Setting {
         let all: Vec<Team> = (0..self.constants.len()).map(Team::Constant).collect();
         if !self.moves() {
             let whole = (self.world.pois.len() * episodes_per_team) as f64;
-            let [action, network] = [0, 1].map(|kind| f64::from(trial.finalists[kind][0].0) / whole);
+            let [action, network, shared] = [0, 1, 2].map(|kind| f64::from(trial.finalists[kind][0].0) / whole);
+            let climbed = |of: fn(&Climbers) -> &Climber| {
+                trial.climbers.as_ref().map_or(0.0, |climbers| f64::from(of(climbers).observed()) / whole)
+            };
+            let (segments, climber) = (climbed(|climbers| &climbers.segments), climbed(|climbers| &climbers.networks));
             let generations = (generations + 1) as f64;
             let constants = trial.constants.iter().map(|&sum| sum as f64 / (whole * generations)).collect();
-            return Ok(Outcome { best_constant: first_largest(&trial.constants), constants, action, network });
+            let best_constant = first_largest(&trial.constants);
+            return Ok(Outcome { best_constant, constants, action, network, shared, segments, climber });
         }
-        let kinds = [&trial.finalists[0], &trial.finalists[1]].map(|of| of.iter().map(|&(_, team)| team));
-        let [actions, networks] = kinds.map(|teams| teams.collect::<Vec<_>>());
         let mut starts = vec![vec![]; episodes as usize];
         for (episode, starts) in starts.iter_mut().enumerate() {
             // No training plays this generation's starts.
@@ -411,27 +546,33 @@ impl Setting {
                 starts,
             );
         }
-        let candidates = [&all[..], &actions, &networks].concat();
-        let mut weights = Vec::new();
-        self.write_policies(trial.index, &candidates, &mut weights);
-        let (world, sharing) = (&self.world, self.config.learning.sharing);
-        let round = Round { world, teams: candidates.len(), weights: &weights, sharing, starts: &starts };
-        let chosen = play(backend, &[round])?.concat();
-        let (of_constants, rest) = chosen.split_at(all.len());
-        let (of_actions, of_networks) = rest.split_at(actions.len());
-        let [action, network] =
-            [(&actions, of_actions), (&networks, of_networks)].map(|(teams, observed)| teams[first_largest(observed)]);
+        let (world, mut weights) = (&self.world, Vec::new());
+        let mut played = |teams: &[Team], starts: &[Vec<Vec2>]| {
+            self.write_policies(trial, teams, &mut weights);
+            Ok::<_, BackendError>(
+                play(backend, &[Round { world, teams: teams.len(), weights: &weights, starts }])?.concat(),
+            )
+        };
+        let best_constant = first_largest(&played(&all, &starts)?);
+        let mut chosen = all.clone();
+        for finalists in &trial.finalists {
+            let teams: Vec<Team> = finalists.iter().map(|&(_, team)| team).collect();
+            chosen.push(teams[first_largest(&played(&teams, &starts)?)]);
+        }
+        chosen.extend(trial.climbers.iter().map(|_| Team::Climbed));
 
         let held_out = Starts::Drawn { episodes, seed: 0, jitter: start_jitter, poi_jitter };
         let starts: Vec<Vec<Vec2>> = (0..episodes as usize).map(|episode| held_out.of(episode, &self.world)).collect();
-        let teams = [&all[..], &[action, network]].concat();
-        self.write_policies(trial.index, &teams, &mut weights);
-        let round = Round { world, teams: teams.len(), weights: &weights, sharing, starts: &starts };
-        let found = play(backend, &[round])?.concat();
         let whole = (self.world.pois.len() * starts.len()) as f64;
-        let mut g: Vec<f64> = found.into_iter().map(|observed| f64::from(observed) / whole).collect();
-        let random = g.split_off(all.len());
-        Ok(Outcome { best_constant: first_largest(of_constants), constants: g, action: random[0], network: random[1] })
+        let mut g: Vec<f64> = played(&chosen, &starts)?.into_iter().map(|count| f64::from(count) / whole).collect();
+        let segments = match &trial.climbers {
+            Some(climbers) => f64::from(play_segments(world, &[(climbers.segments.best(), &starts)])?[0]) / whole,
+            None => 0.0,
+        };
+        let others = g.split_off(all.len());
+        let climber = others.get(RANDOM.len()).copied().unwrap_or(0.0);
+        let (constants, [action, network, shared]) = (g, [others[0], others[1], others[2]]);
+        Ok(Outcome { best_constant, constants, action, network, shared, segments, climber })
     }
 }
 
