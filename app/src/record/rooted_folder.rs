@@ -30,6 +30,7 @@ pub enum FileKind {
 /// A name in an open folder. No file needs to exist under that name.
 pub(crate) struct FolderEntry {
     parent: Handle,
+    #[cfg_attr(not(unix), allow(dead_code, reason = "systems without handles use the path"))]
     name: OsString,
     path: PathBuf,
 }
