@@ -3,8 +3,11 @@
 //! Random records cover every rule, fitness and memory layout. Small records made by hand test one property each.
 
 use crate::support;
+use flotilla::backend::cpu::Cpu;
+use flotilla::backend::{Backend, Group, GroupScores};
 use flotilla::config::{Choice, Coupling, Fitness, LedBy, MAX_AGENTS, Observers, WorldConfig};
 use flotilla::credit::{Credit, Episode, RecordRequest, Scores, Seen, Strided, owner_bits};
+use flotilla::sample;
 use flotilla::world::{Led, World};
 use rand::rngs::ChaCha8Rng;
 use rand::seq::SliceRandom;
@@ -540,4 +543,49 @@ fn dt_gives_each_poi_to_the_leader_that_led_there() {
     // If the first POI opens the second, both depend on leader 0.
     let rule = Rule { after: vec![vec![], vec![0]], ..PLAIN };
     assert_eq!(scores_of(&Record { rule, ..record.clone() }).dt, [1.0, 0.5]);
+}
+
+/// The CPU scores whole vectors of teams where it can. Whatever it scores by, the scores are those of each team's record.
+#[test]
+fn played_teams_get_the_scores_of_their_records() {
+    let fitnesses: Vec<Vec<Fitness>> = Fitness::ALL
+        .iter()
+        .map(|&(_, fitness)| vec![fitness])
+        .chain([vec![], vec![Fitness::Df, Fitness::D], vec![Fitness::G, Fitness::Dpp]])
+        .collect();
+    let (mut cpu, mut credit) = (Cpu::default(), Credit::default());
+    let mut observed_by_rule = [0, 0];
+    for seed in 0..100 {
+        let world = World::new(&sample::world(seed).validate().unwrap());
+        let (leaders, policies) = (world.leaders(), 5);
+        let populations: Vec<u32> = (0..leaders as u32).collect();
+        let weights = sample::weights(&world, policies, seed);
+        let teams: Vec<u32> = (0..37 * leaders).map(|place| (place * 7 % policies) as u32).collect();
+        let group = |fitnesses| Group {
+            world: &world,
+            starts: &world.starts,
+            weights: weights[..].into(),
+            policies,
+            populations: &populations,
+            teams: &teams,
+            fitnesses,
+        };
+        let trace = cpu.trace(&group(&[Fitness::Dt])).unwrap();
+        for fitnesses in &fitnesses {
+            let found = cpu.play(&[group(fitnesses)]).unwrap();
+            let mut expected = GroupScores::default();
+            for team in 0..37 {
+                let (episode, mut scores) = (trace.episode(&world, team), vec![f32::NAN; leaders]);
+                expected.observed.push(credit.score(&episode, &world, Fitness::G, &mut scores));
+                for &fitness in fitnesses {
+                    credit.score(&episode, &world, fitness, &mut scores);
+                    expected.scores.extend(&scores);
+                }
+            }
+            assert_eq!(found, [expected], "world {seed}, {fitnesses:?}");
+            let is_plain = !world.rule.is_timed();
+            observed_by_rule[usize::from(is_plain)] += found[0].observed.iter().filter(|&&count| count > 0).count();
+        }
+    }
+    assert!(observed_by_rule.iter().all(|&teams| teams > 500), "{observed_by_rule:?}");
 }

@@ -44,7 +44,7 @@ pub struct Args {
         value_parser = between(1..=config::MAX_AGENTS as u32))]
     agents: Vec<u32>,
     /// Train for this many generations first. Trained teams observe more POIs, so that scoring them takes longer
-    #[arg(long, value_name = "N", default_value_t = 0, value_parser = between(0..=1000))]
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = between(0..=1000u32))]
     trained: u32,
     /// Measure rollouts only, not whole generations
     #[arg(long)]

@@ -61,18 +61,18 @@ impl<'a> ScoreTable<'a> {
         });
     }
 
-    /// Puts the scores of a team's leaders by the fitness of a row, and how many POIs the team observed.
+    /// Puts how many POIs a team observed, and the scores of its leaders by one of the group's fitnesses, if it has any.
     #[inline(always)]
     pub(crate) fn put(
         &self,
         (group, team): (usize, usize),
-        row: usize,
+        fitness: usize,
         observed: u32,
         scores: impl Iterator<Item = f32>,
     ) {
         let Group { world, fitnesses, .. } = self.groups[group];
-        let row = &self.scores[group][(team * fitnesses.len() + row) * world.leaders()..];
-        row.iter().zip(scores).for_each(|(to, score)| to.store(score.to_bits(), Relaxed));
+        let row = self.scores[group].chunks_exact(world.leaders()).nth(team * fitnesses.len() + fitness);
+        row.into_iter().flatten().zip(scores).for_each(|(to, score)| to.store(score.to_bits(), Relaxed));
         self.observed[group][team].store(observed, Relaxed);
     }
 

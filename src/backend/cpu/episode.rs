@@ -115,21 +115,20 @@ impl<S: Simd> EpisodeBlock<S> {
             let (group, team) = batch.locate(first + lane);
             (batch.first + group, team)
         };
+        // Without a fitness, only the observed POIs are wanted.
+        let counted = batch.fitnesses.map(|fitnesses| if fitnesses.is_empty() { &[Fitness::G] } else { fitnesses });
         let in_lanes = |fitness: &Fitness| LaneCredit::<S>::can_score(batch.world, *fitness);
-        let Some(fitnesses) = batch.fitnesses.filter(|fitnesses| fitnesses.iter().all(in_lanes)) else {
+        let Some(counted) = counted.filter(|fitnesses| fitnesses.iter().all(in_lanes)) else {
             for lane in 0..teams {
                 let (group, team) = places(lane);
                 scores.score(group, team, &self.episode(lane));
             }
             return;
         };
-        // Without a fitness, only the observed POIs are wanted.
-        let counted = if fitnesses.is_empty() { &[Fitness::G] } else { fitnesses };
         for (row, &fitness) in counted.iter().enumerate() {
             self.credit.score(&self.sets, &self.block.counts, batch.world, fitness);
             for lane in 0..teams {
-                let leaders = self.credit.scores(lane).take(fitnesses.len() * batch.world.leaders());
-                scores.put(places(lane), row, self.credit.observed(lane), leaders);
+                scores.put(places(lane), row, self.credit.observed(lane), self.credit.scores(lane));
             }
         }
     }
