@@ -1,5 +1,7 @@
 //! Selection: elites, binary tournaments, and the plan of the next generation.
 
+use std::hint::select_unpredictable;
+
 use fearless_simd::{Level, Simd, dispatch, prelude::*};
 
 use super::random::{Key, index_below};
@@ -52,7 +54,8 @@ fn winner(first: u32, second: u32, scores: &[f32]) -> usize {
     let b = index_below(second, scores.len() - 1);
     let b = if b >= a { b + 1 } else { b };
     let (low, high) = (a.min(b), a.max(b));
-    if scores[high] > scores[low] { high } else { low }
+    // Which of them wins cannot be foreseen, so that a branch would often be guessed wrongly.
+    select_unpredictable(scores[high] > scores[low], high, low)
 }
 
 /// Flag of a plan's entry, see [`draw_parents`]: the slot keeps its parent's weights.
