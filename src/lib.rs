@@ -90,7 +90,7 @@
 //! | [`escape`], [`mod@file`] | reading and writing of names and files |
 //! | [`host`], [`parallel`] | time, waiting, threads and the cache |
 //! | [`config_enum`], [`gpu_struct`] | enums that configs write as words, structs shared with shaders |
-//! | [`reader`] | reading a TOML text key by key |
+//! | [`reader`] | reading configs key by key, from TOML or from programs |
 //! | [`kernels`] | vector arithmetic on many teams at once |
 //! | [`model`] | the parts of a step: keys, constants, formulas, shaders |
 //! | [`config`] | the config, which defines an experiment |

@@ -1,5 +1,5 @@
-//! A reader of configs, from TOML texts or from programs, key by key. Each request for a key states its allowed values, and one pass finds all
-//! problems of the text with their lines.
+//! A reader of configs, from TOML texts or from programs, key by key. Each request for a key states its allowed values,
+//! and one pass finds all problems, with their lines if the config was written.
 //!
 //! The requests also define the table of keys, see [`keys`]. The keys themselves are defined elsewhere.
 //!
@@ -267,8 +267,16 @@ impl<'a> Reader<'a> {
         let unclosed = errors.iter().any(|error| error.message().contains("unclosed array"));
         let in_list = |error: &Error| unclosed && error.message().contains("array");
         let end = errors.iter().position(in_list).map_or(errors.len(), |at| at + 1);
-        for errors in errors[..end].chunk_by(|a, b| lines.line(start_of(a)) == lines.line(start_of(b))) {
-            reader.report(Place::Offset(start_of(&errors[0])), "", syntax_problem(&errors[0], text));
+        let other = if errors.is_empty() { None } else { other_language(text) };
+        if let Some((start, language)) = other {
+            let message = format!(
+                "found {language}, allowed TOML: `key = value` below a [section]; `flotilla init` writes an example"
+            );
+            reader.report(Place::Offset(start), "", message);
+        } else {
+            for errors in errors[..end].chunk_by(|a, b| lines.line(start_of(a)) == lines.line(start_of(b))) {
+                reader.report(Place::Offset(start_of(&errors[0])), "", syntax_problem(&errors[0], text));
+            }
         }
         let mut refused = table.keys().filter(|key| others.refused.contains(&key.get_ref().as_ref()));
         if let (true, Some(section)) = (errors.is_empty(), refused.next()) {
@@ -468,6 +476,19 @@ impl<'a> Reader<'a> {
 /// Returns the offset of a syntax error.
 fn start_of(error: &Error) -> usize {
     error.span().map_or(0, |span| span.start)
+}
+
+/// Returns the language of a text that looks like YAML or JSON, with the offset of its first line but for comments.
+/// Configs of other programs in the field are YAML.
+fn other_language(text: &str) -> Option<(usize, &'static str)> {
+    let lines = text.lines().map(|line| (line.as_ptr() as usize - text.as_ptr() as usize, line.trim()));
+    let (start, first) = lines.into_iter().find(|(_, line)| !line.is_empty() && !line.starts_with('#'))?;
+    let is_name = |name: &str| name.bytes().all(|byte| byte.is_ascii_alphanumeric() || b"_-.".contains(&byte));
+    match first.split_once(':') {
+        _ if first.starts_with('{') => Some((start, "JSON")),
+        Some((name, _)) if !name.is_empty() && is_name(name) => Some((start, "YAML")),
+        _ => (first == "---").then_some((start, "YAML")),
+    }
 }
 
 /// Returns the message of a syntax error in one line.
