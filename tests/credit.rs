@@ -111,7 +111,7 @@ impl Record {
         let contains = |a: &[usize], b: &[usize]| b.iter().all(|agent| a.contains(agent));
         let kept = |poi: usize| {
             let steps: Vec<&Vec<usize>> = self.near.iter().map(|sets| &sets[poi]).collect();
-            let least = request.least(self.coupling[poi]).unwrap() as usize;
+            let least = request.min_agents(self.coupling[poi]).unwrap() as usize;
             let redundant = |index: usize| {
                 let larger = |(other, set): (usize, &&Vec<usize>)| {
                     other != index && contains(set, steps[index]) && (other < index || !contains(steps[index], set))

@@ -16,8 +16,8 @@ impl Credit {
     pub(super) fn find_critical_leaders(&mut self, episode: &Episode<'_>, world: &World) {
         self.mark_all_critical(world);
         let Credit { observed, critical, sets, .. } = self;
-        let least = |poi: usize| world.coupling[poi];
-        each_set(&episode.sets, world, sets, least, |poi, size, set| {
+        let enough = |poi: usize| world.coupling[poi];
+        each_set(&episode.sets, world, sets, enough, |poi, size, set| {
             observed[poi] = true;
             narrow(&mut critical[poi * set.len()..][..set.len()], set, size == world.coupling[poi]);
         });
@@ -30,8 +30,8 @@ impl Credit {
         let Credit { observed, critical, owner, groups, sets, .. } = self;
         let words = world.constants.words as usize;
         groups.clear();
-        let least = |poi: usize| world.coupling[poi];
-        each_set(&episode.sets, world, sets, least, |poi, size, set| {
+        let enough = |poi: usize| world.coupling[poi];
+        each_set(&episode.sets, world, sets, enough, |poi, size, set| {
             observed[poi] = true;
             let spare = size - world.coupling[poi];
             for (index, critical) in critical[poi * words..][..words].iter_mut().enumerate() {
@@ -126,14 +126,14 @@ impl Credit {
     }
 }
 
-/// Calls `visit(poi, size, set)` for every set of at least `least(poi)` agents that differs from the POI's set of the
+/// Calls `visit(poi, size, set)` for every set of at least `enough(poi)` agents that differs from the POI's set of the
 /// step before, because repetition changes no fitness. Goes POI by POI, in order of steps.
 #[inline(always)]
 fn each_set(
     sets: &Strided<'_>,
     world: &World,
     scratch: &mut Vec<u32>,
-    least: impl Fn(usize) -> u32,
+    enough: impl Fn(usize) -> u32,
     mut visit: impl FnMut(usize, u32, &[u32]),
 ) {
     let (pois, words) = (world.pois.len(), world.constants.words as usize);
@@ -143,13 +143,13 @@ fn each_set(
     scratch.clear();
     scratch.resize(2 * words, 0);
     for poi in 0..pois {
-        let least = least(poi);
+        let enough = enough(poi);
         let steps = sets.words[poi * words * sets.stride + sets.offset..].chunks(pois * words * sets.stride);
         if words == 1 {
             let mut before = 0;
             for step in steps {
                 let set = step[0];
-                if set != before && set.count_ones() >= least {
+                if set != before && set.count_ones() >= enough {
                     visit(poi, set.count_ones(), &[set]);
                 }
                 before = set;
@@ -161,7 +161,7 @@ fn each_set(
         for step in steps {
             set.iter_mut().zip(step.iter().step_by(sets.stride)).for_each(|(word, now)| *word = *now);
             let size = set.iter().map(|word| word.count_ones()).sum();
-            if set != before && size >= least {
+            if set != before && size >= enough {
                 visit(poi, size, set);
             }
             std::mem::swap(&mut set, &mut before);

@@ -7,6 +7,7 @@ use fearless_simd::{Simd, prelude::*};
 
 use super::share;
 use crate::config::Fitness;
+use crate::kernels::count_ones;
 use crate::world::World;
 
 /// Scores of one vector of teams, with scratch memory for the next.
@@ -200,15 +201,6 @@ impl<S: Simd> LaneCredit<S> {
 #[inline(always)]
 fn mask<S: Simd>(lanes: S::mask32s) -> S::u32s {
     lanes.to_vector().bitcast()
-}
-
-/// Counts the bits of each lane.
-#[inline(always)]
-fn count_ones<S: Simd>(word: S::u32s) -> S::u32s {
-    let pairs = word - ((word >> 1) & 0x5555_5555);
-    let fours = (pairs & 0x3333_3333) + ((pairs >> 2) & 0x3333_3333);
-    let bytes = (fours + (fours >> 4)) & 0x0f0f_0f0f;
-    (bytes * 0x0101_0101) >> 24
 }
 
 #[cfg(test)]

@@ -30,15 +30,15 @@ pub struct RecordRequest<'a>(pub &'a [Fitness]);
 impl RecordRequest<'_> {
     /// Returns the minimum number of agents in a set that can affect a score, at a POI of this coupling. `None` if the
     /// sets of all steps are needed.
-    pub fn least(self, coupling: u32) -> Option<u32> {
-        let least = |fitness: &Fitness| match fitness {
+    pub fn min_agents(self, coupling: u32) -> Option<u32> {
+        let min_agents = |fitness: &Fitness| match fitness {
             // Dt depends on when sets occur.
             Fitness::Dt => None,
             // D++ depends on how many agents are missing.
             Fitness::Dpp => Some(1),
             Fitness::G | Fitness::D | Fitness::Df => Some(coupling),
         };
-        self.0.iter().map(least).try_fold(coupling, |least, needed| Some(least.min(needed?)))
+        self.0.iter().map(min_agents).try_fold(coupling, |min, needed| Some(min.min(needed?)))
     }
 
     /// Reports whether the leader that each follower saw most is needed.

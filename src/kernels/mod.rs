@@ -53,3 +53,12 @@ pub(crate) fn smaller<S: Simd>(a: S::f32s, b: S::f32s) -> S::f32s {
 pub(crate) fn clamp_to<S: Simd>(x: S::f32s, low: S::f32s, high: S::f32s) -> S::f32s {
     smaller::<S>(larger::<S>(x, low), high)
 }
+
+/// Counts the set bits of each lane.
+#[inline(always)]
+pub(crate) fn count_ones<S: Simd>(word: S::u32s) -> S::u32s {
+    let in_pairs = word - ((word >> 1) & 0x5555_5555);
+    let in_halves = (in_pairs & 0x3333_3333) + ((in_pairs >> 2) & 0x3333_3333);
+    let in_bytes = (in_halves + (in_halves >> 4)) & 0x0f0f_0f0f;
+    (in_bytes * 0x0101_0101) >> 24
+}

@@ -7,7 +7,7 @@ use glam::Vec2;
 
 use crate::backend::cpu::{Agent, Block, BlockState, StepArrays, load_pois, step_sizes, transpose_rows, with_pois};
 use crate::credit::Episode;
-use crate::kernels::{clamp_to, splat};
+use crate::kernels::{clamp_to, count_ones, splat};
 use crate::parallel::*;
 use crate::world::{OUTPUTS, World};
 
@@ -319,7 +319,7 @@ impl<S: Simd> Workspace<S> {
         let rule = &world.rule;
         for (poi, (sets, &coupling)) in self.sets.chunks_exact(words * width).zip(&world.coupling).enumerate() {
             let count = sets.chunks_exact(width).enumerate().fold(S::u32s::splat(simd, 0), |count, (word, sets)| {
-                count + ones::<S>(S::u32s::from_slice(simd, sets) & rule.counted(word, u32::MAX))
+                count + count_ones::<S>(S::u32s::from_slice(simd, sets) & rule.counted(word, u32::MAX))
             });
             let mut enough = count.simd_ge(coupling).to_bitmask() & playing;
             while enough != 0 {
@@ -385,14 +385,4 @@ fn keep<S: Simd>(block: &mut Block<S>, (agents, counts): &(Vec<Agent<S>>, Vec<S:
     for (count, kept) in block.counts.iter_mut().zip(counts) {
         count[lane] = kept[lane];
     }
-}
-
-/// Counts the set bits of each lane.
-#[inline(always)]
-fn ones<S: Simd>(bits: S::u32s) -> S::u32s {
-    let pairs = bits - ((bits >> 1) & 0x5555_5555);
-    let fours = (pairs & 0x3333_3333) + ((pairs >> 2) & 0x3333_3333);
-    let eights = (fours + (fours >> 4)) & 0x0f0f_0f0f;
-    let halves = eights + (eights >> 8);
-    (halves + (halves >> 16)) & 0x3f
 }

@@ -308,7 +308,7 @@ pub fn train(
     let shard = shard.map_err(|error| Error::Usage(error.into()))?;
     same_sweep(sweep, out)?;
     let points = shard.take(&sweep.points);
-    let (backend, on) = backends.open(Work::of(points.iter().map(|point| &*point.config)))?;
+    let (backend, machine) = backends.open(Work::of(points.iter().map(|point| &*point.config)))?;
     check_memory(points.iter().map(|point| &point.config), backend)?;
     warn_of_unreachable(sweep, &points, context);
     // Before anything is written: the folder may be of another user.
@@ -323,7 +323,7 @@ pub fn train(
     let (all, taken) = (sweep.points.len(), points.len());
     let part =
         if shard.count > 1 { format!("shard {shard}: {taken} of {all} points") } else { format!("{all} points") };
-    context.message(format_args!("{part}{skipped}{batches}, on {on}, into {}", out.escaped()));
+    context.message(format_args!("{part}{skipped}{batches}, on {machine}, into {}", out.escaped()));
     let share = |progress: &SweepProgress| {
         let SweepProgress { done, points, batch, generation, last, played, total } = *progress;
         let text =

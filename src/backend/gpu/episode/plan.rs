@@ -260,7 +260,7 @@ impl BatchPlan {
     fn pack(&mut self, groups: &[Group<'_>], records: Records) {
         let packs = |planned: &PlannedTask| {
             let (world, need) = (groups[planned.group].world, groups[planned.group].records());
-            need.least(1).is_some() && !world.rule.is_timed() && pack_iterations(groups, planned) <= MAX_ITERATIONS
+            need.min_agents(1).is_some() && !world.rule.is_timed() && pack_iterations(groups, planned) <= MAX_ITERATIONS
         };
         // The first task of a group is the largest.
         let all_pack = self.tasks.chunk_by(|a, b| a.group == b.group).all(|tasks| packs(&tasks[0]));
@@ -271,7 +271,7 @@ impl BatchPlan {
         for tasks in self.tasks.chunk_by_mut(|a, b| a.group == b.group) {
             let (world, need) = (groups[tasks[0].group].world, groups[tasks[0].group].records());
             let minimums = self.minimums.len() as u32;
-            self.minimums.extend(world.coupling.iter().filter_map(|&coupling| need.least(coupling)));
+            self.minimums.extend(world.coupling.iter().filter_map(|&coupling| need.min_agents(coupling)));
             for PlannedTask { task, .. } in tasks {
                 let teams = task.teams as usize;
                 (task.minimums, task.table, task.owners) = (minimums, head as u32, NOWHERE);
