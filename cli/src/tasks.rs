@@ -74,7 +74,10 @@ fn in_words(found: &Outcome) -> String {
     head.extend(["scripted team".into(), "admitted".into()]);
     let row = |task: &tasks::Found| {
         let mut row = vec![task.name.clone()];
-        row.extend(task.baselines.iter().map(|g| format!("{:.2}", mean(g))));
+        row.extend(task.baselines.iter().map(|g| {
+            let most = g.iter().copied().fold(0.0, f64::max);
+            format!("{:.2} (at most {most:.2})", mean(g))
+        }));
         row.extend(task.trained.iter().map(|found| {
             let champion = statistics::bounded(&found.champion_g.iter().collect(), [0.0, 1.0]);
             let champion = champion.map_or(String::new(), |g| format!("{:.2} [{:.2}, {:.2}]", g.value, g.low, g.high));

@@ -273,8 +273,8 @@ fn wrong_values_are_reported_with_line_and_range() {
         (23, "groups = [[1]]\nsharing = \"group\"", "learning.groups[0]: learner 0 is in no group"),
         (
             23,
-            "groups = [[0, 1, 2]]\nsharing = \"group\"",
-            "learning.groups[0][2]: found 2, allowed 0 to 1 (the number of learners)",
+            "groups = [[0, 2]]\nsharing = \"group\"",
+            "learning.groups[0][1]: found 2, allowed 0 to 1 (the number of learners)",
         ),
         (
             23,

@@ -20,8 +20,8 @@ fn contrasts_are_differences_of_cells_over_pairs() {
     let (cells, pairs) = (rows(&place, "study/cells.csv"), rows(&place, "study/pairs.csv"));
     // Three arms without followers have two fitnesses, two with followers have three; each twice by speed and density.
     assert_eq!((cells.len() - 1, place.path("study/arms").read_dir().unwrap().count()), (12 * 4 * 3, 12 * 4));
-    // Of five contrasts, one is between arms with followers, which alone have Df.
-    assert_eq!(pairs.len() - 1, (5 * 2 + 1) * 4 * 3);
+    // Of five contrasts, one is between arms with followers, which alone have Df. D is compared with G in all arms, Df in two.
+    assert_eq!(pairs.len() - 1, (5 * 2 + 1 + 5 + 2) * 4 * 3);
     let value = |row: &[String]| row[6].parse::<f64>().unwrap();
     let arms = |what: &str| match what.split(' ').next().unwrap() {
         "fewer" => ["no followers, one per group", "no followers, a population per agent"],
@@ -32,10 +32,17 @@ fn contrasts_are_differences_of_cells_over_pairs() {
     };
     let mut differ = 0;
     for row in &pairs[1..] {
-        let [one, other] = arms(&row[4]).map(|arm| {
-            let is = |cell: &&Vec<String>| cell[..4] == row[..4] && cell[4] == arm && cell[5] == row[5];
+        let g = |arm: &str, fitness: &str| {
+            let is = |cell: &&Vec<String>| {
+                (&*cell[1], &*cell[4]) == (fitness, arm)
+                    && [0, 2, 3, 5].iter().all(|&column| cell[column] == row[column])
+            };
             value(cells.iter().find(is).unwrap_or_else(|| panic!("{row:?}: {arm}")))
-        });
+        };
+        let [one, other] = match row[4].split_once(" instead of G: ") {
+            Some((fitness, arm)) => [g(arm, fitness), g(arm, "G")],
+            None => arms(&row[4]).map(|arm| g(arm, &row[1])),
+        };
         assert!((one - other - value(row)).abs() < 2e-4, "{row:?}: {one} and {other}");
         differ += usize::from(one != other);
     }

@@ -151,7 +151,7 @@ fn tasks_resume_and_those_that_a_constant_speed_solves_fail() {
     assert_eq!(run(&format!("{task} --out a --resume")).1, table);
     assert_eq!(run(&format!("{task} --out a")).0, Some(1));
     let (code, _, error) = run(&format!("{solved} --out b"));
-    assert!(code == Some(1) && error.contains("G of the best constant action is 1.00"), "{error}");
+    assert!(code == Some(1) && error.contains("the baseline constant action reaches G 1.00"), "{error}");
     let (code, _, error) = run(&format!("{task} {task} --out c"));
     assert!(code == Some(2) && error.contains("two configs"), "{error}");
 }

@@ -12,7 +12,8 @@ use crate::evolve::{self, Key, Purpose};
 use crate::stepping::{Recording, Stepper};
 use crate::world::{OUTPUTS, World};
 
-/// Number of segments of an open-loop team's episode, of equal length. In each, every leader repeats one action.
+/// Number of segments of an open-loop team's episode, of equal length. In each, every leader makes one turn, as fast as
+/// it can, and drives straight from there, at one speed.
 pub const SEGMENTS: usize = 4;
 /// Number of teams per round.
 pub(super) const ROUND: usize = 16;
@@ -29,7 +30,7 @@ pub(super) enum Genome {
         /// Weights per policy.
         parameters: usize,
     },
-    /// Actions that do not depend on what leaders sense, `[leaders][segments][2]`.
+    /// Turns and speeds that do not depend on what leaders sense, `[leaders][segments][2]`.
     Segments {
         /// Number of leaders.
         leaders: usize,
@@ -166,15 +167,19 @@ pub(super) fn play_segments(world: &World, teams: &[(&[f32], &[Vec<Vec2>])]) -> 
     let Some((_, starts)) = teams.first() else { return Ok(observed) };
     let mut stepper = Stepper::new(world.clone(), teams.len(), Recording::None).map_err(failed)?;
     let (steps, mut actions) = (world.steps(), Vec::new());
+    // The largest turn per step, as a fraction of a half turn.
+    let most = world.constants.motion.max_turn / std::f32::consts::PI;
     for episode in 0..starts.len() {
         let starts: Vec<f32> =
             teams.iter().flat_map(|(_, starts)| &starts[episode]).flat_map(|place| place.to_array()).collect();
         stepper.reset_to(&starts).map_err(failed)?;
         for step in 0..steps {
-            let segment = step * SEGMENTS / steps * OUTPUTS;
+            let segment = step * SEGMENTS / steps;
+            let turned = most * (step - (segment * steps).div_ceil(SEGMENTS)) as f32;
             actions.clear();
             for leader in teams.iter().flat_map(|(team, _)| team.chunks_exact(SEGMENTS * OUTPUTS)) {
-                actions.extend(&leader[segment..segment + OUTPUTS]);
+                let [turn, speed] = [0, 1].map(|output| leader[segment * OUTPUTS + output]);
+                actions.extend([turn.signum() * (turn.abs() - turned).max(0.0), speed]);
             }
             stepper.step(&actions).map_err(failed)?;
         }

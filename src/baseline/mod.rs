@@ -1,6 +1,6 @@
 //! Baselines without coevolution: the best constant action, and the best of as many teams as evolution evaluates of
 //! each kind: random constant actions, random networks of each population, and random networks that all leaders share.
-//! Two more [climb](self::climb) from random teams: open-loop teams, which sense nothing, and whole teams of networks.
+//! Two more climb from random teams, see `climb.rs`: open-loop teams, which sense nothing, and whole teams of networks.
 //!
 //! A backend plays baselines like any team. A constant action is a policy whose only weights are biases of its last
 //! layer. Open-loop teams play on the CPU.

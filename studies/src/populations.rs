@@ -116,7 +116,7 @@ pub struct Row {
     /// The density.
     pub density: Density,
     /// The arm, or what the contrast isolates.
-    pub what: &'static str,
+    pub what: String,
     /// What is measured.
     pub measure: &'static str,
     /// G, or a difference of G over pairs of trials, with its 95 % interval.
@@ -244,27 +244,37 @@ fn rows(cells: &[Cell]) -> Vec<Row> {
     let row = |cell: &Cell, measure: usize| {
         let average: Average = cell.measured[measure].iter().collect();
         let estimate = statistics::bounded(&average, [0.0, 1.0])?;
-        Some(Row { what: ARMS_OF[cell.arm].2, measure: MEASURES[measure], estimate, p_holm: None, ..blank(cell) })
+        Some(Row {
+            what: ARMS_OF[cell.arm].2.into(),
+            measure: MEASURES[measure],
+            estimate,
+            p_holm: None,
+            ..blank(cell)
+        })
     };
     cells.iter().flat_map(|cell| (0..MEASURES.len()).filter_map(move |measure| row(cell, measure))).collect()
 }
 
-/// Compares arms that differ in one thing, over pairs of trials.
+/// Compares arms that differ in one thing, and each fitness with G, over pairs of trials.
 fn contrasts(cells: &[Cell]) -> Vec<Row> {
     let mut all = Vec::new();
-    for measure in 0..MEASURES.len() {
+    for (measured, measure) in MEASURES.into_iter().enumerate() {
         let mut rows = Vec::new();
         for cell in cells {
-            for (what, [one, other]) in CONTRASTS {
-                let with = |cell: &&Cell, arm: usize, place| cell.arm == arm && cell.place() == place;
-                let Some(other) = cells.iter().find(|found| cell.arm == one && with(found, other, cell.place())) else {
-                    continue;
-                };
-                let pairs = cell.measured[measure].iter().zip(&other.measured[measure]);
+            let (layout, fitness, speed, density) = cell.place();
+            let find = |arm: usize, place| cells.iter().find(|other| other.arm == arm && other.place() == place);
+            let of_arms = CONTRASTS.iter().filter(|(_, [one, _])| *one == cell.arm);
+            let of_arms = of_arms.map(|&(what, [_, other])| (what.to_string(), find(other, cell.place())));
+            let name = ARMS_OF[cell.arm].2;
+            let of_credit = (fitness != Fitness::G).then(|| {
+                (format!("{fitness} instead of G: {name}"), find(cell.arm, (layout, Fitness::G, speed, density)))
+            });
+            for (what, other) in of_arms.chain(of_credit) {
+                let Some(other) = other else { continue };
+                let pairs = cell.measured[measured].iter().zip(&other.measured[measured]);
                 let differences: Vec<f64> = pairs.map(|(one, other)| one - other).collect();
                 let estimate = statistics::paired(&differences.iter().collect(), 1.0);
                 if let (Some(estimate), Some(tested)) = (estimate, statistics::signed_rank(&differences)) {
-                    let measure = MEASURES[measure];
                     rows.push(Row { what, measure, estimate, p_holm: Some(tested.p), ..blank(cell) });
                 }
             }
@@ -279,7 +289,16 @@ fn contrasts(cells: &[Cell]) -> Vec<Row> {
 /// Returns a row with the place of a cell.
 fn blank(cell: &Cell) -> Row {
     let (layout, fitness, max_speed, density) = cell.place();
-    Row { layout, fitness, max_speed, density, what: "", measure: "", estimate: Estimate::exact(0.0), p_holm: None }
+    Row {
+        layout,
+        fitness,
+        max_speed,
+        density,
+        what: String::new(),
+        measure: "",
+        estimate: Estimate::exact(0.0),
+        p_holm: None,
+    }
 }
 
 /// Returns rows as a table of comma-separated values.
@@ -305,7 +324,7 @@ fn picture(rows: &[Row]) -> Dots {
     let panel = |(speed, density): (f64, Density)| {
         let found = |layout: &str, what: &str| -> Option<Interval> {
             let is = |row: &&Row| {
-                (row.layout, row.what, row.measure) == (layout, what, MEASURES[0])
+                (row.layout, &*row.what, row.measure) == (layout, what, MEASURES[0])
                     && (row.fitness, row.max_speed, row.density) == (Fitness::G, speed, density)
             };
             rows.iter().find(is).map(|row| [row.estimate.value, row.estimate.low, row.estimate.high])
