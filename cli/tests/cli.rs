@@ -268,9 +268,13 @@ fn wrong_values_are_reported_with_line_and_range() {
         (
             23,
             "groups = [[0, 1], [1]]\nsharing = \"group\"",
-            "learning.groups[1]: learner 1 is in a group already, allowed once",
+            "learning.groups[1]: found learner 1 again, allowed in one group",
         ),
-        (23, "groups = [[1]]\nsharing = \"group\"", "learning.groups[0]: learner 0 is in no group"),
+        (
+            23,
+            "groups = [[1]]\nsharing = \"group\"",
+            "learning.groups[0]: found no learner 0, allowed every learner in one group",
+        ),
         (
             23,
             "groups = [[0, 2]]\nsharing = \"group\"",

@@ -410,14 +410,13 @@ impl Backend for FakeDevice {
     fn play(&mut self, groups: &[Group<'_>]) -> Result<Vec<GroupScores>, BackendError> {
         self.state.call()?;
         let weights = |group: &Group<'_>| match group.weights {
-            Weights::OnHost(weights) => weights.to_vec(),
-            Weights::OnDevice(held) => (held as &dyn Any)
-                .downcast_ref::<FakePopulation>()
-                .expect("a population of this device")
-                .weights
-                .clone(),
+            Weights::OnHost(weights) => Ok(weights.to_vec()),
+            Weights::OnDevice(held) => {
+                let held = (held as &dyn Any).downcast_ref::<FakePopulation>();
+                held.map(|held| held.weights.clone()).ok_or(BackendError::HeldElsewhere)
+            }
         };
-        let weights: Vec<Vec<f32>> = groups.iter().map(weights).collect();
+        let weights: Vec<Vec<f32>> = groups.iter().map(weights).collect::<Result<_, _>>()?;
         let groups: Vec<Group<'_>> = groups
             .iter()
             .zip(&weights)

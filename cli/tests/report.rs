@@ -907,13 +907,13 @@ fn paper_writes_figures_runs_and_claims() {
     for figure in 4..=6 {
         let svg = fs::read_to_string(out.join(format!("figure{figure}.svg"))).unwrap();
         assert!(svg.contains("All-leaders teams") && svg.contains("Leader-follower teams"));
-        assert!(svg.contains("best constant speed") && svg.contains("best of as many random networks"));
+        assert!(svg.contains("best constant speed") && svg.contains("best of as many shared random networks"));
         assert!(fs::metadata(out.join(format!("figure{figure}.png"))).unwrap().len() > 10_000);
         assert!(fs::metadata(out.join(format!("figure{figure}.pdf"))).unwrap().len() > 10_000);
     }
     let summary: Value = serde_json::from_str(&fs::read_to_string(out.join("summary.json")).unwrap()).unwrap();
     let arms = summary["arms"].as_array().unwrap();
-    assert_eq!(arms.len(), 33 + 24);
+    assert_eq!(arms.len(), 33 + 48);
     for arm in arms {
         for curve in ["generation", "mean", "error", "deviation"] {
             assert_eq!(arm[curve].as_array().unwrap().len(), 4, "{curve}");

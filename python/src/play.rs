@@ -4,7 +4,7 @@ use std::ops::ControlFlow;
 use std::time::{Duration, Instant};
 
 use flotilla::backend::cpu::{self, StepArrays};
-use flotilla::config::MAX_HIDDEN_UNITS;
+use flotilla::config::{Fitness, MAX_HIDDEN_UNITS};
 use flotilla::evaluate::{self, Batch, Spread, Starts};
 use flotilla::evolve::{self, MAX_WEIGHT};
 use flotilla::front::{self, ActionNoise, Failure, Played};
@@ -194,7 +194,7 @@ pub fn record<'py>(
     };
     let observed: Vec<f64> =
         scores.iter().flat_map(|episode| &episode.observed).map(|&observed| observed.into()).collect();
-    let dt = (fitnesses.len() > 3).then(|| rows(3)).transpose()?;
+    let dt = fitnesses.iter().position(|&fitness| fitness == Fitness::Dt).map(rows).transpose()?;
     Ok((PyArray1::from_vec(py, observed), rows(0)?, rows(1)?, rows(2)?, dt))
 }
 

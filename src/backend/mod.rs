@@ -72,7 +72,7 @@ pub trait Backend: Send {
 /// The populations of one trial in a device's memory, which dropping them frees.
 ///
 /// After an error their generation is undefined. A backend recognises its own populations in [`Weights::OnDevice`] by
-/// downcasting through [`Any`]. A backend that keeps them in the host's memory can breed with [`Breeding::on_host`], as
+/// downcasting through [`Any`]; of others it returns [`BackendError::HeldElsewhere`]. A backend that keeps them in the host's memory can breed with [`Breeding::on_host`], as
 /// `FakeDevice` in `cli/tests/population.rs` does.
 pub trait DevicePopulation: Any + Debug + Send + Sync {
     /// Replaces the populations by the next generation, with the bits of [`crate::evolve::mutate`].

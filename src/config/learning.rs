@@ -286,12 +286,15 @@ fn groups(r: &mut Reader<'_>, sharing: Sharing, learners: usize) -> Vec<Vec<usiz
         for (index, group) in groups.iter().enumerate() {
             for &learner in group {
                 if group_of[learner].replace(index).is_some() {
-                    return vec![(index, format!("learner {learner} is in a group already, allowed once"))];
+                    return vec![(index, format!("found learner {learner} again, allowed in one group"))];
                 }
             }
         }
         let missing = group_of.iter().position(Option::is_none);
-        missing.map(|learner| (0, format!("learner {learner} is in no group"))).into_iter().collect()
+        missing
+            .map(|learner| (0, format!("found no learner {learner}, allowed every learner in one group")))
+            .into_iter()
+            .collect()
     };
     // Without valid leaders the number of learners is unknown, which is reported already.
     let places = if learners == 0 { MAX_AGENTS } else { learners };
