@@ -232,19 +232,18 @@ pub fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
             true => Some("a run"),
             false => folder::collection(out),
         };
-        if let Some(what) = holds {
-            return refuse(format!("{} holds {what}, not a sweep; choose another --out", out.escaped()));
-        }
-        return match pictures::names()
-            .chain([folder::RESULTS, folder::POINTS].map(String::from))
-            .find(|name| out.join(name).exists())
-        {
-            Some(theirs) => refuse(format!(
-                "{} holds {theirs} but no {SWEEP}, so it is not the folder of a sweep; choose another --out",
-                out.escaped()
-            )),
-            None => Ok(()),
+        let products = || pictures::names().chain([folder::RESULTS, folder::POINTS].map(String::from));
+        let problem = match holds {
+            Some(what) => format!("holds {what}, not a sweep"),
+            None => match products().find(|name| out.join(name).exists()) {
+                Some(theirs) => format!("holds {theirs} but no {SWEEP}, so it is not the folder of a sweep"),
+                None => return Ok(()),
+            },
         };
+        // Another shard may have marked the folder meanwhile.
+        if !runs::exists(&path)? {
+            return refuse(format!("{} {problem}; choose another --out", out.escaped()));
+        }
     }
     let existing = config::read_file(&path)?;
     // A person may have written the file, so the same sweep may be formatted differently.
