@@ -59,8 +59,8 @@ fn in_words(found: &BaselineOutcome) -> String {
         (format!("best of {teams} random constant actions"), &found.action),
         (format!("best of {teams} random networks"), &found.network),
         (format!("best of {teams} random networks, the same for all leaders"), &found.shared),
-        (format!("hill climbing, {teams} open-loop teams of {SEGMENTS} actions per leader"), &found.segments),
-        (format!("hill climbing, {teams} teams of networks"), &found.climber),
+        (format!("hill climbing, {teams} open-loop teams of {SEGMENTS} actions per leader"), &found.open_loop),
+        (format!("hill climbing, {teams} teams of networks"), &found.hill_climbing),
     ] {
         let interval = found.interval_95.map_or(String::new(), |[low, high]| format!(" [{low:.2}, {high:.2}]"));
         let (low, high) = found.seeds.iter().fold((f64::MAX, f64::MIN), |(l, h), &o| (l.min(o), h.max(o)));

@@ -30,7 +30,7 @@ pub(crate) struct Progress {
     /// When progress was last shown, and the interval after which it is shown again.
     shown: Instant,
     pause: Duration,
-    /// Where bars are drawn. None without a terminal, where lines are written.
+    /// The bars, which a terminal shows. `None` without a terminal: then lines are written.
     terminal: Option<MultiProgress>,
     lines: Box<dyn Write + Send>,
     /// The bar of the whole task. It estimates the rate and the time left, whether it is drawn or not.

@@ -359,8 +359,8 @@ fn climbers_keep_the_best_of_sixteen_mutants() {
     };
     type Play<'a> = &'a dyn Fn(&[f32]) -> u32;
     let play: [(Purpose, usize, Play<'_>, &[f64]); 2] = [
-        (Purpose::Climber, parameters, &networks, &found.climber[0]),
-        (Purpose::OpenLoop, 8, &segments, &found.segments[0]),
+        (Purpose::Climber, parameters, &networks, &found.hill_climbing[0]),
+        (Purpose::OpenLoop, 8, &segments, &found.open_loop[0]),
     ];
     for (purpose, size, observed, found) in play {
         let (mut parent, mut most) = (vec![], 0);
@@ -416,8 +416,8 @@ fn judged(trials: u32, generations: u32, g: impl Fn(&Experiment, usize, usize) -
         actions: none.clone(),
         random: none.clone(),
         shared: none.clone(),
-        segments: none.clone(),
-        climber: none,
+        open_loop: none.clone(),
+        hill_climbing: none,
     };
     let baselines = vec![baseline; 8];
     claims(Evidence { arms: &arms, baselines: &baselines })

@@ -278,7 +278,7 @@ fn wrong_values_are_reported_with_line_and_range() {
         (
             23,
             "groups = [[0, 2]]\nsharing = \"group\"",
-            "learning.groups[0][1]: found 2, allowed 0 to 1 (the number of learners)",
+            "learning.groups[0][1]: found 2, allowed 0 to 1 (the last learner)",
         ),
         (
             23,

@@ -85,7 +85,7 @@ fn other_commands_print_json() {
     let baseline = result(&place, &[&baseline[..], &cpu].concat());
     // Two generations of 8 random teams: generation 0, and generation 1 as in training.
     assert_eq!((&baseline["backend"], &baseline["teams"]), (&"cpu".into(), &16.into()));
-    for name in ["constant", "action", "network", "shared", "segments", "climber"] {
+    for name in ["constant", "action", "network", "shared", "open_loop", "hill_climbing"] {
         let seeds = baseline[name]["seeds"].as_array().unwrap().iter().map(|pois| pois.as_f64().unwrap());
         assert_eq!(baseline[name]["mean"].as_f64(), Some(seeds.sum::<f64>() / 2.0), "{name}");
     }

@@ -44,10 +44,10 @@ pub struct Baseline {
     pub random: Vec<Vec<f64>>,
     /// The best random network that all leaders share, so far, with as many drawn.
     pub shared: Vec<Vec<f64>>,
-    /// The open-loop team of [`SEGMENTS`] actions per leader that was climbed to, with as many played.
-    pub segments: Vec<Vec<f64>>,
-    /// The team of networks that was climbed to, with as many played.
-    pub climber: Vec<Vec<f64>>,
+    /// The best open-loop team, of [`SEGMENTS`] actions per leader, that hill climbing found so far, with as many played.
+    pub open_loop: Vec<Vec<f64>>,
+    /// The best team of networks that hill climbing found so far, with as many played.
+    pub hill_climbing: Vec<Vec<f64>>,
 }
 
 /// G of one trial's baselines. Each is chosen by the episodes that training plays. If starts or POIs move, selection
@@ -64,17 +64,17 @@ pub struct Outcome {
     pub network: f64,
     /// G of the shared random network that was chosen.
     pub shared: f64,
-    /// G of the open-loop team that was climbed to.
-    pub segments: f64,
-    /// G of the team of networks that was climbed to.
-    pub climber: f64,
+    /// G of the open-loop team that hill climbing found.
+    pub open_loop: f64,
+    /// G of the team of networks that hill climbing found.
+    pub hill_climbing: f64,
 }
 
 impl Outcome {
     /// Returns G of every baseline, in the order of [`NAMES`].
     pub fn all(&self) -> [f64; NAMES.len()] {
         let constant = self.constants[self.best_constant];
-        [constant, self.action, self.network, self.shared, self.segments, self.climber]
+        [constant, self.action, self.network, self.shared, self.open_loop, self.hill_climbing]
     }
 }
 
@@ -128,7 +128,7 @@ enum Team {
     Network(usize, usize),
     /// A random network that all leaders share, by its generation and slot.
     Shared(usize, usize),
-    /// The team that was climbed to.
+    /// The team of networks that hill climbing found.
     Climbed,
 }
 
@@ -358,8 +358,8 @@ impl Setting {
             actions: none(),
             random: none(),
             shared: none(),
-            segments: none(),
-            climber: none(),
+            open_loop: none(),
+            hill_climbing: none(),
         };
         let (populations, parameters) = (config.populations(), world.parameters());
         let climbers = || Climbers {
@@ -498,10 +498,10 @@ impl Setting {
             trial.constants.iter_mut().zip(constants).for_each(|(sum, &observed)| *sum += u64::from(observed));
             let most = constants.iter().copied().max().unwrap_or(0);
             self.found.constant[place].push(f64::from(most) / whole);
-            let Baseline { actions, random: networks, shared, segments, climber, .. } = &mut self.found;
+            let Baseline { actions, random: networks, shared, open_loop, hill_climbing, .. } = &mut self.found;
             if let Some(climbers) = &trial.climbers {
-                segments[place].push(f64::from(climbers.segments.observed()) / whole);
-                climber[place].push(f64::from(climbers.networks.observed()) / whole);
+                open_loop[place].push(f64::from(climbers.segments.observed()) / whole);
+                hill_climbing[place].push(f64::from(climbers.networks.observed()) / whole);
             }
             let kinds = random.chunks_exact(self.config.learning.teams()).zip([actions, networks, shared]).zip(RANDOM);
             for (((observed, best), team), finalists) in kinds.zip(&mut trial.finalists) {
@@ -528,11 +528,12 @@ impl Setting {
             let climbed = |of: fn(&Climbers) -> &Climber| {
                 trial.climbers.as_ref().map_or(0.0, |climbers| f64::from(of(climbers).observed()) / whole)
             };
-            let (segments, climber) = (climbed(|climbers| &climbers.segments), climbed(|climbers| &climbers.networks));
+            let open_loop = climbed(|climbers| &climbers.segments);
+            let hill_climbing = climbed(|climbers| &climbers.networks);
             let generations = (generations + 1) as f64;
             let constants = trial.constants.iter().map(|&sum| sum as f64 / (whole * generations)).collect();
             let best_constant = first_largest(&trial.constants);
-            return Ok(Outcome { best_constant, constants, action, network, shared, segments, climber });
+            return Ok(Outcome { best_constant, constants, action, network, shared, open_loop, hill_climbing });
         }
         let mut starts = vec![vec![]; episodes as usize];
         for (episode, starts) in starts.iter_mut().enumerate() {
@@ -565,14 +566,14 @@ impl Setting {
         let starts: Vec<Vec<Vec2>> = (0..episodes as usize).map(|episode| held_out.of(episode, &self.world)).collect();
         let whole = (self.world.pois.len() * starts.len()) as f64;
         let mut g: Vec<f64> = played(&chosen, &starts)?.into_iter().map(|count| f64::from(count) / whole).collect();
-        let segments = match &trial.climbers {
+        let open_loop = match &trial.climbers {
             Some(climbers) => f64::from(play_segments(world, &[(climbers.segments.best(), &starts)])?[0]) / whole,
             None => 0.0,
         };
         let others = g.split_off(all.len());
-        let climber = others.get(RANDOM.len()).copied().unwrap_or(0.0);
+        let hill_climbing = others.get(RANDOM.len()).copied().unwrap_or(0.0);
         let (constants, [action, network, shared]) = (g, [others[0], others[1], others[2]]);
-        Ok(Outcome { best_constant, constants, action, network, shared, segments, climber })
+        Ok(Outcome { best_constant, constants, action, network, shared, open_loop, hill_climbing })
     }
 }
 

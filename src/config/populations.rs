@@ -1,4 +1,4 @@
-//! Which population each leader of a team chooses its policy from, `[leaders]`.
+//! Maps from the leaders of a team to the populations that their policies come from, `[leaders]`.
 
 use super::MAX_AGENTS;
 

@@ -12,8 +12,8 @@ use crate::world::World;
 
 /// Scores of one vector of teams, with scratch memory for the next.
 ///
-/// Of a POI's sets only the maximal ones matter, see [`crate::credit`]. These sets mostly grow as agents come near, then
-/// shrink. So one pass looks only at the sets that neither the previous such set nor the next set contains.
+/// Only the maximal sets of a POI matter, see [`crate::credit`]. Its sets mostly grow as agents come near, then shrink.
+/// So one pass is enough, which skips the sets that the kept set before or the next set contains.
 pub(crate) struct LaneCredit<S: Simd> {
     simd: S,
     /// POIs observed.
@@ -28,7 +28,7 @@ pub(crate) struct LaneCredit<S: Simd> {
     shares: Vec<f32>,
 }
 
-/// Who is taken out for a score: nobody (G), a leader (D), or a leader with its followers (Df).
+/// The agents that are taken out for a score: nobody (G), a leader (D), or a leader with its followers (Df).
 const NOBODY: u32 = 0;
 const LEADER: u32 = 1;
 const GROUP: u32 = 2;

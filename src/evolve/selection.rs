@@ -54,7 +54,7 @@ fn winner(first: u32, second: u32, scores: &[f32]) -> usize {
     let b = index_below(second, scores.len() - 1);
     let b = if b >= a { b + 1 } else { b };
     let (low, high) = (a.min(b), a.max(b));
-    // Which of them wins cannot be foreseen, so that a branch would often be guessed wrongly.
+    // A branch would often be predicted wrongly, because the winner is random.
     select_unpredictable(scores[high] > scores[low], high, low)
 }
 

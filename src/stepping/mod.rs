@@ -45,12 +45,12 @@ pub struct Stepper {
     moved: Vec<Vec2>,
 }
 
-/// What a stepper records of every step.
+/// The part of every step that a stepper records.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Recording {
     /// Nothing.
     None,
-    /// Who is at which POI, for [`Stepper::scores`] and [`Stepper::fitness`].
+    /// The agents at each POI, for [`Stepper::scores`] and [`Stepper::fitness`].
     Sets,
     /// Also which leaders each follower sees, for Dt.
     SetsAndSights,

@@ -1,4 +1,4 @@
-//! What followers change, and what the number of evolving populations changes: both are varied apart from each other.
+//! The study of followers and of the number of evolving populations, each varied apart from the other.
 //!
 //! Each [`Arm`] has followers or none, and a population per agent, per group or one for all. It is trained under each
 //! fitness, with each largest speed and density. Trials with the same number form pairs. Champions also play from
@@ -41,7 +41,7 @@ const PAIRS: &str = "pairs.csv";
 /// The name of the picture.
 const PICTURE: &str = "populations";
 
-/// Who has followers, and which agents share a population.
+/// A paradigm, the agents that share a population, and the name of both together.
 type Arm = (Paradigm, Sharing, &'static str);
 /// The arms. A group of leader-follower teams has one leader.
 const ARMS_OF: [Arm; 5] = [
@@ -117,12 +117,12 @@ pub struct Row {
     pub density: Density,
     /// The arm, or what the contrast isolates.
     pub what: String,
-    /// What is measured.
+    /// The measure: see [`MEASURES`].
     pub measure: &'static str,
     /// G, or a difference of G over pairs of trials, with its 95 % interval.
     #[serde(flatten)]
     pub estimate: Estimate,
-    /// Of a contrast, Wilcoxon's p over pairs with Holm's correction for all contrasts of one measure.
+    /// Wilcoxon's p of a contrast over pairs, with Holm's correction for all contrasts of one measure.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub p_holm: Option<f64>,
 }

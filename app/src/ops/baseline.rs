@@ -48,9 +48,9 @@ pub struct BaselineOutcome {
     /// The best random networks that all leaders share.
     pub shared: BaselineScore,
     /// Open-loop actions, by hill climbing.
-    pub segments: BaselineScore,
-    /// Whole teams of networks, by hill climbing.
-    pub climber: BaselineScore,
+    pub open_loop: BaselineScore,
+    /// The best team of networks that hill climbing finds.
+    pub hill_climbing: BaselineScore,
     /// The processor.
     #[serde(flatten)]
     pub processor: ProcessorInfo,
@@ -135,8 +135,8 @@ pub fn run(
         action: found(observed(&|outcome| outcome.action), true),
         network: found(observed(&|outcome| outcome.network), true),
         shared: found(observed(&|outcome| outcome.shared), true),
-        segments: found(observed(&|outcome| outcome.segments), true),
-        climber: found(observed(&|outcome| outcome.climber), true),
+        open_loop: found(observed(&|outcome| outcome.open_loop), true),
+        hill_climbing: found(observed(&|outcome| outcome.hill_climbing), true),
         processor: ProcessorInfo::of(machine, &backend.describe()),
         actions,
         moves,

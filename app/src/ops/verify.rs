@@ -169,7 +169,7 @@ const BUDGET: Duration = Duration::from_secs(60);
 
 /// A processor to compare with a reference.
 struct Combination<'a> {
-    /// Its name in the table, and in progress.
+    /// The processor's name in the table, and in progress.
     names: [String; 2],
     pass: Option<Pass>,
     kernel: Option<Kernel>,

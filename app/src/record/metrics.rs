@@ -271,7 +271,7 @@ pub fn open<'a>(place: impl Into<Place<'a>>) -> Result<Rows<BufReader<File>>, Re
     Rows::new(BufReader::new(file)).map_err(|reason| RecordError::damaged(place.path(), reason))
 }
 
-/// What a file of metrics held.
+/// The result of reading a file of metrics.
 pub(crate) struct Extracted {
     /// Number of rows.
     pub rows: usize,

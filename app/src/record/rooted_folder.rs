@@ -106,7 +106,7 @@ impl RootedFolder {
     }
 }
 
-/// How a file is opened.
+/// The way in which a file is opened.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(crate) enum OpenAs {
     /// An existing file, for reading.

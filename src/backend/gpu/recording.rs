@@ -85,7 +85,7 @@ pub enum Command<'a> {
     Upload {
         /// The buffer.
         to: Buffer,
-        /// Where to write, in bytes.
+        /// The offset in the buffer, in bytes.
         offset: u64,
         /// The bytes.
         bytes: Cow<'a, [u8]>,
@@ -94,7 +94,7 @@ pub enum Command<'a> {
     Dispatch {
         /// The pipeline.
         pipeline: Pipeline,
-        /// Its buffers, in the order of its bindings.
+        /// The pipeline's buffers, in the order of its bindings.
         bindings: Vec<Slice>,
         /// The workgroups in each dimension.
         grid: [u32; 3],
@@ -105,7 +105,7 @@ pub enum Command<'a> {
     ReadBack {
         /// The source.
         from: Slice,
-        /// Where to, in bytes.
+        /// The offset in [`Buffer::Readback`], in bytes.
         offset: u64,
     },
     /// Ends a submission. The last one needs no such end.
@@ -121,11 +121,11 @@ pub struct Recording<'a> {
     pub buffers: Vec<(Buffer, u64)>,
     /// The commands, in order.
     pub commands: Vec<Command<'a>>,
-    /// What the host reads.
+    /// The bytes that the host reads.
     pub readback: Readback,
 }
 
-/// What a recording copies to the host.
+/// The bytes that a recording copies to the host.
 #[derive(Clone, Debug, Default)]
 pub struct Readback {
     /// The bytes of [`Buffer::Readback`].

@@ -129,7 +129,7 @@ impl GatherJob {
     }
 }
 
-/// How a shader uses a buffer.
+/// The use of a buffer by a shader.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Binding {
     /// `var<uniform>`.

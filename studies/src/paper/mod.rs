@@ -170,9 +170,9 @@ pub enum Source {
     /// The same for random networks that all leaders share.
     Shared,
     /// Open-loop actions, by hill climbing with as many teams.
-    Segments,
-    /// Whole teams of networks, by hill climbing with as many teams.
-    Climber,
+    OpenLoop,
+    /// The best team of networks that hill climbing finds with as many teams.
+    HillClimbing,
     /// Teams that evolved with this fitness.
     Evolved(Fitness),
 }
@@ -185,8 +185,8 @@ pub const SOURCES: [Source; BASELINES + FITNESSES.len()] = [
     Source::Actions,
     Source::Random,
     Source::Shared,
-    Source::Segments,
-    Source::Climber,
+    Source::OpenLoop,
+    Source::HillClimbing,
     Source::Evolved(FITNESSES[0]),
     Source::Evolved(FITNESSES[1]),
     Source::Evolved(FITNESSES[2]),
@@ -199,8 +199,8 @@ impl std::fmt::Display for Source {
             Source::Actions => f.write_str("constant actions"),
             Source::Random => f.write_str("random networks"),
             Source::Shared => f.write_str("shared random networks"),
-            Source::Segments => f.write_str("open-loop actions"),
-            Source::Climber => f.write_str("hill climbing"),
+            Source::OpenLoop => f.write_str("open-loop actions"),
+            Source::HillClimbing => f.write_str("hill climbing"),
             Source::Evolved(fitness) => fitness.fmt(f),
         }
     }
@@ -233,8 +233,8 @@ impl Evidence<'_> {
             Source::Actions => (&baseline?.actions, &baseline?.actions),
             Source::Random => (&baseline?.random, &baseline?.random),
             Source::Shared => (&baseline?.shared, &baseline?.shared),
-            Source::Segments => (&baseline?.segments, &baseline?.segments),
-            Source::Climber => (&baseline?.climber, &baseline?.climber),
+            Source::OpenLoop => (&baseline?.open_loop, &baseline?.open_loop),
+            Source::HillClimbing => (&baseline?.hill_climbing, &baseline?.hill_climbing),
             Source::Evolved(fitness) => {
                 here.find(|arm| arm.fitness == fitness).map(|arm| (&arm.champion, &arm.best))?
             }

@@ -16,7 +16,7 @@ pub fn without_learning(results: Evidence<'_>) -> String {
     sources.extend(SOURCES.map(|source| match source {
         Source::Constant => "best constant speed".into(),
         Source::Actions | Source::Random | Source::Shared => format!("best of {teams} {source}"),
-        Source::Segments | Source::Climber => format!("{source}, {teams} teams"),
+        Source::OpenLoop | Source::HillClimbing => format!("{source}, {teams} teams"),
         Source::Evolved(_) => format!("{source}: champion (best of {population} teams)"),
     }));
     let mut rows = vec![sources];

@@ -131,7 +131,7 @@ struct Submitted<'a> {
     /// The estimated work, and the number of submissions.
     iterations: u64,
     submissions: usize,
-    /// What it reads back, and where.
+    /// The words that the batch reads back, and the places of its results among them.
     readback: Readback,
     ranges: BatchReadback,
 }

@@ -137,7 +137,7 @@ impl Elements {
     }
 }
 
-/// How the teams of one group become tasks.
+/// The division of one group's teams into tasks.
 struct GroupPlan<'a> {
     group: &'a Group<'a>,
     per_team: Elements,
@@ -372,7 +372,7 @@ impl BatchPlan {
             recording.commands.push(Command::Submit);
         }
         recording.commands.extend(packing);
-        // What is read back, the record last, because its status words stand for everything before it.
+        // The record is read back last, because its status words stand for everything before it.
         let [.., moment_bytes, _] = self.used.bytes();
         let moments = if trace { recording.read_back(first(Buffer::Moments, moment_bytes)) } else { 0..0 };
         for tasks in self.tasks.chunk_by(|a, b| a.group == b.group) {
@@ -510,7 +510,7 @@ struct Run {
     iterations: u64,
 }
 
-/// What a batch's recording depends on, besides its plan.
+/// The inputs of a batch's recording besides its plan.
 #[derive(Clone, Copy)]
 pub(super) struct RecordingOptions<'a> {
     pub(super) groups: &'a [Group<'a>],
@@ -530,7 +530,7 @@ pub(super) struct RecordingOptions<'a> {
     pub(super) kept_share: f64,
 }
 
-/// Where the host finds what it reads of a batch, in bytes of [`Buffer::Readback`].
+/// The places of a batch's results in [`Buffer::Readback`], in bytes.
 #[derive(Default)]
 pub(super) struct BatchReadback {
     pub(super) moments: Range<usize>,
