@@ -395,7 +395,7 @@ fn learners_share_the_population_of_their_group() {
         (3, vec![1, 1, 2, 2, 0])
     );
     let config = Config::parse(&format!("{text}{all}sharing = 'group'"), "groups.toml").unwrap();
-    let of = |populations| config.population_of_each_of(populations);
+    let of = |populations| config.populations_for(populations);
     assert_eq!([of(1), of(2), of(3), of(5)].map(|of| of.map(|of| of[2])), [Some(0), Some(1), None, Some(2)]);
 }
 

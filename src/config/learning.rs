@@ -300,8 +300,7 @@ fn groups(r: &mut Reader<'_>, sharing: Sharing, learners: usize) -> Vec<Vec<usiz
     let places = if learners == 0 { MAX_AGENTS } else { learners };
     let each_in_one = |groups: &[Vec<usize>]| if learners == 0 { vec![] } else { each_in_one(groups) };
     let learner = between(0, places - 1).because("the last learner");
-    let groups =
-        Learning::groups(r).lists("groups of learners", ("wanted", None), 1..=places, learner, each_in_one);
+    let groups = Learning::groups(r).lists("groups of learners", ("wanted", None), 1..=places, learner, each_in_one);
     if !groups.is_empty() && sharing != Sharing::Group {
         r.report_key("learning.groups", format!("found with learning.sharing = \"{sharing}\", allowed with \"group\""));
         return vec![];

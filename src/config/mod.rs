@@ -206,7 +206,7 @@ impl Config {
 
     /// Returns the population of each learner if there are this many populations, for policies that may be from another
     /// config: as in this config, or one per learner, or one for all. Returns `None` for other numbers.
-    pub fn population_of_each_of(&self, populations: usize) -> Option<Vec<u32>> {
+    pub fn populations_for(&self, populations: usize) -> Option<Vec<u32>> {
         let (own, learners) = (self.population_of_each(), self.learners());
         match populations {
             _ if populations == population_count(&own) => Some(own),

@@ -232,7 +232,7 @@ impl<'a> CheckedTeams<'a> {
         }
         let (leaders, parameters) = (world.leaders(), world.parameters());
         let populations = weights.len() / teams / parameters;
-        let of_each = config.population_of_each_of(populations);
+        let of_each = config.populations_for(populations);
         let Some(of_each) = of_each.filter(|_| weights.len() == populations * teams * parameters) else {
             return Err(Failure::Weights { found: weights.len(), leaders, teams, parameters });
         };

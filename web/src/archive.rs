@@ -206,7 +206,7 @@ pub fn play(config: &Config, policies: usize, mut weights: Vec<f32>) -> Result<V
     let config = config.at(config.learning.generations);
     let world = World::new(config);
     let numbers = policies.saturating_mul(world.parameters());
-    let populations = weights.len().checked_div(numbers).and_then(|count| config.population_of_each_of(count));
+    let populations = weights.len().checked_div(numbers).and_then(|count| config.populations_for(count));
     let populations = populations.filter(|_| weights.len().is_multiple_of(numbers));
     let Some(populations) = populations.filter(|_| evolve::flush_and_validate(&mut weights).is_none()) else {
         return Err(refuse("these policies are not for this config"));

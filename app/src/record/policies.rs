@@ -196,6 +196,6 @@ pub(crate) fn from_file(
             weights[index]
         ));
     }
-    let of_each = config.population_of_each_of(shape[0]).ok_or("populations do not fit the config")?;
+    let of_each = config.populations_for(shape[0]).ok_or("populations do not fit the config")?;
     Ok(Policies { policies: shape[1], populations: of_each, weights })
 }
