@@ -97,7 +97,7 @@ fn lead(task: Task, first: u32, me: ptr<function, Agent>) {
         let place = places[task.pois + poi];
         let dx = place.x - x;
         let dy = place.y - y;
-        let sensed = select(0.0, density(dx, dy), within(dx, dy, world.poi_range2));
+        let sensed = select(0, density(dx, dy), within(dx, dy, world.poi_range2));
         add_sensed(sensed, dx, dy, hx, hy, &of_pois);
     }
     var of_agents = Quadrants();

@@ -3,13 +3,13 @@
 //
 // Uses: lib/math.wgsl, motion.wgsl (rotate), episode.wgsl (world), generic.wgsl (variant), and from src/model: TINY.
 
-// Sums and counts of the offsets to agents within a follower's radii.
+// Sums, in lattice distances, and counts of the offsets to agents within a follower's radii.
 struct Sums {
-    repel_x: f32,
-    repel_y: f32,
+    repel_x: i32,
+    repel_y: i32,
     repel_count: u32,
-    attract_x: f32,
-    attract_y: f32,
+    attract_x: i32,
+    attract_y: i32,
     attract_count: u32,
 }
 
@@ -30,15 +30,13 @@ fn influence(dx: f32, dy: f32, sums: ptr<function, Sums>) -> bool {
     let seen = within(dx, dy, world.attraction_radius2);
     if seen {
         let near = within(dx, dy, world.repulsion_radius2);
-        // One sum grows. Adding 0 to the other would not change its bits.
-        let old = *sums;
-        let x = select(old.attract_x, old.repel_x, near) + dx;
-        let y = select(old.attract_y, old.repel_y, near) + dy;
-        (*sums).repel_x = select(old.repel_x, x, near);
-        (*sums).repel_y = select(old.repel_y, y, near);
+        let x = on_lattice(dx, world.offset_base);
+        let y = on_lattice(dy, world.offset_base);
+        (*sums).repel_x += select(0, x, near);
+        (*sums).repel_y += select(0, y, near);
         (*sums).repel_count += u32(near);
-        (*sums).attract_x = select(x, old.attract_x, near);
-        (*sums).attract_y = select(y, old.attract_y, near);
+        (*sums).attract_x += select(x, 0, near);
+        (*sums).attract_y += select(y, 0, near);
         (*sums).attract_count += u32(!near);
     }
     return seen;
@@ -66,8 +64,8 @@ fn force(sums: Sums, x: f32, y: f32) -> SteeringForce {
     let attract = recip(f32(max(sums.attract_count, 1u))) * world.attraction_scale;
     let walls_x = walls(x, world.map_x);
     let walls_y = walls(y, world.map_y);
-    let force_x = sums.attract_x * attract - sums.repel_x * repel + walls_x.x;
-    let force_y = sums.attract_y * attract - sums.repel_y * repel + walls_y.x;
+    let force_x = nearest_f32(sums.attract_x) * attract - nearest_f32(sums.repel_x) * repel + walls_x.x;
+    let force_y = nearest_f32(sums.attract_y) * attract - nearest_f32(sums.repel_y) * repel + walls_y.x;
     let influenced = sums.repel_count + sums.attract_count > 0u || walls_x.y >= 0.0 || walls_y.y >= 0.0;
     return SteeringForce(flush(force_x, TINY), flush(force_y, TINY), influenced);
 }

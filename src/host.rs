@@ -1,4 +1,4 @@
-//! The clock, blocking waits, threads and the cache. Only this module asks the system for them.
+//! The clock, blocking waits, threads, large pages and the cache. Only this module asks the system for them.
 //!
 //! WebAssembly has no clock and cannot block, so its embedder provides both with `install`. Without that, time stands
 //! still, and waiting polls in a loop.
@@ -20,6 +20,25 @@ pub(crate) fn prefetch(numbers: &[f32]) {
     }
     #[cfg(not(target_arch = "x86_64"))]
     let _ = numbers;
+}
+
+/// Returns zeros in memory with large pages, if the system has such pages for the asking. Populations are read in random
+/// order, so with small pages most reads would also miss the translation of their address.
+pub(crate) fn zeros(count: usize) -> Vec<f32> {
+    let mut numbers = vec![0.0f32; count];
+    #[cfg(target_os = "linux")]
+    {
+        const PAGE: usize = 2 << 20;
+        let (first, bytes) = (numbers.as_mut_ptr(), size_of_val(&numbers[..]));
+        let before = first.align_offset(PAGE) * size_of::<f32>();
+        if let Some(whole) = bytes.checked_sub(before).map(|bytes| bytes / PAGE * PAGE).filter(|&bytes| bytes > 0) {
+            let advice = rustix::mm::Advice::LinuxHugepage;
+            #[expect(unsafe_code, reason = "a hint about whole pages of this array, which changes no contents")]
+            // Without large pages, the array works as well.
+            let _ = unsafe { rustix::mm::madvise(first.wrapping_byte_add(before).cast(), whole, advice) };
+        }
+    }
+    numbers
 }
 
 #[cfg(not(target_family = "wasm"))]

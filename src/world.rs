@@ -86,7 +86,7 @@ impl World {
             policy: PolicyConstants::new(policy),
             motion,
             couple: CoupleConstants::new(world.observation_radius),
-            follow: FollowConstants::new(follow),
+            follow: FollowConstants::new(follow, agents),
             sense: SenseConstants::new(sense, agents, pois, world.map),
         };
         let map = Vec2::new(motion.map_x, motion.map_y);

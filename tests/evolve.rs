@@ -88,14 +88,17 @@ fn bits(weights: &[f32]) -> Vec<u32> {
 proptest! {
     #[test]
     fn every_policy_is_on_exactly_one_team_per_round(
-        seed: u64, generation in 0usize..200, round in 0usize..16, leaders in 1usize..30, population in 1usize..300,
+        seed in 0..u64::MAX / 2, generation in 0usize..200, partners in 1usize..4, leaders in 1usize..30,
+        population in 2usize..300, elites in 0usize..3,
     ) {
-        let mut teams = vec![u32::MAX; population * leaders];
-        evolve::form_teams(Key::new(seed, 3, Purpose::Teams), generation, round, leaders, &mut teams);
-        for leader in 0..leaders {
-            let mut policies: Vec<u32> = teams.iter().skip(leader).step_by(leaders).copied().collect();
-            policies.sort_unstable();
-            prop_assert!(policies.into_iter().eq(0..population as u32));
+        let learning = Learning { seed, partners, population, elites: Elites::Count(elites), ..config(CHAOTIC, |_| ()).learning };
+        let teams = evolve::contemporary_teams(&learning, 3, generation, own_populations(leaders));
+        for round in teams.chunks(population * leaders) {
+            for leader in 0..leaders {
+                let mut policies: Vec<u32> = round.iter().skip(leader).step_by(leaders).copied().collect();
+                policies.sort_unstable();
+                prop_assert!(policies.into_iter().eq(0..population as u32));
+            }
         }
     }
 
@@ -137,17 +140,17 @@ proptest! {
     }
 }
 
+/// Shuffles, which several elites need.
 #[test]
 fn all_ways_to_form_teams_are_equally_likely() {
     let (leaders, population) = (3, 4);
-    let mut teams = vec![0; population * leaders];
+    let learning = Learning { population, elites: Elites::Count(2), ..config(CHAOTIC, |_| ()).learning };
     // Counts the three teams of the policies 0 jointly, because the populations are shuffled independently.
     let mut joint = vec![0; population * population * population];
     let mut orders = vec![0; 256];
     for generation in 0..12_000 {
-        evolve::form_teams(Key::new(5, 0, Purpose::Teams), generation, 0, leaders, &mut teams);
-        let team = |leader: usize| (0..population).position(|team| teams[team * leaders + leader] == 0).unwrap();
-        joint[(team(0) * population + team(1)) * population + team(2)] += 1;
+        let teams = evolve::contemporary_teams(&learning, 0, generation, own_populations(leaders));
+        joint[teams_of_first(&teams, leaders)] += 1;
         let order = (0..population).fold(0, |order, team| order * 4 + teams[team * leaders] as usize);
         orders[order] += 1;
     }
@@ -155,6 +158,65 @@ fn all_ways_to_form_teams_are_equally_likely() {
     orders.retain(|&count| count > 0);
     assert_eq!(orders.len(), 24);
     assert_distribution("orders of four policies", &orders, |_| 1.0 / 24.0);
+}
+
+/// The index of the teams of the policies 0 of three leaders among all such triples.
+fn teams_of_first(teams: &[u32], leaders: usize) -> usize {
+    let population = teams.len() / leaders;
+    let team = |leader: usize| (0..population).position(|team| teams[team * leaders + leader] == 0).unwrap();
+    (team(0) * population + team(1)) * population + team(2)
+}
+
+/// Rotations put the elite on a uniformly random team in each population, independently. The others are exchangeable.
+#[test]
+fn rotations_put_elites_on_independent_teams() {
+    let (leaders, population) = (3, 5);
+    let learning = Learning { population, ..config(CHAOTIC, |_| ()).learning };
+    let mut joint = vec![0; population * population * population];
+    for generation in 1..=12_000 {
+        let teams = evolve::contemporary_teams(&learning, 0, generation, own_populations(leaders));
+        joint[teams_of_first(&teams, leaders)] += 1;
+        for pair in teams.chunks(leaders).collect::<Vec<_>>().windows(2) {
+            let next = pair[0].iter().map(|policy| (policy + 1) % population as u32);
+            assert!(next.eq(pair[1].iter().copied()), "generation {generation}: {teams:?}");
+        }
+    }
+    assert_distribution("teams of the elites", &joint, |_| 1.0 / 125.0);
+}
+
+/// The champions of tied teams: with G, the policies of one team have equal scores in all populations.
+#[test]
+fn tied_champions_are_drawn_independently_unless_the_elite_is_among_them() {
+    let mut scores = vec![0.25; 20];
+    let tied = [3, 4, 9, 17];
+    tied.iter().for_each(|&policy| scores[policy] = 0.75);
+    let key = Key::new(5, 0, Purpose::Tournament);
+    let selection = Selection { elites: 1, parents: Parents::All };
+    let mut joint = vec![0; 16];
+    let mut plan = vec![0; 21];
+    for generation in 0..8000 {
+        let champion = |plan: &[u32]| tied.iter().position(|&policy| plan[20] == policy as u32 | UNCHANGED);
+        let [first, second] = [0, 1].map(|population| {
+            evolve::keep_parents(key, generation, population, selection, &scores, &mut plan);
+            let kept = champion(&plan).expect("the champion is one of the best");
+            evolve::draw_parents(Level::new(), key, generation, population, selection, &scores, &mut plan);
+            assert_eq!(champion(&plan), Some(kept));
+            assert_eq!(plan[0], plan[20], "the champion is the elite");
+            let ranking = evolve::ranking(key, generation, population, selection, &scores);
+            assert_eq!(ranking[0], tied[kept]);
+            let mut others = tied.to_vec();
+            others.remove(kept);
+            assert_eq!(ranking[1..4], others);
+            kept
+        });
+        joint[4 * first + second] += 1;
+    }
+    assert_distribution("champions of two populations", &joint, |_| 1.0 / 16.0);
+    scores[0] = 0.75;
+    for population in 0..50 {
+        evolve::keep_parents(key, 7, population, selection, &scores, &mut plan);
+        assert_eq!(plan[20], UNCHANGED, "the elite stays champion");
+    }
 }
 
 #[test]
@@ -187,30 +249,34 @@ fn a_tournament_draws_every_pair_of_policies_with_the_same_probability() {
     let population = 20;
     let rising: Vec<f32> = (0..population).map(|index| index as f32).collect();
     let tied = vec![0.5; population];
+    let mut first_is_higher = 0;
     let mut counts = vec![0; population * population];
     let tournaments = Key::new(9, 0, Purpose::Tournament);
     for generation in 0..400 {
         for slot in 0..100 {
             let key = tournaments.at(generation, 1, slot);
-            // The same draw twice. With rising scores the higher index wins, with ties the lower, so that both policies
-            // are known.
-            let (high, low) = (evolve::tournament(key, &rising), evolve::tournament(key, &tied));
-            assert!(low < high, "expected two distinct policies, and the lower index for ties: {low}, {high}");
-            counts[low * population + high] += 1;
+            // The same draw three times. With rising scores the higher index wins, and with falling ones the lower.
             let falling: Vec<f32> = rising.iter().map(|score| -score).collect();
-            assert_eq!(evolve::tournament(key, &falling), low, "the higher score wins");
+            let (high, low) = (evolve::tournament(key, &rising), evolve::tournament(key, &falling));
+            assert!(low < high, "expected two distinct policies, and the higher score to win: {low}, {high}");
+            counts[low * population + high] += 1;
+            let first = evolve::tournament(key, &tied);
+            assert!(first == low || first == high, "a tie between {low} and {high} goes to {first}");
+            first_is_higher += u32::from(first == high);
         }
     }
     counts.retain(|&count| count > 0);
     assert_eq!(counts.len(), 190, "number of pairs");
     assert_distribution("pairs", &counts, |_| 1.0 / 190.0);
+    assert_distribution("ties", &[first_is_higher, 40_000 - first_is_higher], |_| 0.5);
     let mut duels = (0..100).map(|slot| evolve::tournament(tournaments.at(0, 0, slot), &[0.0, 1.0]));
     assert!(duels.all(|winner| winner == 1), "with two policies, both are drawn");
 }
 
 #[test]
 fn a_policy_has_different_partners_in_every_round() {
-    let learning = config(CHAOTIC, |config| (config.learning.partners, config.learning.population) = (3, 20)).learning;
+    let learning =
+        Learning { partners: 3, population: 20, elites: Elites::Count(2), ..config(CHAOTIC, |_| ()).learning };
     let (single, own) = (Learning { partners: 1, ..learning.clone() }, own_populations(4));
     let (all_rounds, first_round) =
         (evolve::contemporary_teams(&learning, 1, 5, own), evolve::contemporary_teams(&single, 1, 5, own));
@@ -260,7 +326,7 @@ fn the_champion_replaces_the_oldest_of_the_hall_of_fame() {
             expected[2] = 1 | UNCHANGED
         }
         assert_eq!(plan[3..], expected, "generation {generation}");
-        evolve::keep_parents(&scores, &mut last_plan);
+        evolve::keep_parents(key, generation, 0, selection, &scores, &mut last_plan);
         assert_eq!(
             last_plan[4..],
             [4, 5].map(|slot| slot | UNCHANGED),
@@ -847,10 +913,8 @@ impl PlainTrial<'_> {
         for generation in 0..=generations {
             let stage = config.at(generation);
             let Learning { partners, leniency, hall_of_fame, .. } = stage.learning;
-            let mut chosen = vec![0; partners * population * count];
-            for (round, chosen) in chosen.chunks_mut(population * count).enumerate() {
-                evolve::form_teams(self.key(Purpose::Teams), generation, round, count, chosen);
-            }
+            let own: Vec<u32> = (0..count as u32).collect();
+            let chosen = evolve::contemporary_teams(&stage.learning, self.trial, generation, &own);
             let (mut observed, mut fitness) = (Vec::new(), vec![vec![0.0; population]; count]);
             let mut scored = vec![vec![Vec::new(); population]; count];
             for chosen in chosen.chunks(count) {
@@ -882,9 +946,18 @@ impl PlainTrial<'_> {
                 };
             }
             let ranked: Vec<Vec<usize>> = (fitness.iter())
-                .map(|scores| {
+                .enumerate()
+                .map(|(of, scores)| {
                     let mut order: Vec<usize> = (0..population).collect();
                     order.sort_by(|&a, &b| scores[b].partial_cmp(&scores[a]).unwrap());
+                    // Of several best, the first policy stays the elite, or else one of them is drawn.
+                    let tied: Vec<usize> =
+                        (0..population).filter(|&policy| scores[policy] == scores[order[0]]).collect();
+                    if elites <= 1 && tied[0] != 0 {
+                        let [word, ..] = self.key(Purpose::Tournament).at(generation, of, population).draw(0);
+                        let champion = order.remove((uniform(word) * tied.len() as f64) as usize);
+                        order.insert(0, champion);
+                    }
                     order
                 })
                 .collect();

@@ -315,7 +315,7 @@ fn opening_detects_an_edit_of_any_kernel() {
     let edits: [(&str, Edit); 8] = [
         ("linear density", |text| text.replace("exact_sqrt(d2) * world.inverse_diagonal", "exact_sqrt(d2)")),
         ("inverse density", |text| text.replace("select(1.0, d2, d2 > 1.0)", "1.001 * d2")),
-        ("mean density", |text| text.replace("count > 1.0)), variant", "count > 2.0)), variant")),
+        ("mean density", |text| text.replace("counts.z, counts.z > 1.0", "counts.z, counts.z > 2.0")),
         ("pack", |text| text.replace("size >= enough", "size > enough")),
         ("pack", |text| text.replace("if steps > most", "if steps >= most")),
         ("gather", |text| text.replace("vec4(tile[start], tile[start + 1u]", "vec4(tile[start + 1u], tile[start]")),

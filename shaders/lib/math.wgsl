@@ -106,6 +106,21 @@ fn within(dx: f32, dy: f32, radius2: f32) -> bool {
     return bitcast<i32>(d2) <= bitcast<i32>(radius2);
 }
 
+// A number as a multiple of a lattice's distance, see `lattice` in src/kernels/mod.rs.
+fn on_lattice(x: f32, base: f32) -> i32 {
+    return less_base(x + base, base);
+}
+
+// on_lattice of a number that the base was added to.
+fn less_base(raised: f32, base: f32) -> i32 {
+    return bitcast<i32>(raised) - bitcast<i32>(base);
+}
+
+// The f32 nearest to an integer. Drivers may convert large ones otherwise, but both of these parts are exact.
+fn nearest_f32(x: i32) -> f32 {
+    return f32(x >> 12u) * 4096.0 + f32(x & 0xfff);
+}
+
 // +0 where |x| < limit, else x.
 fn flush(x: f32, limit: f32) -> f32 {
     return select(x, 0.0, abs(x) < limit);

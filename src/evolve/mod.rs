@@ -15,10 +15,9 @@ pub use mutation::{Breeding, InvalidInput, mutate};
 pub(crate) use mutation::{Offspring, breed, mutation_threshold};
 pub(crate) use random::noise;
 pub use random::{Key, Purpose};
-pub(crate) use schedule::shuffle;
 pub use schedule::{
-    aligned_teams, contemporary_teams, episode_positions, form_teams, jitter_pois, jitter_starts, past_champions,
+    aligned_teams, contemporary_teams, episode_positions, jitter_pois, jitter_starts, order_policies, past_champions,
 };
-pub use selection::{Selection, UNCHANGED, draw_parents, keep_parents, top_indices, tournament};
+pub use selection::{Selection, UNCHANGED, draw_parents, keep_parents, ranking, top_indices, tournament};
 pub use strategy::{Samples, Strategy};
 pub use weights::{MAX_WEIGHT, MIN_WEIGHT, flush_and_validate, is_weight, random_policy};

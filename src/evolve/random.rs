@@ -10,11 +10,11 @@ use crate::kernels::math;
 pub enum Purpose {
     /// The weights of the initial policies.
     Weights = 1,
-    /// The teams of a generation, see [`form_teams`](super::form_teams).
+    /// The teams of a generation, see [`order_policies`](super::order_policies).
     Teams = 2,
     /// Start positions in training, see [`jitter_starts`](super::jitter_starts).
     Starts = 3,
-    /// The parents of a generation, see [`draw_parents`](super::draw_parents).
+    /// The parents and the champion of a generation, see [`draw_parents`](super::draw_parents).
     Tournament = 4,
     /// The weights that change, and by how much, see [`mutate`](super::mutate).
     Mutation = 5,

@@ -4,38 +4,52 @@ use fearless_simd::{Level, Simd, dispatch, prelude::*};
 use glam::Vec2;
 
 use super::random::{Key, Purpose, index_below};
-use crate::config::{Learning, population_count};
+use super::selection::Selection;
+use crate::config::{Learning, Method, population_count};
 use crate::world::{World, on_grid};
 
-/// Forms the teams of one round of a generation: a random permutation per population puts each policy on exactly one
-/// team.
-///
-/// Writes the policy of each population, `[teams][populations]`. `key` is of [`Purpose::Teams`].
-pub fn form_teams(key: Key, generation: usize, round: usize, populations: usize, teams: &mut [u32]) {
-    let mut order = vec![0; teams.len() / populations];
-    for population in 0..populations {
-        shuffle(Level::new(), key, generation, round, population, &mut order);
-        let policies = teams.iter_mut().skip(population).step_by(populations);
-        policies.zip(&order).for_each(|(policy, &shuffled)| *policy = shuffled);
-    }
-}
-
 /// Returns the teams of contemporaries in one generation of a trial, `[teams][leaders]`, round by round. `populations`
-/// are the leaders'. If there is only one, team `t` is policy `t`; otherwise see [`form_teams`].
+/// are the leaders'. If there is only one, team `t` is policy `t`; otherwise see [`order_policies`].
 pub fn contemporary_teams(learning: &Learning, trial: usize, generation: usize, populations: &[u32]) -> Vec<u32> {
     let (leaders, count) = (populations.len(), population_count(populations));
     let mut teams = aligned_teams(learning.population, leaders).repeat(learning.partners);
     if count > 1 {
-        let key = Key::new(learning.seed, trial, Purpose::Teams);
-        let mut policies = vec![0; learning.population * count];
+        let mut order = vec![0; learning.population];
         for (round, teams) in teams.chunks_exact_mut(learning.population * leaders).enumerate() {
-            form_teams(key, generation, round, count, &mut policies);
-            for (team, policies) in teams.chunks_exact_mut(leaders).zip(policies.chunks_exact(count)) {
-                team.iter_mut().zip(populations).for_each(|(policy, &of)| *policy = policies[of as usize]);
+            for population in 0..count {
+                order_policies(Level::new(), learning, trial, generation, [round, population], &mut order);
+                for (team, &policy) in teams.chunks_exact_mut(leaders).zip(&order) {
+                    let members = team.iter_mut().zip(populations).filter(|&(_, &of)| of as usize == population);
+                    members.for_each(|(to, _)| *to = policy);
+                }
             }
         }
     }
     teams
+}
+
+/// Writes the policy of a population in each team of a round, `[teams]`: each policy is on exactly one team.
+///
+/// All ways to form teams have the same probability. The children of tournaments are drawn independently, so a random
+/// rotation is enough unless there are several elites, partners or evolution strategies, or policies were given at the
+/// start. Neighbouring teams then have neighbouring policies, which is faster.
+pub fn order_policies(
+    level: Level,
+    learning: &Learning,
+    trial: usize,
+    generation: usize,
+    [round, population]: [usize; 2],
+    order: &mut [u32],
+) {
+    let key = Key::new(learning.seed, trial, Purpose::Teams).at(generation, population, round);
+    let independent = learning.method == Method::Tournament && Selection::of(learning).elites <= 1;
+    if independent && learning.partners == 1 && generation > 0 {
+        let [word, ..] = key.draw(0);
+        let (last, first) = order.split_at_mut(order.len() - index_below(word, order.len()));
+        first.iter_mut().chain(last).zip(0..).for_each(|(policy, index)| *policy = index);
+    } else {
+        dispatch!(level, simd => shuffle(simd, key, order));
+    }
 }
 
 /// Returns teams in which team `t` is every leader's policy `t`, `[teams][leaders]`.
@@ -56,14 +70,9 @@ pub fn past_champions(learning: &Learning, trial: usize, generation: usize) -> O
     Some(population + 1 + past % hall_of_fame)
 }
 
-/// Writes one population's policy in each team of a round, `[teams]`, see [`form_teams`].
-pub(crate) fn shuffle(level: Level, key: Key, generation: usize, round: usize, population: usize, order: &mut [u32]) {
-    let key = key.at(generation, population, round);
-    dispatch!(level, simd => shuffle_lanes(simd, key, order));
-}
-
+/// Writes a random permutation.
 #[inline(always)]
-fn shuffle_lanes<S: Simd>(simd: S, key: Key, order: &mut [u32]) {
+fn shuffle<S: Simd>(simd: S, key: Key, order: &mut [u32]) {
     for first in (0..order.len()).step_by(S::f32s::LEN) {
         let [words, ..] = key.draw_lanes::<S>(S::u32s::from_fn(simd, |lane| (first + lane) as u32));
         for (newcomer, &word) in (first..order.len()).zip(words.as_slice()) {

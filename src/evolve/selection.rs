@@ -41,7 +41,7 @@ pub fn top_indices(scores: &[f32], count: usize) -> Vec<usize> {
 const MAX_SEARCHED: usize = 16;
 
 /// Returns the winner of one slot's binary tournament: of two distinct random policies, the one with the higher score
-/// (`scores` is `[policies]`). Ties go to the lower index.
+/// (`scores` is `[policies]`). Ties go to the policy that was drawn first.
 pub fn tournament(key: Key, scores: &[f32]) -> usize {
     let [first, second, ..] = key.draw(0);
     winner(first, second, scores)
@@ -53,9 +53,8 @@ fn winner(first: u32, second: u32, scores: &[f32]) -> usize {
     let a = index_below(first, scores.len());
     let b = index_below(second, scores.len() - 1);
     let b = if b >= a { b + 1 } else { b };
-    let (low, high) = (a.min(b), a.max(b));
     // A branch would often be predicted wrongly, because the winner is random.
-    select_unpredictable(scores[high] > scores[low], high, low)
+    select_unpredictable(scores[b] > scores[a], b, a)
 }
 
 /// Flag of a plan's entry, see [`draw_parents`]: the slot keeps its parent's weights.
@@ -75,6 +74,39 @@ impl Selection {
     pub fn of(learning: &Learning) -> Selection {
         Selection { elites: learning.elites.count(learning.population), parents: learning.parents }
     }
+
+    /// Returns the elites, best first, or without any the champion.
+    fn best(self, key: Key, generation: usize, population: usize, scores: &[f32]) -> Vec<usize> {
+        match self.elites {
+            0 | 1 => vec![champion(key.at(generation, population, scores.len()), scores)],
+            elites => top_indices(scores, elites),
+        }
+    }
+}
+
+/// Returns the best policy. Ties go to the first policy, which is the elite of the generation before, or else to a random
+/// one.
+///
+/// If they went to the lowest index, the champions of all populations would more often come from one team, because teams
+/// are rotations, see [`order_policies`](super::order_policies).
+fn champion(key: Key, scores: &[f32]) -> usize {
+    let best = scores.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    if scores.first() == Some(&best) {
+        return 0;
+    }
+    let [word, ..] = key.draw(0);
+    let tied = index_below(word, scores.iter().filter(|&&score| score == best).count());
+    (0..).zip(scores).filter(|&(_, &score)| score == best).nth(tied).map_or(0, |(policy, _)| policy)
+}
+
+/// Returns the policies of a population that has played, best first: the elites, then the others by score, ties to the
+/// lower index. `key` is of [`Purpose::Tournament`](super::Purpose::Tournament), `scores` are `[policies]`.
+pub fn ranking(key: Key, generation: usize, population: usize, selection: Selection, scores: &[f32]) -> Vec<usize> {
+    let mut ranking = selection.best(key, generation, population, scores);
+    let champion = ranking[0];
+    ranking.truncate(1);
+    ranking.extend(top_indices(scores, scores.len()).into_iter().filter(|&policy| policy != champion));
+    ranking
 }
 
 /// Plans one population's next generation: the policy that each slot is copied from, `[slots]`, with [`UNCHANGED`] if
@@ -94,7 +126,7 @@ pub fn draw_parents(
     parents: &mut [u32],
 ) {
     let policies = scores.len();
-    let best = top_indices(scores, selection.elites.max(1));
+    let best = selection.best(key, generation, population, scores);
     let choose = |first, second| match selection.parents {
         Parents::All => winner(first, second, scores),
         Parents::Elites => best[index_below(first, best.len())],
@@ -115,13 +147,20 @@ pub fn draw_parents(
     }
 }
 
-/// Plans the end of the last generation: every policy stays, and the champion gets its slot. `scores` is `[policies]`,
-/// `parents` is `[slots]`.
-pub fn keep_parents(scores: &[f32], parents: &mut [u32]) {
+/// Plans the end of the last generation: every policy stays, and the champion gets its slot. Arguments are those of
+/// [`draw_parents`].
+pub fn keep_parents(
+    key: Key,
+    generation: usize,
+    population: usize,
+    selection: Selection,
+    scores: &[f32],
+    parents: &mut [u32],
+) {
     for (slot, parent) in parents.iter_mut().enumerate() {
         *parent = slot as u32 | UNCHANGED;
     }
-    parents[scores.len()] = top_indices(scores, 1)[0] as u32 | UNCHANGED;
+    parents[scores.len()] = selection.best(key, generation, population, scores)[0] as u32 | UNCHANGED;
 }
 
 /// Slots per rayon task.

@@ -2,7 +2,7 @@
 //! processor rounds alike.
 //!
 //! Twin of `shaders/lib/math.wgsl`: same names, same statements, same order. Only f32 `+ - *`, comparison, select, abs,
-//! 32-bit integer operations, bit casts and conversions of integers up to 2^24 occur. Within the stated ranges every
+//! 32-bit integer operations, bit casts and conversions of integers occur; those above 2^24 are rounded to the nearest f32. Within the stated ranges every
 //! intermediate value is 0 or of size 2^-120 to 2^120. So flushed denormals change nothing, and no result depends on
 //! the sign of an intermediate zero.
 //!
@@ -172,6 +172,39 @@ pub fn within<S: Simd>(dx: S::f32s, dy: S::f32s, radius2: S::f32s) -> S::mask32s
     d2.simd_le(radius2)
 }
 
+/// A number as a whole multiple of a [`lattice`]'s distance, rounded to the nearest, ties to even. Sums of these do not
+/// depend on the order. The number's size is at most a third of the base. 2 operations.
+#[inline(always)]
+pub(crate) fn on_lattice<S: Simd>(x: S::f32s, base: S::f32s) -> S::i32s {
+    less_base::<S>(x + base, base)
+}
+
+/// [`on_lattice`] of a number that the base was added to.
+#[inline(always)]
+pub(crate) fn less_base<S: Simd>(raised: S::f32s, base: S::f32s) -> S::i32s {
+    let (raised, base): (S::i32s, S::i32s) = (raised.bitcast(), base.bitcast());
+    raised - base
+}
+
+/// The f32 nearest to an integer, ties to even. 1 operation.
+#[inline(always)]
+pub(crate) fn nearest_f32<S: Simd>(x: S::i32s) -> S::f32s {
+    x.to_float()
+}
+
+/// The base of the finest lattice on which `count` numbers of at most `size` can be added as i32, and the distance of
+/// its points, a power of two and at least `finest`.
+///
+/// Between `base - base/3` and `base + base/3`, neighbouring f32 are one such distance apart, and their bits are
+/// consecutive integers. So adding the base rounds a number to the lattice, and the bits are the multiple.
+pub(crate) fn lattice(count: usize, size: f64, finest: f64) -> [f32; 2] {
+    let mut distance = finest;
+    while size > 2f64.powi(22) * distance || count as f64 * size > 2f64.powi(30) * distance {
+        distance *= 2.0;
+    }
+    [1.5 * 2f64.powi(23) * distance, distance].map(|number| number as f32)
+}
+
 /// +0 where |x| < `limit`, else x. 3 operations.
 #[inline(always)]
 pub fn flush<S: Simd>(x: S::f32s, limit: f32) -> S::f32s {
@@ -211,4 +244,37 @@ pub fn pcg4d_scalar(counter: [u32; 4]) -> [u32; 4] {
         [x, y, z, w] = [x, y, z, w].map(|word| word ^ (word >> 16));
     }
     [x, y, z, w]
+}
+
+#[cfg(test)]
+mod tests {
+    use fearless_simd::{Level, dispatch};
+
+    use super::*;
+    use crate::kernels::splat;
+
+    #[inline(always)]
+    fn rounded<S: Simd>(simd: S, x: f32, base: f32) -> i32 {
+        on_lattice::<S>(splat(simd, x), splat(simd, base))[0]
+    }
+
+    /// Numbers up to the stated size become the nearest multiples, and as many of them as stated can be added.
+    #[test]
+    fn numbers_are_rounded_to_a_lattice_on_which_they_can_be_added() {
+        let finest = 1.0 / 262_144.0;
+        for (count, size) in [(1, 0.01), (12, 5.0), (13, 5.0), (1000, 15.9), (1000, 16.1), (1024, 1e4), (1 << 20, 5.0)]
+        {
+            let [base, distance] = lattice(count, size, finest);
+            let next = (base * 4.0 / 3.0).next_down();
+            assert_eq!([base.next_up() - base, next - next.next_down()], [distance; 2], "{count} of {size}");
+            assert_eq!(distance == finest as f32, size < 16.0 && count as f64 * size <= 4096.0, "{count} of {size}");
+            for part in -1000..=1000 {
+                let x = (size * f64::from(part) / 1000.0) as f32;
+                let multiple = dispatch!(Level::new(), simd => rounded(simd, x, base));
+                let expected = (f64::from(x) / f64::from(distance)).round_ties_even();
+                assert_eq!(f64::from(multiple), expected, "{x} of {size}");
+                assert!(i64::from(multiple).abs() * count as i64 <= 1 << 30, "{count} of {x}");
+            }
+        }
+    }
 }

@@ -3,11 +3,11 @@
 
 use fearless_simd::{Simd, prelude::*};
 
-use super::{LONGEST, Lanes, TINY, motion::rotate};
+use super::{LONGEST, Lanes, TINY, motion::GRID, motion::rotate};
 use crate::gpu_struct::gpu_struct;
 use crate::kernels::{
     larger,
-    math::{flush, recip, rsqrt, within},
+    math::{flush, lattice, nearest_f32, on_lattice, recip, rsqrt, within},
     select, splat, zero_unless,
 };
 use crate::reader::{Reader, between, section};
@@ -60,9 +60,11 @@ gpu_struct! {
         pub repulsion_radius2: f32,
         /// The distance within which walls push.
         pub repulsion_radius: f32,
-        /// The attraction gain over the attraction radius.
+        /// The base of the lattice of offsets, on which they are added.
+        pub offset_base: f32,
+        /// The attraction gain over the attraction radius, per lattice distance.
         pub attraction_scale: f32,
-        /// The repulsion gain over the repulsion radius.
+        /// The repulsion gain over the repulsion radius, per lattice distance.
         pub repulsion_scale: f32,
         /// The push per unit that a wall is nearer than the repulsion radius.
         pub wall_gain: f32,
@@ -70,33 +72,37 @@ gpu_struct! {
 }
 
 impl FollowConstants {
-    /// Computes the constants of a valid section.
-    pub fn new(follow: &Follow) -> FollowConstants {
+    /// Computes the constants of a valid section for teams of so many agents.
+    pub fn new(follow: &Follow, agents: usize) -> FollowConstants {
         let squared = |radius: f64| (radius * radius) as f32;
+        // Within a radius, which is squared and rounded, an offset may exceed it by rounding.
+        let [offset_base, distance] = lattice(agents, follow.attraction_radius * 1.01, 1.0 / f64::from(GRID));
+        let scale = |gain: f64, radius: f64| (gain / radius * f64::from(distance)) as f32;
         FollowConstants {
             attraction_radius2: squared(follow.attraction_radius),
             repulsion_radius2: squared(follow.repulsion_radius),
             repulsion_radius: follow.repulsion_radius as f32,
-            attraction_scale: (follow.attraction_gain / follow.attraction_radius) as f32,
-            repulsion_scale: (follow.repulsion_gain / follow.repulsion_radius) as f32,
+            offset_base,
+            attraction_scale: scale(follow.attraction_gain, follow.attraction_radius),
+            repulsion_scale: scale(follow.repulsion_gain, follow.repulsion_radius),
             wall_gain: follow.wall_gain as f32,
         }
     }
 }
 
-/// Sums and counts of the offsets to agents within a follower's radii.
+/// Sums, in lattice distances, and counts of the offsets to agents within a follower's radii.
 #[derive(Clone, Copy)]
 pub struct Sums<S: Simd> {
     /// The sum of x within the repulsion radius.
-    pub repel_x: S::f32s,
+    pub repel_x: S::i32s,
     /// The sum of y within the repulsion radius.
-    pub repel_y: S::f32s,
+    pub repel_y: S::i32s,
     /// The number of agents within the repulsion radius.
     pub repel_count: S::i32s,
     /// The sum of x within the attraction radius but not the repulsion radius.
-    pub attract_x: S::f32s,
+    pub attract_x: S::i32s,
     /// The sum of y of the same agents.
-    pub attract_y: S::f32s,
+    pub attract_y: S::i32s,
     /// The number of the same agents.
     pub attract_count: S::i32s,
 }
@@ -105,8 +111,8 @@ impl<S: Simd> Sums<S> {
     /// Returns empty sums.
     #[inline(always)]
     pub fn new(simd: S) -> Sums<S> {
-        let (zero, none) = (splat(simd, 0.0), S::i32s::splat(simd, 0));
-        Sums { repel_x: zero, repel_y: zero, repel_count: none, attract_x: zero, attract_y: zero, attract_count: none }
+        let none = S::i32s::splat(simd, 0);
+        Sums { repel_x: none, repel_y: none, repel_count: none, attract_x: none, attract_y: none, attract_count: none }
     }
 }
 
@@ -121,13 +127,15 @@ pub(crate) fn sees<S: Simd>(world: &Lanes<S>, dx: S::f32s, dy: S::f32s) -> S::ma
 pub(crate) fn influence<S: Simd>(world: &Lanes<S>, dx: S::f32s, dy: S::f32s, sums: &mut Sums<S>) -> S::mask32s {
     let near = within::<S>(dx, dy, world.follow.repulsion_radius2);
     let seen = within::<S>(dx, dy, world.follow.attraction_radius2);
-    let far = seen & !near;
-    sums.repel_x += zero_unless::<S>(dx, near);
-    sums.repel_y += zero_unless::<S>(dy, near);
-    sums.repel_count -= near.to_vector();
-    sums.attract_x += zero_unless::<S>(dx, far);
-    sums.attract_y += zero_unless::<S>(dy, far);
-    sums.attract_count -= far.to_vector();
+    let (repels, attracts) = (near.to_vector(), (seen & !near).to_vector());
+    let base = world.follow.offset_base;
+    let [dx, dy] = [on_lattice::<S>(dx, base), on_lattice::<S>(dy, base)];
+    sums.repel_x += dx & repels;
+    sums.repel_y += dy & repels;
+    sums.repel_count -= repels;
+    sums.attract_x += dx & attracts;
+    sums.attract_y += dy & attracts;
+    sums.attract_count -= attracts;
     seen
 }
 
@@ -160,8 +168,8 @@ pub fn force<S: Simd>(world: &Lanes<S>, sums: &Sums<S>, x: S::f32s, y: S::f32s) 
     let attract = recip::<S>(sums.attract_count.max(1).to_float()) * world.follow.attraction_scale;
     let (push_x, near_x) = walls::<S>(world, x, world.motion.map_x);
     let (push_y, near_y) = walls::<S>(world, y, world.motion.map_y);
-    let force_x = sums.attract_x * attract - sums.repel_x * repel + push_x;
-    let force_y = sums.attract_y * attract - sums.repel_y * repel + push_y;
+    let force_x = nearest_f32::<S>(sums.attract_x) * attract - nearest_f32::<S>(sums.repel_x) * repel + push_x;
+    let force_y = nearest_f32::<S>(sums.attract_y) * attract - nearest_f32::<S>(sums.repel_y) * repel + push_y;
     SteeringForce {
         x: flush::<S>(force_x, TINY),
         y: flush::<S>(force_y, TINY),

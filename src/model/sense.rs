@@ -7,8 +7,8 @@ use crate::config_enum::{Choice, config_enum};
 use crate::gpu_struct::gpu_struct;
 use crate::kernels::{
     larger,
-    math::{exact_sqrt, recip, rsqrt},
-    select, splat, zero_if, zero_unless,
+    math::{exact_sqrt, lattice, less_base, nearest_f32, on_lattice, recip, rsqrt},
+    select, splat,
 };
 use crate::reader::{Reader, between, section};
 
@@ -30,6 +30,8 @@ pub(crate) const NAMES: [&str; INPUTS] = [
     "agents front left",
     "agents back left",
 ];
+/// The finest lattice of densities, on which they are added: 2^-20.
+const FINEST: f64 = 1.0 / 1_048_576.0;
 /// A squared range that exceeds every distance on a map.
 const UNLIMITED: f32 = 1e30;
 
@@ -81,7 +83,10 @@ gpu_struct! {
         pub poi_range2: f32,
         /// The squared range of agents.
         pub agent_range2: f32,
-        /// Multiplies a sum over POIs: gain/P, or the gain if densities are means; 0 if no POI is sensed.
+        /// The base of the lattice of densities.
+        pub density_base: f32,
+        /// Multiplies a sum over POIs, in lattice distances: gain/P, or the gain if densities are means, times the
+        /// distance; 0 if no POI is sensed.
         pub poi_share: f32,
         /// The same for sums over agents.
         pub agent_share: f32,
@@ -93,16 +98,19 @@ gpu_struct! {
 impl SenseConstants {
     /// Computes the constants for so many agents and POIs on a map.
     pub fn new(sense: &Sense, agents: usize, pois: usize, map: [f64; 2]) -> SenseConstants {
+        // No density exceeds 1 by more than rounding.
+        let [density_base, distance] = lattice(agents.max(pois), 1.01, FINEST);
         // A range of 0 still reaches what is at the same place: that weighs nothing, on every backend alike.
         let share = |range: f64, count: usize| match sense.density {
             _ if range == 0.0 => 0.0,
-            Density::Mean => sense.gain as f32,
-            Density::Linear | Density::Inverse => (sense.gain / count as f64) as f32,
+            Density::Mean => (sense.gain * f64::from(distance)) as f32,
+            Density::Linear | Density::Inverse => (sense.gain * f64::from(distance) / count as f64) as f32,
         };
         let range2 = |range: f64| if range.is_infinite() { UNLIMITED } else { (range * range) as f32 };
         SenseConstants {
             poi_range2: range2(sense.poi_range),
             agent_range2: range2(sense.agent_range),
+            density_base,
             poi_share: share(sense.poi_range, pois),
             agent_share: share(sense.agent_range, agents),
             inverse_diagonal: (1.0 / (2f64.sqrt() * map[0].max(map[1]))) as f32,
@@ -110,49 +118,84 @@ impl SenseConstants {
     }
 }
 
-/// Returns the density of an entity at offset (`dx`, `dy`). The caller checks that it is in range.
+/// Returns the density of an entity at offset (`dx`, `dy`) in lattice distances. The caller checks that it is in range.
 #[inline(always)]
-pub(crate) fn density<S: Simd, const DENSITY: u32>(world: &Lanes<S>, dx: S::f32s, dy: S::f32s) -> S::f32s {
-    let one = splat(dx.token(), 1.0);
+pub(crate) fn density<S: Simd, const DENSITY: u32>(world: &Lanes<S>, dx: S::f32s, dy: S::f32s) -> S::i32s {
+    let (one, base) = (splat(dx.token(), 1.0), world.sense.density_base);
     let d2 = dx * dx + dy * dy;
     match const { Density::of(DENSITY) } {
-        Density::Linear => one - exact_sqrt::<S>(d2) * world.sense.inverse_diagonal,
-        Density::Inverse | Density::Mean => rsqrt::<S>(select::<S>(one, d2, d2.simd_gt(one))),
+        Density::Linear => less_base::<S>(one + base - exact_sqrt::<S>(d2) * world.sense.inverse_diagonal, base),
+        Density::Inverse | Density::Mean => on_lattice::<S>(rsqrt::<S>(select::<S>(one, d2, d2.simd_gt(one))), base),
     }
 }
 
-/// The entities of one class around a leader, by quadrant in the order of the policy's inputs: back right, front right,
-/// front left, back left.
+/// The entities of one class around a leader: sums over all, over those on the left, in front, and both.
+#[derive(Clone, Copy)]
+struct Halves<S: Simd> {
+    all: S::i32s,
+    left: S::i32s,
+    front: S::i32s,
+    both: S::i32s,
+}
+
+impl<S: Simd> Halves<S> {
+    #[inline(always)]
+    fn add(&mut self, number: S::i32s, left: S::i32s, front: S::i32s) {
+        self.all += number;
+        self.left += number & left;
+        self.front += number & front;
+        self.both += number & left & front;
+    }
+
+    /// Returns the sum of each quadrant, in the order of the policy's inputs: back right, front right, front left, back
+    /// left.
+    #[inline(always)]
+    fn quadrants(self) -> [S::f32s; 4] {
+        let Halves { all, left, front, both } = self;
+        [all - left - front + both, front - both, both, left - both].map(nearest_f32::<S>)
+    }
+}
+
+/// The entities of one class around a leader, by quadrant.
 #[derive(Clone, Copy)]
 pub struct Quadrants<S: Simd> {
-    /// The sums of their densities.
-    sums: [S::f32s; 4],
+    /// The sums of their densities, in lattice distances.
+    densities: Halves<S>,
     /// The number of entities sensed. Only means need it.
-    counts: [S::f32s; 4],
+    counts: Halves<S>,
 }
 
 impl<S: Simd> Quadrants<S> {
     /// Returns empty quadrants.
     #[inline(always)]
     pub fn new(simd: S) -> Quadrants<S> {
-        Quadrants { sums: [splat(simd, 0.0); 4], counts: [splat(simd, 0.0); 4] }
+        let none = S::i32s::splat(simd, 0);
+        let empty = Halves { all: none, left: none, front: none, both: none };
+        Quadrants { densities: empty, counts: empty }
     }
 
     /// Adds an entity with this density, which is 0 out of range, at offset (`dx`, `dy`) from a leader with heading
     /// (`hx`, `hy`).
+    ///
+    /// The signs of the offset along the heading and to its left determine the quadrant. A tie goes to the
+    /// counterclockwise quadrant, so that each boundary belongs to exactly one.
     #[inline(always)]
-    pub fn add<const DENSITY: u32>(&mut self, density: S::f32s, dx: S::f32s, dy: S::f32s, hx: S::f32s, hy: S::f32s) {
-        sense::<S>(density, dx, dy, hx, hy, &mut self.sums);
+    pub fn add<const DENSITY: u32>(&mut self, density: S::i32s, dx: S::f32s, dy: S::f32s, hx: S::f32s, hy: S::f32s) {
+        let zero = splat(dx.token(), 0.0);
+        let fx = dx * hx + dy * hy;
+        let fy = dy * hx - dx * hy;
+        let left = (fy.simd_gt(zero) | (fy.simd_ge(zero) & fx.simd_ge(zero))).to_vector();
+        let front = (fx.simd_gt(zero) | (fx.simd_ge(zero) & !fy.simd_gt(zero))).to_vector();
+        self.densities.add(density, left, front);
         if const { matches!(Density::of(DENSITY), Density::Mean) } {
-            let (zero, one) = (splat(dx.token(), 0.0), splat(dx.token(), 1.0));
-            sense::<S>(zero_unless::<S>(one, density.simd_gt(zero)), dx, dy, hx, hy, &mut self.counts);
+            self.counts.add(density.min(1), left, front);
         }
     }
 
     /// Returns the inputs: the sums, or the means, times a constant.
     #[inline(always)]
     fn inputs<const DENSITY: u32>(self, share: S::f32s) -> [S::f32s; 4] {
-        let [sums, counts] = [self.sums, self.counts];
+        let [sums, counts] = [self.densities.quadrants(), self.counts.quadrants()];
         std::array::from_fn(
             #[inline(always)]
             |quadrant| match const { Density::of(DENSITY) } {
@@ -164,25 +207,6 @@ impl<S: Simd> Quadrants<S> {
             },
         )
     }
-}
-
-/// Adds the density of the entity at offset (`dx`, `dy`) to the sum of its quadrant.
-///
-/// The signs of the offset along the heading and to its left determine the quadrant. A tie goes to the counterclockwise
-/// quadrant, so that each boundary belongs to exactly one.
-#[inline(always)]
-fn sense<S: Simd>(density: S::f32s, dx: S::f32s, dy: S::f32s, hx: S::f32s, hy: S::f32s, sums: &mut [S::f32s; 4]) {
-    let zero = splat(dx.token(), 0.0);
-    let fx = dx * hx + dy * hy;
-    let fy = dy * hx - dx * hy;
-    let left = fy.simd_gt(zero) | (fy.simd_ge(zero) & fx.simd_ge(zero));
-    let front = fx.simd_gt(zero) | (fx.simd_ge(zero) & !fy.simd_gt(zero));
-    let density_left = zero_unless::<S>(density, left);
-    let density_right = zero_if::<S>(density, left);
-    sums[0] += zero_if::<S>(density_right, front);
-    sums[1] += zero_unless::<S>(density_right, front);
-    sums[2] += zero_unless::<S>(density_left, front);
-    sums[3] += zero_if::<S>(density_left, front);
 }
 
 /// Returns the policy's inputs: the densities of both kinds, each multiplied by its constant.

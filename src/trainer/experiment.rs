@@ -11,6 +11,7 @@ use super::{Row, Snapshot};
 use crate::backend::GroupScores;
 use crate::config::{Learning, ValidConfig};
 use crate::evolve::{self, Key, Purpose};
+use crate::host;
 use crate::parallel::*;
 
 /// One experiment and its trials.
@@ -158,7 +159,7 @@ impl TrialState {
         let (populations, parameters) = (config.populations(), world.parameters());
         let stride = config.learning.slots() * parameters;
         let key = Key::new(seed, index, Purpose::Weights);
-        let mut weights = vec![0.0; populations * stride];
+        let mut weights = host::zeros(populations * stride);
         weights.par_chunks_exact_mut(stride).enumerate().for_each(|(leader, policies)| {
             policies[..population * parameters]
                 .par_chunks_exact_mut(parameters)
@@ -168,7 +169,7 @@ impl TrialState {
         });
         TrialState {
             index,
-            children: vec![0.0; weights.len()],
+            children: host::zeros(weights.len()),
             weights,
             scores: vec![],
             previous_stage_scores: vec![],

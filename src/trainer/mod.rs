@@ -267,7 +267,7 @@ impl Trainer {
         let experiment = &self.experiments[experiment];
         let sort = |trial: &experiment::TrialState| {
             let mut policies = vec![0.0; experiment.policy_len()];
-            experiment.sort(&trial.weights, &trial.fitness, &mut policies);
+            experiment.sort(trial, &mut policies);
             policies
         };
         experiment.trials.iter().map(sort).collect()
@@ -282,7 +282,7 @@ impl Trainer {
             for index in 0..experiment.trials.len() {
                 let mut policies = std::mem::take(&mut experiment.trials[index].children);
                 let trial = &experiment.trials[index];
-                experiment.sort(&trial.weights, &trial.fitness, &mut policies[..len]);
+                experiment.sort(trial, &mut policies[..len]);
                 experiment.trials[index].children = policies;
             }
         }

@@ -94,11 +94,10 @@ impl ExperimentState {
             let key = Key::new(learning.seed, trial.index, Purpose::Tournament);
             let plans = trial.parents.par_chunks_exact_mut(learning.slots());
             let plans = plans.zip(trial.fitness.par_chunks_exact(learning.population)).enumerate();
-            plans.for_each(|(leader, (parents, fitness))| match generation == last {
-                true => evolve::keep_parents(fitness, parents),
-                false => {
-                    evolve::draw_parents(level, key, generation, leader, Selection::of(learning), fitness, parents);
-                }
+            let selection = Selection::of(learning);
+            plans.for_each(|(population, (parents, fitness))| match generation == last {
+                true => evolve::keep_parents(key, generation, population, selection, fitness, parents),
+                false => evolve::draw_parents(level, key, generation, population, selection, fitness, parents),
             });
         });
     }
@@ -200,16 +199,18 @@ impl ExperimentState {
         });
     }
 
-    /// Copies policies, without the champions' slots, best first in each population. With an evolution strategy the
-    /// mean comes first, in place of the worst policy.
-    pub fn sort(&self, weights: &[f32], fitness: &[f32], policies: &mut [f32]) {
+    /// Copies policies of the last generation, without the champions' slots, best first in each population. With an
+    /// evolution strategy the mean comes first, in place of the worst policy.
+    pub fn sort(&self, trial: &TrialState, policies: &mut [f32]) {
         let Stage { config, world, .. } = self.stage();
-        let (population, parameters) = (config.learning.population, world.parameters());
-        let mean = (config.learning.method != Method::Tournament).then_some(population);
-        let populations = weights.par_chunks_exact(self.stride());
-        let sorted = policies.par_chunks_exact_mut(population * parameters);
-        populations.zip(fitness.par_chunks_exact(population)).zip(sorted).for_each(|((weights, fitness), sorted)| {
-            let best = evolve::top_indices(fitness, population);
+        let (learning, parameters) = (&config.learning, world.parameters());
+        let mean = (learning.method != Method::Tournament).then_some(learning.population);
+        let key = Key::new(learning.seed, trial.index, Purpose::Tournament);
+        let populations = trial.weights.par_chunks_exact(self.stride());
+        let populations = populations.zip(trial.fitness.par_chunks_exact(learning.population));
+        let sorted = policies.par_chunks_exact_mut(learning.population * parameters);
+        populations.zip(sorted).enumerate().for_each(|(population, ((weights, fitness), sorted))| {
+            let best = evolve::ranking(key, self.last(), population, Selection::of(learning), fitness);
             for (policy, index) in sorted.chunks_exact_mut(parameters).zip(mean.into_iter().chain(best)) {
                 policy.copy_from_slice(&weights[index * parameters..(index + 1) * parameters]);
             }

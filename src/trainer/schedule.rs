@@ -7,7 +7,7 @@ use glam::Vec2;
 
 use super::stages::{Stage, Stages};
 use crate::config::{Learning, population_count};
-use crate::evolve::{self, Key, Purpose};
+use crate::evolve;
 use crate::parallel::*;
 
 /// Minimum number of policies per rayon task for cheap work. Fewer are finished before another thread wakes up.
@@ -67,12 +67,11 @@ impl TeamSchedule {
         let (of_round, orders_of_round) = (population * leaders, population * count);
         self.orders.resize(learning.partners * orders_of_round, 0);
         self.teams.resize(learning.partners * of_round, 0);
-        let key = Key::new(learning.seed, trial, Purpose::Teams);
         let orders = self.orders.par_chunks_exact_mut(population);
         orders.with_min_len(min_populations_per_task(population)).enumerate().for_each(|(index, order)| match count {
             // Every order of a single population makes the same teams.
             1 => order.iter_mut().zip(0..).for_each(|(policy, team)| *policy = team),
-            _ => evolve::shuffle(level, key, generation, index / count, index % count, order),
+            _ => evolve::order_policies(level, learning, trial, generation, [index / count, index % count], order),
         });
         for (teams, orders) in self.teams.chunks_exact_mut(of_round).zip(self.orders.chunks_exact(orders_of_round)) {
             let teams = teams.par_chunks_exact_mut(leaders).with_min_len(MIN_POLICIES_PER_TASK);

@@ -165,6 +165,7 @@ pub const CASES: [Case; 36] = [
         &[
             ("learning.fitness", "'Dt'"),
             ("learning.led_within", "3"),
+            ("learning.seed", "1"),
             ("learning.led_by", "'any-seen'"),
             ("world.observers", "'followers'"),
             ("world.coupling", "2"),

@@ -23,7 +23,7 @@ use super::policies;
 use super::tensors::{self, Tensor, TensorFile};
 use super::{RecordError, config_digest};
 use flotilla::config::Config;
-use flotilla::evolve;
+use flotilla::evolve::{self, Key, Purpose, Selection};
 use flotilla::host::Instant;
 use flotilla::parallel::BackgroundTask;
 use flotilla::trainer::{Row, Snapshot};
@@ -202,13 +202,17 @@ impl Checkpoint {
             let mut slots = vec![0.0; of.populations() * (population + 1) * parameters];
             let populations = slots.chunks_exact_mut((population + 1) * parameters);
             let sorted = sorted.chunks_exact(population * parameters);
-            for ((slots, sorted), fitness) in populations.zip(sorted).zip(fitness.chunks_exact(population)) {
+            let key = Key::new(of.learning.seed, trial, Purpose::Tournament);
+            let last = self.snapshot.generation - 1;
+            for (index, ((slots, sorted), fitness)) in
+                populations.zip(sorted).zip(fitness.chunks_exact(population)).enumerate()
+            {
                 let mut put = |slot: usize, policy: &[f32]| {
                     slots[slot * parameters..(slot + 1) * parameters].copy_from_slice(policy);
                 };
                 // The overall best policy is the champion.
                 put(population, &sorted[..parameters]);
-                let order = evolve::top_indices(fitness, population);
+                let order = evolve::ranking(key, last, index, Selection::of(&of.learning), fitness);
                 order.into_iter().zip(sorted.chunks_exact(parameters)).for_each(|(slot, policy)| put(slot, policy));
             }
             weights.push(slots);

@@ -93,8 +93,8 @@ mod kernel {
 }
 use kernel::*;
 
-/// A leader scales its 8 sums.
-const SCALE_INPUTS: u32 = INPUTS as u32;
+/// A leader converts and scales its 8 sums. The quadrants follow from the halves by 5 differences and sums per kind.
+const SCALE_INPUTS: u32 = 2 * INPUTS as u32 + 2 * 5;
 /// A leader turns.
 const TURN: u32 = CLAMP + SIN_COS + ROTATE;
 /// An agent moves.
@@ -108,15 +108,18 @@ const CHOOSE: u32 = 4 * 3 // the largest output: 4 comparisons with 2 selections
     + 8; // kind, direction, the two actions
 /// A follower meets an agent within the attraction radius.
 const INFLUENCE: u32 = SQUARED_DISTANCE + 3 // 2 tests and their difference
+    + 2 * LATTICE // both offsets
     + 4 + 4 // 4 selections, 4 sums
     + 2; // 2 counts
+/// A number is put on a lattice: a sum, a difference.
+const LATTICE: u32 = 2;
 /// A follower counts a leader that it sees.
 const SEE: u32 = 1;
 /// A follower steers, whoever it met.
 const FOLLOW: u32 = FORCE + INFLUENCED + STEER;
 /// The force on a follower.
 const FORCE: u32 = 2 * (RECIP + 3) // means: the reciprocal of a count of at least 1, scaled
-    + 2 * 4 // per axis: the two weighted sums
+    + 2 * (2 + 4) // per axis: two sums, converted and weighted
     + 2 * (3 + 2 + 1 + 1) // per axis, walls: 3 differences, 2 maxima, a difference, a gain
     + 2 * FLUSH;
 /// The test whether anything is near.
@@ -138,17 +141,17 @@ const OBSERVE: u32 = SQUARED_DISTANCE + 3;
 /// Returns the operations of a leader that senses one entity.
 fn sense(density: Density) -> u32 {
     let density = match density {
-        // A root, scaled and subtracted from 1.
-        Density::Linear => SQRT + 2,
+        // A root, scaled and subtracted from 1 on the lattice.
+        Density::Linear => SQRT + LATTICE + 1,
         // An inverse root of at least 1.
-        Density::Inverse => RSQRT + 2,
-        // Also a test for the count, its selections and sums.
-        Density::Mean => RSQRT + 2 + 2 + 2 + 4 + 4,
+        Density::Inverse => RSQRT + 2 + LATTICE,
+        // Also a count: at most 1, its selections and sums.
+        Density::Mean => RSQRT + 2 + LATTICE + 1 + 3 + 4,
     };
     SQUARED_DISTANCE + ROTATE
         + 2 // the range: a test, a selection
         + 4 + 4 // the quadrant: 4 tests, their combinations
-        + 2 + 4 + 4 // 2 selections by side, 4 by front, 4 sums
+        + 3 + 4 // 3 selections of halves, 4 sums
         + density
 }
 
@@ -208,7 +211,7 @@ mod tests {
         assert_eq!(reach, Reach { sensed_pois: 2.0, ..Reach::default() });
         // 2 POIs sensed; 8 inputs; 10 units of 8 inputs and 2 of 10; the turn and the speed; the move; 2 POIs tested.
         let units = 10.0 * (16.0 + 27.0) + 2.0 * (20.0 + 27.0);
-        assert_eq!(per_team_step(&world, &reach), 2.0 * 45.0 + 8.0 + units + 38.0 + 36.0 + 2.0 * 8.0);
+        assert_eq!(per_team_step(&world, &reach), 2.0 * 43.0 + 26.0 + units + 38.0 + 36.0 + 2.0 * 8.0);
     }
 
     #[test]

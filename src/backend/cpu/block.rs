@@ -9,7 +9,7 @@ use super::pois::PoiPosition;
 use crate::backend::Moment;
 use crate::config_enum::ConstDispatch;
 use crate::kernels::math::within;
-use crate::kernels::{splat, zero_unless};
+use crate::kernels::splat;
 use crate::model::{Lanes, follow, motion, policy, sense};
 use crate::world::{INPUTS, OUTPUTS, World};
 
@@ -146,7 +146,7 @@ impl<S: Simd> Block<S> {
             let mut of_pois = sense::Quadrants::new(*simd);
             let (fours, rest) = pois.as_chunks::<4>();
             for pois in fours {
-                let mut densities = [x; 4];
+                let mut densities = [S::i32s::splat(*simd, 0); 4];
                 for (density, poi) in densities.iter_mut().zip(pois) {
                     let [px, py] = poi.lanes(*simd);
                     let [dx, dy] = [px - x, py - y];
@@ -290,8 +290,8 @@ fn steer<S: Simd, const BY_SINE: bool>(
     }
 }
 
-/// Returns the density that an entity at offset (`dx`, `dy`) adds to its quadrant: 0 out of range.
+/// Returns the density that an entity at offset (`dx`, `dy`) adds to its quadrant, in lattice distances: 0 out of range.
 #[inline(always)]
-fn sensed<S: Simd, const DENSITY: u32>(world: &Lanes<S>, range2: S::f32s, dx: S::f32s, dy: S::f32s) -> S::f32s {
-    zero_unless::<S>(sense::density::<S, DENSITY>(world, dx, dy), within::<S>(dx, dy, range2))
+fn sensed<S: Simd, const DENSITY: u32>(world: &Lanes<S>, range2: S::f32s, dx: S::f32s, dy: S::f32s) -> S::i32s {
+    sense::density::<S, DENSITY>(world, dx, dy) & within::<S>(dx, dy, range2).to_vector()
 }
