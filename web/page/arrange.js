@@ -2,24 +2,21 @@
 import { configs } from "./config.js";
 import { $, count, number } from "./dom.js";
 import { change } from "./experiment.js";
-import { reach, start_scene } from "./scene.js";
+import { start_scene } from "./scene.js";
 import { state } from "./state.js";
-import { draw, only_view, show } from "./views.js";
+import { aim, draw, only_view, show } from "./views.js";
 
 /** The view of the start. @type {View | null} */
 let start_view = null;
 export function show_start() {
   const { config, views } = state, { world } = config;
   if (!start_view || !views.includes(start_view)) {
-    start_view = only_view("Where everyone starts", reach(config));
+    start_view = only_view("Where everyone starts", stage.busy(start_scene(config)));
     start_view.describe = describe_start;
   }
   if (start_view.chosen && !world[start_view.chosen[0]][start_view.chosen[1]]) start_view.chosen = null;
-  start_view.crop = reach(config);
-  if (state.mode === "arrange") {
-    start_view.crop = [0, 0, ...world.map];
-    hands(start_view);
-  }
+  aim(start_view, state.mode === "arrange" ? [0, 0, ...world.map] : stage.busy(start_scene(config)));
+  if (state.mode === "arrange") hands(start_view);
   show(start_view, start_scene(config), false);
 }
 

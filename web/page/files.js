@@ -11,7 +11,7 @@ import { reach } from "./scene.js";
 import { TONES, state } from "./state.js";
 import { digests, forget } from "./train.js";
 import { Training } from "./training.js";
-import { build, controls, following, only_view, seek, show } from "./views.js";
+import { build, controls, following, only_view, reveal, seek, show } from "./views.js";
 
 /** Most runs that are opened together: each has a colour. */
 const MOST_RUNS = TONES.length;
@@ -64,6 +64,7 @@ async function take_runs(read, reading) {
   mode("watch");
   await take(words.toml);
   build(training);
+  reveal();
   controls();
   digests();
   seek(training.last);
@@ -86,6 +87,7 @@ async function take_other({ file, bytes }) {
       only.canvas.ariaLabel = `${only.title.textContent}, step ${step}: ${only.status.textContent}`;
     };
     show(only, data);
+    reveal();
     $("message").textContent = `${file.name}: ${count(words.policies, "policy").replace(/ys$/, "ies")} per leader. Take a leader to play with them.`;
   } else {
     if (!/\.toml$/i.test(file.name)) throw new Error("not a config (.toml), a run (.zip) or policies (.safetensors)");

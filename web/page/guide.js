@@ -56,7 +56,7 @@ let at = 0;
 function show_step(result = "") {
   const goes_on = at < STEPS.length;
   $("guide").hidden = !goes_on;
-  $(goes_on ? "play" : "guide").after($("setup"), $("modes"));
+  $(goes_on ? "credit" : "guide").after($("setup"));
   if (!goes_on) return;
   $("guide-step").textContent = `${at + 1} of ${STEPS.length}`;
   $("guide-says").textContent = result || STEPS[at].says();

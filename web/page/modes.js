@@ -3,13 +3,7 @@ import { show_start } from "./arrange.js";
 import { $, all } from "./dom.js";
 import { drive_off, drive_view, options } from "./drive.js";
 import { state } from "./state.js";
-import { ask, build, clear, controls, follow, position } from "./views.js";
-
-/** @type {Record<string, string>} */
-const HINTS = {
-  watch: "", arrange: "Drag leaders, followers and POIs, then train again.",
-  drive: "Point to where your leader should go, or use the arrow keys. Time passes only while you steer.",
-};
+import { ask, build, clear, controls, follow, position, reveal } from "./views.js";
 
 /** @param {"watch" | "arrange" | "drive"} wanted */
 export function mode(wanted) {
@@ -17,14 +11,12 @@ export function mode(wanted) {
   drive_off();
   state.mode = wanted;
   for (const button of all("[data-mode]")) button.ariaPressed = String(button.dataset.mode === wanted);
-  $("hint").textContent = HINTS[wanted];
   $("arrange").hidden = wanted !== "arrange";
   $("drive").hidden = wanted !== "drive";
   const { training } = state;
   if (wanted !== "watch" && training && training.state === "training") { training.paused = true; controls(); }
   if (wanted === "arrange") {
     show_start();
-    $("modes").scrollIntoView({ block: "start" });
   } else if (wanted === "drive") {
     const led = training && training.arms.find(arm => arm.label === "leader-follower" && arm.ended.length);
     if (led) state.policies = { each: 1, weights: led.ended[Math.min(state.trial, led.ended.length - 1)] };
@@ -32,7 +24,6 @@ export function mode(wanted) {
     options();
     drive_view();
     $("driven").textContent = "";
-    $("modes").scrollIntoView({ block: "start" });
   } else if (training) {
     const { generation, trial } = state;
     build(training);
@@ -45,4 +36,5 @@ export function mode(wanted) {
     clear();
     show_start();
   }
+  reveal();
 }

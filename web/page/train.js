@@ -10,7 +10,7 @@ import { mode } from "./modes.js";
 import { clerk } from "./pool.js";
 import { state } from "./state.js";
 import { Training } from "./training.js";
-import { build, clear, controls, follow, following } from "./views.js";
+import { build, clear, controls, follow, following, reveal } from "./views.js";
 
 let starting = false;
 export async function train() {
@@ -47,6 +47,7 @@ export async function train() {
     following(true);
     tables();
     build(training);
+    reveal();
     await training.start(state.players);
   } catch (thrown) {
     const { message, fatal } = failure(thrown);

@@ -1,7 +1,7 @@
 // Views of episodes: one canvas per arm.
 import { curves } from "./curves.js";
-import { $, failure, make, number, pen_of, still, trouble, write_text } from "./dom.js";
-import { reach } from "./scene.js";
+import { $, failure, make, pen_of, still, trouble, write_text } from "./dom.js";
+import { join, start_scene } from "./scene.js";
 import { angles, moment, words } from "./senses.js";
 import { NAMES, TONES, after, shown, state } from "./state.js";
 import { last_of } from "./training.js";
@@ -12,7 +12,8 @@ function add_view(label, crop) {
   const head = make("h2", "", card);
   const key = make("span", "", head, { className: `key${state.views.length ? " dashed" : ""}` });
   key.style.color = `var(${TONES[state.views.length]})`;
-  const title = make("span", NAMES[label] || label, head);
+  const title = make("span", "", head), [name, ...more] = (NAMES[label] || label).split(/(?=: )/);
+  title.append(name, make("small", more.join("")));
   const status = make("p", "", card, { role: "status", ariaLive: "off" });
   const canvas = make("canvas", "", card, { role: "img" });
   const sensed = make("p", "", card, { className: "sensed", hidden: true });
@@ -25,7 +26,21 @@ function add_view(label, crop) {
   canvas.addEventListener("click", event => picked(view, event));
   canvas.addEventListener("pointerleave", () => { view.over = null; draw(view); });
   state.views.push(view);
+  aim(view, crop);
   return view;
+}
+
+/** Sets the part of the map that a view shows, extended to the shape of its canvas: width divided by height. @param {View} view @param {Crop} crop */
+export function aim(view, [left, below, right, above], shape = (right - left) / (above - below)) {
+  const wide = Math.max(right - left, (above - below) * shape), tall = wide / shape, x = (left + right) / 2, y = (below + above) / 2;
+  view.crop = [x - wide / 2, y - tall / 2, x + wide / 2, y + tall / 2];
+  view.canvas.style.setProperty("--wide", String(shape));
+}
+
+/** Scrolls the maps into view if they are not. The bar with Train stays above them. */
+export function reveal() {
+  const { top, bottom } = $("views").getBoundingClientRect();
+  if (top < $("bar").offsetHeight || bottom > innerHeight) $("views").scrollIntoView({ block: "start" });
 }
 
 /** Shows a single view that belongs to no arm. @param {string} title @param {Crop} crop */
@@ -34,19 +49,16 @@ export function only_view(title, crop) {
   const view = add_view("leader-follower", crop);
   view.title.textContent = title;
   view.key.hidden = true;
-  $("views").classList.add("one");
-  $("views").after($("credit"));
   return view;
 }
 
-/** Makes a view for each arm. The chart comes before the table of credit then: it is what changes. @param {Training} training */
+/** Makes a view for each arm. All show the same part of the map, in a shape that leaves room for the chart. @param {Training} training */
 export function build(training) {
   clear();
   $("loop").checked = false;
-  for (const arm of training.arms) add_view(arm.label, reach(arm.config));
-  $("views").classList.toggle("one", training.arms.length === 1);
-  $("views").classList.toggle("many", training.arms.length > 2);
-  $("play").after($("credit"));
+  const crop = training.arms.map(({ config }) => stage.busy(start_scene(config))).reduce(join);
+  const shape = Math.max(1, Math.min(1.6, (crop[2] - crop[0]) / (crop[3] - crop[1])));
+  for (const arm of training.arms) aim(add_view(arm.label, crop), crop, shape);
   // Trials that all arms have.
   const trials = Math.min(...training.arms.map(arm => arm.trials.length));
   $("trial").replaceChildren(...Array.from({ length: trials }, (_, trial) => make("option", String(trial))));
@@ -75,8 +87,7 @@ export function draw(view) {
   const [observed, text] = stage.say(episode, step);
   if (view.describe) view.describe(step, observed, text);
   else {
-    const end = number(episode.g * data.pois.length);
-    write_text(view.status, `generation ${episode.generation}, trial ${episode.trial} · ${observed} of ${data.pois.length} POIs by step ${step} · ends at ${end}`);
+    write_text(view.status, `generation ${episode.generation}, trial ${episode.trial} · ${observed} of ${data.pois.length} POIs by step ${step}`);
     view.canvas.ariaLabel = `${NAMES[view.label] || view.label}: the best team of generation ${episode.generation}, step ${step}: ${text}`;
   }
   if (view.chosen) ring(view, view.chosen);
@@ -155,10 +166,12 @@ export function select(view, leader) {
  * @param {View} view @param {Scene} data
  */
 export function show(view, data, moves = true) {
-  const last = data.episodes[0].shown.length - 1, plays = moves && !still.matches, [left, below, right, above] = view.crop;
-  // Stages and jitter may move POIs out of the view.
-  if (data.pois.some(([x, y]) => x < left || x > right || y < below || y > above)) view.crop = stage.whole(data);
-  view.canvas.style.setProperty("--wide", String((view.crop[2] - view.crop[0]) / (view.crop[3] - view.crop[1])));
+  const last = data.episodes[0].shown.length - 1, plays = moves && !still.matches, crop = join(view.crop, stage.busy(data));
+  // What is on show grows with the episodes, and is the same in all views.
+  if (crop.some((side, index) => side !== view.crop[index])) {
+    for (const other of state.views) aim(other, crop, Number(other.canvas.style.getPropertyValue("--wide")));
+    state.views.forEach(draw);
+  }
   // A removed leader stays removed while the episode is the same.
   if (data !== view.data) view.removed = null;
   if (view.selected && view.selected >= data.episodes[0].leaders) view.selected = null;
