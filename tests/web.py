@@ -138,8 +138,9 @@ class Tab(Browser):
 
     def train(self, seconds=300):
         """Trains, and returns the digest of each arm by its label."""
+        self.evaluate("window.before = page.state.training; 0")
         self.click("#train")
-        self.wait(DONE, seconds)
+        self.wait(f"page.state.training !== before && {DONE}", seconds)
         return {
             arm["label"]: arm["digest"]
             for arm in self.evaluate("page.state.training.arms.map(({ label, digest }) => ({ label, digest }))")
@@ -194,6 +195,57 @@ def check_map_in_view(tab, page):
     tab.assert_no_errors()
     tab.window(1280, 900, dark=False)
     print("the maps stay in view")
+
+
+def check_consistency(tab, page, downloads):
+    """Tests that nothing on the page is about something else than what it shows."""
+    # The guide speaks only of its own experiments, and leads back to them.
+    tab.load(page)
+    tab.set("#layout", "chaotic")
+    tab.wait("document.querySelector('#layout').value === 'chaotic' && page.state.config.world.coupling !== 6")
+    assert "four leaders" not in tab.text("#guide-says") and "another experiment" in tab.text("#guide-says")
+    tab.click("#guide-next")
+    tab.wait("page.state.views[0].title.textContent.startsWith('A trained team')")
+    assert "another experiment" not in tab.text("#guide-says"), tab.text("#guide-says")
+    # After another run is opened, the result of a former training is gone.
+    tab.load(page, layout="strictly_forward", on="cpu", pace="full", learners="leader-follower", **SMALL)
+    tab.train()
+    tab.evaluate("document.querySelector('.home').click()")
+    run = downloaded(downloads / "strictly_forward-leader-follower.zip")
+    (downloads / "strictly_forward-leader-follower.zip").unlink()
+    tab.load(page, layout="generally_forward", on="cpu", pace="full", **SMALL)
+    tab.train()
+    assert "all-leaders" in tab.text("#announced"), tab.text("#announced")
+    tab.drop("run.zip", base64(run))
+    tab.wait("document.querySelector('#message').textContent.startsWith('run.zip: the run is complete')")
+    assert "all-leaders" not in tab.text("#announced"), tab.text("#announced")
+    assert "of 2 (leader-follower)" in tab.text("#announced"), tab.text("#announced")
+    # What was said about a file is gone with the next experiment.
+    tab.evaluate("document.querySelector('[data-exhibit=blind]').click()")
+    assert tab.text("#message") == "", tab.text("#message")
+    # A leader that is removed is not drawn, even if it was the last one, so that the config has a problem.
+    tab.load(page)
+    tab.drop("one.toml", base64(b"[world]\nleaders = [[5, 5]]\npois = [[5, 12]]\ncoupling = 1\n"))
+    tab.wait("page.state.config.world.leaders.length === 1")
+    tab.click("[data-mode=arrange]")
+    tab.evaluate("page.state.views[0].canvas.focus()")
+    tab.press("]", "BracketRight")
+    tab.press("Delete", "Delete")
+    tab.wait("!page.state.valid")
+    assert tab.evaluate("page.state.views[0].data.episodes[0].leaders") == 0
+    # A note on a damaged link stays when settings change, and a training starts.
+    tab.load(page, layout="chaotic", learners="lead", on="cpu", pace="full", **SMALL)
+    assert "This link is damaged" in tab.text("#trouble")
+    tab.set("#coupling", "1")
+    tab.wait("page.state.config.world.coupling === 1")
+    assert "This link is damaged" in tab.text("#trouble"), tab.text("#trouble")
+    tab.train()
+    assert "This link is damaged" in tab.text("#trouble"), tab.text("#trouble")
+    tab.set("#layout", "strictly_forward")
+    tab.wait("page.state.config.world.pois.length === 2")
+    assert tab.evaluate("document.querySelector('#trouble').hidden")
+    assert not list(tab.complaints())
+    print("the page says nothing about something else than it shows")
 
 
 def check_links_and_devices(tab, page):
@@ -1124,6 +1176,7 @@ def main():
 
         check_several_runs(tab, page, flotilla, folder / "several")
         check_map_in_view(tab, page)
+        check_consistency(tab, page, downloads)
         check_links_and_devices(tab, page)
         check_first_visit(tab, page, call, downloads)
         check_former_defects(tab, page, call, downloads, folder)

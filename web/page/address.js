@@ -1,13 +1,15 @@
 // The experiment in the address.
 import { comparison, read, write } from "./compare.js";
 import { configs } from "./config.js";
-import { $, trouble } from "./dom.js";
+import { $ } from "./dom.js";
 import { edited, take } from "./experiment.js";
-import { KEYS, KEY_IDS, NAMES, quote, state } from "./state.js";
+import { KEYS, KEY_IDS, NAMES, part, quote, render, state, trouble } from "./state.js";
 import { train } from "./train.js";
 import { seek } from "./views.js";
 
 let asked = 0, written = 0;
+part(() => [state.linked && state.toml, state.compared, $("on").value, $("pace").value], () => { if (state.linked) remember(); });
+
 /**
  * Writes the experiment into the address. Returns false if this browser cannot. The address is then empty, because the old one is of
  * another experiment. Packing a config takes a moment, and an older experiment never replaces a newer one.
@@ -53,23 +55,24 @@ export async function recall() {
   }
   const learners = words.get("learners"), known = learners !== null && Object.hasOwn(NAMES, learners);
   if (learners !== null && learners !== "both" && !known) unknown.push(`learners=${learners}`);
-  state.compared = known ? null : comparison("paradigm", 0);
+  let compared = known ? null : comparison("paradigm", 0);
   if (words.has("compare")) {
-    state.compared = read(word("compare"));
-    if (!state.compared) unknown.push("compare");
+    compared = read(word("compare"));
+    if (!compared) unknown.push("compare");
   }
   if (known) text = await edited(text, [["learning.paradigm", `"${learners}"`]]);
   const whole = (/** @type {string} */ key) => /^\d{1,7}$/.test(word(key)) ? Number(word(key)) : null;
   for (const key of ["generation", "trial", "play"]) if (words.has(key) && whole(key) === null) unknown.push(`${key}=${words.get(key)}`);
   wanted = whole("play") === 1 ? { generation: whole("generation") ?? Infinity, trial: whole("trial") ?? 0 } : null;
   const damage = unknown.length ? `This link is damaged: ${unknown.join(", ")} cannot be read. Ask for a new link; this page shows another experiment.` : "";
-  const taken = await take(text, { address: !damage });
+  trouble("link", damage);
+  render({ compared });
+  const taken = await take(text, { linked: !damage });
   if (!taken && !state.views.length) {
     // Show a map even if the config in the link is invalid.
-    await take(configs.layout("generally_forward"), { address: false });
+    await take(configs.layout("generally_forward"), { linked: false });
     await take(text);
   }
-  if (damage) trouble(damage);
   const version = words.get("version");
   $("version").textContent = version !== null && version !== state.version ? `This link is from version ${version}, and this page is version ${state.version}: results may differ.` : "";
 }
@@ -102,7 +105,6 @@ export async function autoplay() {
   await train();
   $("pace").value = pace;
   if (!state.training || state.training.state !== "done") return;
-  state.trial = Math.min(trial, state.training.arms[0].trials.length - 1);
-  $("trial").value = String(state.trial);
+  render({ trial: Math.min(trial, state.training.arms[0].trials.length - 1) });
   seek(generation);
 }

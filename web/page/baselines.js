@@ -1,5 +1,4 @@
 // Baselines without learning: the best constant action, and the best of as many random teams as training evaluates.
-import { curves } from "./curves.js";
 import { clerk } from "./pool.js";
 import { state } from "./state.js";
 
@@ -8,7 +7,7 @@ export async function constants(training) {
   for (const arm of training.arms) {
     if (state.training !== training) return;
     arm.constant = (await clerk.ask({ ask: "constant", text: arm.toml })).words.g;
-    curves();
+    training.news();
   }
 }
 
@@ -25,7 +24,7 @@ export async function randoms(training) {
       const { words } = await clerk.ask({ ask: "more_random", milliseconds: 60 });
       arm.random = words.g;
       done = words.done;
-      curves();
+      training.news();
     }
   }
 }

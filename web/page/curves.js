@@ -1,11 +1,12 @@
 // The learning curves below the map.
 import { chart } from "./chart.js";
 import { $, make } from "./dom.js";
-import { show_machine } from "./machine.js";
-import { TONES, state } from "./state.js";
+import { TONES, part, state } from "./state.js";
 
 /** The chart, once it is drawn. @type {ReturnType<typeof chart.paint> | null} */
 export let drawn_chart = null;
+part(() => [state.training, state.training && state.training.version, state.follow || state.generation, state.pois, state.config.learning.generations], curves);
+
 export function curves() {
   const { training } = state;
   // If the number of POIs differs between stages, the curves show shares instead.
@@ -21,7 +22,7 @@ export function curves() {
       mean: found ? scaled(found.generation.map((generation, at) => /** @type {Place} */ ([generation, found.mean[at]]))) : null, band: found ? scaled(found.band) : null,
     };
   });
-  const last = training ? training.last : state.config ? state.config.learning.generations : 100;
+  const last = training ? training.last : state.config.learning.generations;
   drawn_chart = chart.paint($("curves"), arms, every, last, pois, training && !state.follow ? state.generation : null);
   $("legend").replaceChildren();
   const many = training && training.pois === null ? "share of POIs" : "POIs";
@@ -41,7 +42,6 @@ export function curves() {
   make("span", `${many} observed by the best team, mean over trials${arms.some(arm => arm.band) ? " with its 95 % interval" : ""}; thin: each trial${arms.some(arm => arm.constant !== null) ? "; dotted: the best constant action, and the best of as many random teams" : ""}`, $("legend"));
   $("curves").setAttribute("aria-label", `Learning curves, best team, mean over trials: ${words.join("; ") || "nothing trained yet"}`);
   $("needless").textContent = needless(training);
-  if (training) show_machine();
 }
 
 /** Says if a constant action observes as much as what was trained, because then nothing had to be learned. @param {Training | null} training */

@@ -41,26 +41,3 @@ export const failure = thrown => thrown instanceof Failure ? thrown : new Failur
 export function write_text(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
-
-/** Shows an error, or none. @param {string} message */
-export function trouble(message) {
-  $("trouble").textContent = message;
-  $("trouble").hidden = !message;
-}
-
-/** Saves a file. @param {string} name @param {BlobPart} content @param {string} type */
-export function save(name, content, type) {
-  const link = make("a", "", document.body, { href: URL.createObjectURL(new Blob([content], { type })), download: name });
-  link.click();
-  link.remove();
-  setTimeout(() => URL.revokeObjectURL(link.href), 10000);
-  $("message").textContent = `${name} is saved.`;
-}
-
-/** Copies a text, and reports it. @param {string} text @param {string} message */
-export async function copy(text, message) {
-  try {
-    await navigator.clipboard.writeText(text);
-    $("message").textContent = message;
-  } catch { $("message").textContent = `This browser does not let a page copy. Here it is: ${text}`; }
-}

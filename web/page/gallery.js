@@ -2,7 +2,7 @@
 import { $, make } from "./dom.js";
 import { keep, take } from "./experiment.js";
 import { mode } from "./modes.js";
-import { state } from "./state.js";
+import { render, state } from "./state.js";
 import { forget, train } from "./train.js";
 
 /** `config` names the config, if it is that of another experiment. @typedef {{ name: string, title: string, says: string, compare: Comparison, config?: string }} Exhibit */
@@ -38,13 +38,16 @@ const GALLERY = [
 /** Returns the config of an experiment. @param {string} name */
 export const text_of = name => $(`gallery-${name}`).textContent ?? "";
 
+/** Returns whether the page shows an experiment. @param {string} name */
+export const is_of = name => GALLERY.some(found => found.name === name && found.compare === state.compared && text_of(found.config ?? name) === state.text);
+
 /** Replaces the experiment by one of the gallery, and trains it if asked. @param {string} name */
 export async function exhibit(name, { trains = false } = {}) {
   const found = GALLERY.find(exhibit => exhibit.name === name);
   if (!found) return;
   keep();
   forget();
-  Object.assign(state, { file: null, compared: found.compare });
+  render({ file: null, compared: found.compare });
   mode("watch");
   if (await take(text_of(found.config ?? name)) && trains) await train();
 }

@@ -75,17 +75,21 @@ interface View {
   crop: Crop, chosen: Chosen | null, removed: Removed | null, selected: number | null, drawn: Place[],
   describe: ((step: number, observed: number, text: string) => void) | null,
 }
+/** An episode that belongs to no training. `status` writes the line below its title, and `label` names it for screen readers. */
+interface Exhibit { title: string, data: Scene, label: string, status: (step: number, observed: number) => string }
 /** A view that shows an episode. */
 type Shown = View & { data: Scene };
 
 /**
  * The state of the page. `mode` is what the map is for, and `follow` whether the views follow the training. `training` has the results on
- * show. `valid` tells whether the text is a valid config, and `config`, `toml`, `pois` and `start` are those of the last valid text. `past`
- * has earlier texts, for undo. `layouts` has the config of each layout. `settled` is the choice that `machine` was opened for.
+ * show, and without one `exhibit` the episode. `valid` tells whether the text is a valid config, `problems` why not, and `config`, `toml`, `pois`
+ * and `start` are those of the last valid text. `linked` tells whether the address holds it. `past` has earlier texts, for undo. `guide` is
+ * the step of the guided start. `layouts` has the config of each layout. `settled` is the choice that `machine` was opened for.
  */
 interface State extends Past {
-  valid: boolean, config: Config, toml: string | null, pois: number | null, start: Start, past: Past[], mode: "watch" | "arrange" | "drive",
-  training: Training | null, follow: boolean, generation: number, trial: number, views: View[], gpu: Gpu, machine: Machine, settled: string | null,
+  valid: boolean, config: Config, toml: string | null, pois: number | null, start: Start, past: Past[], problems: Problem[], linked: boolean,
+  mode: "watch" | "arrange" | "drive", training: Training | null, exhibit: Exhibit | null, follow: boolean, generation: number, trial: number,
+  views: View[], guide: number | null, troubles: Record<string, string>, message: string, gpu: Gpu, machine: Machine, settled: string | null,
   players: Player[], policies: { each: number, weights: Bytes } | null, layouts: Record<string, Config>, version: string,
 }
 interface Past { text: string, file: string | null, compared: Comparison | null }

@@ -1,40 +1,44 @@
 // What to do with the map: watch, rearrange, or take a leader.
 import { show_start } from "./arrange.js";
-import { $, all } from "./dom.js";
-import { drive_off, drive_view, options } from "./drive.js";
-import { state } from "./state.js";
-import { ask, build, clear, controls, follow, position, reveal } from "./views.js";
+import { $, all, write_text } from "./dom.js";
+import { drive_off, drive_view } from "./drive.js";
+import { part, render, state } from "./state.js";
+import { ask_all, build, follow, only_view, reveal, show } from "./views.js";
 
-/** @param {"watch" | "arrange" | "drive"} wanted */
-export function mode(wanted) {
-  if (state.mode === wanted) return;
+part(() => [state.mode], () => {
+  for (const button of all("[data-mode]")) button.ariaPressed = String(button.dataset.mode === state.mode);
+  $("arrange").hidden = state.mode !== "arrange";
+  $("drive").hidden = state.mode !== "drive";
+});
+
+/** Returns what the maps show: a training, an episode, or the start of the experiment. */
+const subject = () => state.mode === "watch" && (state.training || state.exhibit) || state.config;
+
+part(() => [state.mode, subject()], () => {
+  const { mode, training, exhibit } = state;
   drive_off();
-  state.mode = wanted;
-  for (const button of all("[data-mode]")) button.ariaPressed = String(button.dataset.mode === wanted);
-  $("arrange").hidden = wanted !== "arrange";
-  $("drive").hidden = wanted !== "drive";
-  const { training } = state;
-  if (wanted !== "watch" && training && training.state === "training") { training.paused = true; controls(); }
-  if (wanted === "arrange") {
-    show_start();
-  } else if (wanted === "drive") {
-    const led = training && training.arms.find(arm => arm.label === "leader-follower" && arm.ended.length);
-    if (led) state.policies = { each: 1, weights: led.ended[Math.min(state.trial, led.ended.length - 1)] };
-    if (led && led.toml !== state.toml && led.config.world.leaders.length !== state.config.world.leaders.length) state.policies = null;
-    options();
-    drive_view();
-    $("driven").textContent = "";
-  } else if (training) {
-    const { generation, trial } = state;
+  if (mode === "drive") drive_view();
+  else if (mode === "watch" && training) {
     build(training);
-    position();
-    $("trial").value = String(trial);
-    if (training.state === "done" || !state.follow) {
-      state.views.forEach((view, run) => ask(view, run, state.follow ? training.last : generation));
-    } else follow();
-  } else {
-    clear();
-    show_start();
-  }
+    if (state.follow) follow(); else ask_all();
+  } else if (mode === "watch" && exhibit) {
+    const { title, data, status, label } = exhibit, view = only_view(title, stage.busy(data));
+    view.describe = (step, observed, text) => {
+      write_text(view.status, status(step, observed));
+      view.canvas.ariaLabel = `${label}, step ${step}: ${text}`;
+    };
+    show(view, data);
+  } else show_start();
+});
+
+/** @param {State["mode"]} mode */
+export function mode(mode) {
+  if (state.mode === mode) return;
+  const { training } = state;
+  if (mode !== "watch" && training) training.paused = true;
+  const led = mode === "drive" && training && training.arms.find(arm => arm.label === "leader-follower" && arm.ended.length);
+  if (led) state.policies = { each: 1, weights: led.ended[Math.min(state.trial, led.ended.length - 1)] };
+  if (led && led.toml !== state.toml && led.config.world.leaders.length !== state.config.world.leaders.length) state.policies = null;
+  render({ mode });
   reveal();
 }

@@ -1,9 +1,8 @@
 // Views of episodes: one canvas per arm.
-import { curves } from "./curves.js";
-import { $, failure, make, pen_of, still, trouble, write_text } from "./dom.js";
+import { $, failure, make, pen_of, still, write_text } from "./dom.js";
 import { join, start_scene } from "./scene.js";
 import { angles, moment, words } from "./senses.js";
-import { NAMES, TONES, after, shown, state } from "./state.js";
+import { NAMES, TONES, part, render, shown, state, trouble } from "./state.js";
 import { last_of } from "./training.js";
 
 /** Adds a view. @param {string} label @param {Crop} crop */
@@ -55,21 +54,14 @@ export function only_view(title, crop) {
 /** Makes a view for each arm. All show the same part of the map, in a shape that leaves room for the chart. @param {Training} training */
 export function build(training) {
   clear();
-  $("loop").checked = false;
   const crop = training.arms.map(({ config }) => stage.busy(start_scene(config))).reduce(join);
   const shape = Math.max(1, Math.min(1.6, (crop[2] - crop[0]) / (crop[3] - crop[1])));
   for (const arm of training.arms) aim(add_view(arm.label, crop), crop, shape);
-  // Trials that all arms have.
-  const trials = Math.min(...training.arms.map(arm => arm.trials.length));
-  $("trial").replaceChildren(...Array.from({ length: trials }, (_, trial) => make("option", String(trial))));
-  $("scrub").max = String(training.last);
-  $("scrub").value = "0";
 }
 
-export function clear() {
+function clear() {
   state.views = [];
   $("views").replaceChildren();
-  $("credit").hidden = true;
 }
 
 /** Draws a view at its place in the episode. @param {View} view */
@@ -158,7 +150,7 @@ function picked(view, event) {
 export function select(view, leader) {
   view.selected = view.selected === leader ? null : leader;
   draw(view);
-  after.episode();
+  render();
 }
 
 /**
@@ -177,7 +169,7 @@ export function show(view, data, moves = true) {
   if (view.selected && view.selected >= data.episodes[0].leaders) view.selected = null;
   Object.assign(view, { data, place: plays ? 0 : last, playing: plays, ended: plays ? null : performance.now() });
   draw(view);
-  after.episode();
+  render();
   wake_up();
 }
 
@@ -265,8 +257,7 @@ function tick(time) {
 export function follow() {
   const { training } = state;
   if (!training || state.mode !== "watch" || !state.follow || training.state === "starting") return;
-  state.generation = Math.max(0, training.reached);
-  position();
+  render({ generation: Math.max(0, training.reached) });
   state.views.forEach((view, run) => {
     const at = view.data ? view.data.episodes[0].generation : -1;
     const rest = still.matches ? 700 : 250;
@@ -286,7 +277,7 @@ export async function ask(view, run, generation) {
     if (state.training === training && state.views[run] === view && state.mode === "watch") show(view, data);
   } catch (thrown) {
     const { message, stopped, fatal } = failure(thrown);
-    if (!stopped && !fatal && state.training === training) trouble(message);
+    if (!stopped && !fatal && state.training === training) trouble("run", message);
   }
   view.asking = false;
   if (view.wanted !== null) {
@@ -300,44 +291,44 @@ export async function ask(view, run, generation) {
 export function seek(generation) {
   const { training } = state;
   if (!training || training.state === "starting") return;
-  following(training.state === "training" && generation >= training.reached);
-  state.generation = Math.max(0, Math.min(training.reached, generation));
-  position();
-  curves();
+  render({ follow: training.state === "training" && generation >= training.reached, generation: Math.max(0, Math.min(training.reached, generation)) });
+  ask_all();
+}
+
+// Requests the generation on show for all views.
+export function ask_all() {
   state.views.forEach((view, run) => {
     if (view.asking) view.wanted = state.generation;
     else ask(view, run, state.generation);
   });
 }
 
-/** Follows the training, or not. @param {boolean} follow */
-export function following(follow) {
-  state.follow = follow;
-  $("following").checked = follow;
-}
-
-export function position() {
-  const { training, generation } = state;
-  if (!training) return;
-  const ahead = state.follow && training.state === "training";
-  $("scrub").value = String(generation);
-  $("generation").textContent = `${ahead ? "trained to generation" : "generation"} ${generation} of ${training.last}`;
-  $("scrub").ariaValueText = $("generation").textContent;
-}
-
-export function controls() {
-  const { training } = state, going = Boolean(training && training.state === "training");
+// The player of the training.
+part(() => [state.training], () => {
+  const { training } = state;
+  $("loop").checked = !training && !still.matches;
+  // Trials that all arms have.
+  const trials = training ? Math.min(...training.arms.map(arm => arm.trials.length)) : 0;
+  $("trial").replaceChildren(...Array.from({ length: trials }, (_, trial) => make("option", String(trial))));
+  $("scrub").max = String(training ? training.last : 100);
+});
+part(() => [state.training, state.training && state.training.state, state.training && state.training.paused, state.follow, state.generation, state.trial], () => {
+  const { training, generation } = state, going = Boolean(training && training.state === "training");
   $("pause").disabled = $("stop").disabled = $("following").disabled = !going;
   $("pause").textContent = going && training && training.paused ? "Continue" : "Pause";
+  $("following").checked = state.follow;
   $("scrub").disabled = !training || training.state === "starting";
-}
+  $("scrub").value = String(training ? generation : 0);
+  $("trial").value = String(state.trial);
+  $("generation").textContent = training ? `${state.follow && going ? "trained to generation" : "generation"} ${generation} of ${training.last}` : "";
+  $("scrub").ariaValueText = $("generation").textContent;
+});
 
 export function pause() {
   const { training } = state;
   if (!training || training.state !== "training") return;
   training.paused = !training.paused;
-  if (!training.paused) following(true);
-  controls();
+  render({ follow: state.follow || !training.paused });
   follow();
 }
 
