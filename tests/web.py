@@ -272,6 +272,17 @@ def check_links_and_devices(tab, page):
     tab.click("#share")
     tab.wait("document.querySelector('#message').textContent.startsWith('No link was copied')")
     assert tab.evaluate("location.href") == address
+    # A problem of a setting is shown beside it, even if the setting is folded away, and ends with it.
+    tab.load(page, layout="chaotic")
+    tab.set("#population", "1")
+    tab.wait("!page.state.valid")
+    beside = "document.querySelector('#population').closest('label').querySelector('.wrong')"
+    assert tab.evaluate(f"{beside}.checkVisibility()")
+    assert "allowed" in tab.evaluate(f"{beside}.textContent"), tab.evaluate(f"{beside}.textContent")
+    assert not tab.evaluate("document.querySelector('#config').open"), "the editor opens for a problem of a setting"
+    tab.set("#population", "10")
+    tab.wait(f"page.state.valid && !{beside}")
+    tab.assert_no_errors()
     # An empty field is reset to the value in use.
     tab.load(page, layout="chaotic", seed=12)
     tab.set("#seed", "")

@@ -3,7 +3,10 @@ import { choice_of, slug } from "./compare.js";
 import { configs } from "./config.js";
 import { $, all, count, failure, make, option } from "./dom.js";
 import { clerk } from "./pool.js";
-import { part, render, state, trouble } from "./state.js";
+import { KEYS, KEY_IDS, part, render, state, trouble } from "./state.js";
+
+/** The controls that set a key. @type {Map<string, keyof typeof KEYS>} */
+const fields = new Map(KEY_IDS.map(id => [KEYS[id], id]));
 
 let newest = 0;
 /**
@@ -21,7 +24,7 @@ export async function take(text, { edited = false, linked = true, keeps = false 
   } catch (thrown) {
     const { problems, message } = failure(thrown);
     if (turn === newest) render({ problems, valid: false });
-    if (turn === newest) trouble("config", problems.length ? `The config cannot be used: ${count(problems.length, "problem")}, beside its lines below.` : message);
+    if (turn === newest) trouble("config", problems.length ? `The config cannot be used: ${count(problems.length, "problem")}, beside ${problems.some(({ key }) => !fields.has(key ?? "")) ? "the lines of the config below" : "the settings"}.` : message);
     return false;
   }
   if (turn !== newest) return false;
@@ -142,7 +145,15 @@ part(() => [state.problems], () => {
       make("span", words, place);
     }
   }
-  if (problems.length) $("config").open = true;
+  for (const [key, id] of fields) {
+    const found = problems.find(problem => problem.key === key), label = /** @type {HTMLElement} */ ($(id).closest("label"));
+    label.querySelector(".wrong")?.remove();
+    $(id).ariaInvalid = String(Boolean(found));
+    if (!found) continue;
+    if (!$(id).checkVisibility()) $("more").open = true;
+    make("small", found.message, label, { className: "wrong" });
+  }
+  if (problems.some(({ key }) => !fields.has(key ?? ""))) $("config").open = true;
   lines();
 });
 

@@ -155,7 +155,7 @@ type Elements =
   & Record<"following" | "loop" | "trails" | "radii" | "heat" | "plain", HTMLInputElement>
   & Record<"train" | "stop" | "pause" | "replay" | "undo" | "again" | "remove" | "verify" | "share" | "open" | "save", HTMLButtonElement>
   & Record<"png" | "gif" | "webm" | "csv" | "guide-next" | "guide-end", HTMLButtonElement>
-  & Record<"text", HTMLTextAreaElement> & Record<"curves", HTMLCanvasElement> & Record<"config", HTMLDetailsElement>
+  & Record<"text", HTMLTextAreaElement> & Record<"curves", HTMLCanvasElement> & Record<"config" | "more", HTMLDetailsElement>
   & Record<"setup" | "guide" | "guide-step" | "guide-says" | "bar" | "arrange" | "drive" | "modes" | "views" | "plain-label", HTMLElement>
   & Record<"credit" | "play" | "team" | "credits" | "lost" | "compared" | "compared-says" | "means" | "pairs" | "tests" | "gallery" | "digests", HTMLElement>
   & Record<"trouble" | "stale" | "announced" | "machine" | "version" | "legend" | "needless" | "problems" | "lines" | "marks", HTMLElement>
