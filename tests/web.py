@@ -760,15 +760,24 @@ def check_first_visit(tab, page, call, downloads):
     # The guide removes the leader with the largest Df. The number of POIs that are lost equals its Df.
     episode = "page.state.views[0].data.episodes[0]"
     assert not tab.evaluate("document.querySelector('#guide').hidden")
-    tab.click("#guide-next")
+    predict = "#guide-choices button"
+    credits = tab.evaluate(f"{episode}.df")
+    assert len(set(credits)) > 1, f"all leaders have the same credit: {credits}"
+    tab.click(predict)
     leader = tab.evaluate("page.state.views[0].removed.leader")
     df = tab.evaluate(f"{episode}.df[{leader}]")
     lost = tab.evaluate(f"{episode}.without[{leader}].group.observed.filter(at => at === null).length")
     assert df > 0 and lost == round(df * 4), (df, lost)
     assert f"{lost} of 4 POIs are lost" in tab.text("#guide-says"), tab.text("#guide-says")
     assert "dark" in tab.text("#lost") and f"{lost} of 4" in tab.text("#lost"), tab.text("#lost")
-    # Then it trains both paradigms, and shows the baselines. Here, constant actions observe nothing.
+    assert tab.text("#guide-says").startswith("You said: one. "), tab.text("#guide-says")
+    # Then it trains both paradigms, and shows the baselines. Here, constant actions observe nothing. It does not say why before
+    # the result is there.
     tab.click("#guide-next")
+    assert "Which observe more" in tab.text("#guide-says") and not tab.evaluate("Boolean(page.state.training)")
+    tab.click(predict)
+    tab.wait("page.state.training && page.state.training.state === 'training'")
+    assert "coincide" not in tab.text("#guide-says"), tab.text("#guide-says")
     tab.wait(DONE, 400)
     tab.wait("page.state.training.arms.every(arm => arm.random.length === 61)", 400)
     assert tab.evaluate("page.state.training.arms.map(arm => arm.constant)") == [0, 0]
@@ -776,6 +785,7 @@ def check_first_visit(tab, page, call, downloads):
     tab.wait("document.querySelector('#guide-says').textContent.includes('Training is finished.')")
     guide = tab.text("#guide-says")
     assert f"{sum(best[0]):.2f} of 4 (leader-follower), 0.00 of 4 (all-leaders)" in guide, guide
+    assert "Six independent learners almost never coincide" in guide, guide
     assert min(best[0]) >= 0.75 and max(best[1]) == 0, best
     assert not tab.text("#needless")
     random = tab.evaluate("page.state.training.arms[0].random")
@@ -783,7 +793,8 @@ def check_first_visit(tab, page, call, downloads):
     tab.assert_no_errors()
     # Larger populations observe more, and constant actions observe nothing.
     tab.click("#guide-next")
-    tab.wait(DONE + " && page.state.training.arms.length === 3", 400)
+    tab.click(predict)
+    tab.wait("page.state.training && page.state.training.arms.length === 3 && " + DONE, 400)
     tab.wait("page.state.training.arms.every(arm => arm.constant === 0)", 60)
     sums = "arm => arm.trials.reduce((sum, trial) => sum + trial.at(-1).best, 0)"
     best = tab.evaluate(f"page.state.training.arms.map({sums})")
@@ -791,11 +802,36 @@ def check_first_visit(tab, page, call, downloads):
     tab.wait(f"document.querySelector('#guide-says').textContent.includes('{best[2]:.2f} of 4 (population 500)')")
     assert not tab.text("#needless")
     tab.assert_no_errors()
+    # The whole population of three generations is shown, as 50 faint teams each.
+    tab.click("#guide-next")
+    tab.click(predict)
+    tab.wait("page.state.views.length === 3 && page.state.views.every(view => view.ghosts.length === 50)", 100)
+    titles = tab.evaluate("page.state.views.map(view => view.title.textContent)")
+    assert titles == ["Generation 0", "Generation 15", "Generation 60"], titles
+    spread = (
+        "page.state.views.map(({ ghosts }) => { const ends = ghosts.map(({ episodes: [e] }) =>"
+        " e.positions[2 * (e.shown.length - 1) * e.agents]); const mean = ends.reduce((a, b) => a + b) / 50;"
+        " return ends.reduce((sum, end) => sum + (end - mean) ** 2, 0); })"
+    )
+    start, _, end = tab.evaluate(spread)
+    assert end < 0.7 * start, ("the first leader's policies do not come together", start, end)
+    tab.assert_no_errors()
+    # The surprise: with one population per group, teams without followers learn, too.
+    tab.click("#guide-next")
+    tab.click(predict)
+    tab.wait("page.state.training && page.state.training.arms[0].label === 'sharing none' && " + DONE, 400)
+    none, group, _ = tab.evaluate(f"page.state.training.arms.map({sums})")
+    assert none == 0 and group > 2, (none, group)
+    assert "number of populations" in tab.text("#guide-says"), tab.text("#guide-says")
+    tab.evaluate("document.querySelector('#guide-next').focus(); document.querySelector('#guide-next').click()")
+    assert tab.evaluate("document.querySelector('#guide').hidden")
+    assert tab.evaluate("document.activeElement.id") == "train", "the focus is lost after the guide"
+    tab.assert_no_errors()
     print(f"the opening and the guide work; first motion after {first:.0f} ms")
 
     # Every experiment of the gallery opens with its arms.
     names = tab.evaluate("[...document.querySelectorAll('[data-exhibit]')].map(button => button.dataset.exhibit)")
-    assert len(names) == 6, names
+    assert len(names) == 7, names
     for name in names:
         tab.click(f"[data-exhibit={name}]")
         training = "page.state.training"
@@ -805,7 +841,7 @@ def check_first_visit(tab, page, call, downloads):
         tab.assert_no_errors()
         tab.click("#stop")
         tab.wait("page.state.training.found")
-    print("the six experiments of the gallery open")
+    print("the experiments of the gallery open")
 
     # If a constant action is as good as training, the page says so.
     tab.load(page, layout="generally_forward", on="cpu", pace="full", **SMALL)

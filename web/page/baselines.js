@@ -1,13 +1,13 @@
 // Baselines without learning: the best constant action, and the best of as many random teams as training evaluates.
 import { clerk } from "./pool.js";
-import { state } from "./state.js";
+import { news, state } from "./state.js";
 
 /** Plays the constant actions of a training's arms. @param {Training} training */
 export async function constants(training) {
   for (const arm of training.arms) {
     if (state.training !== training) return;
     arm.constant = (await clerk.ask({ ask: "constant", text: arm.toml })).words.g;
-    training.news();
+    news(training);
   }
 }
 
@@ -24,7 +24,7 @@ export async function randoms(training) {
       const { words } = await clerk.ask({ ask: "more_random", milliseconds: 60 });
       arm.random = words.g;
       done = words.done;
-      training.news();
+      news(training);
     }
   }
 }

@@ -69,7 +69,7 @@ async function take_other({ file, bytes }) {
     const data = stage.unpack((await clerk.ask({ ask: "play", text: state.toml, policies: words.policies }, weights)).words), title = `The champion of ${file.name}`;
     forget();
     mode("watch");
-    render({ guide: null, policies: { each: words.policies, weights }, exhibit: { title, data, label: title, status: (step, observed) => `${observed} of ${data.pois.length} POIs by step ${step}` } });
+    render({ guide: null, policies: { each: words.policies, weights }, exhibit: { name: file.name, scenes: [{ title, data, label: title, status: (step, observed) => `${observed} of ${data.pois.length} POIs by step ${step}` }] } });
     reveal();
     report(`${file.name}: ${count(words.policies, "policy").replace(/ys$/, "ies")} per leader. Take a leader to play with them.`);
   } else {

@@ -72,11 +72,14 @@ declare const stage: {
 interface View {
   label: string, card: HTMLElement, title: HTMLElement, key: HTMLElement, status: HTMLElement, sensed: HTMLElement, canvas: HTMLCanvasElement,
   data: Scene | null, place: number, playing: boolean, ended: number | null, over: number | null, wanted: number | null, asking: boolean,
-  crop: Crop, chosen: Chosen | null, removed: Removed | null, selected: number | null, drawn: Place[],
+  crop: Crop, chosen: Chosen | null, removed: Removed | null, selected: number | null, drawn: Place[], ghosts: Scene[],
   describe: ((step: number, observed: number, text: string) => void) | null,
 }
-/** An episode that belongs to no training. `status` writes the line below its title, and `label` names it for screen readers. */
-interface Exhibit { title: string, data: Scene, label: string, status: (step: number, observed: number) => string }
+/**
+ * Episodes that belong to no training. `status` writes the line below a title, `label` names the episode for screen readers, and `ghosts` are
+ * other teams, whose leaders' ways are drawn faintly.
+ */
+interface Exhibit { name: string, scenes: { title: string, data: Scene, label: string, status: (step: number, observed: number) => string, ghosts?: Scene[] }[] }
 /** A view that shows an episode. */
 type Shown = View & { data: Scene };
 
@@ -84,12 +87,12 @@ type Shown = View & { data: Scene };
  * The state of the page. `mode` is what the map is for, and `follow` whether the views follow the training. `training` has the results on
  * show, and without one `exhibit` the episode. `valid` tells whether the text is a valid config, `problems` why not, and `config`, `toml`, `pois`
  * and `start` are those of the last valid text. `linked` tells whether the address holds it. `past` has earlier texts, for undo. `guide` is
- * the step of the guided start. `layouts` has the config of each layout. `settled` is the choice that `machine` was opened for.
+ * the step of the guided start, and what the visitor predicted. `layouts` has the config of each layout. `settled` is the choice that `machine` was opened for.
  */
 interface State extends Past {
   valid: boolean, config: Config, toml: string | null, pois: number | null, start: Start, past: Past[], problems: Problem[], linked: boolean,
   mode: "watch" | "arrange" | "drive", training: Training | null, exhibit: Exhibit | null, follow: boolean, generation: number, trial: number,
-  views: View[], guide: number | null, troubles: Record<string, string>, message: string, gpu: Gpu, machine: Machine, settled: string | null,
+  views: View[], guide: { step: number, said: string | null } | null, troubles: Record<string, string>, message: string, gpu: Gpu, machine: Machine, settled: string | null,
   players: Player[], policies: { each: number, weights: Bytes } | null, layouts: Record<string, Config>, version: string,
 }
 interface Past { text: string, file: string | null, compared: Comparison | null }
@@ -156,7 +159,7 @@ type Elements =
   & Record<"train" | "stop" | "pause" | "replay" | "undo" | "again" | "remove" | "verify" | "share" | "open" | "save", HTMLButtonElement>
   & Record<"png" | "gif" | "webm" | "csv" | "guide-next" | "guide-end", HTMLButtonElement>
   & Record<"text", HTMLTextAreaElement> & Record<"curves", HTMLCanvasElement> & Record<"config" | "more", HTMLDetailsElement>
-  & Record<"setup" | "guide" | "guide-step" | "guide-says" | "bar" | "arrange" | "drive" | "modes" | "views" | "plain-label", HTMLElement>
+  & Record<"setup" | "guide" | "guide-step" | "guide-says" | "guide-choices" | "bar" | "arrange" | "drive" | "modes" | "views" | "plain-label", HTMLElement>
   & Record<"credit" | "play" | "team" | "credits" | "lost" | "compared" | "compared-says" | "means" | "pairs" | "tests" | "gallery" | "digests", HTMLElement>
   & Record<"trouble" | "stale" | "announced" | "machine" | "version" | "legend" | "needless" | "problems" | "lines" | "marks", HTMLElement>
   & Record<"chosen" | "driven" | "generation" | "message" | "verified", HTMLElement>

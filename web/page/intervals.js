@@ -1,7 +1,7 @@
 // Intervals over trials, and the comparison of arms. The module computes them as `flotilla compare` does.
 import { $, make } from "./dom.js";
 import { clerk } from "./pool.js";
-import { part, state } from "./state.js";
+import { news, part, state } from "./state.js";
 
 /** Shows the intervals and tests of a training that has ended, or of opened runs. @param {Training} training */
 export async function intervals(training) {
@@ -10,7 +10,7 @@ export async function intervals(training) {
   const { words } = await clerk.ask({ ask: "compare", arms }, new Uint8Array(numbers.buffer));
   if (state.training !== training) return;
   training.found = words;
-  training.news();
+  news(training);
 }
 
 /** Returns the comparison on show. */

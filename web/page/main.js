@@ -138,7 +138,6 @@ async function start() {
   if (opens) await take(text_of(OPENING), { linked: false, keeps: true });
   else await recall();
   await settle();
-  $("guide-next").disabled = false;
   document.body.dataset.ready = "";
   await autoplay();
 }

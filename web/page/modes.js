@@ -2,8 +2,9 @@
 import { show_start } from "./arrange.js";
 import { $, all, write_text } from "./dom.js";
 import { drive_off, drive_view } from "./drive.js";
+import { join } from "./scene.js";
 import { part, render, state } from "./state.js";
-import { ask_all, build, follow, only_view, reveal, show } from "./views.js";
+import { add_view, ask_all, build, clear, follow, reveal, show } from "./views.js";
 
 part(() => [state.mode], () => {
   for (const button of all("[data-mode]")) button.ariaPressed = String(button.dataset.mode === state.mode);
@@ -22,12 +23,17 @@ part(() => [state.mode, subject()], () => {
     build(training);
     if (state.follow) follow(); else ask_all();
   } else if (mode === "watch" && exhibit) {
-    const { title, data, status, label } = exhibit, view = only_view(title, stage.busy(data));
-    view.describe = (step, observed, text) => {
-      write_text(view.status, status(step, observed));
-      view.canvas.ariaLabel = `${label}, step ${step}: ${text}`;
-    };
-    show(view, data);
+    clear();
+    const crop = exhibit.scenes.flatMap(({ data, ghosts = [] }) => [data, ...ghosts]).map(stage.busy).reduce(join);
+    for (const { title, data, status, label, ghosts = [] } of exhibit.scenes) {
+      const view = add_view("leader-follower", crop, title);
+      view.describe = (step, observed, text) => {
+        write_text(view.status, status(step, observed));
+        view.canvas.ariaLabel = `${label}, step ${step}: ${text}`;
+      };
+      view.ghosts = ghosts;
+      show(view, data);
+    }
   } else show_start();
 });
 

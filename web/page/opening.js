@@ -8,8 +8,11 @@ export const OPENING = "two_groups";
 export const OPENED = (() => {
   const { config, trial, generation } = opening, data = stage.unpack(opening.data);
   return {
-    title: "A trained team, in a task where learning matters", data,
-    status: (step, observed) => `${observed} of ${data.pois.length} POIs by step ${step} · trained for ${generation} generations with population ${config.learning.population}`,
-    label: `${NAMES["leader-follower"]}: the best team of generation ${generation}, trial ${trial}`,
+    name: "opening",
+    scenes: [{
+      title: "A trained team, in a task where learning matters", data,
+      status: (step, observed) => `${observed} of ${data.pois.length} POIs by step ${step} · trained for ${generation} generations with population ${config.learning.population}`,
+      label: `${NAMES["leader-follower"]}: the best team of generation ${generation}, trial ${trial}`,
+    }],
   };
 })();

@@ -41,6 +41,12 @@ export function render(changes = {}) {
   }
 }
 
+/** Shows new results of a training. @param {Training} training */
+export function news(training) {
+  training.version += 1;
+  render();
+}
+
 /** Shows an error, or none, and keeps those about other things. @param {"config" | "link" | "run" | "file"} about @param {string} text */
 export const trouble = (about, text) => render({ troubles: { ...state.troubles, [about]: text } });
 /** Reports what was done. @param {string} message */

@@ -7,7 +7,7 @@ import { intervals } from "./intervals.js";
 import { renew, settle } from "./machine.js";
 import { mode } from "./modes.js";
 import { clerk } from "./pool.js";
-import { copy, part, render, save, state, trouble } from "./state.js";
+import { copy, news, part, render, save, state, trouble } from "./state.js";
 import { Training } from "./training.js";
 import { follow, reveal } from "./views.js";
 
@@ -53,7 +53,7 @@ export async function train() {
   render();
   constants(training).catch(() => {});
   // For watching, the pace is limited to `last / 8` generations per second, but at least 1. Pauses do not count.
-  let played = 0, clock = performance.now(), dirty = true, news = clock;
+  let played = 0, clock = performance.now(), dirty = true, latest = clock;
   const allowed = () => {
     const now = performance.now(), each = training.last / 8;
     if (!training.paused) played += (now - clock) / 1000 * Math.max(1, each);
@@ -63,8 +63,8 @@ export async function train() {
   // Four charts a second are enough, and leave the main thread free.
   const painting = setInterval(() => {
     if (state.training !== training || document.hidden) return;
-    if (dirty) { dirty = false; news = performance.now(); training.news(); follow(); }
-    const silent = (performance.now() - news) / 1000;
+    if (dirty) { dirty = false; latest = performance.now(); news(training); follow(); }
+    const silent = (performance.now() - latest) / 1000;
     if (silent > 2 && !training.paused && training.reached < training.last) {
       write_text($("generation"), `generation ${training.reached + 1} of ${training.last}: ${Math.round(silent)} s so far`);
     }
@@ -81,7 +81,7 @@ export async function train() {
   }
   clearInterval(painting);
   if (state.training !== training) return;
-  training.news();
+  news(training);
   follow();
   intervals(training).catch(() => {});
   if (training.state === "done") randoms(training).catch(() => {});

@@ -1,8 +1,6 @@
 // A training of some arms, or runs that were opened. On the GPU, one worker trains everything as one batch. On the CPU, the trials are
 // divided among the workers. The division does not change the results.
 
-import { render } from "./state.js";
-
 /** Milliseconds after which a player that waits asks again whether it may play. */
 const REST = 40;
 
@@ -175,12 +173,6 @@ export class Training {
     const [episode] = words.episodes, recorded = this.arms[run].trials[trial][episode.generation];
     if (recorded && recorded.best !== episode.best_g) throw new Error(`Generation ${episode.generation} cannot be replayed: it gives G = ${episode.best_g} here, and the run has ${recorded.best}. The run started from given policies, or another version made it.`);
     return words;
-  }
-
-  // Shows new results.
-  news() {
-    this.version += 1;
-    render();
   }
 
   stop() { if (this.state !== "done") this.state = "stopped"; }

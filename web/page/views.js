@@ -5,13 +5,14 @@ import { angles, moment, words } from "./senses.js";
 import { NAMES, TONES, part, render, shown, state, trouble } from "./state.js";
 import { last_of } from "./training.js";
 
-/** Adds a view. @param {string} label @param {Crop} crop */
-function add_view(label, crop) {
+/** Adds a view of an arm, or with a title of its own. @param {string} label @param {Crop} crop */
+export function add_view(label, crop, title_of = NAMES[label] || label) {
   const card = make("section", "", $("views"), { className: "card" });
   const head = make("h2", "", card);
   const key = make("span", "", head, { className: `key${state.views.length ? " dashed" : ""}` });
   key.style.color = `var(${TONES[state.views.length]})`;
-  const title = make("span", "", head), [name, ...more] = (NAMES[label] || label).split(/(?=: )/);
+  key.hidden = title_of !== (NAMES[label] || label);
+  const title = make("span", "", head), [name, ...more] = title_of.split(/(?=: )/);
   title.append(name, make("small", more.join("")));
   const status = make("p", "", card, { role: "status", ariaLive: "off" });
   const canvas = make("canvas", "", card, { role: "img" });
@@ -19,7 +20,7 @@ function add_view(label, crop) {
   /** @type {View} */
   const view = {
     label, card, key, title, status, canvas, sensed, crop, data: null, place: 0, playing: false, ended: null, over: null, wanted: null,
-    asking: false, chosen: null, removed: null, selected: null, drawn: [], describe: null,
+    asking: false, chosen: null, removed: null, selected: null, drawn: [], ghosts: [], describe: null,
   };
   canvas.addEventListener("pointermove", event => pointed(view, event));
   canvas.addEventListener("click", event => picked(view, event));
@@ -36,19 +37,16 @@ export function aim(view, [left, below, right, above], shape = (right - left) / 
   view.canvas.style.setProperty("--wide", String(shape));
 }
 
-/** Scrolls the maps into view if they are not. The bar with Train stays above them. */
+/** Scrolls the maps into view if they are not, with the guide and the bar above them. */
 export function reveal() {
-  const { top, bottom } = $("views").getBoundingClientRect();
-  if (top < $("bar").offsetHeight || bottom > innerHeight) $("views").scrollIntoView({ block: "start" });
+  const above = $("guide").hidden ? $("views") : $("guide"), least = above === $("views") ? $("bar").offsetHeight : 0;
+  if (above.getBoundingClientRect().top < least || $("views").getBoundingClientRect().bottom > innerHeight) above.scrollIntoView({ block: "start" });
 }
 
 /** Shows a single view that belongs to no arm. @param {string} title @param {Crop} crop */
 export function only_view(title, crop) {
   clear();
-  const view = add_view("leader-follower", crop);
-  view.title.textContent = title;
-  view.key.hidden = true;
-  return view;
+  return add_view("leader-follower", crop, title);
 }
 
 /** Makes a view for each arm. All show the same part of the map, in a shape that leaves room for the chart. @param {Training} training */
@@ -59,7 +57,7 @@ export function build(training) {
   for (const arm of training.arms) aim(add_view(arm.label, crop), crop, shape);
 }
 
-function clear() {
+export function clear() {
   state.views = [];
   $("views").replaceChildren();
 }
@@ -75,6 +73,7 @@ export function draw(view) {
   };
   const { step, positions } = stage.paint(data, episode, view.canvas, view.place, look);
   view.drawn = positions;
+  haunt(view);
   if (view === state.views[0]) steps(data, view.place);
   const [observed, text] = stage.say(episode, step);
   if (view.describe) view.describe(step, observed, text);
@@ -94,6 +93,26 @@ const without = (episode, removed) => removed && episode.without ? episode.witho
 export function dark(data, removed) {
   const [episode] = data.episodes, gone = without(episode, removed);
   return gone ? episode.observed.flatMap((at, poi) => at !== null && gone.observed[poi] === null ? [poi] : []) : [];
+}
+
+/** Draws the ways of the leaders of other teams as faint lines. @param {View} view */
+function haunt({ canvas, crop, ghosts }) {
+  const { X, Y } = stage.place_on(canvas, crop), pen = pen_of(canvas);
+  pen.lineWidth = 1;
+  pen.globalAlpha = 0.2;
+  for (const ghost of ghosts) {
+    const [episode] = ghost.episodes, colors = stage.palette(ghost);
+    for (let leader = 0; leader < episode.leaders; leader++) {
+      pen.strokeStyle = colors[leader % colors.length];
+      pen.beginPath();
+      for (let frame = 0; frame < episode.shown.length; frame++) {
+        const [x, y] = stage.moment(ghost, episode, frame, leader);
+        pen.lineTo(X(x), Y(y));
+      }
+      pen.stroke();
+    }
+  }
+  pen.globalAlpha = 1;
 }
 
 /** Draws a ring around what is chosen in a view. @param {View} view @param {Chosen} chosen */
