@@ -14,6 +14,7 @@ colours, when zoomed, and at three sizes.
 """
 
 import difflib
+import http.server
 import itertools
 import json
 import os
@@ -21,6 +22,7 @@ import pathlib
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import zipfile
 
@@ -159,6 +161,62 @@ def base64(content):
     import base64
 
     return base64.b64encode(content).decode()
+
+
+def check_slow_network(tab, page):
+    """Tests that the opening moves and answers before the module has arrived, and that the page shifts little."""
+    content, rest = page.read_bytes(), threading.Event()
+    head, module = content[: content.index(b'id="wasm"') + 1000], content[content.index(b'id="wasm"') + 1000 :]
+
+    class Slow(http.server.BaseHTTPRequestHandler):
+        def do_GET(self):
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html")
+            self.end_headers()
+            self.wfile.write(head)
+            self.wfile.flush()
+            rest.wait(60)
+            self.wfile.write(module)
+
+        def log_message(self, *_):
+            pass
+
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Slow)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    tab.call("Page.navigate", url=f"http://127.0.0.1:{server.server_port}/")
+    tab.wait("performance.getEntriesByName('motion').length", 20)
+    assert not tab.evaluate("document.querySelector('#wasm')?.nextElementSibling"), "the module is there"
+    # What needs no module works at once, and what needs it waits for it.
+    tab.click("#guide-choices button")
+    assert tab.evaluate("page.state.views[0].removed.group")
+    tab.click("#replay")
+    tab.set("#step", 9)
+    assert tab.evaluate("page.state.views[0].place") == 9
+    tab.click("[data-mode=arrange]")
+    assert tab.text("#views h2") == "Where everyone starts"
+    tab.set("#layout", "chaotic")
+    rest.set()
+    tab.wait(f"{READY} && document.querySelector('#layout').value === 'chaotic'")
+    tab.wait("page.state.config.world.coupling === 5")
+    server.shutdown()
+    # The sum of layout shifts, while the page opens and while it trains.
+    shift = "new PerformanceObserver(list => list.getEntries().forEach(({ value, hadRecentInput, sources }) => {"
+    shift += " if (!hadRecentInput) { shifts += value; moved.push(...sources.map(({ node }) => node?.id ?? node?.className)); }"
+    shift += " })).observe({ type: 'layout-shift', buffered: true })"
+    source = f"window.shifts = 0; window.moved = []; {shift}"
+    script = tab.call("Page.addScriptToEvaluateOnNewDocument", source=source)["identifier"]
+    for width, height in [(1280, 800), (1024, 768), (820, 1180), (390, 844)]:
+        tab.window(width, height, dark=False)
+        for settings in [{}, {"layout": "generally_forward", "on": "cpu", "pace": "full", **SMALL}]:
+            tab.load(page, **settings)
+            time.sleep(0.3)
+            assert tab.evaluate("shifts") < 0.1, (width, settings, tab.evaluate("shifts"), tab.evaluate("moved"))
+        tab.train()
+        time.sleep(0.5)
+        assert tab.evaluate("shifts") < 0.1, (width, "training", tab.evaluate("shifts"), tab.evaluate("moved"))
+    tab.call("Page.removeScriptToEvaluateOnNewDocument", identifier=script)
+    tab.window(1280, 900, dark=False)
+    print("the opening moves before the module has arrived, and the page shifts little")
 
 
 def check_map_in_view(tab, page):
@@ -1222,6 +1280,7 @@ def main():
         print("configs are opened, and problems are marked at their lines")
 
         check_several_runs(tab, page, flotilla, folder / "several")
+        check_slow_network(tab, page)
         check_map_in_view(tab, page)
         check_consistency(tab, page, downloads)
         check_links_and_devices(tab, page)

@@ -3,7 +3,7 @@ import { comparison, read, write } from "./compare.js";
 import { configs } from "./config.js";
 import { $ } from "./dom.js";
 import { edited, take } from "./experiment.js";
-import { KEYS, KEY_IDS, NAMES, part, quote, render, state, trouble } from "./state.js";
+import { KEYS, KEY_IDS, NAMES, part, quote, render, state } from "./state.js";
 import { train } from "./train.js";
 import { seek } from "./views.js";
 
@@ -65,8 +65,7 @@ export async function recall() {
   for (const key of ["generation", "trial", "play"]) if (words.has(key) && whole(key) === null) unknown.push(`${key}=${words.get(key)}`);
   wanted = whole("play") === 1 ? { generation: whole("generation") ?? Infinity, trial: whole("trial") ?? 0 } : null;
   const damage = unknown.length ? `This link is damaged: ${unknown.join(", ")} cannot be read. Ask for a new link; this page shows another experiment.` : "";
-  trouble("link", damage);
-  render({ compared });
+  Object.assign(state, { compared, troubles: { ...state.troubles, link: damage } });
   const taken = await take(text, { linked: !damage });
   if (!taken && !state.views.length) {
     // Show a map even if the config in the link is invalid.

@@ -16,7 +16,7 @@ let newest = 0;
  */
 export async function take(text, { edited = false, linked = true, keeps = false } = {}) {
   const turn = ++newest;
-  render({ text, exhibit: keeps ? state.exhibit : null });
+  Object.assign(state, { text, exhibit: keeps ? state.exhibit : null });
   if (!edited) $("text").value = text;
   let resolved;
   try {

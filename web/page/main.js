@@ -115,28 +115,35 @@ function listen() {
 // Without an address, the page opens on a trained team. Its motion waits for no worker.
 const opens = location.hash.length <= 1;
 
+// Shows the page once it shows what was asked for, so that nothing moves afterwards.
+const appear = () => { document.body.dataset.shown = ""; };
+
 async function start() {
+  listen();
+  gallery();
   if (opens) {
-    render({ exhibit: OPENED });
+    render({ text: text_of(OPENING), exhibit: OPENED });
     guide();
+    appear();
   }
   try {
     [state.gpu] = await Promise.all([pool.gpu(), renew()]);
   } catch (thrown) {
     $("machine").textContent = "";
+    appear();
     return trouble("run", `This browser cannot run flotilla: ${failure(thrown).message}. It needs WebAssembly with SIMD, which browsers have had since 2023.`);
   }
-  for (const name of configs.LAYOUTS) state.layouts[name] = (await clerk.ask({ ask: "resolve", text: configs.layout(name), name, changes: [] })).words.config;
+  const layout = async (/** @type {string} */ name) => [name, (await clerk.ask({ ask: "resolve", text: configs.layout(name), name, changes: [] })).words.config];
+  state.layouts = Object.fromEntries(await Promise.all(configs.LAYOUTS.map(layout)));
   state.version = (await clerk.ask({ ask: "about" })).words.version;
   $("verify").disabled = !state.gpu.name;
   $("plain-label").hidden = !state.gpu.name;
   $("verified").textContent = state.gpu.name ? "Compares this browser's GPU with its CPU, bit for bit." : `There is no GPU to verify: ${state.gpu.reason}.`;
   option($("on"), "gpu").disabled = !state.gpu.name;
-  listen();
-  gallery();
-  // The settings become those of the opening. Its episode goes on.
-  if (opens) await take(text_of(OPENING), { linked: false, keeps: true });
-  else await recall();
+  // The settings become those of the opening, unless others were chosen meanwhile. Its episode goes on.
+  if (!opens) await recall();
+  else if (state.text === text_of(OPENING)) await take(state.text, { linked: false, keeps: true });
+  appear();
   await settle();
   document.body.dataset.ready = "";
   await autoplay();
