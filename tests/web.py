@@ -476,6 +476,12 @@ def check_several_runs(tab, page, flotilla, folder):
     assert not tab.evaluate("document.querySelector('#guide').hidden")
     open_and_compare(["of-g", "of-df"])
     assert tab.evaluate("document.querySelector('#guide').hidden"), "the guide describes another team"
+    # Colours belong to arms, whatever the order of files.
+    tones = "Object.fromEntries(page.state.training.arms.map(({ label, style }) => [label, style]))"
+    first = tab.evaluate(tones)
+    open_and_compare(["of-df", "of-g"])
+    assert tab.evaluate(tones) == first == {"fitness G": 0, "fitness Df": 2}, (first, tab.evaluate(tones))
+    open_and_compare(["of-g", "of-df"])
     # A link contains only settings, and the page says that it does not contain the runs.
     tab.evaluate("navigator.clipboard.writeText = text => { window.copied = text; return Promise.resolve(); }; 0")
     tab.click("#share")
@@ -699,7 +705,7 @@ STATES = [
     ("#modes button[aria-pressed=true]", "#modes button[aria-pressed=false]", "backgroundColor"),
     ('#credits button[data-credit="true 0"]', '#credits button[data-credit="true 1"]', "backgroundColor"),
     ("#train", "#undo", "backgroundColor"),
-    ("#legend > :nth-child(1) .key", "#legend > :nth-child(2) .key", "borderTopColor"),
+    ("#legend > :nth-child(1) .key", "#legend > :nth-child(2) .key", "color"),
     ('#credits [data-credit="sense 0"]', '#credits [data-credit="sense 1"]', "borderBottomColor"),
 ]
 
@@ -906,7 +912,21 @@ def check_first_visit(tab, page, call, downloads):
     tab.train()
     tab.wait("page.state.training.arms.every(arm => arm.random.length === 7)", 200)
     assert tab.evaluate("page.state.training.arms[0].constant") == 1
-    assert tab.text("#needless").startswith("A constant action observes as much"), tab.text("#needless")
+    assert tab.text("#needless").startswith("No learning is needed here."), tab.text("#needless")
+    assert "and the best constant action 4.00" in tab.text("#needless"), tab.text("#needless")
+    # The pointer on the chart shows the values of a generation.
+    x, y = tab.evaluate(
+        "(() => { const box = document.querySelector('#curves').getBoundingClientRect();"
+        " return [box.left + 30 + (box.width - 44) / 3, box.top + 60]; })()"
+    )
+    mean = "page.state.training.arms[0].trials.reduce((sum, trial) => sum + trial[{}].best, 0) / 2 * 4".format
+    for at, move in [(2, [x, y]), (6, [x, y - 100])]:
+        tab.mouse("mouseMoved", *move)
+        tab.wait(f"document.querySelector('#legend').textContent.includes('at generation {at},')")
+        assert f"leader-follower: {tab.evaluate(mean(at)):.2f} of 4" in tab.text("#legend"), tab.text("#legend")
+    # The keys have the dashes that are drawn.
+    dashes = "[...document.querySelectorAll('#legend line')].map(line => line.getAttribute('stroke-dasharray'))"
+    assert tab.evaluate(dashes) == ["", "7 3", "1.5 4", "6 3 1.5 3"], tab.evaluate(dashes)
     # The credit of every leader equals the share of POIs that are lost without it.
     tab.set("#scrub", 6)
     tab.wait("page.state.views.every(view => view.data && view.data.episodes[0].generation === 6)")

@@ -13,6 +13,14 @@ export function make(name, text = "", parent = null, more = {}) {
   if (parent) parent.append(element);
   return element;
 }
+/** Makes the key of a line as it is drawn. @param {string} tone @param {number[]} dashes @param {Element} parent */
+export function make_key(tone, dashes, parent) {
+  const key = document.createElementNS("http://www.w3.org/2000/svg", "svg");
+  key.setAttribute("class", "key");
+  key.innerHTML = `<line x2="34" y1="4" y2="4" stroke-dasharray="${dashes.join(" ")}"/>`;
+  key.style.color = `var(${tone})`;
+  parent.append(key);
+}
 /** Returns all elements that a selector matches. @type {(selector: string, within?: ParentNode) => HTMLElement[]} */
 export const all = (selector, within = document) => [...within.querySelectorAll(selector)].filter(element => element instanceof HTMLElement);
 /** Returns an option of a list. @param {HTMLSelectElement} list @param {string} value */

@@ -120,7 +120,7 @@ export function fill() {
   option($("layout"), "own").hidden = Boolean(layout);
   $("layout").value = layout || "own";
 }
-part(() => [state.config, state.compared, state.layouts], fill);
+part(() => [state.toml, state.compared, state.layouts], fill);
 
 // Returns whether a config differs from a layout at most in keys that have a command-line flag.
 const same_world = (/** @type {string} */ name) => rest_of(state.config) === rest_of(state.layouts[name]);

@@ -70,7 +70,7 @@ declare const stage: {
 
 /** One canvas: its arm, its episode, and the place in it. `describe` writes the text of a view that shows no training. */
 interface View {
-  label: string, card: HTMLElement, title: HTMLElement, key: HTMLElement, status: HTMLElement, sensed: HTMLElement, canvas: HTMLCanvasElement,
+  label: string, card: HTMLElement, title: HTMLElement, status: HTMLElement, sensed: HTMLElement, canvas: HTMLCanvasElement,
   data: Scene | null, place: number, playing: boolean, ended: number | null, over: number | null, wanted: number | null, asking: boolean,
   crop: Crop, chosen: Chosen | null, removed: Removed | null, selected: number | null, drawn: Place[], ghosts: Scene[],
   describe: ((step: number, observed: number, text: string) => void) | null,
@@ -91,7 +91,7 @@ type Shown = View & { data: Scene };
  */
 interface State extends Past {
   valid: boolean, config: Config, toml: string | null, pois: number | null, start: Start, past: Past[], problems: Problem[], linked: boolean,
-  mode: "watch" | "arrange" | "drive", training: Training | null, exhibit: Exhibit | null, follow: boolean, generation: number, trial: number,
+  mode: "watch" | "arrange" | "drive", training: Training | null, exhibit: Exhibit | null, follow: boolean, generation: number, over: number | null, trial: number,
   views: View[], guide: { step: number, said: string | null } | null, troubles: Record<string, string>, message: string, gpu: Gpu, machine: Machine, settled: string | null,
   players: Player[], policies: { each: number, weights: Bytes } | null, layouts: Record<string, Config>, version: string,
 }
@@ -106,8 +106,8 @@ interface Planned {
   name: string, label: string, toml: string, config: Config, pois: number | null, parameters: number, command?: string, digest?: string,
   zip?: Bytes, bytes?: number, constant: number | null, random: number[],
 }
-/** An arm of a training. `ended` has the champions of each trial. */
-interface Arm extends Planned { trials: Row[][], ended: Bytes[] }
+/** An arm of a training. `style` is the index of its colour and dashes, and `ended` has the champions of each trial. */
+interface Arm extends Planned { style: number, trials: Row[][], ended: Bytes[] }
 /** A run from a file. */
 interface Opened { name: string, label: string, words: Answers["read"], bytes: Bytes }
 /** The comparison of arms: curves with intervals, and tables. */

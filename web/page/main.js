@@ -72,6 +72,8 @@ function listen() {
   });
   $("loop").addEventListener("change", () => { if ($("loop").checked) wake_up(); });
   for (const id of /** @type {const} */ (["trails", "radii", "heat"])) $(id).addEventListener("change", () => state.views.forEach(draw));
+  $("curves").addEventListener("pointermove", event => { if (drawn_chart && state.training) render({ over: drawn_chart.generation(event.offsetX) }); });
+  $("curves").addEventListener("pointerleave", () => render({ over: null }));
   $("curves").addEventListener("click", event => { if (drawn_chart && state.training) { if (state.mode !== "watch") mode("watch"); seek(drawn_chart.generation(event.offsetX)); } });
   $("verify").addEventListener("click", verify);
   $("share").addEventListener("click", async () => {

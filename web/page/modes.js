@@ -26,7 +26,7 @@ part(() => [state.mode, subject()], () => {
     clear();
     const crop = exhibit.scenes.flatMap(({ data, ghosts = [] }) => [data, ...ghosts]).map(stage.busy).reduce(join);
     for (const { title, data, status, label, ghosts = [] } of exhibit.scenes) {
-      const view = add_view("leader-follower", crop, title);
+      const view = add_view(title, crop);
       view.describe = (step, observed, text) => {
         write_text(view.status, status(step, observed));
         view.canvas.ariaLabel = `${label}, step ${step}: ${text}`;

@@ -1,18 +1,21 @@
 // A training of some arms, or runs that were opened. On the GPU, one worker trains everything as one batch. On the CPU, the trials are
 // divided among the workers. The division does not change the results.
 
+import { styles } from "./compare.js";
+
 /** Milliseconds after which a player that waits asks again whether it may play. */
 const REST = 40;
 
 export class Training {
   /** @param {Planned[]} arms @param {Machine} machine */
   constructor(arms, machine) {
+    const own = styles(arms.map(({ label }) => label));
     /** The text and the comparison that were trained. @type {{ text: string, compared: Comparison | null } | null} */
     this.source = null;
     /** The comparison of the arms, once it is made. @type {Found | null} */
     this.found = null;
     /** @type {Arm[]} */
-    this.arms = arms.map(arm => ({ ...arm, trials: Array.from({ length: arm.config.learning.trials }, () => []), ended: [] }));
+    this.arms = arms.map((arm, index) => ({ ...arm, style: own[index], trials: Array.from({ length: arm.config.learning.trials }, () => []), ended: [] }));
     this.machine = machine;
     /** @type {Player[]} */
     this.players = [];

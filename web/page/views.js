@@ -1,25 +1,24 @@
 // Views of episodes: one canvas per arm.
-import { $, failure, make, pen_of, still, write_text } from "./dom.js";
+import { chart } from "./chart.js";
+import { $, failure, make, make_key, pen_of, still, write_text } from "./dom.js";
 import { join, start_scene } from "./scene.js";
 import { angles, moment, words } from "./senses.js";
 import { NAMES, TONES, part, render, shown, state, trouble } from "./state.js";
 import { last_of } from "./training.js";
 
-/** Adds a view of an arm, or with a title of its own. @param {string} label @param {Crop} crop */
-export function add_view(label, crop, title_of = NAMES[label] || label) {
+/** Adds a view: of an arm with a style, or without one. @param {string} label @param {Crop} crop @param {number | null} style */
+export function add_view(label, crop, style = null) {
   const card = make("section", "", $("views"), { className: "card" });
   const head = make("h2", "", card);
-  const key = make("span", "", head, { className: `key${state.views.length ? " dashed" : ""}` });
-  key.style.color = `var(${TONES[state.views.length]})`;
-  key.hidden = title_of !== (NAMES[label] || label);
-  const title = make("span", "", head), [name, ...more] = title_of.split(/(?=: )/);
+  if (style !== null) make_key(TONES[style], chart.DASHES[style], head);
+  const title = make("span", "", head), [name, ...more] = (NAMES[label] || label).split(/(?=: )/);
   title.append(name, make("small", more.join("")));
   const status = make("p", "", card, { role: "status", ariaLive: "off" });
   const canvas = make("canvas", "", card, { role: "img" });
   const sensed = make("p", "", card, { className: "sensed", hidden: true });
   /** @type {View} */
   const view = {
-    label, card, key, title, status, canvas, sensed, crop, data: null, place: 0, playing: false, ended: null, over: null, wanted: null,
+    label, card, title, status, canvas, sensed, crop, data: null, place: 0, playing: false, ended: null, over: null, wanted: null,
     asking: false, chosen: null, removed: null, selected: null, drawn: [], ghosts: [], describe: null,
   };
   canvas.addEventListener("pointermove", event => pointed(view, event));
@@ -46,7 +45,7 @@ export function reveal() {
 /** Shows a single view that belongs to no arm. @param {string} title @param {Crop} crop */
 export function only_view(title, crop) {
   clear();
-  return add_view("leader-follower", crop, title);
+  return add_view(title, crop);
 }
 
 /** Makes a view for each arm. All show the same part of the map, in a shape that leaves room for the chart. @param {Training} training */
@@ -54,7 +53,7 @@ export function build(training) {
   clear();
   const crop = training.arms.map(({ config }) => stage.busy(start_scene(config))).reduce(join);
   const shape = Math.max(1, Math.min(1.6, (crop[2] - crop[0]) / (crop[3] - crop[1])));
-  for (const arm of training.arms) aim(add_view(arm.label, crop), crop, shape);
+  for (const { label, style } of training.arms) aim(add_view(label, crop, style), crop, shape);
 }
 
 export function clear() {
