@@ -306,6 +306,67 @@ def check_consistency(tab, page, downloads):
     print("the page says nothing about something else than it shows")
 
 
+def check_history(tab, page):
+    """Tests that Back returns to results, that links open what is on show, and what Space does."""
+    digests, arms = "page.state.training.arms.map(arm => arm.digest).join()", "page.state.training.arms.map(arm => arm.label).join()"
+    tab.load(page, layout="generally_forward", on="cpu", pace="full", **SMALL)
+    tab.train()
+    tab.set("#scrub", 4)
+    first, text = tab.evaluate(digests), tab.evaluate("page.state.text")
+    tab.click("[data-exhibit=blind]")
+    tab.wait("page.state.training && page.state.training.arms.length === 3 && page.state.training.reached >= 1")
+    tab.evaluate("history.back(); 0")
+    tab.wait("page.state.training && page.state.training.arms.length === 2")
+    assert tab.evaluate(digests) == first and tab.evaluate("page.state.text") == text
+    tab.wait("page.state.views.length === 2 && page.state.views.every(v => v.data && v.data.episodes[0].generation === 4)")
+    assert tab.text(".sha") == first.split(",")[0] and tab.evaluate("location.hash").startswith("#layout=generally_forward")
+    assert tab.evaluate("document.querySelector('#stale').hidden")
+    tab.evaluate("history.forward(); 0")
+    tab.wait("page.state.training && page.state.training.arms.length === 3")
+    assert tab.evaluate(arms).startswith("start jitter"), tab.evaluate(arms)
+    tab.wait("page.state.views.every(view => view.data)")
+    tab.assert_no_errors()
+    # Back from the first experiment of the gallery returns to the opening.
+    tab.load(page)
+    tab.click("[data-exhibit=relay]")
+    tab.wait("page.state.training && page.state.training.reached >= 0")
+    tab.evaluate("history.back(); 0")
+    tab.wait("!page.state.training && page.state.exhibit && page.state.exhibit.name === 'opening'")
+    assert tab.text("#views h2").startswith("A trained team") and tab.evaluate("location.hash") == ""
+    # A link to the opening opens the opening. A link to results opens these, even if the settings have changed since.
+    tab.evaluate("navigator.clipboard.writeText = text => { window.copied = text; return Promise.resolve(); }; 0")
+    tab.click("#share")
+    tab.wait("window.copied")
+    assert tab.evaluate("copied") == page.as_uri(), tab.evaluate("copied")
+    tab.load(page, layout="strictly_forward", on="cpu", pace="full", **SMALL)
+    tab.evaluate("navigator.clipboard.writeText = text => { window.copied = text; return Promise.resolve(); }; 0")
+    tab.train()
+    first = tab.evaluate(digests)
+    tab.set("#seed", "99")
+    tab.wait("!document.querySelector('#stale').hidden")
+    tab.click("#share")
+    tab.wait("window.copied")
+    tab.open(tab.evaluate("copied"))
+    tab.wait(f"{READY} && {DONE}")
+    assert tab.evaluate(digests) == first
+    # Space pauses what plays. Otherwise it scrolls.
+    space = "(() => { const key = new KeyboardEvent('keydown', { key: ' ', bubbles: true, cancelable: true });"
+    space += " document.body.dispatchEvent(key); return key.defaultPrevented; })()"
+    tab.load(page, layout="chaotic")
+    assert not tab.evaluate(space)
+    tab.load(page)
+    tab.wait("page.state.views[0].playing")
+    assert tab.evaluate(space) and not tab.evaluate("page.state.views[0].playing")
+    # With reduced motion, the guide starts no motion.
+    tab.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-reduced-motion", "value": "reduce"}])
+    tab.load(page)
+    tab.click("#guide-choices button")
+    assert tab.evaluate("page.state.views[0].removed.group && !page.state.views[0].playing")
+    tab.window(1280, 900, dark=False)
+    tab.assert_no_errors()
+    print("Back returns to results, links open what is on show, and Space pauses only what plays")
+
+
 def check_links_and_devices(tab, page):
     """Tests links, small windows, focus, live announcements, reduced motion, and touch."""
     trouble = "document.querySelector('#trouble').textContent"
@@ -1302,6 +1363,7 @@ def main():
         check_several_runs(tab, page, flotilla, folder / "several")
         check_slow_network(tab, page)
         check_map_in_view(tab, page)
+        check_history(tab, page)
         check_consistency(tab, page, downloads)
         check_links_and_devices(tab, page)
         check_first_visit(tab, page, call, downloads)

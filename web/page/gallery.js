@@ -43,10 +43,11 @@ const GALLERY = [
 /** Returns the config of an experiment. @param {string} name */
 export const text_of = name => $(`gallery-${name}`).textContent ?? "";
 
-/** The experiment that was chosen last, and what it set. @type {{ name: string, text: string, compared: Comparison } | null} */
-let chosen = null;
 /** Returns whether the page shows an experiment. @param {string} name */
-export const is_of = name => chosen !== null && chosen.name === name && chosen.text === state.text && chosen.compared === state.compared;
+export const is_of = name => {
+  const { chosen, text, compared } = state;
+  return chosen !== null && chosen.name === name && chosen.text === text && chosen.compared === compared;
+};
 
 /** Replaces the experiment by one of the gallery, and trains it if asked. @param {string} name */
 export async function exhibit(name, { trains = false } = {}) {
@@ -55,8 +56,7 @@ export async function exhibit(name, { trains = false } = {}) {
   const own = text_of(found.config ?? name), text = found.changes ? await edited(own, found.changes) : own;
   keep();
   forget();
-  chosen = { name, text, compared: found.compare };
-  render({ file: null, compared: found.compare, mode: "watch" });
+  render({ chosen: { name, text, compared: found.compare }, file: null, compared: found.compare, mode: "watch" });
   if (await take(text) && trains) await train();
 }
 

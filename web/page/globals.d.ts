@@ -84,18 +84,21 @@ interface Exhibit { name: string, scenes: { title: string, data: Scene, label: s
 type Shown = View & { data: Scene };
 
 /**
- * The state of the page. `mode` is what the map is for, and `follow` whether the views follow the training. `training` has the results on
+ * The state of the page. `mode` is what the map is for, `follow` whether the views follow the training, and `over` the
+ * generation under the pointer. `training` has the results on
  * show, and without one `exhibit` the episode. `valid` tells whether the text is a valid config, `problems` why not, and `config`, `toml`, `pois`
- * and `start` are those of the last valid text. `linked` tells whether the address holds it. `past` has earlier texts, for undo. `guide` is
- * the step of the guided start, and what the visitor predicted. `layouts` has the config of each layout. `settled` is the choice that `machine` was opened for.
+ * and `start` are those of the last valid text. `linked` tells whether the address holds it. `past` has earlier texts, for undo. `chosen` is
+ * the latest experiment of the gallery, and `guide` the step of the guided start, and what the visitor predicted. `layouts` has the config of each layout. `settled` is the choice that `machine` was opened for.
  */
 interface State extends Past {
   valid: boolean, config: Config, toml: string | null, pois: number | null, start: Start, past: Past[], problems: Problem[], linked: boolean,
   mode: "watch" | "arrange" | "drive", training: Training | null, exhibit: Exhibit | null, follow: boolean, generation: number, over: number | null, trial: number,
-  views: View[], guide: { step: number, said: string | null } | null, troubles: Record<string, string>, message: string, gpu: Gpu, machine: Machine, settled: string | null,
+  views: View[], chosen: Picked | null, guide: { step: number, said: string | null } | null, troubles: Record<string, string>, message: string, gpu: Gpu, machine: Machine, settled: string | null,
   players: Player[], policies: { each: number, weights: Bytes } | null, layouts: Record<string, Config>, version: string,
 }
 interface Past { text: string, file: string | null, compared: Comparison | null }
+/** An experiment of the gallery, and what it set. */
+interface Picked { name: string, text: string, compared: Comparison }
 /** The browser's GPU, or the reason why none can be used. */
 interface Gpu { name?: string, software?: boolean, reason?: string }
 

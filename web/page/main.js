@@ -14,6 +14,7 @@ import { guide, leave_guide } from "./guide.js";
 import { renew, settle } from "./machine.js";
 import { mode } from "./modes.js";
 import { OPENED, OPENING } from "./opening.js";
+import { arrive, go_back } from "./past.js";
 import { clerk, pool } from "./pool.js";
 import { KEYS, KEY_IDS, copy, quote, render, report, save, state, trouble } from "./state.js";
 import { forget, stop, train } from "./train.js";
@@ -79,9 +80,10 @@ function listen() {
   $("share").addEventListener("click", async () => {
     await entered();
     if (!state.valid) return report("No link was copied: the config has problems. Correct them first.");
-    if (!await remember()) return report("No link was copied: this browser cannot compress a config. Save config.toml instead.");
-    if (shows_runs()) return void copy(link(), "The link is copied: it has the settings of the first run, but not the runs.");
-    copy(link(), `The link is copied: whoever opens it ${state.training ? "sees the same generation of the same training" : "trains the same"}.`);
+    if (state.exhibit !== OPENED && !await remember()) return report("No link was copied: this browser cannot compress a config. Save config.toml instead.");
+    if (shows_runs()) return void copy(await link(), "The link is copied: it has the settings of the first run, but not the runs.");
+    const sees = state.training ? "sees the same generation of the same training" : state.exhibit === OPENED ? "sees the same team" : "trains the same";
+    copy(await link(), `The link is copied: whoever opens it ${sees}.`);
   });
   $("png").addEventListener("click", save_png);
   $("gif").addEventListener("click", save_gif);
@@ -105,13 +107,21 @@ function listen() {
   });
   addEventListener("keydown", event => {
     if (event.key !== " " || /** @type {Element} */ (event.target).closest("button, input, select, textarea, summary, a")) return;
+    // Where nothing plays, Space scrolls.
+    const { training, mode } = state, going = training && training.state === "training";
+    if (mode !== "watch" || !going && !state.views.some(view => view.playing)) return;
     event.preventDefault();
-    pause();
+    if (going) pause(); else replay();
   });
   const again = () => { state.views.forEach(draw); curves(); };
   addEventListener("resize", again);
   stage.night.addEventListener("change", again);
-  addEventListener("hashchange", async () => { leave_guide(); await recall(); });
+  addEventListener("popstate", go_back);
+  addEventListener("hashchange", async () => {
+    if (arrive()) return;
+    leave_guide();
+    await recall();
+  });
 }
 
 // Without an address, the page opens on a trained team. Its motion waits for no worker.
@@ -121,6 +131,7 @@ const opens = location.hash.length <= 1;
 const appear = () => { document.body.dataset.shown = ""; };
 
 async function start() {
+  arrive();
   listen();
   gallery();
   if (opens) {

@@ -6,6 +6,7 @@ import { command, entered, name_of } from "./experiment.js";
 import { intervals } from "./intervals.js";
 import { renew, settle } from "./machine.js";
 import { mode } from "./modes.js";
+import { leave } from "./past.js";
 import { clerk } from "./pool.js";
 import { copy, news, part, render, save, state, trouble } from "./state.js";
 import { Training } from "./training.js";
@@ -40,6 +41,7 @@ export async function train() {
     if (bytes > 3 * 2 ** 30) throw new Error(`This takes ${(bytes / 2 ** 30).toFixed(1)} GiB, and a tab has at most 4. Choose a smaller population, fewer trials or fewer arms, or use the command line.`);
     training = new Training(arms, state.machine);
     training.source = { text: state.text, compared: state.compared };
+    leave();
     render({ training, exhibit: null, generation: 0, trial: 0, policies: null, follow: true });
     reveal();
     await training.start(state.players);
@@ -119,7 +121,7 @@ export function stop() {
 
 // Discards a training and its results.
 export function forget() {
-  if (state.training) state.training.stop();
+  leave();
   render({ training: null, exhibit: null, policies: null, generation: 0, trial: 0, troubles: {}, message: "" });
 }
 

@@ -152,15 +152,18 @@ export class Training {
         own.trials[trial][generation] = { best, mean, champion, seconds };
       }
       const start = words.rows * 56, size = (bytes.byteLength - start) / own.trials.length;
-      own.trials.forEach((_, trial) => {
-        own.ended[trial] = champions(own, bytes.subarray(start + trial * size, start + (trial + 1) * size), size / 4);
-        training.owners.set(`${run}/${trial}`, player);
-      });
+      own.trials.forEach((_, trial) => { own.ended[trial] = champions(own, bytes.subarray(start + trial * size, start + (trial + 1) * size), size / 4); });
     });
-    training.players = [player];
-    await player.ask({ ask: "train", runs: opened.map(({ words }) => ({ text: words.toml, trials: [] })) });
+    await training.revive(player);
     training.state = "done";
     return training;
+  }
+
+  /** Lets a player replay all generations, after it or others played something else. @param {Player} player */
+  async revive(player) {
+    this.players = [player];
+    this.arms.forEach((arm, run) => arm.trials.forEach((_, trial) => this.owners.set(`${run}/${trial}`, player)));
+    await player.ask({ ask: "train", runs: this.arms.map(({ toml }) => ({ text: toml, trials: [] })) });
   }
 
   /**
