@@ -78,7 +78,7 @@ part(() => [state.guide, state.mode, state.exhibit, state.text, state.compared, 
   const { step, said } = guide, { asks, choices, why } = STEPS[step], here = is_shown(about(guide).of), last = step === STEPS.length - 1;
   const watches = said !== null && training && training.state !== "done", result = training ? $("announced").textContent : "";
   $("guide-step").textContent = `${step + 1} of ${STEPS.length}`;
-  $("guide-says").textContent = !here ? "The guide is about another experiment than the one on show."
+  $("guide-says").textContent = !here ? "What is on show is not part of the guide."
     : said === null ? asks : `You said: ${said.toLowerCase()}. ${watches ? "Watch the map and the chart." : `${result ? `${result} ` : ""}${why}`}`;
   const asked = here && said === null;
   $("guide-choices").replaceChildren(...(asked ? choices : []).map(choice => {
@@ -97,9 +97,10 @@ async function enter(guide) {
   for (const button of all("button", $("guide-choices"))) button.inert = true;
   if (guide.said !== null) await made;
   render({ guide });
-  if (guide.said !== null || !is_shown(about(guide).of)) await about(guide).watch();
+  const watched = guide.said !== null || !is_shown(about(guide).of) ? about(guide).watch() : null;
+  if (had_focus) ($("guide-next").hidden ? all("button", $("guide-choices"))[0] : $("guide-next")).focus({ preventScroll: true });
+  await watched;
   render();
-  if (had_focus && document.activeElement === document.body) $("guide-next").focus();
 }
 
 export function guide() {

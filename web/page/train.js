@@ -121,6 +121,7 @@ export function stop() {
 
 // Discards a training and its results.
 export function forget() {
+  if (state.training) state.training.stop();
   leave();
   render({ training: null, exhibit: null, policies: null, generation: 0, trial: 0, troubles: {}, message: "" });
 }

@@ -55,7 +55,8 @@ export class Training {
       return player.ask({ ask: "train", runs: this.arms.map((arm, run) => ({ text: arm.toml, trials: trials(run) })) });
     }));
     this.busy = this.players.map(() => 0);
-    this.state = "training";
+    // It may have been stopped meanwhile.
+    if (this.state === "starting") this.state = "training";
   }
 
   /**
