@@ -24,7 +24,7 @@ part(() => [state.mode, subject()], () => {
     if (state.follow) follow(); else ask_all();
   } else if (mode === "watch" && exhibit) {
     clear();
-    const crop = exhibit.scenes.flatMap(({ data, ghosts = [] }) => [data, ...ghosts]).map(stage.busy).reduce(join);
+    const crop = exhibit.scenes.map(({ data }) => stage.busy(data)).reduce(join);
     for (const { title, data, status, label, ghosts = [] } of exhibit.scenes) {
       const view = add_view(title, crop);
       view.describe = (step, observed, text) => {

@@ -9,20 +9,20 @@ const MOST = 8;
 const entries = new Map();
 let latest = 0, on_show = 0;
 
-/** Returns the number of the history's present entry. Only entries that a link made have none. @returns {number | undefined} */
+/** Returns the number of the history's present entry. One that the browser made for a link has none. @returns {number | undefined} */
 const entry = () => history.state?.entry;
 
-/** Keeps what is on show. */
+const KEPT = /** @type {const} */ (["text", "file", "compared", "chosen", "config", "toml", "pois", "start", "valid", "problems", "linked", "training", "exhibit", "generation", "trial", "guide"]);
+// Keeps what is on show.
 function keep_results() {
-  const { text, file, compared, chosen, config, toml, pois, start, valid, problems, linked, training, exhibit, generation, trial, guide } = state;
-  if (!training && !exhibit) return;
-  entries.set(on_show, { text, file, compared, chosen, config, toml, pois, start, valid, problems, linked, training, exhibit, generation, trial, guide });
+  if (!state.training && !state.exhibit) return;
+  entries.set(on_show, Object.fromEntries(KEPT.map(key => [key, state[key]])));
   for (const old of [...entries.keys()].slice(0, -MOST)) entries.delete(old);
 }
 
 /** Numbers the history's present entry, if it has no number. Returns whether its results are kept here. */
 export function arrive() {
-  keep_results();
+  if (entry() !== on_show) keep_results();
   latest = Math.max(latest, entry() ?? 0);
   if (entry() === undefined) history.replaceState({ entry: ++latest }, "", location.href);
   on_show = entry() ?? 0;
