@@ -201,7 +201,8 @@ def check_slow_network(tab, page):
     server.shutdown()
     # The sum of layout shifts, while the page opens and while it trains.
     shift = "new PerformanceObserver(list => list.getEntries().forEach(({ value, hadRecentInput, sources }) => {"
-    shift += " if (!hadRecentInput) { shifts += value; moved.push(...sources.map(({ node }) => node?.id ?? node?.className)); }"
+    shift += " if (hadRecentInput) return;"
+    shift += " shifts += value; moved.push(...sources.map(({ node }) => node?.id ?? node?.className));"
     shift += " })).observe({ type: 'layout-shift', buffered: true })"
     source = f"window.shifts = 0; window.moved = []; {shift}"
     script = tab.call("Page.addScriptToEvaluateOnNewDocument", source=source)["identifier"]
@@ -223,8 +224,8 @@ def check_map_in_view(tab, page):
     """Tests that the maps are inside the window, without scrolling, after whatever changes what they show."""
     outside = (
         "page.state.views.map(view => view.canvas.getBoundingClientRect()).filter(({ top, bottom, left, right }) =>"
-        " top < (document.querySelector('#bar')?.getBoundingClientRect().bottom ?? 0) - 1 || bottom > innerHeight || left < 0"
-        " || right > innerWidth).map(({ top, bottom, left, right }) => [top, bottom, left, right])"
+        " top < (document.querySelector('#bar')?.getBoundingClientRect().bottom ?? 0) - 1 || bottom > innerHeight"
+        " || left < 0 || right > innerWidth).map(({ top, bottom, left, right }) => [top, bottom, left, right])"
     )
     press = "document.querySelector({!r}).click()".format
 
@@ -308,7 +309,7 @@ def check_consistency(tab, page, downloads):
 
 def check_history(tab, page):
     """Tests that Back returns to results, that links open what is on show, and what Space does."""
-    digests, arms = "page.state.training.arms.map(arm => arm.digest).join()", "page.state.training.arms.map(arm => arm.label).join()"
+    digests, arms = (f"page.state.training.arms.map(arm => arm.{key}).join()" for key in ["digest", "label"])
     tab.load(page, layout="generally_forward", on="cpu", pace="full", **SMALL)
     tab.train()
     tab.set("#scrub", 4)
@@ -318,8 +319,10 @@ def check_history(tab, page):
     tab.evaluate("history.back(); 0")
     tab.wait("page.state.training && page.state.training.arms.length === 2")
     assert tab.evaluate(digests) == first and tab.evaluate("page.state.text") == text
-    tab.wait("page.state.views.length === 2 && page.state.views.every(v => v.data && v.data.episodes[0].generation === 4)")
-    assert tab.text(".sha") == first.split(",")[0] and tab.evaluate("location.hash").startswith("#layout=generally_forward")
+    at_four = "view.data && view.data.episodes[0].generation === 4"
+    tab.wait(f"page.state.views.length === 2 && page.state.views.every(view => {at_four})")
+    assert tab.text(".sha") == first.split(",")[0]
+    assert tab.evaluate("location.hash").startswith("#layout=generally_forward")
     assert tab.evaluate("document.querySelector('#stale').hidden")
     tab.evaluate("history.forward(); 0")
     tab.wait("page.state.training && page.state.training.arms.length === 3")
@@ -897,8 +900,8 @@ def check_first_visit(tab, page, call, downloads):
     assert "dark" in tab.text("#lost") and f"{lost} of 4" in tab.text("#lost"), tab.text("#lost")
     assert tab.evaluate("document.activeElement.id") == "guide-next", "the focus is lost after a prediction"
     assert tab.text("#guide-says").startswith("You said: one. "), tab.text("#guide-says")
-    # Then it trains both paradigms, and shows the baselines. Here, constant actions observe nothing. It does not say why before
-    # the result is there.
+    # Then it trains both paradigms, and shows the baselines. Here, constant actions observe nothing. It does
+    # not say why before the result is there.
     tab.click("#guide-next")
     assert tab.evaluate("document.activeElement.parentElement.id") == "guide-choices", "the focus is lost after Next"
     assert "Which observe more" in tab.text("#guide-says") and not tab.evaluate("Boolean(page.state.training)")
