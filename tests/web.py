@@ -14,6 +14,7 @@ colours, when zoomed, and at three sizes.
 """
 
 import difflib
+import http.server
 import itertools
 import json
 import os
@@ -21,6 +22,7 @@ import pathlib
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import zipfile
 
@@ -138,8 +140,9 @@ class Tab(Browser):
 
     def train(self, seconds=300):
         """Trains, and returns the digest of each arm by its label."""
+        self.evaluate("window.before = page.state.training; 0")
         self.click("#train")
-        self.wait(DONE, seconds)
+        self.wait(f"page.state.training !== before && {DONE}", seconds)
         return {
             arm["label"]: arm["digest"]
             for arm in self.evaluate("page.state.training.arms.map(({ label, digest }) => ({ label, digest }))")
@@ -158,6 +161,213 @@ def base64(content):
     import base64
 
     return base64.b64encode(content).decode()
+
+
+def check_slow_network(tab, page):
+    """Tests that the opening moves and answers before the module has arrived, and that the page shifts little."""
+    content, rest = page.read_bytes(), threading.Event()
+    head, module = content[: content.index(b'id="wasm"') + 1000], content[content.index(b'id="wasm"') + 1000 :]
+
+    class Slow(http.server.BaseHTTPRequestHandler):
+        def do_GET(self):
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html")
+            self.end_headers()
+            self.wfile.write(head)
+            self.wfile.flush()
+            rest.wait(60)
+            self.wfile.write(module)
+
+        def log_message(self, *_):
+            pass
+
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Slow)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    tab.call("Page.navigate", url=f"http://127.0.0.1:{server.server_port}/")
+    tab.wait("performance.getEntriesByName('motion').length", 20)
+    assert not tab.evaluate("document.querySelector('#wasm')?.nextElementSibling"), "the module is there"
+    # What needs no module works at once, and what needs it waits for it.
+    tab.click("#guide-choices button")
+    assert tab.evaluate("page.state.views[0].removed.group")
+    tab.click("#replay")
+    tab.set("#step", 9)
+    assert tab.evaluate("page.state.views[0].place") == 9
+    tab.click("[data-mode=arrange]")
+    assert tab.text("#views h2") == "Where everyone starts"
+    tab.set("#layout", "chaotic")
+    rest.set()
+    tab.wait(f"{READY} && document.querySelector('#layout').value === 'chaotic'")
+    tab.wait("page.state.config.world.coupling === 5")
+    server.shutdown()
+    # The sum of layout shifts, while the page opens and while it trains.
+    shift = "new PerformanceObserver(list => list.getEntries().forEach(({ value, hadRecentInput, sources }) => {"
+    shift += " if (hadRecentInput) return;"
+    shift += " shifts += value; moved.push(...sources.map(({ node }) => node?.id ?? node?.className));"
+    shift += " })).observe({ type: 'layout-shift', buffered: true })"
+    source = f"window.shifts = 0; window.moved = []; {shift}"
+    script = tab.call("Page.addScriptToEvaluateOnNewDocument", source=source)["identifier"]
+    for width, height in [(1280, 800), (1024, 768), (820, 1180), (390, 844)]:
+        tab.window(width, height, dark=False)
+        for settings in [{}, {"layout": "generally_forward", "on": "cpu", "pace": "full", **SMALL}]:
+            tab.load(page, **settings)
+            time.sleep(0.3)
+            assert tab.evaluate("shifts") < 0.1, (width, settings, tab.evaluate("shifts"), tab.evaluate("moved"))
+        tab.train()
+        time.sleep(0.5)
+        assert tab.evaluate("shifts") < 0.1, (width, "training", tab.evaluate("shifts"), tab.evaluate("moved"))
+    tab.call("Page.removeScriptToEvaluateOnNewDocument", identifier=script)
+    tab.window(1280, 900, dark=False)
+    print("the opening moves before the module has arrived, and the page shifts little")
+
+
+def check_map_in_view(tab, page):
+    """Tests that the maps are inside the window, without scrolling, after whatever changes what they show."""
+    outside = (
+        "page.state.views.map(view => view.canvas.getBoundingClientRect()).filter(({ top, bottom, left, right }) =>"
+        " top < (document.querySelector('#bar')?.getBoundingClientRect().bottom ?? 0) - 1 || bottom > innerHeight"
+        " || left < 0 || right > innerWidth).map(({ top, bottom, left, right }) => [top, bottom, left, right])"
+    )
+    press = "document.querySelector({!r}).click()".format
+
+    def look(what, width):
+        assert tab.evaluate(outside) == [], (what, width, tab.evaluate(outside))
+        train = tab.evaluate("document.querySelector('#train').getBoundingClientRect().toJSON()")
+        assert train["top"] >= 0 and train["right"] <= width, (what, width, train)
+
+    for width, height in [(1280, 800), (1024, 768), (820, 1180), (390, 844)]:
+        tab.window(width, height, dark=False)
+        tab.load(page)
+        look("the opening", width)
+        for scroll in [0, 100000]:
+            for mode in ["arrange", "drive", "watch"]:
+                tab.evaluate(f"scrollTo(0, {scroll}); {press(f'[data-mode={mode}]')}; 0")
+                look(mode, width)
+        for name, arms in [("two_groups", 2), ("population", 3)]:
+            tab.evaluate(f"scrollTo(0, 100000); {press(f'[data-exhibit={name}]')}; 0")
+            tab.wait(f"page.state.views.length === {arms} && page.state.views.every(view => view.data)")
+            look(name, width)
+            # All teams are side by side, and the chart is below them.
+            tops = tab.evaluate("page.state.views.map(view => Math.round(view.canvas.getBoundingClientRect().top))")
+            assert len(set(tops)) == 1, (width, tops)
+            chart = tab.evaluate("document.querySelector('#curves').getBoundingClientRect().top")
+            assert tops[0] < chart < height, (width, tops, chart)
+    tab.assert_no_errors()
+    tab.window(1280, 900, dark=False)
+    print("the maps stay in view")
+
+
+def check_consistency(tab, page, downloads):
+    """Tests that nothing on the page is about something else than what it shows."""
+    # The guide speaks only of its own experiments, and leads back to them.
+    tab.load(page)
+    tab.set("#layout", "chaotic")
+    tab.wait("document.querySelector('#layout').value === 'chaotic' && page.state.config.world.coupling !== 6")
+    assert "four leaders" not in tab.text("#guide-says") and "not part of the guide" in tab.text("#guide-says")
+    tab.click("#guide-next")
+    tab.wait("page.state.views[0].title.textContent.startsWith('A trained team')")
+    assert "not part of the guide" not in tab.text("#guide-says"), tab.text("#guide-says")
+    # After another run is opened, the result of a former training is gone.
+    tab.load(page, layout="strictly_forward", on="cpu", pace="full", learners="leader-follower", **SMALL)
+    tab.train()
+    tab.evaluate("document.querySelector('.home').click()")
+    run = downloaded(downloads / "strictly_forward-leader-follower.zip")
+    (downloads / "strictly_forward-leader-follower.zip").unlink()
+    tab.load(page, layout="generally_forward", on="cpu", pace="full", **SMALL)
+    tab.train()
+    assert "all-leaders" in tab.text("#announced"), tab.text("#announced")
+    tab.drop("run.zip", base64(run))
+    tab.wait("document.querySelector('#message').textContent.startsWith('run.zip: the run is complete')")
+    assert "all-leaders" not in tab.text("#announced"), tab.text("#announced")
+    assert "of 2 (leader-follower)" in tab.text("#announced"), tab.text("#announced")
+    # What was said about a file is gone with the next experiment.
+    tab.evaluate("document.querySelector('[data-exhibit=blind]').click()")
+    assert tab.text("#message") == "", tab.text("#message")
+    # A leader that is removed is not drawn, even if it was the last one, so that the config has a problem.
+    tab.load(page)
+    tab.drop("one.toml", base64(b"[world]\nleaders = [[5, 5]]\npois = [[5, 12]]\ncoupling = 1\n"))
+    tab.wait("page.state.config.world.leaders.length === 1")
+    tab.click("[data-mode=arrange]")
+    tab.evaluate("page.state.views[0].canvas.focus()")
+    tab.press("]", "BracketRight")
+    tab.press("Delete", "Delete")
+    tab.wait("!page.state.valid")
+    assert tab.evaluate("page.state.views[0].data.episodes[0].leaders") == 0
+    # A note on a damaged link stays when settings change, and a training starts.
+    tab.load(page, layout="chaotic", learners="lead", on="cpu", pace="full", **SMALL)
+    assert "This link is damaged" in tab.text("#trouble")
+    tab.set("#coupling", "1")
+    tab.wait("page.state.config.world.coupling === 1")
+    assert "This link is damaged" in tab.text("#trouble"), tab.text("#trouble")
+    tab.train()
+    assert "This link is damaged" in tab.text("#trouble"), tab.text("#trouble")
+    tab.set("#layout", "strictly_forward")
+    tab.wait("page.state.config.world.pois.length === 2")
+    assert tab.evaluate("document.querySelector('#trouble').hidden")
+    assert not list(tab.complaints())
+    print("the page says nothing about something else than it shows")
+
+
+def check_history(tab, page):
+    """Tests that Back returns to results, that links open what is on show, and what Space does."""
+    digests, arms = (f"page.state.training.arms.map(arm => arm.{key}).join()" for key in ["digest", "label"])
+    tab.load(page, layout="generally_forward", on="cpu", pace="full", **SMALL)
+    tab.train()
+    tab.set("#scrub", 4)
+    first, text = tab.evaluate(digests), tab.evaluate("page.state.text")
+    tab.click("[data-exhibit=blind]")
+    tab.wait("page.state.training && page.state.training.arms.length === 3 && page.state.training.reached >= 1")
+    tab.evaluate("history.back(); 0")
+    tab.wait("page.state.training && page.state.training.arms.length === 2")
+    assert tab.evaluate(digests) == first and tab.evaluate("page.state.text") == text
+    at_four = "view.data && view.data.episodes[0].generation === 4"
+    tab.wait(f"page.state.views.length === 2 && page.state.views.every(view => {at_four})")
+    assert tab.text(".sha") == first.split(",")[0]
+    assert tab.evaluate("location.hash").startswith("#layout=generally_forward")
+    assert tab.evaluate("document.querySelector('#stale').hidden")
+    tab.evaluate("history.forward(); 0")
+    tab.wait("page.state.training && page.state.training.arms.length === 3")
+    assert tab.evaluate(arms).startswith("start jitter"), tab.evaluate(arms)
+    tab.wait("page.state.views.every(view => view.data)")
+    tab.assert_no_errors()
+    # Back from the first experiment of the gallery returns to the opening.
+    tab.load(page)
+    tab.click("[data-exhibit=relay]")
+    tab.wait("page.state.training && page.state.training.reached >= 0")
+    tab.evaluate("history.back(); 0")
+    tab.wait("!page.state.training && page.state.exhibit && page.state.exhibit.name === 'opening'")
+    assert tab.text("#views h2").startswith("A trained team") and tab.evaluate("location.hash") == ""
+    # A link to the opening opens the opening. A link to results opens these, even if the settings have changed since.
+    tab.evaluate("navigator.clipboard.writeText = text => { window.copied = text; return Promise.resolve(); }; 0")
+    tab.click("#share")
+    tab.wait("window.copied")
+    assert tab.evaluate("copied") == page.as_uri(), tab.evaluate("copied")
+    tab.load(page, layout="strictly_forward", on="cpu", pace="full", **SMALL)
+    tab.evaluate("navigator.clipboard.writeText = text => { window.copied = text; return Promise.resolve(); }; 0")
+    tab.train()
+    first = tab.evaluate(digests)
+    tab.set("#seed", "99")
+    tab.wait("!document.querySelector('#stale').hidden")
+    tab.click("#share")
+    tab.wait("window.copied")
+    tab.open(tab.evaluate("copied"))
+    tab.wait(f"{READY} && {DONE}")
+    assert tab.evaluate(digests) == first
+    # Space pauses what plays. Otherwise it scrolls.
+    space = "(() => { const key = new KeyboardEvent('keydown', { key: ' ', bubbles: true, cancelable: true });"
+    space += " document.body.dispatchEvent(key); return key.defaultPrevented; })()"
+    tab.load(page, layout="chaotic")
+    assert not tab.evaluate(space)
+    tab.load(page)
+    tab.wait("page.state.views[0].playing")
+    assert tab.evaluate(space) and not tab.evaluate("page.state.views[0].playing")
+    # With reduced motion, the guide starts no motion.
+    tab.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-reduced-motion", "value": "reduce"}])
+    tab.load(page)
+    tab.click("#guide-choices button")
+    assert tab.evaluate("page.state.views[0].removed.group && !page.state.views[0].playing")
+    tab.window(1280, 900, dark=False)
+    tab.assert_no_errors()
+    print("Back returns to results, links open what is on show, and Space pauses only what plays")
 
 
 def check_links_and_devices(tab, page):
@@ -184,6 +394,17 @@ def check_links_and_devices(tab, page):
     tab.click("#share")
     tab.wait("document.querySelector('#message').textContent.startsWith('No link was copied')")
     assert tab.evaluate("location.href") == address
+    # A problem of a setting is shown beside it, even if the setting is folded away, and ends with it.
+    tab.load(page, layout="chaotic")
+    tab.set("#population", "1")
+    tab.wait("!page.state.valid")
+    beside = "document.querySelector('#population').closest('label').querySelector('.wrong')"
+    assert tab.evaluate(f"{beside}.checkVisibility()")
+    assert "allowed" in tab.evaluate(f"{beside}.textContent"), tab.evaluate(f"{beside}.textContent")
+    assert not tab.evaluate("document.querySelector('#config').open"), "the editor opens for a problem of a setting"
+    tab.set("#population", "10")
+    tab.wait(f"page.state.valid && !{beside}")
+    tab.assert_no_errors()
     # An empty field is reset to the value in use.
     tab.load(page, layout="chaotic", seed=12)
     tab.set("#seed", "")
@@ -319,6 +540,12 @@ def check_several_runs(tab, page, flotilla, folder):
     assert not tab.evaluate("document.querySelector('#guide').hidden")
     open_and_compare(["of-g", "of-df"])
     assert tab.evaluate("document.querySelector('#guide').hidden"), "the guide describes another team"
+    # Colours belong to arms, whatever the order of files.
+    tones = "Object.fromEntries(page.state.training.arms.map(({ label, style }) => [label, style]))"
+    first = tab.evaluate(tones)
+    open_and_compare(["of-df", "of-g"])
+    assert tab.evaluate(tones) == first == {"fitness G": 0, "fitness Df": 2}, (first, tab.evaluate(tones))
+    open_and_compare(["of-g", "of-df"])
     # A link contains only settings, and the page says that it does not contain the runs.
     tab.evaluate("navigator.clipboard.writeText = text => { window.copied = text; return Promise.resolve(); }; 0")
     tab.click("#share")
@@ -542,7 +769,7 @@ STATES = [
     ("#modes button[aria-pressed=true]", "#modes button[aria-pressed=false]", "backgroundColor"),
     ('#credits button[data-credit="true 0"]', '#credits button[data-credit="true 1"]', "backgroundColor"),
     ("#train", "#undo", "backgroundColor"),
-    ("#legend > :nth-child(1) .key", "#legend > :nth-child(2) .key", "borderTopColor"),
+    ("#legend > :nth-child(1) .key", "#legend > :nth-child(2) .key", "color"),
     ('#credits [data-credit="sense 0"]', '#credits [data-credit="sense 1"]', "borderBottomColor"),
 ]
 
@@ -661,15 +888,26 @@ def check_first_visit(tab, page, call, downloads):
     # The guide removes the leader with the largest Df. The number of POIs that are lost equals its Df.
     episode = "page.state.views[0].data.episodes[0]"
     assert not tab.evaluate("document.querySelector('#guide').hidden")
-    tab.click("#guide-next")
+    predict = "#guide-choices button"
+    credits = tab.evaluate(f"{episode}.df")
+    assert len(set(credits)) > 1, f"all leaders have the same credit: {credits}"
+    tab.click(predict)
     leader = tab.evaluate("page.state.views[0].removed.leader")
     df = tab.evaluate(f"{episode}.df[{leader}]")
     lost = tab.evaluate(f"{episode}.without[{leader}].group.observed.filter(at => at === null).length")
     assert df > 0 and lost == round(df * 4), (df, lost)
     assert f"{lost} of 4 POIs are lost" in tab.text("#guide-says"), tab.text("#guide-says")
     assert "dark" in tab.text("#lost") and f"{lost} of 4" in tab.text("#lost"), tab.text("#lost")
-    # Then it trains both paradigms, and shows the baselines. Here, constant actions observe nothing.
+    assert tab.evaluate("document.activeElement.id") == "guide-next", "the focus is lost after a prediction"
+    assert tab.text("#guide-says").startswith("You said: one. "), tab.text("#guide-says")
+    # Then it trains both paradigms, and shows the baselines. Here, constant actions observe nothing. It does
+    # not say why before the result is there.
     tab.click("#guide-next")
+    assert tab.evaluate("document.activeElement.parentElement.id") == "guide-choices", "the focus is lost after Next"
+    assert "Which observe more" in tab.text("#guide-says") and not tab.evaluate("Boolean(page.state.training)")
+    tab.click(predict)
+    tab.wait("page.state.training && page.state.training.state === 'training'")
+    assert "coincide" not in tab.text("#guide-says"), tab.text("#guide-says")
     tab.wait(DONE, 400)
     tab.wait("page.state.training.arms.every(arm => arm.random.length === 61)", 400)
     assert tab.evaluate("page.state.training.arms.map(arm => arm.constant)") == [0, 0]
@@ -677,6 +915,7 @@ def check_first_visit(tab, page, call, downloads):
     tab.wait("document.querySelector('#guide-says').textContent.includes('Training is finished.')")
     guide = tab.text("#guide-says")
     assert f"{sum(best[0]):.2f} of 4 (leader-follower), 0.00 of 4 (all-leaders)" in guide, guide
+    assert "Six independent learners almost never coincide" in guide, guide
     assert min(best[0]) >= 0.75 and max(best[1]) == 0, best
     assert not tab.text("#needless")
     random = tab.evaluate("page.state.training.arms[0].random")
@@ -684,7 +923,8 @@ def check_first_visit(tab, page, call, downloads):
     tab.assert_no_errors()
     # Larger populations observe more, and constant actions observe nothing.
     tab.click("#guide-next")
-    tab.wait(DONE + " && page.state.training.arms.length === 3", 400)
+    tab.click(predict)
+    tab.wait("page.state.training && page.state.training.arms.length === 3 && " + DONE, 400)
     tab.wait("page.state.training.arms.every(arm => arm.constant === 0)", 60)
     sums = "arm => arm.trials.reduce((sum, trial) => sum + trial.at(-1).best, 0)"
     best = tab.evaluate(f"page.state.training.arms.map({sums})")
@@ -692,11 +932,36 @@ def check_first_visit(tab, page, call, downloads):
     tab.wait(f"document.querySelector('#guide-says').textContent.includes('{best[2]:.2f} of 4 (population 500)')")
     assert not tab.text("#needless")
     tab.assert_no_errors()
+    # The whole population of three generations is shown, as 50 faint teams each.
+    tab.click("#guide-next")
+    tab.click(predict)
+    tab.wait("page.state.views.length === 3 && page.state.views.every(view => view.ghosts.length === 50)", 100)
+    titles = tab.evaluate("page.state.views.map(view => view.title.textContent)")
+    assert titles == ["Generation 0", "Generation 15", "Generation 60"], titles
+    spread = (
+        "page.state.views.map(({ ghosts }) => { const ends = ghosts.map(({ episodes: [e] }) =>"
+        " e.positions[2 * (e.shown.length - 1) * e.agents]); const mean = ends.reduce((a, b) => a + b) / 50;"
+        " return ends.reduce((sum, end) => sum + (end - mean) ** 2, 0); })"
+    )
+    start, _, end = tab.evaluate(spread)
+    assert end < 0.7 * start, ("the first leader's policies do not come together", start, end)
+    tab.assert_no_errors()
+    # The surprise: with one population per group, teams without followers learn, too.
+    tab.click("#guide-next")
+    tab.click(predict)
+    tab.wait("page.state.training && page.state.training.arms[0].label === 'sharing none' && " + DONE, 400)
+    none, group, _ = tab.evaluate(f"page.state.training.arms.map({sums})")
+    assert none == 0 and group > 2, (none, group)
+    assert "number of populations" in tab.text("#guide-says"), tab.text("#guide-says")
+    tab.evaluate("document.querySelector('#guide-next').focus(); document.querySelector('#guide-next').click()")
+    assert tab.evaluate("document.querySelector('#guide').hidden")
+    assert tab.evaluate("document.activeElement.id") == "train", "the focus is lost after the guide"
+    tab.assert_no_errors()
     print(f"the opening and the guide work; first motion after {first:.0f} ms")
 
     # Every experiment of the gallery opens with its arms.
     names = tab.evaluate("[...document.querySelectorAll('[data-exhibit]')].map(button => button.dataset.exhibit)")
-    assert len(names) == 6, names
+    assert len(names) == 7, names
     for name in names:
         tab.click(f"[data-exhibit={name}]")
         training = "page.state.training"
@@ -706,14 +971,28 @@ def check_first_visit(tab, page, call, downloads):
         tab.assert_no_errors()
         tab.click("#stop")
         tab.wait("page.state.training.found")
-    print("the six experiments of the gallery open")
+    print("the experiments of the gallery open")
 
     # If a constant action is as good as training, the page says so.
     tab.load(page, layout="generally_forward", on="cpu", pace="full", **SMALL)
     tab.train()
     tab.wait("page.state.training.arms.every(arm => arm.random.length === 7)", 200)
     assert tab.evaluate("page.state.training.arms[0].constant") == 1
-    assert tab.text("#needless").startswith("A constant action observes as much"), tab.text("#needless")
+    assert tab.text("#needless").startswith("No learning is needed here."), tab.text("#needless")
+    assert "and the best constant action 4.00" in tab.text("#needless"), tab.text("#needless")
+    # The pointer on the chart shows the values of a generation.
+    x, y = tab.evaluate(
+        "(() => { const box = document.querySelector('#curves').getBoundingClientRect();"
+        " return [box.left + 30 + (box.width - 44) / 3, box.top + 60]; })()"
+    )
+    mean = "page.state.training.arms[0].trials.reduce((sum, trial) => sum + trial[{}].best, 0) / 2 * 4".format
+    for at, move in [(2, [x, y]), (6, [x, y - 100])]:
+        tab.mouse("mouseMoved", *move)
+        tab.wait(f"document.querySelector('#legend').textContent.includes('at generation {at},')")
+        assert f"leader-follower: {tab.evaluate(mean(at)):.2f} of 4" in tab.text("#legend"), tab.text("#legend")
+    # The keys have the dashes that are drawn.
+    dashes = "[...document.querySelectorAll('#legend line')].map(line => line.getAttribute('stroke-dasharray'))"
+    assert tab.evaluate(dashes) == ["", "7 3", "1.5 4", "6 3 1.5 3"], tab.evaluate(dashes)
     # The credit of every leader equals the share of POIs that are lost without it.
     tab.set("#scrub", 6)
     tab.wait("page.state.views.every(view => view.data && view.data.episodes[0].generation === 6)")
@@ -829,16 +1108,15 @@ def check_first_visit(tab, page, call, downloads):
         tab.assert_no_errors()
     print("the controls edit any valid TOML, and keep its comments")
 
-    # On a phone, the maps follow directly after Train.
+    # On a phone, the maps follow directly after the settings, the bar with Train, and then the chart.
     tab.window(390, 844, dark=False)
     tab.load(page, layout="chaotic")
     tab.wait("page.state.views[0].data")
-    train, more, views, modes, play = tab.evaluate(
+    more, train, views, play = tab.evaluate(
         "(() => { const box = selector => document.querySelector(selector).getBoundingClientRect();"
-        " return [box('#train').bottom, box('#more').bottom, box('#views').top, box('#modes').top, box('#play').top];"
-        " })()"
+        " return [box('#more').bottom, box('#train').bottom, box('#views').top, box('#play').top]; })()"
     )
-    assert train <= more <= views <= modes <= play and views - more < 40, (train, more, views, modes, play)
+    assert more <= train <= views <= play and views - more < 100, (more, train, views, play)
     tab.window(1280, 900, dark=False)
 
     # With the pace "watch", the main thread draws few pictures during training. The time that they take depends on the
@@ -1088,6 +1366,10 @@ def main():
         print("configs are opened, and problems are marked at their lines")
 
         check_several_runs(tab, page, flotilla, folder / "several")
+        check_slow_network(tab, page)
+        check_map_in_view(tab, page)
+        check_history(tab, page)
+        check_consistency(tab, page, downloads)
         check_links_and_devices(tab, page)
         check_first_visit(tab, page, call, downloads)
         check_former_defects(tab, page, call, downloads, folder)

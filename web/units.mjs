@@ -4,7 +4,7 @@ import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
 import { test } from "node:test";
 import { deflateSync } from "node:zlib";
-import { choice_of, comparison, label, read, slug, toml, write } from "./page/compare.js";
+import { choice_of, comparison, label, read, slug, styles, toml, write } from "./page/compare.js";
 import { angles, moment, words } from "./page/senses.js";
 import { csv } from "./page/table.js";
 
@@ -34,6 +34,14 @@ test("values are written as TOML, labels name arms, and slugs are safe file name
   assert.equal(label({ key: "learning.fitness", values: ["G", "D"] }, "D"), "D");
   assert.equal(slug("../my config/D++ run"), "my-config-Dpp-run");
   assert.equal(slug("…"), "run");
+});
+
+test("an arm has the same style in every order and in every comparison", () => {
+  assert.deepEqual(styles(["all-leaders", "leader-follower"]), [1, 0]);
+  assert.deepEqual(styles(["all-leaders"]), [1]);
+  assert.deepEqual(styles(["fitness Dt", "fitness G"]), [4, 0]);
+  assert.deepEqual(styles(["population 100", "population 20", "population 500"]), [1, 0, 2]);
+  assert.deepEqual(styles(["G, seed 2", "G, seed 1"]), [1, 0]);
 });
 
 test("curves are written as CSV, with labels quoted if necessary", () => {

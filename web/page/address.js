@@ -1,37 +1,48 @@
 // The experiment in the address.
 import { comparison, read, write } from "./compare.js";
 import { configs } from "./config.js";
-import { $, trouble } from "./dom.js";
+import { $ } from "./dom.js";
 import { edited, take } from "./experiment.js";
-import { KEYS, KEY_IDS, NAMES, quote, state } from "./state.js";
+import { OPENED } from "./opening.js";
+import { KEYS, KEY_IDS, NAMES, part, quote, render, state } from "./state.js";
 import { train } from "./train.js";
 import { seek } from "./views.js";
 
 let asked = 0, written = 0;
+part(() => [state.linked && state.toml, state.compared, $("on").value, $("pace").value], () => { if (state.linked) remember(); });
+
 /**
  * Writes the experiment into the address. Returns false if this browser cannot. The address is then empty, because the old one is of
  * another experiment. Packing a config takes a moment, and an older experiment never replaces a newer one.
  */
 export async function remember() {
-  const turn = ++asked, words = new URLSearchParams(), layout = $("layout").value;
-  if (layout === "own") {
-    try { words.set("config", await configs.pack(state.text)); } catch {
-      history.replaceState(null, "", "#");
-      return false;
-    }
-  } else {
+  const turn = ++asked;
+  /** @type {URLSearchParams} */
+  let words;
+  try { words = await words_of(state, state.config, $("layout").value); } catch {
+    history.replaceState(history.state, "", "#");
+    return false;
+  }
+  if (turn < written) return true;
+  written = turn;
+  history.replaceState(history.state, "", `#${words}`);
+  return true;
+}
+
+/** Returns an experiment as words of an address. @param {{ text: string, compared: Comparison | null }} experiment @param {Config} config @param {string} layout */
+async function words_of({ text, compared }, config, layout) {
+  const words = new URLSearchParams();
+  if (layout === "own") words.set("config", await configs.pack(text));
+  else {
     words.set("layout", layout);
     for (const id of KEY_IDS) if (id !== "coupling") words.set(id, $(id).value);
   }
-  const compared = state.compared, both = compared && compared.key === "learning.paradigm";
-  words.set("learners", both ? "both" : state.config.learning.paradigm);
+  const both = compared && compared.key === "learning.paradigm";
+  words.set("learners", both ? "both" : config.learning.paradigm);
   if (compared && !both) words.set("compare", write(compared));
   if ($("on").value !== "auto") words.set("on", $("on").value);
   if ($("pace").value !== "watch") words.set("pace", $("pace").value);
-  if (turn < written) return true;
-  written = turn;
-  history.replaceState(null, "", `#${words}`);
-  return true;
+  return words;
 }
 
 // Opens the experiment in the address. Reports the parts that cannot be read, and then leaves the address unchanged.
@@ -53,23 +64,23 @@ export async function recall() {
   }
   const learners = words.get("learners"), known = learners !== null && Object.hasOwn(NAMES, learners);
   if (learners !== null && learners !== "both" && !known) unknown.push(`learners=${learners}`);
-  state.compared = known ? null : comparison("paradigm", 0);
+  let compared = known ? null : comparison("paradigm", 0);
   if (words.has("compare")) {
-    state.compared = read(word("compare"));
-    if (!state.compared) unknown.push("compare");
+    compared = read(word("compare"));
+    if (!compared) unknown.push("compare");
   }
   if (known) text = await edited(text, [["learning.paradigm", `"${learners}"`]]);
   const whole = (/** @type {string} */ key) => /^\d{1,7}$/.test(word(key)) ? Number(word(key)) : null;
   for (const key of ["generation", "trial", "play"]) if (words.has(key) && whole(key) === null) unknown.push(`${key}=${words.get(key)}`);
   wanted = whole("play") === 1 ? { generation: whole("generation") ?? Infinity, trial: whole("trial") ?? 0 } : null;
   const damage = unknown.length ? `This link is damaged: ${unknown.join(", ")} cannot be read. Ask for a new link; this page shows another experiment.` : "";
-  const taken = await take(text, { address: !damage });
+  Object.assign(state, { compared, troubles: { ...state.troubles, link: damage } });
+  const taken = await take(text, { linked: !damage });
   if (!taken && !state.views.length) {
     // Show a map even if the config in the link is invalid.
-    await take(configs.layout("generally_forward"), { address: false });
+    await take(configs.layout("generally_forward"), { linked: false });
     await take(text);
   }
-  if (damage) trouble(damage);
   const version = words.get("version");
   $("version").textContent = version !== null && version !== state.version ? `This link is from version ${version}, and this page is version ${state.version}: results may differ.` : "";
 }
@@ -77,16 +88,18 @@ export async function recall() {
 /** Returns whether several opened runs are on show. No link holds them. */
 export const shows_runs = () => Boolean(state.training && state.training.arms.length > 1 && state.training.source && !state.training.source.compared);
 
-// Returns a link to what is on show: the address, and if there is a training its generation and trial. Whoever opens it
-// trains at once. Digests depend on the version.
-export function link() {
-  const words = new URLSearchParams(location.hash.slice(1));
-  if (state.training && !shows_runs()) {
-    const { generation, trial } = state;
-    for (const [key, value] of Object.entries({ generation, trial, play: 1 })) words.set(key, String(value));
-  }
+/**
+ * Returns a link to what is on show: a training with its generation and trial, the opening, or otherwise the experiment. Whoever opens a
+ * training trains at once. Digests depend on the version.
+ */
+export async function link() {
+  const { training, exhibit, generation, trial } = state, page = location.href.split("#")[0];
+  if (exhibit === OPENED) return page;
+  const source = training && !shows_runs() ? training.source : null, old = source && (source.text !== state.text || source.compared !== state.compared);
+  const words = old && training ? await words_of(source, training.arms[0].config, "own") : new URLSearchParams(location.hash.slice(1));
+  if (source) for (const [key, value] of Object.entries({ generation, trial, play: 1 })) words.set(key, String(value));
   words.set("version", state.version);
-  return `${location.href.split("#")[0]}#${words}`;
+  return `${page}#${words}`;
 }
 
 /** What the opened link asks to show after training, or null. @type {{ generation: number, trial: number } | null} */
@@ -102,7 +115,6 @@ export async function autoplay() {
   await train();
   $("pace").value = pace;
   if (!state.training || state.training.state !== "done") return;
-  state.trial = Math.min(trial, state.training.arms[0].trials.length - 1);
-  $("trial").value = String(state.trial);
+  render({ trial: Math.min(trial, state.training.arms[0].trials.length - 1) });
   seek(generation);
 }

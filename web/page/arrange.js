@@ -1,31 +1,29 @@
 // Rearranging the map by pointer and keys.
 import { configs } from "./config.js";
-import { $, count, number } from "./dom.js";
+import { $, count, number, write_text } from "./dom.js";
 import { change } from "./experiment.js";
-import { reach, start_scene } from "./scene.js";
-import { state } from "./state.js";
-import { draw, only_view, show } from "./views.js";
+import { start_scene } from "./scene.js";
+import { render, state } from "./state.js";
+import { aim, draw, only_view, show } from "./views.js";
 
 /** The view of the start. @type {View | null} */
 let start_view = null;
 export function show_start() {
   const { config, views } = state, { world } = config;
   if (!start_view || !views.includes(start_view)) {
-    start_view = only_view("Where everyone starts", reach(config));
+    start_view = only_view("Where everyone starts", stage.busy(start_scene(config)));
     start_view.describe = describe_start;
   }
   if (start_view.chosen && !world[start_view.chosen[0]][start_view.chosen[1]]) start_view.chosen = null;
-  start_view.crop = reach(config);
-  if (state.mode === "arrange") {
-    start_view.crop = [0, 0, ...world.map];
-    hands(start_view);
-  }
+  aim(start_view, state.mode === "arrange" ? [0, 0, ...world.map] : stage.busy(start_scene(config)));
+  if (state.mode === "arrange") hands(start_view);
   show(start_view, start_scene(config), false);
 }
 
 function describe_start() {
   const { world } = state.config;
   if (!start_view) return;
+  write_text($("chosen"), start_view.chosen ? `Chosen: ${name_chosen(start_view.chosen)}` : "");
   start_view.status.textContent = `${count(world.leaders.length, "leader")}, ${count(world.followers.length, "follower")}, ${count(world.pois.length, "POI")} · ${world.steps} steps`;
   start_view.canvas.ariaLabel = `Map of the start: ${start_view.status.textContent}${start_view.chosen ? `; chosen: ${name_chosen(start_view.chosen)}` : ""}`;
 }
@@ -40,9 +38,11 @@ const items = ({ world }) => LISTS.flatMap(list => world[list].map((place, index
 /** @param {View} view @param {Chosen | null} chosen */
 function choose(view, chosen) {
   view.chosen = chosen;
-  $("chosen").textContent = chosen ? `Chosen: ${name_chosen(chosen)}` : "";
   draw(view);
 }
+
+/** Shows a list of the world before the module has resolved it. @param {List} list @param {Place[]} places */
+const put = (list, places) => render({ config: { ...state.config, world: { ...state.config.world, [list]: places } } });
 
 // Positions are rounded to a tenth, and stay on the map.
 const tenth = (/** @type {number} */ value, /** @type {number} */ most) => Math.round(Math.max(0, Math.min(most, value)) * 10) / 10;
@@ -75,9 +75,7 @@ function hands(view) {
   });
   view.canvas.addEventListener("pointermove", event => {
     if (!held) return;
-    state.config.world[held[0]][held[1]] = place(event);
-    show(view, start_scene(state.config), false);
-    choose(view, held);
+    put(held[0], state.config.world[held[0]].with(held[1], place(event)));
   });
   const release = () => {
     if (held) moved(held[0]);
@@ -95,9 +93,8 @@ function hands(view) {
     } else if (by && view.chosen) {
       const [list, at] = view.chosen, [width, height] = state.config.world.map, size = event.shiftKey ? 0.1 : 1;
       const [x, y] = state.config.world[list][at];
-      state.config.world[list][at] = [tenth(x + by[0] * size, width), tenth(y + by[1] * size, height)];
+      put(list, state.config.world[list].with(at, [tenth(x + by[0] * size, width), tenth(y + by[1] * size, height)]));
       moved(list);
-      choose(view, view.chosen);
     } else if (event.key === "Delete" && view.chosen) remove();
     else return;
     event.preventDefault();
@@ -122,17 +119,16 @@ export function add(list) {
     const away = 1.5 * Math.sqrt(ring), angle = 2.4 * ring;
     place = [tenth(width / 2 + away * Math.cos(angle), width), tenth(height / 2 + away * Math.sin(angle), height)];
   }
-  world[list].push(place);
+  put(list, [...world[list], place]);
+  choose(first, [list, world[list].length]);
   moved(list);
-  choose(first, [list, world[list].length - 1]);
 }
 
 export function remove() {
   const [first] = state.views;
   if (!first || !first.chosen) return;
   const [list, index] = first.chosen;
-  state.config.world[list].splice(index, 1);
   first.chosen = null;
+  put(list, state.config.world[list].toSpliced(index, 1));
   moved(list);
-  $("chosen").textContent = "";
 }

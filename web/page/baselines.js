@@ -1,14 +1,13 @@
 // Baselines without learning: the best constant action, and the best of as many random teams as training evaluates.
-import { curves } from "./curves.js";
 import { clerk } from "./pool.js";
-import { state } from "./state.js";
+import { news, state } from "./state.js";
 
 /** Plays the constant actions of a training's arms. @param {Training} training */
 export async function constants(training) {
   for (const arm of training.arms) {
     if (state.training !== training) return;
     arm.constant = (await clerk.ask({ ask: "constant", text: arm.toml })).words.g;
-    curves();
+    news(training);
   }
 }
 
@@ -25,7 +24,7 @@ export async function randoms(training) {
       const { words } = await clerk.ask({ ask: "more_random", milliseconds: 60 });
       arm.random = words.g;
       done = words.done;
-      curves();
+      news(training);
     }
   }
 }

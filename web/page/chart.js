@@ -5,13 +5,14 @@ import { pen_of } from "./dom.js";
  * An arm of the chart. Each trial is a list of POIs, one value per `every` generations. `mean` and the outline `band` of its interval are
  * lists of [generation, POIs], or null: then the mean is drawn without an interval. `constant` is what the best constant action
  * observes, or null, and `random` the best random team, per generation.
- * @typedef {{ tone: string, trials: number[][], constant: number | null, random: number[], mean: Place[] | null, band: Place[] | null }} Drawn
+ * @typedef {{ tone: string, dashes: number[], trials: number[][], constant: number | null, random: number[], mean: Place[] | null, band: Place[] | null }} Drawn
  */
 
 export const chart = (() => {
-  const DASHES = [[], [7, 3], [12, 4], [3, 3], [10, 3, 3, 3], [16, 3]];
+  // Dashes of arms, by style, and of the baselines.
+  const DASHES = [[], [7, 3], [12, 4], [3, 3], [10, 3, 3, 3], [16, 3]], CONSTANT = [1.5, 4], RANDOM = [6, 3, 1.5, 3];
   /**
-   * `cursor` is the generation to mark, or null.
+   * `cursor` is the generation to mark, or null. Then the means have a dot there, otherwise at their end.
    * @param {HTMLCanvasElement} canvas @param {Drawn[]} arms @param {number} every @param {number} last @param {number} pois
    * @param {number | null} cursor
    */
@@ -71,26 +72,26 @@ export const chart = (() => {
     for (const { tone, constant, random } of arms) {
       draw.strokeStyle = color(tone);
       draw.lineWidth = 1.6;
-      draw.setLineDash([1.5, 4]);
+      draw.setLineDash(CONSTANT);
       if (constant !== null) { draw.beginPath(); draw.moveTo(left, Y(constant)); draw.lineTo(wide - right, Y(constant)); draw.stroke(); }
-      draw.setLineDash([6, 3, 1.5, 3]);
+      draw.setLineDash(RANDOM);
       if (random.length) line(draw, random, 1, X, Y);
       draw.setLineDash([]);
     }
-    arms.forEach(({ tone, trials, mean: found }, index) => {
+    for (const { tone, dashes, trials, mean: found } of arms) {
       const means = found || averages(trials).map((value, at) => /** @type {Place} */ ([at * every, value]));
-      if (!means.length) return;
+      if (!means.length) continue;
       draw.strokeStyle = color(tone);
       draw.lineWidth = 2.5;
-      draw.setLineDash(DASHES[index % DASHES.length]);
+      draw.setLineDash(dashes);
       draw.beginPath();
       for (const [generation, value] of means) draw.lineTo(X(generation), Y(value));
       draw.stroke();
       draw.setLineDash([]);
-      const [generation, value] = means[means.length - 1];
+      const [generation, value] = means.findLast(([generation]) => cursor !== null && generation <= cursor) ?? means[means.length - 1];
       draw.fillStyle = color(tone);
       draw.beginPath(); draw.arc(X(generation), Y(value), 4, 0, 2 * Math.PI); draw.fill();
-    });
+    }
     return { generation: (/** @type {number} */ x) => Math.round(Math.max(0, Math.min(1, (x - left) / (wide - left - right))) * last) };
   }
 
@@ -108,5 +109,5 @@ export const chart = (() => {
     return Array.from({ length }, (_, generation) => trials.reduce((sum, trial) => sum + trial[generation], 0) / trials.length);
   }
 
-  return { paint };
+  return { paint, DASHES, CONSTANT, RANDOM };
 })();

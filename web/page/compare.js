@@ -56,5 +56,17 @@ export function label({ key, values }, value) {
   return `${key.split(".")[1].replaceAll("_", " ")} ${value}`;
 }
 
+/**
+ * Returns the style of each arm: the index of its colour and dashes. Paradigms and fitnesses have their own. Other arms have theirs by the
+ * order of their names, whatever the order of files.
+ * @param {string[]} labels
+ */
+export function styles(labels) {
+  const own = labels.map(label => [PARADIGMS, FITNESSES].map(names => names.findIndex(name => label.split(/[ ,]+/).includes(name))).find(at => at >= 0) ?? -1);
+  if (!own.includes(-1) && new Set(own).size === own.length) return own;
+  const sorted = labels.toSorted((a, b) => a.localeCompare(b, "en", { numeric: true }));
+  return labels.map(label => sorted.indexOf(label));
+}
+
 /** Returns a text as a file name. @param {string} text */
 export const slug = text => text.replaceAll("++", "pp").replace(/[^A-Za-z0-9._-]+/g, "-").replace(/^[-.]+|-+$/g, "") || "run";

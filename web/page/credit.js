@@ -1,15 +1,18 @@
 // Credit of each leader, and the episode without a leader: the POIs that go dark are its credit.
 import { $, all, count, make, number } from "./dom.js";
-import { shown, state } from "./state.js";
+import { part, render, shown, state } from "./state.js";
 import { dark, draw, select } from "./views.js";
 
 // Most leaders in the table.
 const SHOWN = 32;
 const narrow = matchMedia("(max-width: 640px)");
-narrow.addEventListener("change", () => credits());
+narrow.addEventListener("change", () => render());
+
+// The table changes with the episodes, but not with their steps.
+part(() => [state.mode, narrow.matches, $("credited").value, ...shown().flatMap(view => [view, view.data, view.removed, view.selected])], credits);
 
 // Shows the credits of the view that is chosen in the list.
-export function credits() {
+function credits() {
   const views = shown().filter(({ data: { episodes: [episode] } }) => episode.without && episode.shown.length > 1);
   $("credit").hidden = views.length === 0 || state.mode !== "watch";
   if ($("credit").hidden) return;
@@ -23,16 +26,9 @@ export function credits() {
   table(view);
 }
 
-/** What the table was drawn of. @type {unknown[] | null} */
-let drawn = null;
-
 /** @param {Shown} view */
 function table(view) {
   const { data } = view, [episode] = data.episodes;
-  // The table changes with the episode, but not with its steps.
-  const key = [view, data, view.removed, view.selected, narrow.matches], before = drawn;
-  if (before && key.every((part, index) => part === before[index])) return;
-  drawn = key;
   const leaders = Array.from({ length: Math.min(episode.leaders, SHOWN) }, (_, leader) => leader);
   const scores = Object.entries({ D: episode.d, Df: episode.df, "D++": episode.dpp, Dt: episode.dt }).flatMap(([name, values]) => values && values.length ? [{ name, values }] : []);
   /** A list per measure and action: its name, and then a cell per leader. @type {(string | HTMLElement)[][]} */
@@ -88,7 +84,7 @@ function remove_button(view, { leader, group }) {
 export function remove_leader(view, removed) {
   view.removed = removed;
   draw(view);
-  credits();
+  render();
 }
 
 /** Says what the removal costs. @param {Shown} view */

@@ -1,54 +1,65 @@
 // The learning curves below the map.
 import { chart } from "./chart.js";
-import { $, make } from "./dom.js";
-import { show_machine } from "./machine.js";
-import { TONES, state } from "./state.js";
+import { $, make, make_key } from "./dom.js";
+import { TONES, part, state } from "./state.js";
 
 /** The chart, once it is drawn. @type {ReturnType<typeof chart.paint> | null} */
 export let drawn_chart = null;
+part(() => [state.training, state.training && state.training.version, state.follow || state.generation, state.over, state.pois, state.config.learning.generations], curves);
+
 export function curves() {
-  const { training } = state;
+  const { training, follow, generation, over } = state;
   // If the number of POIs differs between stages, the curves show shares instead.
   const pois = (training ? training.pois : state.pois) ?? 1;
   // About 1000 points per curve are enough for the width of the chart.
   const every = training ? Math.ceil(Math.max(1, training.reached) / 1000) : 1;
   const sample = (/** @type {Row[]} */ trial) => Array.from({ length: Math.ceil(trial.length / every) }, (_, index) => trial[index * every].best * pois);
   const scaled = (/** @type {Place[] | null} */ points) => points && points.map(([generation, g]) => /** @type {Place} */ ([generation, g * pois]));
-  const arms = (training ? training.arms : []).map(({ trials, constant, random }, index) => {
+  const arms = (training ? training.arms : []).map(({ style, trials, constant, random }, index) => {
     const found = training && training.found && training.found.curves[index];
     return {
-      tone: TONES[index], trials: trials.map(sample), constant: constant === null ? null : constant * pois, random: random.map(g => g * pois),
+      tone: TONES[style], dashes: chart.DASHES[style], trials: trials.map(sample), constant: constant === null ? null : constant * pois, random: random.map(g => g * pois),
       mean: found ? scaled(found.generation.map((generation, at) => /** @type {Place} */ ([generation, found.mean[at]]))) : null, band: found ? scaled(found.band) : null,
     };
   });
-  const last = training ? training.last : state.config ? state.config.learning.generations : 100;
-  drawn_chart = chart.paint($("curves"), arms, every, last, pois, training && !state.follow ? state.generation : null);
+  const last = training ? training.last : state.config.learning.generations;
+  const cursor = !training ? null : over ?? (follow ? null : generation);
+  drawn_chart = chart.paint($("curves"), arms, every, last, pois, cursor);
   $("legend").replaceChildren();
-  const many = training && training.pois === null ? "share of POIs" : "POIs";
-  const words = (training ? training.arms : []).map(({ label, trials, constant, random }, index) => {
-    const reached = Math.min(...trials.map(trial => trial.length)) - 1, at = state.follow ? reached : Math.min(state.generation, reached);
-    const item = make("span", "", $("legend"));
-    make("span", "", item, { className: `key${index ? " dashed" : ""}` }).style.color = `var(${TONES[index]})`;
-    const mean = at < 0 ? 0 : trials.reduce((sum, trial) => sum + trial[at].best, 0) / trials.length * pois;
+  const many = training && training.pois === null ? "share of POIs" : "POIs", own = training ? training.arms : [];
+  const reached = Math.min(...own.map(({ trials }) => Math.min(...trials.map(trial => trial.length)) - 1), Infinity), at = Math.min(cursor ?? reached, reached);
+  /** @param {string} tone @param {number[]} dashes @param {string} text */
+  const item = (tone, dashes, text) => {
+    const place = make("span", "", $("legend"));
+    make_key(tone, dashes, place);
+    make("span", ` ${text}`, place);
+  };
+  const words = own.map(({ label, style, trials }) => {
+    const mean = trials.reduce((sum, trial) => sum + trial[Math.min(Math.max(0, at), trial.length - 1)]?.best, 0) / trials.length * pois;
     const value = at >= 0 ? `${mean.toFixed(2)} of ${pois}` : "–";
-    make("span", ` ${label}: ${value}`, item);
-    const beside = [];
-    if (constant !== null) beside.push(`best constant action ${(constant * pois).toFixed(2)}`);
-    if (random.length) beside.push(`best random team ${(random[Math.min(Math.max(0, at), random.length - 1)] * pois).toFixed(2)}`);
-    if (beside.length) make("small", ` (without learning: ${beside.join(", ")})`, item);
+    item(TONES[style], chart.DASHES[style], `${label}: ${value}`);
     return `${label} ${value} ${many} at generation ${Math.max(0, at)}`;
   });
-  make("span", `${many} observed by the best team, mean over trials${arms.some(arm => arm.band) ? " with its 95 % interval" : ""}; thin: each trial${arms.some(arm => arm.constant !== null) ? "; dotted: the best constant action, and the best of as many random teams" : ""}`, $("legend"));
+  /** Adds the key of a baseline. @param {number[]} dashes @param {string} name @param {(number | null | undefined)[]} values */
+  const baseline = (dashes, name, values) => {
+    const found = own.flatMap(({ label }, index) => typeof values[index] === "number" ? [{ label, value: (values[index] * pois).toFixed(2) }] : []);
+    if (!found.length) return;
+    const alike = found.length === own.length && found.every(({ value }) => value === found[0].value);
+    item("--faint", dashes, `${name}: ${alike ? found[0].value : found.map(({ label, value }) => `${value} (${label})`).join(", ")}`);
+  };
+  baseline(chart.CONSTANT, "best constant action", own.map(({ constant }) => constant));
+  baseline(chart.RANDOM, "best of as many random teams", own.map(({ random }) => random[Math.min(Math.max(0, at), random.length - 1)]));
+  make("span", `${many} observed by the best team${training && at >= 0 ? ` at generation ${at}` : ""}, mean over trials${arms.some(arm => arm.band) ? " with its 95 % interval" : ""}; thin: each trial`, $("legend"));
   $("curves").setAttribute("aria-label", `Learning curves, best team, mean over trials: ${words.join("; ") || "nothing trained yet"}`);
   $("needless").textContent = needless(training);
-  if (training) show_machine();
 }
 
 /** Says if a constant action observes as much as what was trained, because then nothing had to be learned. @param {Training | null} training */
 function needless(training) {
   if (!training || training.state !== "done") return "";
   const final = (/** @type {Arm} */ { trials }) => trials.reduce((sum, trial) => sum + trial[trial.length - 1].best, 0) / trials.length;
-  const alike = training.arms.filter(arm => arm.constant !== null && arm.constant > 0 && arm.constant >= final(arm) - 1e-9);
+  const alike = training.arms.flatMap(arm => arm.constant !== null && arm.constant > 0 && arm.constant >= final(arm) - 1e-9 ? [{ arm, constant: arm.constant }] : []);
   if (!alike.length) return "";
-  return `A constant action observes as much as ${alike.map(arm => arm.label).join(", ")}. No learning is needed for that. In "Two groups must meet", a constant action observes nothing.`;
+  const all = training.pois ?? 1, many = (/** @type {number} */ g) => (g * all).toFixed(2);
+  return `No learning is needed here. ${alike.map(({ arm, constant }) => `${arm.label} observes ${many(final(arm))} of ${all} POIs, and the best constant action ${many(constant)}`).join("; ")}. In "Two groups must meet", a constant action observes nothing.`;
 }

@@ -13,6 +13,14 @@ export function make(name, text = "", parent = null, more = {}) {
   if (parent) parent.append(element);
   return element;
 }
+/** Makes the key of a line as it is drawn. @param {string} tone @param {number[]} dashes @param {Element} parent */
+export function make_key(tone, dashes, parent) {
+  const key = document.createElementNS("http://www.w3.org/2000/svg", "svg");
+  key.setAttribute("class", "key");
+  key.innerHTML = `<line x2="34" y1="4" y2="4" stroke-dasharray="${dashes.join(" ")}"/>`;
+  key.style.color = `var(${tone})`;
+  parent.append(key);
+}
 /** Returns all elements that a selector matches. @type {(selector: string, within?: ParentNode) => HTMLElement[]} */
 export const all = (selector, within = document) => [...within.querySelectorAll(selector)].filter(element => element instanceof HTMLElement);
 /** Returns an option of a list. @param {HTMLSelectElement} list @param {string} value */
@@ -40,27 +48,4 @@ export const failure = thrown => thrown instanceof Failure ? thrown : new Failur
 /** Writes a text if it differs. Even the same text would cost a layout. @param {HTMLElement} element @param {string} text */
 export function write_text(element, text) {
   if (element.textContent !== text) element.textContent = text;
-}
-
-/** Shows an error, or none. @param {string} message */
-export function trouble(message) {
-  $("trouble").textContent = message;
-  $("trouble").hidden = !message;
-}
-
-/** Saves a file. @param {string} name @param {BlobPart} content @param {string} type */
-export function save(name, content, type) {
-  const link = make("a", "", document.body, { href: URL.createObjectURL(new Blob([content], { type })), download: name });
-  link.click();
-  link.remove();
-  setTimeout(() => URL.revokeObjectURL(link.href), 10000);
-  $("message").textContent = `${name} is saved.`;
-}
-
-/** Copies a text, and reports it. @param {string} text @param {string} message */
-export async function copy(text, message) {
-  try {
-    await navigator.clipboard.writeText(text);
-    $("message").textContent = message;
-  } catch { $("message").textContent = `This browser does not let a page copy. Here it is: ${text}`; }
 }

@@ -1,22 +1,23 @@
 // Steering a leader.
-import { $, count, failure, make, number, trouble } from "./dom.js";
+import { $, count, failure, make, number } from "./dom.js";
 import { edited } from "./experiment.js";
 import { clerk } from "./pool.js";
 import { reach, start_scene } from "./scene.js";
-import { state } from "./state.js";
+import { part, state, trouble } from "./state.js";
 import { draw, only_view, show } from "./views.js";
 
 /** What steers. `turn` identifies the drive in progress. @type {{ on: boolean, timer: number, pointer: Place | null, keys: Set<string>, turn: object | null }} */
 const drive = { on: false, timer: 0, pointer: null, keys: new Set(), turn: null };
 
-export function options() {
+part(() => [state.config.world.leaders.length], () => {
   const many = state.config.world.leaders.length, chosen = $("leader").value;
   $("leader").replaceChildren(...Array.from({ length: many }, (_, leader) => make("option", String(leader))));
   if (Number(chosen) < many && chosen !== "") $("leader").value = chosen;
-}
+});
 
 export function drive_view() {
   const only = only_view("In your hands", reach(state.config));
+  $("driven").textContent = "";
   only.canvas.classList.add("steer");
   only.canvas.tabIndex = 0;
   only.canvas.setAttribute("role", "application");
@@ -79,7 +80,7 @@ export async function drive_on() {
     $("driven").textContent = now.learned ? "The other leaders do what they learned." : state.policies ? "The other leaders go straight ahead: what was learned is not for these teams." : "The other leaders go straight ahead: train first, and they do what they learned.";
   } catch (thrown) {
     drive_off();
-    return trouble(failure(thrown).message);
+    return trouble("run", failure(thrown).message);
   }
   const data = start_scene(state.config), [episode] = data.episodes;
   /** @type {Record<"positions" | "headings" | "near", number[]>} */
@@ -102,7 +103,7 @@ export async function drive_on() {
     const from = performance.now(), wanted = wish(now.positions, now.headings, leader);
     if (!wanted) return void (drive.timer = setTimeout(step, 30));
     const [angle, speed] = wanted;
-    try { now = (await clerk.ask({ ask: "step", turn: angle, speed })).words; } catch (thrown) { return trouble(failure(thrown).message); }
+    try { now = (await clerk.ask({ ask: "step", turn: angle, speed })).words; } catch (thrown) { return trouble("run", failure(thrown).message); }
     if (drive.turn !== turn) return;
     take(now);
     Object.assign(only, { place: now.step });

@@ -1,31 +1,36 @@
 // The experiment: its text, its controls, and its editor.
 import { choice_of, slug } from "./compare.js";
 import { configs } from "./config.js";
-import { $, all, count, failure, make, option, trouble } from "./dom.js";
+import { $, all, count, failure, make, option } from "./dom.js";
 import { clerk } from "./pool.js";
-import { after, state } from "./state.js";
+import { KEYS, KEY_IDS, part, render, state, trouble } from "./state.js";
+
+/** The controls that set a key. @type {Map<string, keyof typeof KEYS>} */
+const fields = new Map(KEY_IDS.map(id => [KEYS[id], id]));
 
 let newest = 0;
-/** Makes a text the config. If it is invalid, shows its problems and returns false. @param {string} text */
-export async function take(text, { edited = false, address = true, views = true } = {}) {
+/**
+ * Makes a text the config. If it is invalid, shows its problems and returns false. `linked` puts the experiment into the address, and `keeps`
+ * keeps the episode with which the page opens.
+ * @param {string} text
+ */
+export async function take(text, { edited = false, linked = true, keeps = false } = {}) {
   const turn = ++newest;
-  state.text = text;
+  Object.assign(state, { text, exhibit: keeps ? state.exhibit : null });
   if (!edited) $("text").value = text;
   let resolved;
   try {
     resolved = (await clerk.ask({ ask: "resolve", text, name: "config.toml", changes: [] })).words;
   } catch (thrown) {
     const { problems, message } = failure(thrown);
-    if (turn === newest) { mark(problems, message); $("train").disabled = true; state.valid = false; }
+    if (turn === newest) render({ problems, valid: false });
+    if (turn === newest) trouble("config", problems.length ? `The config cannot be used: ${count(problems.length, "problem")}, beside ${problems.some(({ key }) => !fields.has(key ?? "")) ? "the lines of the config below" : "the settings"}.` : message);
     return false;
   }
   if (turn !== newest) return false;
-  mark([]);
-  Object.assign(state, { config: resolved.config, toml: resolved.toml, pois: resolved.pois, start: resolved.start, valid: true });
-  $("train").disabled = false;
-  fill();
-  after.config({ views, address });
-  stale();
+  const { config, toml, pois, start } = resolved;
+  render({ config, toml, pois, start, valid: true, problems: [], linked });
+  trouble("config", "");
   return true;
 }
 
@@ -52,10 +57,7 @@ export async function edited(text, changes) {
 /** Compares other values, or nothing. @param {Comparison | null} compared */
 export function compare(compared) {
   keep();
-  state.compared = compared;
-  fill();
-  after.config({ views: false, address: true });
-  stale();
+  render({ compared, linked: true });
 }
 
 /** Returns whether an earlier experiment is the present one. @param {Past | undefined} past */
@@ -65,27 +67,28 @@ const is_now = past => past && past.text === state.text && JSON.stringify(past.c
 export function keep() {
   if (!is_now(state.past.at(-1))) state.past.push({ text: state.text, file: state.file, compared: state.compared });
   if (state.past.length > 100) state.past.shift();
-  $("undo").disabled = false;
 }
 
 export async function undo() {
   let last;
   do last = state.past.pop(); while (is_now(last));
-  $("undo").disabled = state.past.length === 0;
-  if (!last) return;
-  state.file = last.file;
-  state.compared = last.compared;
+  if (!last) return render();
+  render({ file: last.file, compared: last.compared });
   await take(last.text);
 }
+part(() => [state.past.length, state.valid], () => {
+  $("undo").disabled = state.past.length === 0;
+  $("train").disabled = !state.valid;
+});
 
 // Shows a note if the results were trained with settings that differ from those in the form.
-export function stale() {
+part(() => [state.training, state.text, state.compared], () => {
   const { training } = state, differs = training && training.source && (training.source.text !== state.text || JSON.stringify(training.source.compared) !== JSON.stringify(state.compared));
   $("stale").hidden = !differs;
   if (!differs) return;
   const { fitness, seed, population, generations } = training.arms[0].config.learning;
   $("stale").textContent = `The results below were trained with other settings: fitness ${fitness}, seed ${seed}, population ${population}, ${generations} generations. Train again to see the present ones.`;
-}
+});
 
 // Edits are applied after a delay. `entered` applies pending ones at once, so that what follows uses them.
 /** @type {number | undefined} */
@@ -117,6 +120,7 @@ export function fill() {
   option($("layout"), "own").hidden = Boolean(layout);
   $("layout").value = layout || "own";
 }
+part(() => [state.toml, state.compared, state.layouts], fill);
 
 // Returns whether a config differs from a layout at most in keys that have a command-line flag.
 const same_world = (/** @type {string} */ name) => rest_of(state.config) === rest_of(state.layouts[name]);
@@ -126,8 +130,8 @@ const rest_of = (/** @type {Config | undefined} */ config) => {
   return JSON.stringify({ ...config, learning });
 };
 
-/** @param {Problem[]} problems */
-function mark(problems, message = "") {
+part(() => [state.problems], () => {
+  const { problems } = state;
   $("marks").replaceChildren();
   $("problems").replaceChildren();
   $("text").ariaInvalid = String(problems.length > 0);
@@ -141,10 +145,17 @@ function mark(problems, message = "") {
       make("span", words, place);
     }
   }
-  trouble(problems.length ? `The config cannot be used: ${count(problems.length, "problem")}, beside its lines below.` : message);
-  if (problems.length || message) $("config").open = true;
+  for (const [key, id] of fields) {
+    const found = problems.find(problem => problem.key === key), label = /** @type {HTMLElement} */ ($(id).closest("label"));
+    label.querySelector(".wrong")?.remove();
+    $(id).ariaInvalid = String(Boolean(found));
+    if (!found) continue;
+    if (!$(id).checkVisibility()) $("more").open = true;
+    make("small", found.message, label, { className: "wrong" });
+  }
+  if (problems.some(({ key }) => !fields.has(key ?? ""))) $("config").open = true;
   lines();
-}
+});
 
 /** @param {number} line */
 function go_to(line) {

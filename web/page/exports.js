@@ -1,9 +1,9 @@
 // Pictures, films and tables of what is on show.
 import { slug } from "./compare.js";
-import { $, failure, pen_of, save, trouble } from "./dom.js";
+import { failure, pen_of } from "./dom.js";
 import { name_of } from "./experiment.js";
 import { clerk } from "./pool.js";
-import { shown, state } from "./state.js";
+import { report, save, shown, state, trouble } from "./state.js";
 import { csv } from "./table.js";
 import { draw, end_of, moving } from "./views.js";
 
@@ -72,11 +72,11 @@ let busy = false;
 async function one_at_a_time(act) {
   if (busy || !moving().length) return;
   busy = true;
-  try { await act(); } catch (thrown) { trouble(`The film could not be made: ${failure(thrown).message}`); } finally { busy = false; }
+  try { await act(); } catch (thrown) { trouble("file", `The film could not be made: ${failure(thrown).message}`); } finally { busy = false; }
 }
 
 export const save_gif = () => one_at_a_time(async () => {
-  $("message").textContent = "Making the GIF…";
+  report("Making the GIF…");
   const canvas = document.createElement("canvas"), pictures = /** @type {Bytes[]} */ ([]);
   let many = 1;
   await film(canvas, async (_, frames) => {
@@ -90,7 +90,7 @@ export const save_gif = () => one_at_a_time(async () => {
 
 export const save_webm = () => one_at_a_time(async () => {
   if (typeof MediaRecorder !== "function") throw new Error("this browser cannot record a canvas");
-  $("message").textContent = "Recording the film…";
+  report("Recording the film…");
   const canvas = document.createElement("canvas");
   compose(canvas, WIDTH);
   const recorder = new MediaRecorder(canvas.captureStream(25), { mimeType: "video/webm" }), parts = /** @type {Blob[]} */ ([]);
@@ -106,5 +106,5 @@ export const save_webm = () => one_at_a_time(async () => {
 
 export function save_csv() {
   if (state.training) save(`${slug(name_of())}-curves.csv`, csv(state.training.arms), "text/csv");
-  else $("message").textContent = "There are no curves yet. Train first.";
+  else report("There are no curves yet. Train first.");
 }

@@ -1,17 +1,14 @@
 // Files that are dropped or opened.
-import { show_start } from "./arrange.js";
-import { $, count, failure, trouble } from "./dom.js";
+import { count, failure } from "./dom.js";
 import { keep, take } from "./experiment.js";
-import { leave_guide } from "./guide.js";
 import { renew_failed, settle } from "./machine.js";
 import { mode } from "./modes.js";
 import { intervals } from "./intervals.js";
 import { clerk } from "./pool.js";
-import { reach } from "./scene.js";
-import { TONES, state } from "./state.js";
-import { digests, forget } from "./train.js";
+import { TONES, render, report, state, trouble } from "./state.js";
+import { forget } from "./train.js";
 import { Training } from "./training.js";
-import { build, controls, following, only_view, seek, show } from "./views.js";
+import { reveal } from "./views.js";
 
 /** Most runs that are opened together: each has a colour. */
 const MOST_RUNS = TONES.length;
@@ -20,8 +17,8 @@ const MOST_RUNS = TONES.length;
 
 /** Opens files: several runs as arms of one chart, or a single file of any kind. @param {File[]} files */
 export async function take_files(files) {
-  trouble("");
-  $("message").textContent = "";
+  trouble("file", "");
+  report("");
   let now = files[0];
   try {
     /** @type {Read[]} */
@@ -35,7 +32,7 @@ export async function take_files(files) {
       if (is_run && read.length === files.length) return await take_runs(read, file => { now = file; });
     }
     if (read.length) await take_other(read[0]);
-  } catch (thrown) { trouble(`${now.name}: ${failure(thrown).message}`); }
+  } catch (thrown) { trouble("file", `${now.name}: ${failure(thrown).message}`); }
 }
 
 /** Opens runs as arms of one chart. @param {Read[]} read @param {(file: File) => void} reading */
@@ -54,50 +51,35 @@ async function take_runs(read, reading) {
   }
   await settle();
   const training = await Training.read(state.players[0], state.machine, found), [{ words }] = found;
-  if (state.training) state.training.stop();
-  state.training = training;
-  leave_guide();
   keep();
-  Object.assign(state, { compared: null, trial: 0, generation: training.last, policies: null });
-  following(false);
+  forget();
   training.source = { text: words.toml, compared: null };
   mode("watch");
+  render({ training, guide: null, compared: null, trial: 0, generation: training.last, follow: false });
   await take(words.toml);
-  build(training);
-  controls();
-  digests();
-  seek(training.last);
+  reveal();
   await intervals(training);
-  $("message").textContent = found.length > 1 ? `${found.length} runs are compared. Each is complete, and its digest matches. The settings are those of ${found[0].name}.` : `${found[0].name}: the run is complete, and its digest matches.`;
+  report(found.length > 1 ? `${found.length} runs are compared. Each is complete, and its digest matches. The settings are those of ${found[0].name}.` : `${found[0].name}: the run is complete, and its digest matches.`);
 }
 
 /** Opens policies or a config. @param {Read} read */
 async function take_other({ file, bytes }) {
   if (/\.safetensors$/i.test(file.name)) {
     const { words, bytes: weights } = await clerk.ask({ ask: "read", text: state.toml }, bytes);
+    const data = stage.unpack((await clerk.ask({ ask: "play", text: state.toml, policies: words.policies }, weights)).words), title = `The champion of ${file.name}`;
     forget();
-    leave_guide();
-    state.policies = { each: words.policies, weights };
-    const data = stage.unpack((await clerk.ask({ ask: "play", text: state.toml, policies: words.policies }, weights)).words);
     mode("watch");
-    const only = only_view(`The champion of ${file.name}`, reach(state.config));
-    only.describe = (step, observed) => {
-      only.status.textContent = `${observed} of ${data.pois.length} POIs by step ${step}`;
-      only.canvas.ariaLabel = `${only.title.textContent}, step ${step}: ${only.status.textContent}`;
-    };
-    show(only, data);
-    $("message").textContent = `${file.name}: ${count(words.policies, "policy").replace(/ys$/, "ies")} per leader. Take a leader to play with them.`;
+    render({ guide: null, policies: { each: words.policies, weights }, exhibit: { name: file.name, scenes: [{ title, data, label: title, status: (step, observed) => `${observed} of ${data.pois.length} POIs by step ${step}` }] } });
+    reveal();
+    report(`${file.name}: ${count(words.policies, "policy").replace(/ys$/, "ies")} per leader. Take a leader to play with them.`);
   } else {
     if (!/\.toml$/i.test(file.name)) throw new Error("not a config (.toml), a run (.zip) or policies (.safetensors)");
     const text = new TextDecoder("utf-8", { fatal: true }).decode(bytes);
     keep();
-    state.file = file.name.replace(/\.toml$/i, "");
-    state.compared = null;
     forget();
-    leave_guide();
     mode("watch");
-    show_start();
+    render({ guide: null, file: file.name.replace(/\.toml$/i, ""), compared: null });
     const taken = await take(text);
-    $("message").textContent = taken ? `${file.name} is the config now.` : `${file.name} has problems; they are shown beside its lines.`;
+    report(taken ? `${file.name} is the config now.` : `${file.name} has problems; they are shown beside its lines.`);
   }
 }

@@ -1,13 +1,13 @@
 // Experiments to start from. Each has a config in web/gallery and what it compares.
 import { $, make } from "./dom.js";
-import { keep, take } from "./experiment.js";
-import { mode } from "./modes.js";
-import { state } from "./state.js";
+import { edited, keep, take } from "./experiment.js";
+import { render, state } from "./state.js";
 import { forget, train } from "./train.js";
 
-/** `config` names the config, if it is that of another experiment. @typedef {{ name: string, title: string, says: string, compare: Comparison, config?: string }} Exhibit */
-
-/** @type {Exhibit[]} */
+/**
+ * `config` names the config if it is that of another experiment, and `changes` sets keys of it.
+ * @type {{ name: string, title: string, says: string, compare: Comparison, config?: string, changes?: [string, string][] }[]}
+ */
 const GALLERY = [
   {
     name: "two_groups", title: "Two groups must meet", compare: { key: "learning.paradigm", values: ["leader-follower", "all-leaders"] },
@@ -16,6 +16,11 @@ const GALLERY = [
   {
     name: "population", config: "two_groups", title: "Few policies or many", compare: { key: "learning.population", values: ["20", "100", "500"] },
     says: "The same task. With 20 policies per leader, the best teams observe at most one of the four POIs; with 500, three or four.",
+  },
+  {
+    name: "groups", config: "two_groups", title: "Who shares a population?", changes: [["learning.paradigm", '"all-leaders"']],
+    compare: { key: "learning.sharing", values: ["none", "group", "all"] },
+    says: "The same task without followers. With a population per agent, nothing is learned. With one per group of three agents, most POIs are observed.",
   },
   {
     name: "blind", title: "Blind leaders", compare: { key: "learning.start_jitter", values: ["0.0", "2.0", "4.0"] },
@@ -38,15 +43,21 @@ const GALLERY = [
 /** Returns the config of an experiment. @param {string} name */
 export const text_of = name => $(`gallery-${name}`).textContent ?? "";
 
+/** Returns whether the page shows an experiment. @param {string} name */
+export const is_of = name => {
+  const { chosen, text, compared } = state;
+  return chosen !== null && chosen.name === name && chosen.text === text && chosen.compared === compared;
+};
+
 /** Replaces the experiment by one of the gallery, and trains it if asked. @param {string} name */
 export async function exhibit(name, { trains = false } = {}) {
   const found = GALLERY.find(exhibit => exhibit.name === name);
   if (!found) return;
+  const own = text_of(found.config ?? name), text = found.changes ? await edited(own, found.changes) : own;
   keep();
   forget();
-  Object.assign(state, { file: null, compared: found.compare });
-  mode("watch");
-  if (await take(text_of(found.config ?? name)) && trains) await train();
+  render({ chosen: { name, text, compared: found.compare }, file: null, compared: found.compare, mode: "watch" });
+  if (await take(text) && trains) await train();
 }
 
 export function gallery() {

@@ -70,25 +70,35 @@ declare const stage: {
 
 /** One canvas: its arm, its episode, and the place in it. `describe` writes the text of a view that shows no training. */
 interface View {
-  label: string, card: HTMLElement, title: HTMLElement, key: HTMLElement, status: HTMLElement, sensed: HTMLElement, canvas: HTMLCanvasElement,
+  label: string, card: HTMLElement, title: HTMLElement, status: HTMLElement, sensed: HTMLElement, canvas: HTMLCanvasElement,
   data: Scene | null, place: number, playing: boolean, ended: number | null, over: number | null, wanted: number | null, asking: boolean,
-  crop: Crop, chosen: Chosen | null, removed: Removed | null, selected: number | null, drawn: Place[],
+  crop: Crop, chosen: Chosen | null, removed: Removed | null, selected: number | null, drawn: Place[], ghosts: Scene[],
   describe: ((step: number, observed: number, text: string) => void) | null,
 }
+/**
+ * Episodes that belong to no training. `status` writes the line below a title, `label` names the episode for screen readers, and `ghosts` are
+ * other teams, whose leaders' ways are drawn faintly.
+ */
+interface Exhibit { name: string, scenes: { title: string, data: Scene, label: string, status: (step: number, observed: number) => string, ghosts?: Scene[] }[] }
 /** A view that shows an episode. */
 type Shown = View & { data: Scene };
 
 /**
- * The state of the page. `mode` is what the map is for, and `follow` whether the views follow the training. `training` has the results on
- * show. `valid` tells whether the text is a valid config, and `config`, `toml`, `pois` and `start` are those of the last valid text. `past`
- * has earlier texts, for undo. `layouts` has the config of each layout. `settled` is the choice that `machine` was opened for.
+ * The state of the page. `mode` is what the map is for, `follow` whether the views follow the training, and `over` the
+ * generation under the pointer. `training` has the results on
+ * show, and without one `exhibit` the episode. `valid` tells whether the text is a valid config, `problems` why not, and `config`, `toml`, `pois`
+ * and `start` are those of the last valid text. `linked` tells whether the address holds it. `past` has earlier texts, for undo. `chosen` is
+ * the latest experiment of the gallery, and `guide` the step of the guided start, and what the visitor predicted. `layouts` has the config of each layout. `settled` is the choice that `machine` was opened for.
  */
 interface State extends Past {
-  valid: boolean, config: Config, toml: string | null, pois: number | null, start: Start, past: Past[], mode: "watch" | "arrange" | "drive",
-  training: Training | null, follow: boolean, generation: number, trial: number, views: View[], gpu: Gpu, machine: Machine, settled: string | null,
+  valid: boolean, config: Config, toml: string | null, pois: number | null, start: Start, past: Past[], problems: Problem[], linked: boolean,
+  mode: "watch" | "arrange" | "drive", training: Training | null, exhibit: Exhibit | null, follow: boolean, generation: number, over: number | null, trial: number,
+  views: View[], chosen: Picked | null, guide: { step: number, said: string | null } | null, troubles: Record<string, string>, message: string, gpu: Gpu, machine: Machine, settled: string | null,
   players: Player[], policies: { each: number, weights: Bytes } | null, layouts: Record<string, Config>, version: string,
 }
 interface Past { text: string, file: string | null, compared: Comparison | null }
+/** An experiment of the gallery, and what it set. */
+interface Picked { name: string, text: string, compared: Comparison }
 /** The browser's GPU, or the reason why none can be used. */
 interface Gpu { name?: string, software?: boolean, reason?: string }
 
@@ -99,8 +109,8 @@ interface Planned {
   name: string, label: string, toml: string, config: Config, pois: number | null, parameters: number, command?: string, digest?: string,
   zip?: Bytes, bytes?: number, constant: number | null, random: number[],
 }
-/** An arm of a training. `ended` has the champions of each trial. */
-interface Arm extends Planned { trials: Row[][], ended: Bytes[] }
+/** An arm of a training. `style` is the index of its colour and dashes, and `ended` has the champions of each trial. */
+interface Arm extends Planned { style: number, trials: Row[][], ended: Bytes[] }
 /** A run from a file. */
 interface Opened { name: string, label: string, words: Answers["read"], bytes: Bytes }
 /** The comparison of arms: curves with intervals, and tables. */
@@ -151,8 +161,8 @@ type Elements =
   & Record<"following" | "loop" | "trails" | "radii" | "heat" | "plain", HTMLInputElement>
   & Record<"train" | "stop" | "pause" | "replay" | "undo" | "again" | "remove" | "verify" | "share" | "open" | "save", HTMLButtonElement>
   & Record<"png" | "gif" | "webm" | "csv" | "guide-next" | "guide-end", HTMLButtonElement>
-  & Record<"text", HTMLTextAreaElement> & Record<"curves", HTMLCanvasElement> & Record<"config", HTMLDetailsElement>
-  & Record<"setup" | "guide" | "guide-step" | "guide-says" | "hint" | "arrange" | "drive" | "modes" | "views" | "plain-label", HTMLElement>
+  & Record<"text", HTMLTextAreaElement> & Record<"curves", HTMLCanvasElement> & Record<"config" | "more", HTMLDetailsElement>
+  & Record<"setup" | "guide" | "guide-step" | "guide-says" | "guide-choices" | "bar" | "arrange" | "drive" | "modes" | "views" | "plain-label", HTMLElement>
   & Record<"credit" | "play" | "team" | "credits" | "lost" | "compared" | "compared-says" | "means" | "pairs" | "tests" | "gallery" | "digests", HTMLElement>
   & Record<"trouble" | "stale" | "announced" | "machine" | "version" | "legend" | "needless" | "problems" | "lines" | "marks", HTMLElement>
   & Record<"chosen" | "driven" | "generation" | "message" | "verified", HTMLElement>

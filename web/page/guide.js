@@ -1,86 +1,123 @@
-// The guided start: one sentence and one button per step. Until it ends, the map is above the settings.
+// The guided start: each step asks for a prediction, shows what happens, and says why. Until it ends, the map is above the settings.
 import { remove_leader } from "./credit.js";
-import { $ } from "./dom.js";
-import { exhibit } from "./gallery.js";
-import { shown, state } from "./state.js";
-import { train } from "./train.js";
+import { $, all, make, number, still } from "./dom.js";
+import { evolution } from "./evolution.js";
+import { exhibit, is_of } from "./gallery.js";
+import { OPENED } from "./opening.js";
+import { part, render, shown, state } from "./state.js";
+import { forget } from "./train.js";
 import { replay } from "./views.js";
 
-/** Returns the view in which leaders can be removed. */
-const removable = () => shown().find(({ data }) => data.episodes[0].without);
-/** Returns the leader with the largest Df, and what the team loses without it. @param {Episode} episode */
-function dearest({ df = [], observed }) {
-  const most = Math.max(...df);
-  return { leader: df.indexOf(most), lost: Math.round(most * observed.length), pois: observed.length };
-}
+/** The leader of the opening with the largest Df, and what the team loses without it. */
+const dearest = (() => {
+  const [{ data: { episodes: [{ df = [], observed }] } }] = OPENED.scenes, most = Math.max(...df);
+  return { df, leader: df.indexOf(most), lost: Math.round(most * observed.length), pois: observed.length };
+})();
 
-/** @type {{ says: () => string, button: string, act: () => Promise<void> | void }[]} */
+/**
+ * A step: `of` names what `watch` shows, an exhibit or an experiment of the gallery, once `ready` has made it.
+ * @type {{ of: string, asks: string, choices: string[], ready?: () => Promise<unknown>, watch: () => unknown, why: string }[]}
+ */
 const STEPS = [
   {
-    says: () => "This team was trained: its four leaders (filled arrows) learned where to go, and eight followers (hollow arrows) follow them. A point of interest (POI, a circle) is observed once six agents are inside it at the same time, so groups have to meet.",
-    button: "What is one leader worth?",
-    act() {
-      const view = removable();
-      if (!view) return;
-      remove_leader(view, { leader: dearest(view.data.episodes[0]).leader, group: true });
-      if (!view.playing) replay();
-    },
+    of: "opening", watch: () => show_opening({ leader: dearest.leader, group: true }),
+    asks: `This team was trained: its four leaders (filled arrows) learned where to go, and eight followers (hollow arrows) follow them. A point of interest (POI, a circle) is observed once six agents are inside it at the same time, so groups have to meet. How many of the four POIs are left without leader ${dearest.leader} and its followers?`,
+    choices: ["One", "Two", "Three"],
+    why: `Leader ${dearest.leader} and its followers (pale) no longer count, and ${dearest.lost} of ${dearest.pois} POIs are lost (dark). This loss, ${dearest.lost / dearest.pois}, is the leader's Df. The Df of the four leaders are ${dearest.df.map(number).join(", ")}: one score of the team, but different credits. Training with Df keeps the leaders without which the team would lose most.`,
   },
   {
-    says() {
-      const view = removable(), { leader, lost, pois } = view ? dearest(view.data.episodes[0]) : { leader: 0, lost: 0, pois: 1 };
-      return `Leader ${leader} and its followers (pale) no longer count, and ${lost} of ${pois} POIs are lost (dark). This loss, ${lost / pois}, is the leader's Df. Training with Df keeps the leaders without which the team would lose most.`;
-    },
-    button: "Train such teams",
-    act() {
-      const view = removable();
-      if (view) remove_leader(view, null);
-      return train();
-    },
+    of: "two_groups", watch: () => exhibit("two_groups", { trains: true }),
+    asks: "Now two kinds of team start from nothing: leaders with followers, and teams in which all twelve agents learn. Which observe more POIs?",
+    choices: ["Leader-follower", "All-leaders", "Both alike"],
+    why: "Six independent learners almost never coincide. If each is at a POI in 3 of 10 episodes, all six are there in 7 of 10 000. All teams then score 0, and there is nothing to select. Two leaders that bring their followers coincide in 9 of 100.",
   },
   {
-    says: () => "Two kinds of team learn this task from nothing: leaders with followers, and teams in which all twelve agents learn. The chart shows how many POIs their best teams observe, generation by generation.",
-    button: "What does a larger population change?",
-    act: () => exhibit("population", { trains: true }),
+    of: "population", watch: () => exhibit("population", { trains: true }),
+    asks: "The same task, with followers. Each leader's policy is selected from a population of policies. How many does it take?",
+    choices: ["20 are enough", "100", "500"],
+    why: "The first policies are random. Among few, hardly any two leaders meet. Among many, some do, and selection copies them.",
   },
   {
-    says: () => "The same task, with followers. This time each leader's policy is chosen from a population of 20, 100 or 500 policies. Compare the three lines of the chart.",
-    button: "Done",
-    act() {},
+    of: "evolution", ready: evolution, watch: async () => show_exhibit(await evolution()),
+    asks: "Selection changes whole populations. The 50 policies of each leader start at random. Where do they go after 60 generations?",
+    choices: ["Everywhere", "Nearly all the same way"],
+    why: "Each faint line is the way of one policy, in the colour of its leader. At first they go everywhere. Selection keeps the few that meet, and their changed copies soon fill the population.",
+  },
+  {
+    of: "groups", watch: () => exhibit("groups", { trains: true }),
+    asks: "Do followers make the difference? Take them away, and let the three agents of a group share one population instead. What do such teams observe?",
+    choices: ["Nothing", "Less than half", "Most POIs"],
+    why: "Most of the difference was the number of populations, not the followers. In 30 trials of the paper's first layout, champions without followers reach G = 0.12 with a population per agent and 0.78 with one per group. With followers they reach 0.92. But somebody has to say who belongs to a group. Followers find their leader themselves.",
   },
 ];
 
-let at = 0;
+/** Shows an exhibit instead of a training. @param {Exhibit} exhibit */
+function show_exhibit(exhibit) {
+  if (state.exhibit !== exhibit) forget();
+  render({ mode: "watch", exhibit });
+}
 
-/** Shows a step, or its result once there is one. */
-function show_step(result = "") {
-  const goes_on = at < STEPS.length;
-  $("guide").hidden = !goes_on;
-  $(goes_on ? "play" : "guide").after($("setup"), $("modes"));
-  if (!goes_on) return;
-  $("guide-step").textContent = `${at + 1} of ${STEPS.length}`;
-  $("guide-says").textContent = result || STEPS[at].says();
-  $("guide-next").textContent = STEPS[at].button;
-  $("guide-end").hidden = at === STEPS.length - 1;
+/** Shows the opening, without a leader if given. @param {Removed | null} removed */
+function show_opening(removed) {
+  show_exhibit(OPENED);
+  const [view] = shown();
+  remove_leader(view, removed);
+  if (!view.playing && !still.matches) replay();
+}
+
+/** Returns whether the page shows an exhibit or an experiment. @param {string} name */
+const is_shown = name => state.mode === "watch" && (state.exhibit ? state.exhibit.name === name : is_of(name));
+/** Returns what a step, or its question, is about. @param {NonNullable<State["guide"]>} at */
+const about = ({ step, said }) => STEPS[said === null ? Math.max(0, step - 1) : step];
+
+part(() => [state.guide, state.mode, state.exhibit, state.text, state.compared, state.training, state.training && state.training.state], () => {
+  const { guide, training } = state;
+  $("guide").hidden = guide === null;
+  $(guide === null ? "guide" : "credit").after($("setup"));
+  if (!guide) return;
+  const { step, said } = guide, { asks, choices, why } = STEPS[step], here = is_shown(about(guide).of), last = step === STEPS.length - 1;
+  const watches = said !== null && training && training.state !== "done", result = training ? $("announced").textContent : "";
+  $("guide-step").textContent = `${step + 1} of ${STEPS.length}`;
+  $("guide-says").textContent = !here ? "What is on show is not part of the guide."
+    : said === null ? asks : `You said: ${said.toLowerCase()}. ${watches ? "Watch the map and the chart." : `${result ? `${result} ` : ""}${why}`}`;
+  const asked = here && said === null;
+  $("guide-choices").replaceChildren(...(asked ? choices : []).map(choice => {
+    const button = make("button", choice, null, { type: "button" });
+    button.addEventListener("click", () => enter({ step, said: choice }));
+    return button;
+  }));
+  $("guide-next").hidden = asked;
+  $("guide-next").textContent = !here ? "Back to the guide" : last ? "Done" : "Next";
+  $("guide-end").hidden = here && last && !asked;
+});
+
+/** Shows a step, and what it is about. @param {NonNullable<State["guide"]>} guide */
+async function enter(guide) {
+  const had_focus = $("guide").contains(document.activeElement), { ready } = STEPS[guide.step], made = ready && ready();
+  for (const button of all("button", $("guide-choices"))) button.inert = true;
+  if (guide.said !== null) await made;
+  render({ guide });
+  const watched = guide.said !== null || !is_shown(about(guide).of) ? about(guide).watch() : null;
+  if (had_focus) ($("guide-next").hidden ? all("button", $("guide-choices"))[0] : $("guide-next")).focus({ preventScroll: true });
+  await watched;
+  render();
 }
 
 export function guide() {
-  show_step();
-  $("guide-next").addEventListener("click", async () => {
-    const { act } = STEPS[at];
-    at += 1;
-    const now = at, trained = act();
-    show_step();
-    if (!trained) return;
-    // A step that trains ends with the result.
-    await trained;
-    if (at === now && state.training && state.training.state === "done") show_step($("announced").textContent ?? "");
+  render({ guide: { step: 0, said: null } });
+  $("guide-next").addEventListener("click", () => {
+    const { guide } = state;
+    if (!guide) return;
+    if (!is_shown(about(guide).of)) return enter(guide);
+    if (guide.step + 1 === STEPS.length) return leave_guide();
+    enter({ step: guide.step + 1, said: null });
   });
   $("guide-end").addEventListener("click", leave_guide);
 }
 
 // Ends the guided start.
 export function leave_guide() {
-  at = STEPS.length;
-  show_step();
+  const had_focus = $("guide").contains(document.activeElement);
+  render({ guide: null });
+  if (had_focus) $("train").focus();
 }

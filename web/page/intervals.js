@@ -1,8 +1,7 @@
 // Intervals over trials, and the comparison of arms. The module computes them as `flotilla compare` does.
-import { curves } from "./curves.js";
 import { $, make } from "./dom.js";
 import { clerk } from "./pool.js";
-import { state } from "./state.js";
+import { news, part, state } from "./state.js";
 
 /** Shows the intervals and tests of a training that has ended, or of opened runs. @param {Training} training */
 export async function intervals(training) {
@@ -11,13 +10,14 @@ export async function intervals(training) {
   const { words } = await clerk.ask({ ask: "compare", arms }, new Uint8Array(numbers.buffer));
   if (state.training !== training) return;
   training.found = words;
-  tables();
-  curves();
+  news(training);
 }
 
-/** Writes the tables, or removes them if there is nothing to show. */
-export function tables() {
-  const found = state.training && state.training.found;
+/** Returns the comparison on show. */
+const compared = () => state.training && state.training.found;
+
+part(() => [compared()], () => {
+  const found = compared();
   $("compared").hidden = !found;
   if (!found) return;
   const { means = [], pairs = [], refused, legend = "", notes = [] } = found;
@@ -25,7 +25,7 @@ export function tables() {
   $("pairs").replaceChildren(...(pairs.length > 1 ? [grid(pairs)] : []));
   $("tests").hidden = pairs.length < 2;
   $("compared-says").textContent = refused ? `The arms are not compared: ${refused}.` : [...notes.map(note => `${note[0].toUpperCase()}${note.slice(1)}.`), legend].join(" ").replaceAll("\n", " ");
-}
+});
 
 /** Makes a table of rows, of which the first is the head. Narrow windows show a block per row. @param {string[][]} rows */
 function grid([head, ...rows]) {

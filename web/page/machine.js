@@ -1,7 +1,7 @@
 // The workers, and the backend that trains.
 import { $, count, failure, write_text } from "./dom.js";
 import { pool } from "./pool.js";
-import { state } from "./state.js";
+import { part, render, state } from "./state.js";
 
 // Opens the chosen backend, or the CPU if no GPU is exact. `auto` also ignores software renderers.
 export async function settle() {
@@ -13,25 +13,21 @@ export async function settle() {
     try {
       if (!gpu.name) throw new Error(gpu.reason);
       $("machine").textContent = `Testing ${gpu.name} for exactness…`;
-      state.machine = (await state.players[0].ask({ ask: "open", gpu: true, pass: null })).words;
-      state.machine.adapter = gpu.name;
-      state.machine.description = `${gpu.name}${gpu.software ? ", a software renderer," : ""} with WebGPU, which passed the exactness test`;
-      state.settled = wanted;
-      return show_machine();
+      const { words } = await state.players[0].ask({ ask: "open", gpu: true, pass: null });
+      const description = `${gpu.name}${gpu.software ? ", a software renderer," : ""} with WebGPU, which passed the exactness test`;
+      return render({ machine: { ...words, adapter: gpu.name, description }, settled: wanted });
     } catch (thrown) { why = failure(thrown).message; }
   } else if (wanted === "auto") why = gpu.software ? `this browser's GPU is a software renderer, ${gpu.name}` : gpu.reason ?? "";
-  state.machine = (await state.players[0].ask({ ask: "open", gpu: false, pass: null })).words;
-  state.machine.threads = state.players.length;
-  state.machine.why = why;
-  state.settled = wanted;
-  show_machine();
+  const { words } = await state.players[0].ask({ ask: "open", gpu: false, pass: null });
+  render({ machine: { ...words, threads: state.players.length, why }, settled: wanted });
 }
 
-export function show_machine() {
+part(() => [state.machine, state.training, state.training && state.training.version], () => {
+  if (!state.settled) return;
   const { training, machine } = state, workers = machine.backend === "cpu" ? `${machine.description.replace(/, \d+ threads?/, "")} in ${count(state.players.length, "worker")}` : machine.description;
   const speed = training && training.teams ? ` · ${Math.round(training.rate).toLocaleString("en")} teams per second` : "";
   write_text($("machine"), `Runs on ${workers}${speed}${machine.why ? ` (${machine.why})` : ""}`);
-}
+});
 
 // Replaces the players, for example after they stopped responding.
 export async function renew() {

@@ -1,12 +1,11 @@
 // The page's event listeners and its start.
 import { autoplay, link, recall, remember, shows_runs } from "./address.js";
-import { add, remove, show_start } from "./arrange.js";
+import { add, remove } from "./arrange.js";
 import { comparison } from "./compare.js";
 import { configs } from "./config.js";
-import { credits } from "./credit.js";
 import { curves, drawn_chart } from "./curves.js";
-import { $, all, copy, failure, option, save, trouble } from "./dom.js";
-import { drive_off, drive_on, drive_view, options } from "./drive.js";
+import { $, all, failure, option } from "./dom.js";
+import { drive_off, drive_on, drive_view } from "./drive.js";
 import { change, compare, edited, entered, fill, keep, lines, take, typing, undo } from "./experiment.js";
 import { save_csv, save_gif, save_png, save_webm } from "./exports.js";
 import { take_files } from "./files.js";
@@ -14,20 +13,13 @@ import { gallery, text_of } from "./gallery.js";
 import { guide, leave_guide } from "./guide.js";
 import { renew, settle } from "./machine.js";
 import { mode } from "./modes.js";
-import { OPENING, show_opening } from "./opening.js";
+import { OPENED, OPENING } from "./opening.js";
+import { arrive, go_back } from "./past.js";
 import { clerk, pool } from "./pool.js";
-import { KEYS, KEY_IDS, after, quote, state } from "./state.js";
+import { KEYS, KEY_IDS, copy, quote, render, report, save, state, trouble } from "./state.js";
 import { forget, stop, train } from "./train.js";
 import { verify } from "./verify.js";
-import { ask, draw, follow, following, pause, replay, seek, step_to, wake_up } from "./views.js";
-
-after.episode = credits;
-after.config = ({ views, address }) => {
-  options();
-  if (state.mode === "drive") { drive_off(); drive_view(); } else if (views && (!state.training || state.mode === "arrange")) show_start();
-  curves();
-  if (address) remember();
-};
+import { ask_all, draw, follow, pause, replay, seek, step_to, wake_up } from "./views.js";
 
 function listen() {
   $("setup").addEventListener("submit", event => { event.preventDefault(); train(); });
@@ -36,9 +28,7 @@ function listen() {
     const text = await edited(configs.layout($("layout").value), [["learning.fitness", `"${fitness}"`], ["learning.seed", seed]]);
     keep();
     forget();
-    state.file = null;
-    const arranging = state.mode === "arrange";
-    mode(arranging ? "arrange" : "watch");
+    render({ file: null, mode: state.mode === "arrange" ? "arrange" : "watch" });
     await take(text);
   });
   $("paradigm").addEventListener("change", () => {
@@ -52,9 +42,9 @@ function listen() {
     // An empty field is reset to the config's value.
     $(id).addEventListener("change", () => { if ($(id).value !== "") change([[KEYS[id], quote(id)($(id).value)]]); else fill(); });
   }
-  for (const id of /** @type {const} */ (["on", "pace"])) $(id).addEventListener("change", remember);
+  for (const id of /** @type {const} */ (["on", "pace", "credited"])) $(id).addEventListener("change", () => render());
   // A training in progress keeps its backend. The next one uses the new choice.
-  $("on").addEventListener("change", () => { if (!state.training || state.training.state === "done" || state.training.state === "stopped") settle().catch(thrown => trouble(failure(thrown).message)); });
+  $("on").addEventListener("change", () => { if (!state.training || state.training.state === "done" || state.training.state === "stopped") settle().catch(thrown => trouble("run", failure(thrown).message)); });
   for (const button of all("[data-mode]")) button.addEventListener("click", () => mode(/** @type {typeof state.mode} */ (button.dataset.mode)));
   for (const button of all("[data-add]")) button.addEventListener("click", () => add(/** @type {List} */ (button.dataset.add)));
   $("remove").addEventListener("click", remove);
@@ -65,7 +55,7 @@ function listen() {
   $("undo").addEventListener("click", undo);
   $("step").addEventListener("input", () => step_to(Number($("step").value)));
   $("following").addEventListener("change", () => {
-    following($("following").checked);
+    render({ follow: $("following").checked });
     if (state.follow) follow(); else seek(state.generation);
   });
   $("scrub").addEventListener("input", () => {
@@ -73,26 +63,27 @@ function listen() {
     seek(Number($("scrub").value));
   });
   $("trial").addEventListener("change", () => {
-    state.trial = Number($("trial").value);
-    if (!state.follow) return seek(state.generation);
-    // Keep following, in the other trial.
-    state.views.forEach((view, run) => { if (view.asking) view.wanted = state.generation; else ask(view, run, state.generation); });
+    // Following goes on in the other trial.
+    render({ trial: Number($("trial").value) });
+    ask_all();
   });
   $("replay").addEventListener("click", () => {
     if (state.mode !== "watch") mode("watch");
     replay();
   });
   $("loop").addEventListener("change", () => { if ($("loop").checked) wake_up(); });
-  $("credited").addEventListener("change", credits);
   for (const id of /** @type {const} */ (["trails", "radii", "heat"])) $(id).addEventListener("change", () => state.views.forEach(draw));
+  $("curves").addEventListener("pointermove", event => { if (drawn_chart && state.training) render({ over: drawn_chart.generation(event.offsetX) }); });
+  $("curves").addEventListener("pointerleave", () => render({ over: null }));
   $("curves").addEventListener("click", event => { if (drawn_chart && state.training) { if (state.mode !== "watch") mode("watch"); seek(drawn_chart.generation(event.offsetX)); } });
   $("verify").addEventListener("click", verify);
   $("share").addEventListener("click", async () => {
     await entered();
-    if (!state.valid) return void ($("message").textContent = "No link was copied: the config has problems. Correct them first.");
-    if (!await remember()) return void ($("message").textContent = "No link was copied: this browser cannot compress a config. Save config.toml instead.");
-    if (shows_runs()) return void copy(link(), "The link is copied: it has the settings of the first run, but not the runs.");
-    copy(link(), `The link is copied: whoever opens it ${state.training ? "sees the same generation of the same training" : "trains the same"}.`);
+    if (!state.valid) return report("No link was copied: the config has problems. Correct them first.");
+    if (state.exhibit !== OPENED && !await remember()) return report("No link was copied: this browser cannot compress a config. Save config.toml instead.");
+    if (shows_runs()) return void copy(await link(), "The link is copied: it has the settings of the first run, but not the runs.");
+    const sees = state.training ? "sees the same generation of the same training" : state.exhibit === OPENED ? "sees the same team" : "trains the same";
+    copy(await link(), `The link is copied: whoever opens it ${sees}.`);
   });
   $("png").addEventListener("click", save_png);
   $("gif").addEventListener("click", save_gif);
@@ -116,42 +107,57 @@ function listen() {
   });
   addEventListener("keydown", event => {
     if (event.key !== " " || /** @type {Element} */ (event.target).closest("button, input, select, textarea, summary, a")) return;
+    // Where nothing plays, Space scrolls.
+    const { training, mode } = state, going = training && training.state === "training";
+    if (mode !== "watch" || !going && !state.views.some(view => view.playing)) return;
     event.preventDefault();
-    pause();
+    if (going) pause(); else replay();
   });
   const again = () => { state.views.forEach(draw); curves(); };
   addEventListener("resize", again);
   stage.night.addEventListener("change", again);
-  addEventListener("hashchange", async () => { leave_guide(); await recall(); });
+  addEventListener("popstate", go_back);
+  addEventListener("hashchange", async () => {
+    if (arrive()) return;
+    leave_guide();
+    await recall();
+  });
 }
 
 // Without an address, the page opens on a trained team. Its motion waits for no worker.
 const opens = location.hash.length <= 1;
 
+// Shows the page once it shows what was asked for, so that nothing moves afterwards.
+const appear = () => { document.body.dataset.shown = ""; };
+
 async function start() {
+  arrive();
+  listen();
+  gallery();
   if (opens) {
-    show_opening();
+    render({ text: text_of(OPENING), exhibit: OPENED });
     guide();
+    appear();
   }
   try {
     [state.gpu] = await Promise.all([pool.gpu(), renew()]);
   } catch (thrown) {
     $("machine").textContent = "";
-    return trouble(`This browser cannot run flotilla: ${failure(thrown).message}. It needs WebAssembly with SIMD, which browsers have had since 2023.`);
+    appear();
+    return trouble("run", `This browser cannot run flotilla: ${failure(thrown).message}. It needs WebAssembly with SIMD, which browsers have had since 2023.`);
   }
-  for (const name of configs.LAYOUTS) state.layouts[name] = (await clerk.ask({ ask: "resolve", text: configs.layout(name), name, changes: [] })).words.config;
+  const layout = async (/** @type {string} */ name) => [name, (await clerk.ask({ ask: "resolve", text: configs.layout(name), name, changes: [] })).words.config];
+  state.layouts = Object.fromEntries(await Promise.all(configs.LAYOUTS.map(layout)));
   state.version = (await clerk.ask({ ask: "about" })).words.version;
   $("verify").disabled = !state.gpu.name;
   $("plain-label").hidden = !state.gpu.name;
   $("verified").textContent = state.gpu.name ? "Compares this browser's GPU with its CPU, bit for bit." : `There is no GPU to verify: ${state.gpu.reason}.`;
   option($("on"), "gpu").disabled = !state.gpu.name;
-  listen();
-  gallery();
-  // The settings become those of the opening. Its episode goes on.
-  if (opens) await take(text_of(OPENING), { address: false, views: false });
-  else await recall();
+  // The settings become those of the opening, unless others were chosen meanwhile. Its episode goes on.
+  if (!opens) await recall();
+  else if (state.text === text_of(OPENING)) await take(state.text, { linked: false, keeps: true });
+  appear();
   await settle();
-  $("guide-next").disabled = false;
   document.body.dataset.ready = "";
   await autoplay();
 }

@@ -1,48 +1,50 @@
 // What to do with the map: watch, rearrange, or take a leader.
 import { show_start } from "./arrange.js";
-import { $, all } from "./dom.js";
-import { drive_off, drive_view, options } from "./drive.js";
-import { state } from "./state.js";
-import { ask, build, clear, controls, follow, position } from "./views.js";
+import { $, all, write_text } from "./dom.js";
+import { drive_off, drive_view } from "./drive.js";
+import { join } from "./scene.js";
+import { part, render, state } from "./state.js";
+import { add_view, ask_all, build, clear, follow, reveal, show } from "./views.js";
 
-/** @type {Record<string, string>} */
-const HINTS = {
-  watch: "", arrange: "Drag leaders, followers and POIs, then train again.",
-  drive: "Point to where your leader should go, or use the arrow keys. Time passes only while you steer.",
-};
+part(() => [state.mode], () => {
+  for (const button of all("[data-mode]")) button.ariaPressed = String(button.dataset.mode === state.mode);
+  $("arrange").hidden = state.mode !== "arrange";
+  $("drive").hidden = state.mode !== "drive";
+});
 
-/** @param {"watch" | "arrange" | "drive"} wanted */
-export function mode(wanted) {
-  if (state.mode === wanted) return;
+/** Returns what the maps show: a training, an episode, or the start of the experiment. */
+const subject = () => state.mode === "watch" && (state.training || state.exhibit) || state.config;
+
+part(() => [state.mode, subject()], () => {
+  const { mode, training, exhibit } = state;
   drive_off();
-  state.mode = wanted;
-  for (const button of all("[data-mode]")) button.ariaPressed = String(button.dataset.mode === wanted);
-  $("hint").textContent = HINTS[wanted];
-  $("arrange").hidden = wanted !== "arrange";
-  $("drive").hidden = wanted !== "drive";
-  const { training } = state;
-  if (wanted !== "watch" && training && training.state === "training") { training.paused = true; controls(); }
-  if (wanted === "arrange") {
-    show_start();
-    $("modes").scrollIntoView({ block: "start" });
-  } else if (wanted === "drive") {
-    const led = training && training.arms.find(arm => arm.label === "leader-follower" && arm.ended.length);
-    if (led) state.policies = { each: 1, weights: led.ended[Math.min(state.trial, led.ended.length - 1)] };
-    if (led && led.toml !== state.toml && led.config.world.leaders.length !== state.config.world.leaders.length) state.policies = null;
-    options();
-    drive_view();
-    $("driven").textContent = "";
-    $("modes").scrollIntoView({ block: "start" });
-  } else if (training) {
-    const { generation, trial } = state;
+  if (mode === "drive") drive_view();
+  else if (mode === "watch" && training) {
     build(training);
-    position();
-    $("trial").value = String(trial);
-    if (training.state === "done" || !state.follow) {
-      state.views.forEach((view, run) => ask(view, run, state.follow ? training.last : generation));
-    } else follow();
-  } else {
+    if (state.follow) follow(); else ask_all();
+  } else if (mode === "watch" && exhibit) {
     clear();
-    show_start();
-  }
+    const crop = exhibit.scenes.map(({ data }) => stage.busy(data)).reduce(join);
+    for (const { title, data, status, label, ghosts = [] } of exhibit.scenes) {
+      const view = add_view(title, crop);
+      view.describe = (step, observed, text) => {
+        write_text(view.status, status(step, observed));
+        view.canvas.ariaLabel = `${label}, step ${step}: ${text}`;
+      };
+      view.ghosts = ghosts;
+      show(view, data);
+    }
+  } else show_start();
+});
+
+/** @param {State["mode"]} mode */
+export function mode(mode) {
+  if (state.mode === mode) return;
+  const { training } = state;
+  if (mode !== "watch" && training) training.paused = true;
+  const led = mode === "drive" && training && training.arms.find(arm => arm.label === "leader-follower" && arm.ended.length);
+  if (led) state.policies = { each: 1, weights: led.ended[Math.min(state.trial, led.ended.length - 1)] };
+  if (led && led.toml !== state.toml && led.config.world.leaders.length !== state.config.world.leaders.length) state.policies = null;
+  render({ mode });
+  reveal();
 }

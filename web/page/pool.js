@@ -65,6 +65,8 @@ export const pool = (() => {
 
   // Starts a worker, and returns it once it accepts requests.
   async function open() {
+    // The module comes after the script, and may still be on its way.
+    if (document.readyState === "loading") await new Promise(done => document.addEventListener("DOMContentLoaded", done, { once: true }));
     // If compiling fails, the next worker tries again.
     compiled ??= compile().catch(thrown => { compiled = null; throw thrown; });
     const player = new Player();

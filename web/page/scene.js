@@ -16,6 +16,9 @@ export function reach({ world, motion }) {
   return [left, below, right, above];
 }
 
+/** Returns the smallest part of the map that holds two. @param {Crop} one @param {Crop} other @returns {Crop} */
+export const join = (one, other) => [Math.min(one[0], other[0]), Math.min(one[1], other[1]), Math.max(one[2], other[2]), Math.max(one[3], other[3])];
+
 /**
  * Returns the start as an episode without steps. Places are those of the config, which may have moved since the module resolved it.
  * @param {Config} config @returns {Scene}

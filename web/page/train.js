@@ -1,16 +1,16 @@
 // Starts, shows and ends trainings.
 import { constants, randoms } from "./baselines.js";
 import { label, slug, toml } from "./compare.js";
-import { curves } from "./curves.js";
-import { $, copy, failure, make, save, trouble, write_text } from "./dom.js";
-import { command, entered, name_of, stale } from "./experiment.js";
-import { intervals, tables } from "./intervals.js";
-import { renew, settle, show_machine } from "./machine.js";
+import { $, failure, make, write_text } from "./dom.js";
+import { command, entered, name_of } from "./experiment.js";
+import { intervals } from "./intervals.js";
+import { renew, settle } from "./machine.js";
 import { mode } from "./modes.js";
+import { leave } from "./past.js";
 import { clerk } from "./pool.js";
-import { state } from "./state.js";
+import { copy, news, part, render, save, state, trouble } from "./state.js";
 import { Training } from "./training.js";
-import { build, clear, controls, follow, following } from "./views.js";
+import { follow, reveal } from "./views.js";
 
 let starting = false;
 export async function train() {
@@ -18,10 +18,8 @@ export async function train() {
   starting = true;
   const busy = state.training && ["starting", "training"].includes(state.training.state);
   if (state.training) state.training.stop();
-  trouble("");
+  render({ troubles: { link: state.troubles.link }, message: "" });
   mode("watch");
-  $("digests").replaceChildren();
-  $("announced").textContent = "";
   /** @type {Training} */
   let training;
   try {
@@ -41,24 +39,23 @@ export async function train() {
     }));
     const bytes = arms.reduce((sum, arm) => sum + arm.bytes, 0);
     if (bytes > 3 * 2 ** 30) throw new Error(`This takes ${(bytes / 2 ** 30).toFixed(1)} GiB, and a tab has at most 4. Choose a smaller population, fewer trials or fewer arms, or use the command line.`);
-    training = state.training = new Training(arms, state.machine);
+    training = new Training(arms, state.machine);
     training.source = { text: state.text, compared: state.compared };
-    Object.assign(state, { generation: 0, trial: 0, policies: null });
-    following(true);
-    tables();
-    build(training);
+    leave();
+    render({ training, exhibit: null, generation: 0, trial: 0, policies: null, follow: true });
+    reveal();
     await training.start(state.players);
   } catch (thrown) {
     const { message, fatal } = failure(thrown);
     if (fatal) await renew();
-    trouble(message);
+    if (state.training && state.training.state === "starting") forget();
+    trouble("run", message);
     return;
   } finally { starting = false; }
-  stale();
-  controls();
+  render();
   constants(training).catch(() => {});
   // For watching, the pace is limited to `last / 8` generations per second, but at least 1. Pauses do not count.
-  let played = 0, clock = performance.now(), dirty = true, news = clock;
+  let played = 0, clock = performance.now(), dirty = true, latest = clock;
   const allowed = () => {
     const now = performance.now(), each = training.last / 8;
     if (!training.paused) played += (now - clock) / 1000 * Math.max(1, each);
@@ -68,8 +65,8 @@ export async function train() {
   // Four charts a second are enough, and leave the main thread free.
   const painting = setInterval(() => {
     if (state.training !== training || document.hidden) return;
-    if (dirty) { dirty = false; news = performance.now(); curves(); follow(); }
-    const silent = (performance.now() - news) / 1000;
+    if (dirty) { dirty = false; latest = performance.now(); news(training); follow(); }
+    const silent = (performance.now() - latest) / 1000;
     if (silent > 2 && !training.paused && training.reached < training.last) {
       write_text($("generation"), `generation ${training.reached + 1} of ${training.last}: ${Math.round(silent)} s so far`);
     }
@@ -81,26 +78,31 @@ export async function train() {
     if (!stopped && state.training === training) {
       training.stop();
       if (fatal || state.machine.backend === "gpu") await renew();
-      trouble(`${message}\nTraining stopped there. ${state.machine.backend === "gpu" ? "Train again, if necessary on the CPU: the result is the same." : "Train again: the result is the same."}`);
+      trouble("run", `${message}\nTraining stopped there. ${state.machine.backend === "gpu" ? "Train again, if necessary on the CPU: the result is the same." : "Train again: the result is the same."}`);
     }
   }
   clearInterval(painting);
   if (state.training !== training) return;
-  controls();
-  curves();
+  news(training);
   follow();
-  show_machine();
   intervals(training).catch(() => {});
-  if (training.state === "done") {
-    digests();
-    randoms(training).catch(() => {});
-    const found = training.arms.map(arm => {
-      const last = arm.trials.map(trial => trial[trial.length - 1].best), mean = last.reduce((sum, best) => sum + best, 0) / last.length;
-      return `${(mean * (arm.pois ?? 1)).toFixed(2)} of ${arm.pois ?? 1} (${arm.label})`;
-    });
-    $("announced").textContent = `Training is finished. ${training.pois === null ? "Share of POIs" : "POIs"} that the best team observes, on average over trials: ${found.join(", ")}.`;
-  }
+  if (training.state === "done") randoms(training).catch(() => {});
 }
+
+/** Returns what each arm of a finished training observes. @param {Training} training */
+function found_by(training) {
+  const found = training.arms.map(arm => {
+    const last = arm.trials.map(trial => trial[trial.length - 1].best), mean = last.reduce((sum, best) => sum + best, 0) / last.length;
+    return `${(mean * (arm.pois ?? 1)).toFixed(2)} of ${arm.pois ?? 1} (${arm.label})`;
+  });
+  return `${training.pois === null ? "Share of POIs" : "POIs"} that the best team observes, on average over trials: ${found.join(", ")}.`;
+}
+
+part(() => [state.training, state.training && state.training.state], () => {
+  const { training } = state;
+  if (training && training.state === "done") $("announced").textContent = `Training is finished. ${found_by(training)}`;
+  else $("announced").textContent = training && training.state === "stopped" ? `Stopped after generation ${Math.max(0, training.reached)}.` : "";
+});
 
 // Returns what the arms differ in. Without followers, there is only one paradigm. One value makes one arm.
 function effective() {
@@ -114,35 +116,27 @@ export function stop() {
   const { training } = state;
   if (!training || training.state !== "training") return;
   training.stop();
-  controls();
-  $("announced").textContent = `Stopped after generation ${Math.max(0, training.reached)}.`;
+  render();
 }
 
 // Discards a training and its results.
 export function forget() {
   if (state.training) state.training.stop();
-  Object.assign(state, { training: null, policies: null });
-  $("digests").replaceChildren();
-  $("scrub").value = "0";
-  $("generation").textContent = "";
-  $("announced").textContent = "";
-  $("trial").replaceChildren();
-  tables();
-  clear();
-  controls();
-  stale();
+  leave();
+  render({ training: null, exhibit: null, policies: null, generation: 0, trial: 0, troubles: {}, message: "" });
 }
 
-export function digests() {
+part(() => [state.training, state.training && state.training.state === "done"], () => {
   const { training } = state;
   $("digests").replaceChildren();
-  for (const arm of training ? training.arms : []) {
+  if (!training || training.state !== "done") return;
+  for (const arm of training.arms) {
     const place = make("div", "", $("digests"), { className: "digest" });
     const head = make("div", "", place, { className: "row" });
     make("b", `${arm.label}:`, head);
     make("code", arm.digest, head, { className: "sha" });
     if (arm.command) make("code", arm.command, place);
-    const { command, zip } = arm, source = training && training.source;
+    const { command, zip } = arm, { source } = training;
     const acts = make("div", "", place, { className: "row" });
     if (zip) make("button", `Save the ${arm.label} run (.zip)`, acts, { type: "button", className: "home" }).addEventListener("click", () => save(`${arm.name}-${slug(arm.label)}.zip`, zip, "application/zip"));
     if (source && command && !command.includes(" configs/")) {
@@ -150,4 +144,4 @@ export function digests() {
     }
     if (command) make("button", "Copy the command", acts, { type: "button" }).addEventListener("click", () => copy(command, "The command is copied. It gives the same digest."));
   }
-}
+});

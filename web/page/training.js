@@ -1,18 +1,21 @@
 // A training of some arms, or runs that were opened. On the GPU, one worker trains everything as one batch. On the CPU, the trials are
 // divided among the workers. The division does not change the results.
 
+import { styles } from "./compare.js";
+
 /** Milliseconds after which a player that waits asks again whether it may play. */
 const REST = 40;
 
 export class Training {
   /** @param {Planned[]} arms @param {Machine} machine */
   constructor(arms, machine) {
+    const own = styles(arms.map(({ label }) => label));
     /** The text and the comparison that were trained. @type {{ text: string, compared: Comparison | null } | null} */
     this.source = null;
     /** The comparison of the arms, once it is made. @type {Found | null} */
     this.found = null;
     /** @type {Arm[]} */
-    this.arms = arms.map(arm => ({ ...arm, trials: Array.from({ length: arm.config.learning.trials }, () => []), ended: [] }));
+    this.arms = arms.map((arm, index) => ({ ...arm, style: own[index], trials: Array.from({ length: arm.config.learning.trials }, () => []), ended: [] }));
     this.machine = machine;
     /** @type {Player[]} */
     this.players = [];
@@ -21,6 +24,8 @@ export class Training {
     this.paused = false;
     this.state = "starting";
     this.teams = 0;
+    /** Counts the changes of what is shown of the results. */
+    this.version = 0;
     /** Seconds that each player has worked. @type {number[]} */
     this.busy = [];
     this.started = new Date().toISOString().replace(/\.\d+Z$/, "Z");
@@ -50,7 +55,8 @@ export class Training {
       return player.ask({ ask: "train", runs: this.arms.map((arm, run) => ({ text: arm.toml, trials: trials(run) })) });
     }));
     this.busy = this.players.map(() => 0);
-    this.state = "training";
+    // It may have been stopped meanwhile.
+    if (this.state === "starting") this.state = "training";
   }
 
   /**
@@ -147,15 +153,18 @@ export class Training {
         own.trials[trial][generation] = { best, mean, champion, seconds };
       }
       const start = words.rows * 56, size = (bytes.byteLength - start) / own.trials.length;
-      own.trials.forEach((_, trial) => {
-        own.ended[trial] = champions(own, bytes.subarray(start + trial * size, start + (trial + 1) * size), size / 4);
-        training.owners.set(`${run}/${trial}`, player);
-      });
+      own.trials.forEach((_, trial) => { own.ended[trial] = champions(own, bytes.subarray(start + trial * size, start + (trial + 1) * size), size / 4); });
     });
-    training.players = [player];
-    await player.ask({ ask: "train", runs: opened.map(({ words }) => ({ text: words.toml, trials: [] })) });
+    await training.revive(player);
     training.state = "done";
     return training;
+  }
+
+  /** Lets a player replay all generations, after it or others played something else. @param {Player} player */
+  async revive(player) {
+    this.players = [player];
+    this.arms.forEach((arm, run) => arm.trials.forEach((_, trial) => this.owners.set(`${run}/${trial}`, player)));
+    await player.ask({ ask: "train", runs: this.arms.map(({ toml }) => ({ text: toml, trials: [] })) });
   }
 
   /**

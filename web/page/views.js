@@ -1,63 +1,64 @@
 // Views of episodes: one canvas per arm.
-import { curves } from "./curves.js";
-import { $, failure, make, number, pen_of, still, trouble, write_text } from "./dom.js";
-import { reach } from "./scene.js";
+import { chart } from "./chart.js";
+import { $, failure, make, make_key, pen_of, still, write_text } from "./dom.js";
+import { join, start_scene } from "./scene.js";
 import { angles, moment, words } from "./senses.js";
-import { NAMES, TONES, after, shown, state } from "./state.js";
+import { NAMES, TONES, part, render, shown, state, trouble } from "./state.js";
 import { last_of } from "./training.js";
 
-/** Adds a view. @param {string} label @param {Crop} crop */
-function add_view(label, crop) {
+/** Adds a view: of an arm with a style, or without one. @param {string} label @param {Crop} crop @param {number | null} style */
+export function add_view(label, crop, style = null) {
   const card = make("section", "", $("views"), { className: "card" });
   const head = make("h2", "", card);
-  const key = make("span", "", head, { className: `key${state.views.length ? " dashed" : ""}` });
-  key.style.color = `var(${TONES[state.views.length]})`;
-  const title = make("span", NAMES[label] || label, head);
+  if (style !== null) make_key(TONES[style], chart.DASHES[style], head);
+  const title = make("span", "", head), [name, ...more] = (NAMES[label] || label).split(/(?=: )/);
+  title.append(name, make("small", more.join("")));
   const status = make("p", "", card, { role: "status", ariaLive: "off" });
   const canvas = make("canvas", "", card, { role: "img" });
   const sensed = make("p", "", card, { className: "sensed", hidden: true });
   /** @type {View} */
   const view = {
-    label, card, key, title, status, canvas, sensed, crop, data: null, place: 0, playing: false, ended: null, over: null, wanted: null,
-    asking: false, chosen: null, removed: null, selected: null, drawn: [], describe: null,
+    label, card, title, status, canvas, sensed, crop, data: null, place: 0, playing: false, ended: null, over: null, wanted: null,
+    asking: false, chosen: null, removed: null, selected: null, drawn: [], ghosts: [], describe: null,
   };
   canvas.addEventListener("pointermove", event => pointed(view, event));
   canvas.addEventListener("click", event => picked(view, event));
   canvas.addEventListener("pointerleave", () => { view.over = null; draw(view); });
   state.views.push(view);
+  aim(view, crop);
   return view;
+}
+
+/** Sets the part of the map that a view shows, extended to the shape of its canvas: width divided by height. @param {View} view @param {Crop} crop */
+export function aim(view, [left, below, right, above], shape = (right - left) / (above - below)) {
+  const wide = Math.max(right - left, (above - below) * shape), tall = wide / shape, x = (left + right) / 2, y = (below + above) / 2;
+  view.crop = [x - wide / 2, y - tall / 2, x + wide / 2, y + tall / 2];
+  view.canvas.style.setProperty("--wide", String(shape));
+}
+
+/** Scrolls the maps into view if they are not, with the guide and the bar above them. */
+export function reveal() {
+  const above = $("guide").hidden ? $("views") : $("guide"), least = above === $("views") ? $("bar").offsetHeight : 0;
+  if (above.getBoundingClientRect().top < least || $("views").getBoundingClientRect().bottom > innerHeight) above.scrollIntoView({ block: "start" });
 }
 
 /** Shows a single view that belongs to no arm. @param {string} title @param {Crop} crop */
 export function only_view(title, crop) {
   clear();
-  const view = add_view("leader-follower", crop);
-  view.title.textContent = title;
-  view.key.hidden = true;
-  $("views").classList.add("one");
-  $("views").after($("credit"));
-  return view;
+  return add_view(title, crop);
 }
 
-/** Makes a view for each arm. The chart comes before the table of credit then: it is what changes. @param {Training} training */
+/** Makes a view for each arm. All show the same part of the map, in a shape that leaves room for the chart. @param {Training} training */
 export function build(training) {
   clear();
-  $("loop").checked = false;
-  for (const arm of training.arms) add_view(arm.label, reach(arm.config));
-  $("views").classList.toggle("one", training.arms.length === 1);
-  $("views").classList.toggle("many", training.arms.length > 2);
-  $("play").after($("credit"));
-  // Trials that all arms have.
-  const trials = Math.min(...training.arms.map(arm => arm.trials.length));
-  $("trial").replaceChildren(...Array.from({ length: trials }, (_, trial) => make("option", String(trial))));
-  $("scrub").max = String(training.last);
-  $("scrub").value = "0";
+  const crop = training.arms.map(({ config }) => stage.busy(start_scene(config))).reduce(join);
+  const shape = Math.max(1, Math.min(1.6, (crop[2] - crop[0]) / (crop[3] - crop[1])));
+  for (const { label, style } of training.arms) aim(add_view(label, crop, style), crop, shape);
 }
 
 export function clear() {
   state.views = [];
   $("views").replaceChildren();
-  $("credit").hidden = true;
 }
 
 /** Draws a view at its place in the episode. @param {View} view */
@@ -71,12 +72,12 @@ export function draw(view) {
   };
   const { step, positions } = stage.paint(data, episode, view.canvas, view.place, look);
   view.drawn = positions;
+  haunt(view);
   if (view === state.views[0]) steps(data, view.place);
   const [observed, text] = stage.say(episode, step);
   if (view.describe) view.describe(step, observed, text);
   else {
-    const end = number(episode.g * data.pois.length);
-    write_text(view.status, `generation ${episode.generation}, trial ${episode.trial} · ${observed} of ${data.pois.length} POIs by step ${step} · ends at ${end}`);
+    write_text(view.status, `generation ${episode.generation}, trial ${episode.trial} · ${observed} of ${data.pois.length} POIs by step ${step}`);
     view.canvas.ariaLabel = `${NAMES[view.label] || view.label}: the best team of generation ${episode.generation}, step ${step}: ${text}`;
   }
   if (view.chosen) ring(view, view.chosen);
@@ -91,6 +92,26 @@ const without = (episode, removed) => removed && episode.without ? episode.witho
 export function dark(data, removed) {
   const [episode] = data.episodes, gone = without(episode, removed);
   return gone ? episode.observed.flatMap((at, poi) => at !== null && gone.observed[poi] === null ? [poi] : []) : [];
+}
+
+/** Draws the ways of the leaders of other teams as faint lines. @param {View} view */
+function haunt({ canvas, crop, ghosts }) {
+  const { X, Y } = stage.place_on(canvas, crop), pen = pen_of(canvas);
+  pen.lineWidth = 1;
+  pen.globalAlpha = 0.2;
+  for (const ghost of ghosts) {
+    const [episode] = ghost.episodes, colors = stage.palette(ghost);
+    for (let leader = 0; leader < episode.leaders; leader++) {
+      pen.strokeStyle = colors[leader % colors.length];
+      pen.beginPath();
+      for (let frame = 0; frame < episode.shown.length; frame++) {
+        const [x, y] = stage.moment(ghost, episode, frame, leader);
+        pen.lineTo(X(x), Y(y));
+      }
+      pen.stroke();
+    }
+  }
+  pen.globalAlpha = 1;
 }
 
 /** Draws a ring around what is chosen in a view. @param {View} view @param {Chosen} chosen */
@@ -147,7 +168,7 @@ function picked(view, event) {
 export function select(view, leader) {
   view.selected = view.selected === leader ? null : leader;
   draw(view);
-  after.episode();
+  render();
 }
 
 /**
@@ -155,16 +176,18 @@ export function select(view, leader) {
  * @param {View} view @param {Scene} data
  */
 export function show(view, data, moves = true) {
-  const last = data.episodes[0].shown.length - 1, plays = moves && !still.matches, [left, below, right, above] = view.crop;
-  // Stages and jitter may move POIs out of the view.
-  if (data.pois.some(([x, y]) => x < left || x > right || y < below || y > above)) view.crop = stage.whole(data);
-  view.canvas.style.setProperty("--wide", String((view.crop[2] - view.crop[0]) / (view.crop[3] - view.crop[1])));
+  const last = data.episodes[0].shown.length - 1, plays = moves && !still.matches, crop = join(view.crop, stage.busy(data));
+  // What is on show grows with the episodes, and is the same in all views.
+  if (crop.some((side, index) => side !== view.crop[index])) {
+    for (const other of state.views) aim(other, crop, Number(other.canvas.style.getPropertyValue("--wide")));
+    state.views.forEach(draw);
+  }
   // A removed leader stays removed while the episode is the same.
   if (data !== view.data) view.removed = null;
   if (view.selected && view.selected >= data.episodes[0].leaders) view.selected = null;
   Object.assign(view, { data, place: plays ? 0 : last, playing: plays, ended: plays ? null : performance.now() });
   draw(view);
-  after.episode();
+  render();
   wake_up();
 }
 
@@ -252,8 +275,7 @@ function tick(time) {
 export function follow() {
   const { training } = state;
   if (!training || state.mode !== "watch" || !state.follow || training.state === "starting") return;
-  state.generation = Math.max(0, training.reached);
-  position();
+  render({ generation: Math.max(0, training.reached) });
   state.views.forEach((view, run) => {
     const at = view.data ? view.data.episodes[0].generation : -1;
     const rest = still.matches ? 700 : 250;
@@ -273,7 +295,7 @@ export async function ask(view, run, generation) {
     if (state.training === training && state.views[run] === view && state.mode === "watch") show(view, data);
   } catch (thrown) {
     const { message, stopped, fatal } = failure(thrown);
-    if (!stopped && !fatal && state.training === training) trouble(message);
+    if (!stopped && !fatal && state.training === training) trouble("run", message);
   }
   view.asking = false;
   if (view.wanted !== null) {
@@ -287,44 +309,44 @@ export async function ask(view, run, generation) {
 export function seek(generation) {
   const { training } = state;
   if (!training || training.state === "starting") return;
-  following(training.state === "training" && generation >= training.reached);
-  state.generation = Math.max(0, Math.min(training.reached, generation));
-  position();
-  curves();
+  render({ follow: training.state === "training" && generation >= training.reached, generation: Math.max(0, Math.min(training.reached, generation)) });
+  ask_all();
+}
+
+// Requests the generation on show for all views.
+export function ask_all() {
   state.views.forEach((view, run) => {
     if (view.asking) view.wanted = state.generation;
     else ask(view, run, state.generation);
   });
 }
 
-/** Follows the training, or not. @param {boolean} follow */
-export function following(follow) {
-  state.follow = follow;
-  $("following").checked = follow;
-}
-
-export function position() {
-  const { training, generation } = state;
-  if (!training) return;
-  const ahead = state.follow && training.state === "training";
-  $("scrub").value = String(generation);
-  $("generation").textContent = `${ahead ? "trained to generation" : "generation"} ${generation} of ${training.last}`;
-  $("scrub").ariaValueText = $("generation").textContent;
-}
-
-export function controls() {
-  const { training } = state, going = Boolean(training && training.state === "training");
+// The player of the training.
+part(() => [state.training], () => {
+  const { training } = state;
+  $("loop").checked = !training && !still.matches;
+  // Trials that all arms have.
+  const trials = training ? Math.min(...training.arms.map(arm => arm.trials.length)) : 0;
+  $("trial").replaceChildren(...Array.from({ length: trials }, (_, trial) => make("option", String(trial))));
+  $("scrub").max = String(training ? training.last : 100);
+});
+part(() => [state.training, state.training && state.training.state, state.training && state.training.paused, state.follow, state.generation, state.trial], () => {
+  const { training, generation } = state, going = Boolean(training && training.state === "training");
   $("pause").disabled = $("stop").disabled = $("following").disabled = !going;
   $("pause").textContent = going && training && training.paused ? "Continue" : "Pause";
+  $("following").checked = state.follow;
   $("scrub").disabled = !training || training.state === "starting";
-}
+  $("scrub").value = String(training ? generation : 0);
+  $("trial").value = String(state.trial);
+  $("generation").textContent = training ? `${state.follow && going ? "trained to generation" : "generation"} ${generation} of ${training.last}` : "";
+  $("scrub").ariaValueText = $("generation").textContent;
+});
 
 export function pause() {
   const { training } = state;
   if (!training || training.state !== "training") return;
   training.paused = !training.paused;
-  if (!training.paused) following(true);
-  controls();
+  render({ follow: state.follow || !training.paused });
   follow();
 }
 

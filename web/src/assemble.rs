@@ -76,6 +76,18 @@ mod page {
         }
     }
 
+    /// Returns elements that hold texts for the script.
+    fn inert(texts: &[(String, String)]) -> Result<String, String> {
+        let mut elements = String::new();
+        for (name, text) in texts {
+            if text.contains("</") && text.to_lowercase().contains("</script") {
+                return Err(format!("{name} would end its element early"));
+            }
+            elements += &format!("<script type=\"text/plain\" id=\"{name}\">{text}</script>\n");
+        }
+        Ok(elements)
+    }
+
     pub fn make(wasm: &Path, folder: &Path) -> Result<(), Box<dyn Error>> {
         let mut made = Bindgen::new()
             .input_path(wasm)
@@ -88,7 +100,8 @@ mod page {
         let wasm = made.wasm_mut().emit_wasm();
         let packed = compress_to_vec_zlib(&wasm, 10);
         let worker = format!("{glue}\n{}", source("page/worker.js")?);
-        let mut texts = vec![("wasm".to_string(), BASE64_STANDARD.encode(&packed)), ("worker".to_string(), worker)];
+        let module = [("wasm".to_string(), BASE64_STANDARD.encode(&packed)), ("worker".to_string(), worker)];
+        let mut texts = Vec::new();
         for layout in LAYOUTS {
             texts.push((format!("layout-{layout}"), source(&format!("../configs/{layout}.toml"))?));
         }
@@ -100,14 +113,8 @@ mod page {
         script.join("main")?;
         let mut page = source("page/index.html")?;
         page = page.replacen("/* STYLE */", &source("page/style.css")?, 1).replacen("/* SCRIPTS */", &script.text, 1);
-        let mut inert = String::new();
-        for (name, text) in texts {
-            if text.contains("</") && text.to_lowercase().contains("</script") {
-                return Err(format!("{name} would end its element early").into());
-            }
-            inert += &format!("<script type=\"text/plain\" id=\"{name}\">{text}</script>\n");
-        }
-        page = page.replacen("<!-- TEXTS -->", &inert, 1);
+        // The script precedes the module, which is most of the page, so that the opening moves while the module arrives.
+        page = page.replacen("<!-- TEXTS -->", &inert(&texts)?, 1).replacen("<!-- MODULE -->", &inert(&module)?, 1);
         fs::create_dir_all(folder)?;
         fs::write(folder.join("index.html"), &page)?;
         let all = compress_to_vec_zlib(page.as_bytes(), 9).len();

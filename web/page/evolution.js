@@ -1,0 +1,38 @@
+// Whole populations of the first experiment, at some generations.
+import { text_of } from "./gallery.js";
+import { clerk } from "./pool.js";
+
+const GENERATIONS = [0, 15, 60], POPULATION = 50;
+
+/** @type {Promise<Exhibit> | null} */
+let made = null;
+// Trains until each generation, and plays every policy. Policy n of a leader plays with policy n of the others. Trainings with the same
+// seed are equal until one ends.
+export const evolution = () => made ??= make_evolution();
+
+async function make_evolution() {
+  const resolve = (/** @type {number} */ generations) => clerk.ask({
+    ask: "resolve", text: text_of("two_groups"), name: "two_groups.toml",
+    changes: [["learning.generations", String(generations)], ["learning.population", String(POPULATION)], ["learning.trials", "1"]],
+  });
+  const configs = await Promise.all(GENERATIONS.map(async generations => (await resolve(generations)).words));
+  await clerk.ask({ ask: "train", runs: configs.map(({ toml }) => ({ text: toml, trials: [0] })) });
+  while (!(await clerk.ask({ ask: "advance", generations: 1000, milliseconds: 60 })).words.done);
+  /** @type {Exhibit} */
+  const exhibit = { name: "evolution", scenes: [] };
+  for (const [run, { toml, parameters }] of configs.entries()) {
+    const { words: [{ policies }], bytes } = await clerk.ask({ ask: "ends", run }), weights = new Float32Array(bytes.buffer, bytes.byteOffset, policies);
+    /** @type {Scene[]} */
+    const ghosts = [];
+    for (let policy = 0; policy < POPULATION; policy++) {
+      const own = Float32Array.from({ length: policies / POPULATION }, (_, at) => weights[(Math.floor(at / parameters) * POPULATION + policy) * parameters + at % parameters]);
+      ghosts.push(stage.unpack((await clerk.ask({ ask: "play", text: toml, policies: 1 }, new Uint8Array(own.buffer))).words));
+    }
+    const best = ghosts.reduce((best, ghost) => ghost.episodes[0].g > best.episodes[0].g ? ghost : best), generation = GENERATIONS[run];
+    exhibit.scenes.push({
+      title: `Generation ${generation}`, data: best, ghosts, label: `${POPULATION} teams of generation ${generation}; the best of them`,
+      status: (step, observed) => `the best of ${POPULATION}: ${observed} of ${best.pois.length} POIs by step ${step}`,
+    });
+  }
+  return exhibit;
+}
