@@ -25,11 +25,11 @@ pub(crate) fn prefetch(numbers: &[f32]) {
 /// Returns zeros in memory with large pages, if the system has such pages for the asking. Populations are read in random
 /// order, so with small pages most reads would also miss the translation of their address.
 pub(crate) fn zeros(count: usize) -> Vec<f32> {
-    let mut numbers = vec![0.0f32; count];
+    let numbers = vec![0.0f32; count];
     #[cfg(target_os = "linux")]
     {
         const PAGE: usize = 2 << 20;
-        let (first, bytes) = (numbers.as_mut_ptr(), size_of_val(&numbers[..]));
+        let (first, bytes) = (numbers.as_ptr().cast_mut(), size_of_val(&numbers[..]));
         let before = first.align_offset(PAGE) * size_of::<f32>();
         if let Some(whole) = bytes.checked_sub(before).map(|bytes| bytes / PAGE * PAGE).filter(|&bytes| bytes > 0) {
             let advice = rustix::mm::Advice::LinuxHugepage;
