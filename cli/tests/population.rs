@@ -255,7 +255,7 @@ fn experiments_at_different_generations_train_together() {
 /// Returns a short training with stages. Its task is so easy that champions observe POIs.
 fn staged(stages: &str) -> Config {
     let mut config = support::layout("generally_forward");
-    (config.learning.trials, config.learning.generations, config.learning.population) = (2, 7, 15);
+    (config.learning.trials, config.learning.generations, config.learning.population) = (2, 7, 40);
     config.world.coupling = Coupling::Same(1);
     Config::parse(&(config.to_toml() + stages), "staged.toml").unwrap()
 }

@@ -199,10 +199,12 @@ pub(crate) fn nearest_f32<S: Simd>(x: S::i32s) -> S::f32s {
 /// consecutive integers. So adding the base rounds a number to the lattice, and the bits are the multiple.
 pub(crate) fn lattice(count: usize, size: f64, finest: f64) -> [f32; 2] {
     let mut distance = finest;
-    while size > 2f64.powi(22) * distance || count as f64 * size > 2f64.powi(30) * distance {
+    // The largest multiples of one number, and of a sum.
+    let (of_number, of_sum) = (f64::from(1 << 22), f64::from(1 << 30));
+    while size > of_number * distance || count as f64 * size > of_sum * distance {
         distance *= 2.0;
     }
-    [1.5 * 2f64.powi(23) * distance, distance].map(|number| number as f32)
+    [3.0 * of_number * distance, distance].map(|number| number as f32)
 }
 
 /// +0 where |x| < `limit`, else x. 3 operations.
