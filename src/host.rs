@@ -22,8 +22,8 @@ pub(crate) fn prefetch(numbers: &[f32]) {
     let _ = numbers;
 }
 
-/// Returns zeros in memory with large pages, if the system has such pages for the asking. Populations are read in random
-/// order, so with small pages most reads would also miss the translation of their address.
+/// Returns zeros, in large pages of memory where the system offers them. Parents are in random places of a population, so
+/// that with small pages most reads would have to look up the address of their page, too.
 pub(crate) fn zeros(count: usize) -> Vec<f32> {
     let numbers = vec![0.0f32; count];
     #[cfg(target_os = "linux")]

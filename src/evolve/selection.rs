@@ -84,11 +84,11 @@ impl Selection {
     }
 }
 
-/// Returns the best policy. Ties go to the first policy, which is the elite of the generation before, or else to a random
-/// one.
+/// Returns the best policy. If several tie, it is policy 0, the elite of the generation before, if that is among them, or
+/// else a random one of them.
 ///
-/// If they went to the lowest index, the champions of all populations would more often come from one team, because teams
-/// are rotations, see [`order_policies`](super::order_policies).
+/// Teams are rotations, see [`order_policies`](super::order_policies). With ties to the lowest index, the champions of
+/// all populations would therefore come from one team too often.
 fn champion(key: Key, scores: &[f32]) -> usize {
     let best = scores.iter().copied().fold(f32::NEG_INFINITY, f32::max);
     if scores.first() == Some(&best) {

@@ -2,9 +2,9 @@
 //! processor rounds alike.
 //!
 //! Twin of `shaders/lib/math.wgsl`: same names, same statements, same order. Only f32 `+ - *`, comparison, select, abs,
-//! 32-bit integer operations, bit casts and conversions of integers occur; those above 2^24 are rounded to the nearest f32. Within the stated ranges every
-//! intermediate value is 0 or of size 2^-120 to 2^120. So flushed denormals change nothing, and no result depends on
-//! the sign of an intermediate zero.
+//! 32-bit integer operations, bit casts and conversions of integers occur. Integers above 2^24 become the nearest f32.
+//! Within the stated ranges every intermediate value is 0 or of size 2^-120 to 2^120. So flushed denormals change
+//! nothing, and no result depends on the sign of an intermediate zero.
 //!
 //! Stated errors are maxima over every float of the range (`tests/math.rs`). One ULP is the spacing of floats at the
 //! exact value. `tests/fit.rs` fits the polynomials. Operations are lane operations, constants not counted.
