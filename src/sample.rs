@@ -282,6 +282,8 @@ fn plain_world(seed: u64) -> Config {
             seed,
         },
         checkpoint: CheckpointConfig::default(),
+        agents: vec![],
+        pois: vec![],
         stages,
     }
 }

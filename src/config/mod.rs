@@ -17,9 +17,13 @@ pub use crate::model::follow::Follow;
 pub use crate::model::motion::Motion;
 pub use crate::model::policy::{Actions, MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, Policy};
 pub use crate::model::rule::{Coupling, Observers};
-pub use crate::model::sense::{Density, Sense};
+pub use crate::model::sense::{Combine, Density, Frame, Measure, Sense};
 pub use crate::model::start::Heading;
 pub use crate::reader::{Definition, Override, Problem};
+pub use classes::{
+    AGENTS, AgentClass, Channel, Classes, Control, MAX_CHANNELS, MAX_CLASSES, MAX_SECTORS, MAX_TERMS, Mobility, POIS,
+    PoiGroup, Term,
+};
 pub use learning::{
     CheckpointConfig, Elites, Fitness, Learning, LedBy, Leniency, MAX_EPISODES, MAX_GENERATIONS, MAX_HALL_OF_FAME,
     MAX_PARTNERS, MAX_POPULATION, MAX_TRIALS, Method, Mutation, Paradigm, Parents, Sharing,
@@ -32,6 +36,7 @@ pub use stages::{GENERATIONS, STAGES, Stage};
 pub use valid::{StageConfig, ValidConfig};
 pub use world::{MAX_AGENTS, MAX_POIS, MAX_STEPS, WorldConfig};
 
+mod classes;
 mod learning;
 mod load;
 mod populations;
@@ -84,6 +89,12 @@ pub struct Config {
     pub learning: Learning,
     /// `[checkpoint]`: how often a run saves.
     pub checkpoint: CheckpointConfig,
+    /// `[[agents]]`: classes of agents, written in full. Empty if they are written in short, see [`Config::classes`].
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub agents: Vec<AgentClass>,
+    /// `[[pois]]`: groups of POIs, written in full. Empty if they are written in short.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub pois: Vec<PoiGroup>,
     /// `[[stages]]`: keys that change from some generation on, see [`ValidConfig::stages`].
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub stages: Vec<Stage>,
@@ -150,7 +161,7 @@ impl Config {
 
     /// Returns the value of each dotted key, without the stages.
     fn values(&self) -> impl Iterator<Item = (&'static str, reader::Value<'static>)> {
-        let Config { world, motion, follow, sense, policy, learning, checkpoint, stages: _ } = self;
+        let Config { world, motion, follow, sense, policy, learning, checkpoint, agents: _, pois: _, stages: _ } = self;
         let sections = [world.values(), motion.values(), follow.values(), sense.values(), policy.values()];
         sections.into_iter().chain([learning.values(), checkpoint.values()]).flatten()
     }
@@ -257,6 +268,8 @@ impl Config {
             policy: Policy::read(r),
             learning: Learning::read(r, paradigm, learners),
             checkpoint: CheckpointConfig::read(r),
+            agents: vec![],
+            pois: vec![],
             stages: vec![],
         };
         let Learning { population, hall_of_fame, .. } = config.learning;

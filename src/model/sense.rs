@@ -76,6 +76,48 @@ config_enum! {
     }
 }
 
+config_enum! {
+    /// What an entity at distance d counts in its sector.
+    Measure {
+        /// `1 - d/D` with D = √2·max(map).
+        Linear = "linear",
+        /// `1 / max(d, nearest)`.
+        Inverse = "inverse",
+        /// `1 / max(d, nearest)²`.
+        InverseSquared = "inverse-squared",
+        /// `exp(-d)`.
+        Exponential = "exponential",
+        /// `d / range`.
+        Distance = "distance",
+        /// `1 - d / range`.
+        Closeness = "closeness",
+    }
+}
+
+config_enum! {
+    /// How the measures of a sector become one input.
+    Combine {
+        /// Their sum divided by the number of such entities in the world.
+        Share = "share",
+        /// Their sum.
+        Sum = "sum",
+        /// Their mean.
+        Mean = "mean",
+        /// The largest of them.
+        Closest = "closest",
+    }
+}
+
+config_enum! {
+    /// What the sectors of a channel turn with.
+    Frame {
+        /// The agent's heading: the first sector begins straight behind.
+        Heading = "heading",
+        /// The map: the first sector begins at the x axis.
+        Map = "map",
+    }
+}
+
 gpu_struct! {
     /// Constants of sensing.
     pub struct SenseConstants as SenseLanes {
