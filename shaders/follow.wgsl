@@ -1,16 +1,19 @@
-// The followers' preset behaviour: attraction to agents in sight, repulsion from close ones and walls (paper, Section
-// 4.1, Figure 2b).
+// The rule of agents that do not learn: a force from other agents and walls (paper, Section 4.1, Figure 2b).
 //
-// Uses: lib/math.wgsl, motion.wgsl (rotate), episode.wgsl (world), generic.wgsl (variant), and from src/model: TINY.
+// Uses: lib/math.wgsl, motion.wgsl (rotate), episode.wgsl (world, own), and from src/model: TINY.
 
-// Sums, in lattice distances, and counts of the offsets to agents within a follower's radii.
-struct Sums {
-    repel_x: i32,
-    repel_y: i32,
-    repel_count: u32,
-    attract_x: i32,
-    attract_y: i32,
-    attract_count: u32,
+// The sum over the agents that count for a term, in lattice distances, and their number.
+struct Sum {
+    x: i32,
+    y: i32,
+    count: i32,
+}
+
+// The numbers of a term that kernels are not specialised for.
+struct Pull {
+    inner2: f32,
+    outer2: f32,
+    scale: f32,
 }
 
 // A heading and the wanted speed along it.
@@ -20,54 +23,46 @@ struct Steering {
     speed: f32,
 }
 
-// Reports whether a follower sees the agent at offset (`dx`, `dy`): it is within the attraction radius.
-fn sees(dx: f32, dy: f32) -> bool {
-    return within(dx, dy, world.attraction_radius2);
+// Adds an offset or a heading, on its lattice, if the squared distance is within the term's. Compares bits, which are in
+// the order of the numbers because only a distance within which nothing is can be negative.
+fn add_to_term(pull: Pull, d2: f32, x: i32, y: i32, sum: ptr<function, Sum>) {
+    let bits = bitcast<i32>(d2);
+    let counts = bits <= bitcast<i32>(pull.outer2) && bits > bitcast<i32>(pull.inner2);
+    (*sum).x += select(0, x, counts);
+    (*sum).y += select(0, y, counts);
+    (*sum).count += select(0, 1, counts);
 }
 
-// Adds the agent at offset (`dx`, `dy`), and reports whether the follower sees it.
-fn influence(dx: f32, dy: f32, sums: ptr<function, Sums>) -> bool {
-    let seen = within(dx, dy, world.attraction_radius2);
-    if seen {
-        let near = within(dx, dy, world.repulsion_radius2);
-        let x = on_lattice(dx, world.offset_base);
-        let y = on_lattice(dy, world.offset_base);
-        (*sums).repel_x += select(0, x, near);
-        (*sums).repel_y += select(0, y, near);
-        (*sums).repel_count += u32(near);
-        (*sums).attract_x += select(x, 0, near);
-        (*sums).attract_y += select(y, 0, near);
-        (*sums).attract_count += u32(!near);
-    }
-    return seen;
-}
-
-// The force on a follower, and whether any agent or wall is near.
+// The force on an agent that obeys a rule, and whether any agent or wall is near.
 struct SteeringForce {
     x: f32,
     y: f32,
     influenced: bool,
 }
 
-// Returns the push of the two walls of one axis, at 0 and at `size`, and a number that is not negative if either is
-// within the repulsion radius.
-fn walls(at: f32, size: f32) -> vec2<f32> {
-    let low = world.repulsion_radius - at;
-    let high = world.repulsion_radius - (size - at);
-    let push = select(0.0, low, low > 0.0) - select(0.0, high, high > 0.0);
-    return vec2(push * world.wall_gain, select(high, low, low > high));
+// Adds the scaled mean of a term's sum.
+fn add_term(pull: Pull, sum: Sum, force: ptr<function, SteeringForce>) {
+    let scale = recip(nearest_f32(max(sum.count, 1))) * pull.scale;
+    (*force).x += nearest_f32(sum.x) * scale;
+    (*force).y += nearest_f32(sum.y) * scale;
+    (*force).influenced = (*force).influenced || sum.count > 0;
 }
 
-// Returns the sum of repulsion, attraction and wall push at a position. Each mean offset is scaled by gain over radius.
-fn force(sums: Sums, x: f32, y: f32) -> SteeringForce {
-    let repel = recip(f32(max(sums.repel_count, 1u))) * world.repulsion_scale;
-    let attract = recip(f32(max(sums.attract_count, 1u))) * world.attraction_scale;
+// Returns the push of the two walls of one axis, at 0 and at `size`, and a number that is not negative if either is
+// within their radius.
+fn walls(at: f32, size: f32) -> vec2<f32> {
+    let low = own.wall_radius - at;
+    let high = own.wall_radius - (size - at);
+    let push = select(0.0, low, low > 0.0) - select(0.0, high, high > 0.0);
+    return vec2(push * own.wall_gain, select(high, low, low > high));
+}
+
+// Adds the walls' push at a position to the force of all terms.
+fn with_walls(terms: SteeringForce, x: f32, y: f32) -> SteeringForce {
     let walls_x = walls(x, world.map_x);
     let walls_y = walls(y, world.map_y);
-    let force_x = nearest_f32(sums.attract_x) * attract - nearest_f32(sums.repel_x) * repel + walls_x.x;
-    let force_y = nearest_f32(sums.attract_y) * attract - nearest_f32(sums.repel_y) * repel + walls_y.x;
-    let influenced = sums.repel_count + sums.attract_count > 0u || walls_x.y >= 0.0 || walls_y.y >= 0.0;
-    return SteeringForce(flush(force_x, TINY), flush(force_y, TINY), influenced);
+    let influenced = terms.influenced || walls_x.y >= 0.0 || walls_y.y >= 0.0;
+    return SteeringForce(flush(terms.x + walls_x.x, TINY), flush(terms.y + walls_y.x, TINY), influenced);
 }
 
 // Returns the squared size of a force, and the inverse of its size.
@@ -87,18 +82,18 @@ fn steer(force: SteeringForce, sizes: vec2<f32>, hx: f32, hy: f32, speed: f32) -
     let uy = force.y * inverse;
     let along = hx * ux + hy * uy;
     let across = hx * uy - hy * ux;
-    let sine = select(0.0 - world.max_turn_sin, world.max_turn_sin, across >= 0.0);
-    let turned = rotate(hx, hy, world.max_turn_cos, sine);
+    let sine = select(0.0 - own.max_turn_sin, own.max_turn_sin, across >= 0.0);
+    let turned = rotate(hx, hy, own.max_turn_cos, sine);
     let has_force = force2 > 0.0;
     // A cosine near 1 cannot resolve small angles, and a sine near 1 cannot resolve large ones. Without a force,
     // `along` is 0.
-    var reached = along >= world.max_turn_cos && has_force;
-    if variant.by_sine != 0u {
-        reached = along > 0.0 && abs(across) <= world.max_turn_sin;
+    var reached = along >= own.max_turn_cos && has_force;
+    if own.by_sine != 0u {
+        reached = along > 0.0 && abs(across) <= own.max_turn_sin;
     }
     let next_x = select(select(hx, turned.x, has_force), ux, reached);
     let next_y = select(select(hy, turned.y, has_force), uy, reached);
-    let ahead = select(world.min_speed, force2 * inverse, along > 0.0);
+    let ahead = select(own.min_speed, force2 * inverse, along > 0.0);
     let wanted = select(speed, select(0.0, ahead, has_force), force.influenced);
     return Steering(next_x, next_y, wanted);
 }

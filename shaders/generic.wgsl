@@ -1,34 +1,64 @@
-// The sizes of a task's world, which are constants in specialised kernels.
+// The sizes and the classes of a task's world, which are constants in specialised kernels.
 //
-// Uses: lib/layout.wgsl (weights), policy.wgsl, episode.wgsl (world, Shape).
+// Uses: lib/layout.wgsl (weights, classes), policy.wgsl, episode.wgsl (world, own, Shape, Agent).
 //
 // The host prepends:
-//   WIDEST         the widest layer of any policy, inputs included
 //   CHOOSES        whether outputs choose a behaviour
-//   world_variant  the variant of this task's world
+//   shape_of       the shape of a class, channel_of of a channel, term_of of a term
 
 var<private> shape: Shape;
-var<private> variant: Variant;
 
 fn set_shape(task: Task) {
     let agents = world.leaders + world.followers;
     // An empty task has no team, but the number is a divisor.
     let teams = max(task.teams, 1u);
-    shape = Shape(world.leaders, agents, world.pois, world.words, teams);
-    variant = world_variant();
+    shape = Shape(world.leaders, agents, world.pois, world.words, world.class_count, world.widths[0], teams);
+}
+
+// Returns the shape of a class.
+fn class_shape(index: u32) -> ClassShape {
+    return shape_of(world.first_class + index);
+}
+
+// Senses all channels of the agent's class.
+fn sense_all(task: Task, first: u32, me: ptr<function, Agent>, inputs: ptr<function, array<f32, INPUTS>>) {
+    let class_number = world.first_class + (*me).class_index;
+    for (var index = 0u; index < own.channel_count; index++) {
+        sense_channel(task, first, channel_of(class_number, index), index, me, inputs);
+    }
+}
+
+// Adds all terms of the rule of the agent's class to the force. Neighbours of one shape are added together.
+fn obey_all(task: Task, first: u32, me: ptr<function, Agent>, force: ptr<function, SteeringForce>) {
+    let class_number = world.first_class + (*me).class_index;
+    for (var index = 0u; index < own.term_count; index++) {
+        let term = term_of(class_number, index);
+        var pair = index + 1u < own.term_count;
+        if pair {
+            pair = same_term(term, term_of(class_number, index + 1u));
+        }
+        obey_terms(task, first, term, index, pair, me, force);
+        index += u32(pair);
+    }
+}
+
+fn same_term(a: TermShape, b: TermShape) -> bool {
+    var same = a.aligns == b.aligns;
+    let x = a.ranges;
+    let y = b.ranges;
+    same = same && x[0] == y[0] && x[1] == y[1] && x[2] == y[2] && x[3] == y[3];
+    return same && x[4] == y[4] && x[5] == y[5] && x[6] == y[6] && x[7] == y[7];
 }
 
 // Computes a leader's outputs: layer by layer, each unit's bias plus its weighted inputs in order.
 fn decide(start: u32, stride: u32, sensed: array<f32, INPUTS>) -> vec2<f32> {
-    var inputs: array<f32, WIDEST>;
-    for (var input = 0u; input < INPUTS; input++) {
-        inputs[input] = sensed[input];
-    }
+    // There is room for every layer.
+    var inputs = sensed;
     var first = 0u;
     for (var layer = 0u; layer < world.layers; layer++) {
         let rows = world.widths[layer];
         let columns = world.widths[layer + 1u];
-        var units: array<f32, WIDEST>;
+        var units: array<f32, INPUTS>;
         for (var column = 0u; column < columns; column++) {
             var index = first + column;
             var sum = weight(start, stride, index + rows * columns);

@@ -1,6 +1,6 @@
 // Motion: a proportional controller, limited in turn, acceleration and speed (paper, Section 3.1).
 //
-// Uses: lib/math.wgsl, episode.wgsl (world), and from src/model: TINY, GRID, INVERSE_GRID.
+// Uses: lib/math.wgsl, episode.wgsl (own), and from src/model: TINY, GRID, INVERSE_GRID.
 
 // Rotates a heading to the left, by the angle of this cosine and sine.
 fn rotate(hx: f32, hy: f32, cosine: f32, sine: f32) -> vec2<f32> {
@@ -9,7 +9,7 @@ fn rotate(hx: f32, hy: f32, cosine: f32, sine: f32) -> vec2<f32> {
 
 // Turns a heading by a wanted angle (radians, to the left), at most the maximum turn.
 fn turn(hx: f32, hy: f32, wanted: f32) -> vec2<f32> {
-    let angle = clamp_to(wanted, -world.max_turn, world.max_turn);
+    let angle = clamp_to(wanted, -own.max_turn, own.max_turn);
     let turned = sin_cos(angle);
     return rotate(hx, hy, turned.y, turned.x);
 }
@@ -22,12 +22,12 @@ fn renormalize(hx: f32, hy: f32) -> vec2<f32> {
 
 // Changes the speed towards the wanted one, within the limits.
 fn accelerate(speed: f32, wanted: f32) -> f32 {
-    let limit = world.max_speed_change;
+    let limit = own.max_speed_change;
     let change = clamp_to(wanted - speed, -limit, limit);
-    return clamp_to(speed + change, world.min_speed, world.max_speed);
+    return clamp_to(speed + change, own.min_speed, own.max_speed);
 }
 
-// Moves one coordinate along the heading, clamped to the map and rounded to the grid.
+// Moves one coordinate by a distance along one component of a heading, clamped to the map and rounded to the grid.
 fn advance(at: f32, step: f32, heading: f32, size: f32) -> f32 {
     return clamp_to(snap(at + step * heading), 0.0, size);
 }

@@ -1,6 +1,6 @@
 // A leader's policy: a fully connected network with biases and tanh in every layer (paper, Sections 2.4 and 3.1).
 //
-// Uses: lib/math.wgsl, episode.wgsl (world), and from src/model: TINY, INPUTS, BEHAVIOURS.
+// Uses: lib/math.wgsl, episode.wgsl (own), source.rs (INPUTS), and from src/model: TINY, BEHAVIOURS.
 
 // Returns the tanh of a unit's sum. Small sums are flushed to 0, so that the next layer has no denormals.
 fn activate(sum: f32) -> f32 {
@@ -62,5 +62,5 @@ fn wanted_turn(output: f32) -> f32 {
 
 // Converts the second output, in -1..1, to a wanted speed.
 fn wanted_speed(output: f32) -> f32 {
-    return (output + 1.0) * 0.5 * world.max_speed;
+    return (output + 1.0) * 0.5 * own.max_speed;
 }

@@ -1,75 +1,107 @@
-// Sensing: the density of POIs and of agents in four quadrants around a leader's heading (paper, Section 3.1).
+// Sensing: what agents and POIs add to the inputs of a policy, by channel and sector (paper, Section 3.1).
 //
-// Uses: lib/math.wgsl, episode.wgsl (world), generic.wgsl (variant), and from src/model: INPUTS, DENSITY_LINEAR,
-// DENSITY_MEAN.
+// Uses: lib/math.wgsl, and from src/model: ChannelShape, MEASURE_…, COMBINE_…, FRAME_….
 
-// Returns the density of an entity at offset (`dx`, `dy`) in lattice distances. The caller checks that it is in range.
-fn density(dx: f32, dy: f32) -> i32 {
-    let base = world.density_base;
-    let d2 = dx * dx + dy * dy;
-    if variant.density == DENSITY_LINEAR {
-        return less_base(1.0 + base - exact_sqrt(d2) * world.inverse_diagonal, base);
-    }
-    return on_lattice(rsqrt(select(1.0, d2, d2 > 1.0)), base);
+// The numbers of a channel that kernels are not specialised for.
+struct Gauge {
+    range2: f32,
+    base: f32,
+    slope: f32,
+    nearest2: f32,
+    scale: f32,
+    empty: f32,
 }
 
-// The entities of one class around a leader: sums over all, over those on the left, in front, and both.
+// What an entity counts in lattice distances, 0 out of range, and whether it is in range.
+struct Measured {
+    measure: i32,
+    within: bool,
+}
+
+// Returns what an entity of this value at offset (`dx`, `dy`) counts.
+fn measured(channel: ChannelShape, gauge: Gauge, value: f32, dx: f32, dy: f32) -> Measured {
+    let base = gauge.base;
+    let d2 = dx * dx + dy * dy;
+    var measure = 0;
+    if channel.measure == MEASURE_LINEAR || channel.measure == MEASURE_CLOSENESS {
+        measure = less_base(value + base - exact_sqrt(d2) * (gauge.slope * value), base);
+    } else if channel.measure == MEASURE_DISTANCE {
+        measure = on_lattice(exact_sqrt(d2) * (gauge.slope * value), base);
+    } else if channel.measure == MEASURE_EXPONENTIAL {
+        measure = on_lattice(exp_negative(exact_sqrt(d2)) * value, base);
+    } else {
+        let inverse = rsqrt(select(gauge.nearest2, d2, d2 > gauge.nearest2));
+        if channel.measure == MEASURE_INVERSE {
+            measure = on_lattice(inverse * value, base);
+        } else {
+            measure = on_lattice(inverse * inverse * value, base);
+        }
+    }
+    let within = within(dx, dy, gauge.range2);
+    return Measured(select(0, measure, within), within);
+}
+
+// Returns an offset relative to a heading: along it, and to its left.
+fn turned(dx: f32, dy: f32, hx: f32, hy: f32) -> vec2<f32> {
+    return vec2(dx * hx + dy * hy, dy * hx - dx * hy);
+}
+
+// A channel of four sectors, which are the quadrants around a heading: sums over all, over those on the left, in front,
+// and both. It needs fewer operations than any number of sectors, and gives the same bits.
 struct Quadrants {
-    // Of their densities, in lattice distances.
-    densities: vec4<i32>,
-    // Of their number. Only means need it.
+    // Of measures, in lattice distances.
+    sums: vec4<i32>,
+    // Of numbers of entities.
     counts: vec4<i32>,
 }
 
-// Adds an entity with this density, which is 0 out of range, at offset (`dx`, `dy`) from a leader with heading (`hx`,
-// `hy`).
+// Adds an entity with this measure at offset (`dx`, `dy`) from an agent with heading (`hx`, `hy`).
 //
 // The signs of the offset along the heading and to its left determine the quadrant. A tie goes to the counterclockwise
 // quadrant, so that each boundary belongs to exactly one.
-fn add_sensed(density: i32, dx: f32, dy: f32, hx: f32, hy: f32, quadrants: ptr<function, Quadrants>) {
-    let fx = dx * hx + dy * hy;
-    let fy = dy * hx - dx * hy;
-    let left = fy > 0.0 || (fy >= 0.0 && fx >= 0.0);
-    let front = fx > 0.0 || (fx >= 0.0 && !(fy > 0.0));
+fn add_to_quadrant(
+    channel: ChannelShape,
+    measured: Measured,
+    dx: f32,
+    dy: f32,
+    hx: f32,
+    hy: f32,
+    quadrants: ptr<function, Quadrants>,
+) {
+    let f = turned(dx, dy, hx, hy);
+    let left = f.y > 0.0 || (f.y >= 0.0 && f.x >= 0.0);
+    let front = f.x > 0.0 || (f.x >= 0.0 && !(f.y > 0.0));
     let halves = vec4(true, left, front, left && front);
-    (*quadrants).densities += select(vec4(0), vec4(density), halves);
-    if variant.density == DENSITY_MEAN {
-        (*quadrants).counts += select(vec4(0), vec4(select(0, 1, density > 0)), halves);
+    (*quadrants).sums += select(vec4(0), vec4(measured.measure), halves);
+    if channel.counts != 0u {
+        (*quadrants).counts += select(vec4(0), vec4(select(0, 1, measured.within)), halves);
     }
 }
 
-// Returns the sum of each quadrant, in the order of the policy's inputs: back right, front right, front left, back left.
-fn quadrant_sums(halves: vec4<i32>) -> vec4<f32> {
+// Returns the sum of each quadrant: back right, front right, front left, back left.
+fn quadrant_sums(halves: vec4<i32>) -> vec4<i32> {
     let all = halves.x;
     let left = halves.y;
     let front = halves.z;
     let both = halves.w;
-    return vec4(
-        nearest_f32(all - left - front + both),
-        nearest_f32(front - both),
-        nearest_f32(both),
-        nearest_f32(left - both),
-    );
+    return vec4(all - left - front + both, front - both, both, left - both);
 }
 
-// Returns the sums of all quadrants, or the means.
-fn sums_or_means(quadrants: Quadrants) -> vec4<f32> {
-    let sums = quadrant_sums(quadrants.densities);
-    if variant.density != DENSITY_MEAN {
-        return sums;
+// Whether a direction is less than half a turn after the beginning of a sector.
+fn is_after(boundary: vec2<f32>, f: vec2<f32>) -> bool {
+    let across = boundary.x * f.y - boundary.y * f.x;
+    return across > 0.0 || (across >= 0.0 && boundary.x * f.x + boundary.y * f.y >= 0.0);
+}
+
+// Returns the input of a sector from the sum, or the largest, of its measures, and the number of its entities.
+fn input_of(channel: ChannelShape, gauge: Gauge, sum: i32, count: i32) -> f32 {
+    var value = nearest_f32(sum);
+    if channel.combine == COMBINE_MEAN {
+        value = value * recip(nearest_f32(max(count, 1)));
     }
-    let counts = quadrant_sums(quadrants.counts);
-    return vec4(
-        sums.x * recip(select(1.0, counts.x, counts.x > 1.0)),
-        sums.y * recip(select(1.0, counts.y, counts.y > 1.0)),
-        sums.z * recip(select(1.0, counts.z, counts.z > 1.0)),
-        sums.w * recip(select(1.0, counts.w, counts.w > 1.0)),
-    );
-}
-
-// Returns the policy's inputs: the densities of both kinds, each multiplied by its constant.
-fn scale_inputs(of_pois: Quadrants, of_agents: Quadrants) -> array<f32, INPUTS> {
-    let p = sums_or_means(of_pois) * world.poi_share;
-    let a = sums_or_means(of_agents) * world.agent_share;
-    return array(p.x, p.y, p.z, p.w, a.x, a.y, a.z, a.w);
+    value = value * gauge.scale;
+    if channel.counts != 0u && count <= 0 {
+        return gauge.empty;
+    }
+    return value;
 }

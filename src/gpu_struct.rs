@@ -3,7 +3,7 @@
 use bytemuck::Pod;
 use fearless_simd::{Simd, prelude::*};
 
-/// The type of a field of a GPU struct: 32 bits, an array of those, or another GPU struct.
+/// The type of a field of a GPU struct: 32 bits, another GPU struct, or an array of either.
 pub trait Field: Pod {
     /// The type with one team per lane: `f32` is copied to all lanes, other fields keep their type.
     type Lanes<S: Simd>: Copy;
@@ -13,6 +13,14 @@ pub trait Field: Pod {
 
     /// Returns the WGSL lines that declare a field of this type.
     fn declared(name: &str) -> String;
+
+    /// Returns the WGSL expressions of the value, separated by commas.
+    fn value(&self) -> String;
+
+    /// Returns the names in WGSL of a field of this type.
+    fn names(name: &'static str) -> Vec<&'static str> {
+        vec![name]
+    }
 }
 
 impl Field for u32 {
@@ -25,6 +33,10 @@ impl Field for u32 {
     fn declared(name: &str) -> String {
         format!("    {name}: u32,\n")
     }
+
+    fn value(&self) -> String {
+        format!("{self}u")
+    }
 }
 
 impl Field for f32 {
@@ -36,6 +48,10 @@ impl Field for f32 {
 
     fn declared(name: &str) -> String {
         format!("    {name}: f32,\n")
+    }
+
+    fn value(&self) -> String {
+        format!("bitcast<f32>({}u)", self.to_bits())
     }
 }
 
@@ -51,10 +67,35 @@ macro_rules! lists {
             fn declared(name: &str) -> String {
                 format!("    {name}: array<{}, {N}>,\n", stringify!($of))
             }
+
+            fn value(&self) -> String {
+                let items: Vec<String> = self.iter().map(Field::value).collect();
+                format!("array<{}, {N}>({})", stringify!($of), items.join(", "))
+            }
         }
     )*};
 }
 lists!(u32 f32);
+
+impl<T: GpuStruct + Field, const N: usize> Field for [T; N]
+where
+    [T; N]: Pod,
+{
+    type Lanes<S: Simd> = [T::Lanes<S>; N];
+
+    fn lanes<S: Simd>(self, simd: S) -> [T::Lanes<S>; N] {
+        self.map(|item| item.lanes(simd))
+    }
+
+    fn declared(name: &str) -> String {
+        format!("    {name}: array<{}, {N}>,\n", T::NAME)
+    }
+
+    fn value(&self) -> String {
+        let items: Vec<String> = self.iter().map(GpuStruct::literal).collect();
+        format!("array<{}, {N}>({})", T::NAME, items.join(", "))
+    }
+}
 
 /// The type of a constant that a shader shares with the host.
 pub trait Constant {
@@ -106,18 +147,20 @@ pub trait GpuStruct: Pod {
     /// Returns the fields in WGSL. Those of a nested struct are inlined.
     fn fields() -> String;
 
-    /// Returns the names of the fields.
-    fn names() -> &'static [&'static str];
+    /// Returns the names of the fields. Those of a nested struct are inlined.
+    fn names() -> Vec<&'static str>;
 
     /// Returns the declaration in WGSL: `struct Name { … }`.
     fn wgsl() -> String {
         format!("struct {} {{\n{}}}\n", Self::NAME, Self::fields())
     }
 
-    /// Returns the WGSL expression of this value. All fields must be integers.
-    fn value(&self) -> String {
-        let words: Vec<String> = bytemuck::cast_slice(&[*self]).iter().map(|word: &u32| format!("{word}u")).collect();
-        format!("{}({})", Self::NAME, words.join(", "))
+    /// Returns the WGSL expressions of the fields, separated by commas.
+    fn values(&self) -> String;
+
+    /// Returns the WGSL expression of this value: `Name(…)`.
+    fn literal(&self) -> String {
+        format!("{}({})", Self::NAME, self.values())
     }
 
     /// Returns a WGSL expression that copies the fields from another struct.
@@ -128,11 +171,35 @@ pub trait GpuStruct: Pod {
 }
 
 /// Declares structs that a shader shares with the host. The `#[repr(C)]` type and the WGSL text are made from the same
-/// list of fields. `pub struct A as B` also declares `B`, with every `f32` field copied to all lanes.
+/// list of fields. `pub struct A as B` also declares `B`, with every `f32` field copied to all lanes; `as itself` is for
+/// structs of integers.
 ///
 /// All fields consist of 32-bit words, so neither side adds padding.
 macro_rules! gpu_struct {
     () => {};
+    ($(#[$about:meta])* pub struct $name:ident as itself { $($fields:tt)+ } $($more:tt)*) => {
+        $crate::gpu_struct::gpu_struct! { @struct $(#[$about])* $name { $($fields)+ } }
+        impl $crate::gpu_struct::Field for $name {
+            type Lanes<S: fearless_simd::Simd> = $name;
+
+            fn lanes<S: fearless_simd::Simd>(self, _: S) -> $name {
+                self
+            }
+
+            fn declared(_: &str) -> String {
+                <$name as $crate::gpu_struct::GpuStruct>::fields()
+            }
+
+            fn value(&self) -> String {
+                $crate::gpu_struct::GpuStruct::values(self)
+            }
+
+            fn names(_: &'static str) -> Vec<&'static str> {
+                <$name as $crate::gpu_struct::GpuStruct>::names()
+            }
+        }
+        $crate::gpu_struct::gpu_struct! { $($more)* }
+    };
     ($(#[$about:meta])* pub struct $name:ident as $lanes:ident { $($fields:tt)+ } $($more:tt)*) => {
         $crate::gpu_struct::gpu_struct! { @struct $(#[$about])* $name { $($fields)+ } }
         $crate::gpu_struct::gpu_struct! { @lanes $name $lanes { $($fields)+ } }
@@ -157,8 +224,12 @@ macro_rules! gpu_struct {
                 [$(<$type as $crate::gpu_struct::Field>::declared(stringify!($field))),+].concat()
             }
 
-            fn names() -> &'static [&'static str] {
-                &[$(stringify!($field)),+]
+            fn names() -> Vec<&'static str> {
+                [$(<$type as $crate::gpu_struct::Field>::names(stringify!($field))),+].concat()
+            }
+
+            fn values(&self) -> String {
+                [$($crate::gpu_struct::Field::value(&self.$field)),+].join(", ")
             }
         }
     };
@@ -178,6 +249,14 @@ macro_rules! gpu_struct {
 
             fn declared(_: &str) -> String {
                 <$name as $crate::gpu_struct::GpuStruct>::fields()
+            }
+
+            fn value(&self) -> String {
+                $crate::gpu_struct::GpuStruct::values(self)
+            }
+
+            fn names(_: &'static str) -> Vec<&'static str> {
+                <$name as $crate::gpu_struct::GpuStruct>::names()
             }
         }
     };
@@ -218,8 +297,13 @@ mod tests {
         let outer = Outer { first: 1, inner: Inner { size: 2.5, count: 3 }, list: [4.0, 5.0, 6.0], numbers: [7, 8] };
         let words = [1, 2.5f32.to_bits(), 3, 4f32.to_bits(), 5f32.to_bits(), 6f32.to_bits(), 7, 8];
         assert_eq!(bytemuck::cast_slice::<_, u32>(&[outer]), words);
-        assert_eq!(Duo { size: 7, count: 8 }.value(), "Duo(7u, 8u)");
+        assert_eq!(Duo { size: 7, count: 8 }.literal(), "Duo(7u, 8u)");
         assert_eq!(Duo::copied_from("world"), "Duo(world.size, world.count)");
+        assert_eq!(
+            Outer::copied_from("a"),
+            "Outer(a.first, a.size, a.count, a.list, a.numbers)",
+            "fields of a nested struct are inlined"
+        );
     }
 
     #[test]

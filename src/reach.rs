@@ -5,7 +5,7 @@
 
 use std::fmt::{self, Display};
 
-use crate::config::{MAX_STEPS, Observers, StageConfig};
+use crate::config::{Control, MAX_STEPS, Observers, StageConfig};
 use crate::model::rule::NEVER;
 use crate::world::{GRID, World};
 
@@ -84,23 +84,32 @@ impl Display for Unreachable {
     }
 }
 
-/// Returns the maximum distance that an agent travels after each step, in units: `[steps + 1]`, 0 at the start.
+/// Returns the maximum distance that an agent of any class travels after each step, in units: `[steps + 1]`, 0 at the
+/// start.
 ///
 /// The agent accelerates as fast as it can and never turns. Walls can only shorten its path.
 pub fn travel(world: &World, steps: usize) -> Vec<f64> {
-    let motion = &world.constants.motion;
-    let [change, min, max, dt] =
-        [motion.max_speed_change, motion.min_speed, motion.max_speed, motion.dt].map(f64::from);
+    let [largest, dt] = [world.map().max_element(), world.constants.map.dt].map(f64::from);
     // Positions are rounded to f32 and then to the grid, on both axes.
-    let largest = f64::from(motion.map_x.max(motion.map_y));
     let rounding = 2f64.sqrt() * (1.0 / f64::from(GRID) + largest * f64::from(f32::EPSILON));
-    let (mut speed, mut far) = (f64::from(world.constants.speed), 0.0);
-    let step = |_| {
-        speed = (speed + change).max(min).min(max);
-        far += speed * dt * (1.0 + ROUNDING) + rounding;
-        far
-    };
-    std::iter::once(0.0).chain((0..steps).map(step)).collect()
+    let mut farthest = vec![0.0; steps + 1];
+    for class in world.classes.iter().map(|class| &class.constants) {
+        let motion = &class.motion;
+        let [start, change, min, max] =
+            [motion.speed, motion.max_speed_change, motion.min_speed, motion.max_speed].map(f64::from);
+        let (mut speed, mut far) = (start, 0.0);
+        for farthest in &mut farthest[1..] {
+            speed = match (class.shape.control(), class.shape.free) {
+                (Control::Still, _) => 0.0,
+                // The maximum holds for each axis.
+                (_, 1..) => max * 2f64.sqrt(),
+                _ => (speed + change).max(min).min(max),
+            };
+            far += speed * dt * (1.0 + ROUNDING) + rounding;
+            *farthest = far.max(*farthest);
+        }
+    }
+    farthest
 }
 
 /// Returns the POIs that no team can observe in any episode. Uses the config's own keys and ignores its stages.
@@ -108,7 +117,7 @@ pub fn unreachable(config: &StageConfig) -> Vec<Unreachable> {
     let world = World::new(config);
     let steps = world.steps();
     let travel = travel(&world, steps);
-    let radius = config.world.observation_radius;
+    let radius = |poi: usize| f64::from(world.radii2[poi]).sqrt();
     // Jitter moves agent and POI, each by up to this much per axis.
     let jitter = 2f64.sqrt() * (config.learning.start_jitter + config.learning.poi_jitter);
     let who = match config.world.observers {
@@ -119,13 +128,14 @@ pub fn unreachable(config: &StageConfig) -> Vec<Unreachable> {
     // Distance to the farthest agent that a POI needs.
     let distance = |poi: usize| {
         let from = |agent: usize| world.starts[agent].as_dvec2().distance(world.pois[poi].as_dvec2());
-        let mut distances: Vec<f64> = (0..world.agents()).filter(|&agent| world.rule.counts(agent)).map(from).collect();
+        let mut distances: Vec<f64> =
+            (0..world.agents()).filter(|&agent| world.rule.counts_at(poi, agent)).map(from).collect();
         distances.sort_by(f64::total_cmp);
         let last = (world.coupling[poi] as usize).saturating_sub(1);
         (distances.get(last).copied().unwrap_or(f64::INFINITY) - jitter).max(0.0)
     };
     let distances: Vec<f64> = (0..world.pois.len()).map(distance).collect();
-    let there = |poi: usize, step: u32| distances[poi] <= travel[step as usize] + radius * (1.0 + ROUNDING);
+    let there = |poi: usize, step: u32| distances[poi] <= travel[step as usize] + radius(poi) * (1.0 + ROUNDING);
     let mut observed = vec![NEVER; world.pois.len()];
     world.rule.observe(steps as u32, &mut observed, |poi, mut open| open.find(|&step| there(poi, step)));
     let why = |poi: usize| {
@@ -139,7 +149,7 @@ pub fn unreachable(config: &StageConfig) -> Vec<Unreachable> {
                 needed: world.coupling[poi] as usize,
                 who,
                 distance: distances[poi],
-                radius,
+                radius: radius(poi),
                 travel: travel[last as usize],
                 steps: last as usize,
             },

@@ -1,23 +1,22 @@
 //! One experiment's constants and start state, as kernels and shaders read them.
 
-use std::ops::Deref;
+use std::ops::{Deref, Range};
 
 use glam::{DVec2, Vec2};
 
-use crate::config::{Config, LedBy, StageConfig};
-use crate::model::couple::CoupleConstants;
-use crate::model::follow::FollowConstants;
-use crate::model::motion::MotionConstants;
+use crate::config::{AgentClass, Classes, Config, Control, LedBy, MAX_STEPS, PoiGroup, StageConfig};
+use crate::model::class::Class;
+use crate::model::motion::MapConstants;
 use crate::model::policy::PolicyConstants;
 use crate::model::rule::Rule;
-use crate::model::sense::SenseConstants;
 
+pub use crate::model::Constants;
 pub use crate::model::motion::GRID;
 pub use crate::model::policy::OUTPUTS;
-pub use crate::model::sense::INPUTS;
-pub use crate::model::{Constants, Variant};
 
-/// One world: constants, start positions (leaders first), POIs, their coupling, and the rule of observation.
+/// One world: constants, classes of agents, POIs, and the rule of observation.
+///
+/// Agents that learn come first. Here and in the record of an episode they are called leaders, and all others followers.
 ///
 /// Only a valid config makes a world, and its [parts](WorldParts) can be read but not changed, so that they agree with each
 /// other. Shaders run without bounds checks and rely on this.
@@ -29,12 +28,22 @@ pub struct World(WorldParts);
 pub struct WorldParts {
     /// The constants of kernels.
     pub constants: Constants,
+    /// The classes of agents, those that learn first.
+    pub classes: Vec<Class>,
     /// Start positions in units, on the kernels' grid, `[agents]`.
     pub starts: Vec<Vec2>,
     /// Initial headings, unit vectors, `[agents]`.
     pub headings: Vec<Vec2>,
     /// POI positions in units, on the kernels' grid, `[pois]`.
     pub pois: Vec<Vec2>,
+    /// The squared observation radius of each POI, `[pois]`.
+    pub radii2: Vec<f32>,
+    /// The value of each POI, `[pois]`.
+    pub values: Vec<f32>,
+    /// The value of each POI as a multiple of a common unit, and their sum. Scores are counted in these units.
+    pub worth: Vec<u32>,
+    /// The sum of [`WorldParts::worth`].
+    pub total_worth: u32,
     /// C: observers that each POI needs at the same step, `[pois]`.
     pub coupling: Vec<u32>,
     /// Who observes, when, and in what order.
@@ -69,38 +78,56 @@ impl Deref for World {
 }
 
 impl World {
-    /// Builds the world of a valid config. In the all-leaders paradigm the followers are leaders too.
+    /// Builds the world of a valid config.
     pub fn new(config: &impl AsRef<StageConfig>) -> World {
-        let Config { world, motion, follow, sense, policy, learning, .. } = &**config.as_ref();
-        let (agents, leaders) = (world.leaders.len() + world.followers.len(), config.as_ref().learners());
-        let pois = world.pois.len();
-        let motion = MotionConstants::new(motion, world.dt, world.map);
+        let Config { world, policy, learning, .. } = &**config.as_ref();
+        let Classes { agents: classes, pois: groups } = config.as_ref().classes();
+        let map = Vec2::new(world.map[0] as f32, world.map[1] as f32);
+        let on_grid = |&at: &[f64; 2]| on_grid(DVec2::from(at).as_vec2(), map);
+        let starts: Vec<Vec2> = classes.iter().flat_map(|class| &class.at).map(on_grid).collect();
+        let headings = classes.iter().flat_map(|class| class.heading.of_each(class.at.len()));
+        let agents = starts.len();
+        let of_each = |of: &dyn Fn(&PoiGroup) -> f64| -> Vec<f64> {
+            groups.iter().flat_map(|group| vec![of(group); group.at.len()]).collect()
+        };
+        let values = of_each(&|group| group.value);
+        let (worth, total_worth) = worth(&values);
+        let values: Vec<f32> = values.into_iter().map(|value| value as f32).collect();
+        let places = places(&groups);
+        let radii2 = of_each(&|group| group.radius * group.radius).into_iter().map(|radius2| radius2 as f32).collect();
+        let classes_of_world = Class::all(&classes, &places, &values, world.map, world.dt);
+        let learns = |class: &&Class| class.constants.shape.control() == Control::Policy;
+        let leaders = classes_of_world.iter().filter(learns).map(|class| class.agents().len()).sum::<usize>();
+        let inputs = classes_of_world.iter().map(Class::inputs).max().unwrap_or(0);
         let constants = Constants {
             leaders: leaders as u32,
             followers: (agents - leaders) as u32,
-            pois: pois as u32,
+            pois: values.len() as u32,
             steps: world.steps as u32,
             words: agents.div_ceil(32) as u32,
-            speed: world.speed as f32,
-            variant: Variant { density: sense.density as u32, by_sine: motion.by_sine().into() },
-            policy: PolicyConstants::new(policy),
-            motion,
-            couple: CoupleConstants::new(world.observation_radius),
-            follow: FollowConstants::new(follow, agents),
-            sense: SenseConstants::new(sense, agents, pois, world.map),
+            class_count: classes.len() as u32,
+            first_class: 0,
+            map: MapConstants::new(world.map, world.dt),
+            policy: PolicyConstants::new(policy, inputs),
         };
-        let map = Vec2::new(motion.map_x, motion.map_y);
-        let points =
-            |list: &[[f64; 2]]| list.iter().map(|&at| on_grid(DVec2::from(at).as_vec2(), map)).collect::<Vec<_>>();
         World(WorldParts {
             constants,
-            starts: [points(&world.leaders), points(&world.followers)].concat(),
-            headings: world.headings().into_iter().map(unit).collect(),
-            pois: points(&world.pois),
-            coupling: world.coupling.of_each(pois),
+            starts,
+            headings: headings.map(unit).collect(),
+            pois: groups.iter().flat_map(|group| &group.at).map(on_grid).collect(),
+            radii2,
+            values,
+            worth,
+            total_worth,
+            coupling: groups
+                .iter()
+                .flat_map(|group| group.coupling.of_each(group.at.len()))
+                .map(|c| c as u32)
+                .collect(),
             populations: config.as_ref().population_of_each(),
             led: Led { within: learning.led_within, by: learning.led_by },
-            rule: Rule::new(world.observers.among(leaders, agents - leaders), agents, &world.windows, &world.after),
+            rule: rule(&classes, &classes_of_world, &groups, &places, agents),
+            classes: classes_of_world,
         })
     }
 
@@ -115,7 +142,23 @@ impl World {
 
     /// Returns the width and height of the map.
     pub fn map(&self) -> Vec2 {
-        Vec2::new(self.constants.motion.map_x, self.constants.motion.map_y)
+        Vec2::new(self.constants.map.map_x, self.constants.map.map_y)
+    }
+
+    /// Returns the inputs of a policy: the most that any class has.
+    pub fn inputs(&self) -> usize {
+        self.constants.policy.inputs()
+    }
+
+    /// Reports whether any rule aligns headings.
+    pub(crate) fn aligns(&self) -> bool {
+        self.classes.iter().flat_map(Class::terms).any(|term| term.shape.aligns != 0)
+    }
+
+    /// Returns the class of an agent.
+    pub fn class_of(&self, agent: usize) -> &Class {
+        let of = |class: &&Class| class.agents().contains(&agent);
+        self.classes.iter().find(of).expect("every agent has a class")
     }
 
     /// Returns the number of leaders, the agents with a policy.
@@ -164,6 +207,70 @@ impl World {
     }
 }
 
+/// Returns the POIs of each group, by its name.
+fn places(groups: &[PoiGroup]) -> Vec<(String, Range<usize>)> {
+    let mut end = 0;
+    let place = |group: &PoiGroup| {
+        end += group.at.len();
+        (group.name.clone(), end - group.at.len()..end)
+    };
+    groups.iter().map(place).collect()
+}
+
+/// Returns the rule of observation of some groups, which are at `places`.
+fn rule(
+    classes: &[AgentClass],
+    of_world: &[Class],
+    groups: &[PoiGroup],
+    places: &[(String, Range<usize>)],
+    agents: usize,
+) -> Rule {
+    let observers = |group: &PoiGroup| -> Vec<Range<usize>> {
+        let counts = |class: &AgentClass| match group.observers.is_empty() {
+            true => class.observes,
+            false => group.observers.contains(&class.name),
+        };
+        let counted = classes.iter().zip(of_world).filter(|(class, _)| counts(class));
+        counted.map(|(_, class)| class.agents()).collect()
+    };
+    let each = |of: &dyn Fn(&PoiGroup) -> Vec<Range<usize>>| -> Vec<Vec<Range<usize>>> {
+        groups.iter().flat_map(|group| vec![of(group); group.at.len()]).collect()
+    };
+    let after = |group: &PoiGroup| -> Vec<Range<usize>> {
+        let before = places.iter().filter(|(name, _)| group.after.contains(name));
+        before.map(|(_, place)| place.clone()).collect()
+    };
+    let always = [1, MAX_STEPS];
+    let windows = match groups.iter().all(|group| group.windows.is_empty()) {
+        true => vec![],
+        false => groups
+            .iter()
+            .flat_map(|group| (0..group.at.len()).map(|poi| group.windows.get(poi).copied().unwrap_or(always)))
+            .map(|window| window.map(|step| step as u32))
+            .collect(),
+    };
+    let after = each(&after).into_iter().map(|places| places.into_iter().flatten().collect()).collect();
+    Rule::new(each(&observers).into_iter(), agents, windows, after)
+}
+
+/// Returns values as whole multiples of a common unit, as small as possible, and their sum, at most 2^22. With equal values
+/// each is 1.
+fn worth(values: &[f64]) -> (Vec<u32>, u32) {
+    let mut units = f64::from(1 << 20);
+    while values.iter().sum::<f64>() * units > f64::from(1 << 22) {
+        units /= 2.0;
+    }
+    let multiples: Vec<u32> = values.iter().map(|value| ((value * units).round() as u32).max(1)).collect();
+    let common = multiples.iter().copied().fold(0, greatest_common_divisor);
+    let worth: Vec<u32> = multiples.into_iter().map(|multiple| multiple / common).collect();
+    let total = worth.iter().sum();
+    (worth, total)
+}
+
+fn greatest_common_divisor(a: u32, b: u32) -> u32 {
+    if b == 0 { a } else { greatest_common_divisor(b, a % b) }
+}
+
 /// Rounds a position to the kernels' grid, and clamps it to the map.
 pub fn on_grid(place: Vec2, map: Vec2) -> Vec2 {
     ((place * GRID + 0.5).floor() / GRID).clamp(Vec2::ZERO, map)
@@ -181,8 +288,6 @@ fn unit(angle: f64) -> Vec2 {
 mod tests {
     use super::*;
     use crate::config::MAX_HIDDEN_UNITS;
-    use crate::config_enum::Choice;
-    use crate::model::sense::Density;
     use crate::sample;
 
     /// Shaders run without bounds checks and rely on this.
@@ -199,8 +304,7 @@ mod tests {
             assert_eq!([pois.len(), coupling.len()], [constants.pois as usize; 2], "{seed}");
             assert_eq!(constants.words as usize, world.agents().div_ceil(32), "{seed}");
             assert!(rule.fits(constants.words as usize, pois.len()), "{seed}: {rule:?}");
-            assert!((constants.variant.density as usize) < Density::ALL.len(), "{seed}");
-            assert_eq!((used[0] as usize, weights), (INPUTS, parameters), "{seed}: {widths:?}");
+            assert_eq!((used[0] as usize, weights), (world.inputs(), parameters), "{seed}: {widths:?}");
             assert!(
                 constants.policy.actions().is_some() && unused.iter().all(|&width| width == 0),
                 "{seed}: {widths:?}"

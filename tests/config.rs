@@ -85,6 +85,8 @@ fn every_key_but_leaders_and_pois_has_its_default() {
             seed: 0,
         },
         checkpoint: CheckpointConfig { generations: 0, seconds: 30.0 },
+        agents: vec![],
+        pois: vec![],
         stages: vec![],
     };
     assert_eq!(config, expected);
@@ -356,7 +358,18 @@ fn configs() -> impl Strategy<Value = Config> {
             if learning.paradigm == Paradigm::AllLeaders && world.observers == Observers::Followers {
                 world.observers = Observers::Leaders;
             }
-            let mut config = Config { world, motion, follow, sense, policy, learning, checkpoint, stages: vec![] };
+            let mut config = Config {
+                world,
+                motion,
+                follow,
+                sense,
+                policy,
+                learning,
+                checkpoint,
+                agents: vec![],
+                pois: vec![],
+                stages: vec![],
+            };
             if config.populations() == 1 {
                 config.learning.hall_of_fame = 0;
             }
@@ -413,17 +426,22 @@ proptest! {
     fn a_valid_config_makes_normal_constants(config in configs()) {
         let world = flotilla::world::World::new(&config.validate().unwrap());
         let headings = world.headings.iter().flat_map(|heading| heading.to_array());
-        let constants = world.constants;
-        let c = &constants;
-        let parts: [&[f32]; 4] = [
-            bytemuck::cast_slice(std::slice::from_ref(&c.motion)),
-            bytemuck::cast_slice(std::slice::from_ref(&c.couple)),
-            bytemuck::cast_slice(std::slice::from_ref(&c.follow)),
-            bytemuck::cast_slice(std::slice::from_ref(&c.sense)),
-        ];
-        for value in parts.concat().into_iter().chain(headings).chain([c.speed]) {
-            prop_assert!(value == 0.0 || (2f32.powi(-100)..=1e30).contains(&value.abs()), "{:?}", constants);
+        let mut numbers: Vec<f32> = headings.chain(world.radii2.iter().copied()).collect();
+        for class in &world.classes {
+            let constants = &class.constants;
+            numbers.extend(bytemuck::cast_slice::<_, f32>(std::slice::from_ref(&constants.motion)));
+            numbers.extend(bytemuck::cast_slice::<_, f32>(std::slice::from_ref(&constants.rule)));
+            numbers.extend(constants.influence2);
+            for channel in class.channels() {
+                numbers.extend([channel.range2, channel.base, channel.slope, channel.nearest2, channel.scale]);
+                numbers.extend(channel.boundaries);
+            }
+            numbers.extend(class.terms().iter().flat_map(|term| [term.inner2, term.outer2, term.scale]));
         }
+        for value in numbers {
+            prop_assert!(value == 0.0 || (2f32.powi(-100)..=1e30).contains(&value.abs()), "{:?}", world.classes);
+        }
+        let c = &world.constants;
         prop_assert_eq!(config.parameters(), c.policy.parameters as usize);
         prop_assert_eq!(config.learners(), c.leaders as usize);
     }

@@ -75,7 +75,15 @@ fn trace(backend: &mut dyn Backend, config: &Config, world: &World, weights: &[f
         fitnesses: &[],
     };
     let trace = backend.trace(&group).unwrap();
-    let floats: Vec<f32> = bytemuck::cast_slice(&trace.moments).iter().map(|float: &f32| float + 0.0).collect();
+    // Each agent's inputs, zeros if it follows, and its moment.
+    let mut floats: Vec<f32> = vec![];
+    for (index, moment) in trace.moments.iter().enumerate() {
+        let (row, agent) = (index / trace.agents, index % trace.agents);
+        let leads = agent < trace.leaders;
+        let inputs = trace.inputs_of(row / trace.teams, row % trace.teams, if leads { agent } else { 0 });
+        floats.extend(inputs.iter().map(|input| if leads { input + 0.0 } else { 0.0 }));
+        floats.extend(bytemuck::cast_slice(std::slice::from_ref(moment)).iter().map(|float: &f32| float + 0.0));
+    }
     hex(&Sha256::digest(bytemuck::cast_slice::<f32, u8>(&floats)))
 }
 

@@ -9,11 +9,12 @@ use flotilla::backend::gpu::device::Request;
 use flotilla::backend::gpu::episode::{GpuBackend, Kernel, Records, ResidencyPolicy};
 use flotilla::backend::gpu::exact::{self, Pass};
 use flotilla::backend::gpu::source::{BreedJob, GatherJob, State, Task};
-use flotilla::backend::{Backend, Group, Moment, Weights};
+use flotilla::backend::{Backend, Group, Weights};
 use flotilla::config::{Config, Coupling, Fitness, Observers, ValidConfig, one_population, own_populations};
 use flotilla::evaluate::{SCORES_AND_DT, Starts, evaluate};
 use flotilla::evolve::{Breeding, Key, Purpose};
 use flotilla::gpu_struct::GpuStruct;
+use flotilla::model::class::Class;
 use flotilla::trainer::Trainer;
 use flotilla::verify::{Agreement, Plan, compare};
 use flotilla::world::{Constants, World};
@@ -234,7 +235,7 @@ fn structs_have_the_same_size_in_shaders_and_on_the_host() {
     check::<State>(&modules);
     check::<BreedJob>(&modules);
     check::<GatherJob>(&modules);
-    check::<Moment>(&modules);
+    check::<Class>(&modules);
 }
 
 /// Drawn starts make one group per episode, so a batch has many groups of few teams.
@@ -407,8 +408,9 @@ fn the_order_of_followers_and_pois_does_not_matter() {
             let weights = sample::weights(&world, 1, 5);
             let trace = Cpu::default().trace(&group_of_teams(&world, &weights, 1, &[0, 0])).unwrap();
             let of = |agent: usize| -> Vec<_> {
-                let moments = (1..=40).map(|step| trace.moment(step, 0, agent));
-                moments.map(|moment| (moment.inputs, moment.force, moment.position, moment.heading)).collect()
+                let inputs = |step| if agent < 2 { trace.inputs_of(step, 0, agent).to_vec() } else { vec![] };
+                let moments = (1..=40).map(|step| (trace.moment(step, 0, agent), inputs(step)));
+                moments.map(|(moment, inputs)| (inputs, moment.force, moment.position, moment.heading)).collect()
             };
             let mut paths: Vec<_> = order.iter().enumerate().map(|(place, &index)| (index, of(2 + place))).collect();
             paths.sort_by_key(|&(index, _)| index);
@@ -445,7 +447,7 @@ fn own_headings_and_ranges_of_zero_agree() {
         let sensed = |from: usize| {
             let of = |team| (1..=20).flat_map(move |step| (0..2).map(move |leader| (step, team, leader)));
             (0..3).flat_map(of).any(|(step, team, leader)| {
-                trace.moment(step, team, leader).inputs[from..from + 4].iter().any(|&input| input.to_bits() != 0)
+                trace.inputs_of(step, team, leader)[from..from + 4].iter().any(|&input| input.to_bits() != 0)
             })
         };
         assert_eq!(

@@ -61,7 +61,8 @@ impl Played {
         let bits = |numbers: &[f32]| numbers.iter().map(|number| number.to_bits()).collect::<Vec<_>>();
         let moments = |step: usize, count| (0..count).map(move |agent| *self.trace.moment(step, team, agent));
         if step < self.world.steps() {
-            let sensed: Vec<f32> = moments(step + 1, leaders).flat_map(|moment| moment.inputs).collect();
+            let inputs = (0..leaders).flat_map(|leader| self.trace.inputs_of(step + 1, team, leader));
+            let sensed: Vec<f32> = inputs.copied().collect();
             assert_eq!(bits(&stepper.inputs()[team * sensed.len()..][..sensed.len()]), bits(&sensed), "inputs, {case}");
         }
         let states = stepper.states();

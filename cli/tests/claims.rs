@@ -349,7 +349,7 @@ fn climbers_keep_the_best_of_sixteen_mutants() {
             let segment = step * 4 / world.steps();
             let first = (0..=step).find(|step| step * 4 / world.steps() == segment).unwrap();
             // A turn takes as many steps as the largest turn per step allows.
-            let turned = (world.constants.motion.max_turn / std::f32::consts::PI) * (step - first) as f32;
+            let turned = (world.classes[0].constants.motion.max_turn / std::f32::consts::PI) * (step - first) as f32;
             let left = |turn: f32| if turned < turn.abs() { turn - turned.copysign(turn) } else { 0.0 };
             let action = |leader: &[f32]| [left(leader[2 * segment]), leader[2 * segment + 1]];
             let actions: Vec<f32> = team.chunks(8).flat_map(action).collect();

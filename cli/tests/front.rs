@@ -309,7 +309,7 @@ fn play_and_trace_treat_each_team_separately() {
             assert_eq!(traced.speeds[at], moment.speed, "seed {seed}");
             if agent < leaders && step > 0 {
                 let at = (team * steps + step - 1) * leaders + agent;
-                assert_eq!(traced.inputs[at * 8..][..8], moment.inputs, "seed {seed}");
+                assert_eq!(traced.inputs[at * 8..][..8], *trace.inputs_of(step, team, agent), "seed {seed}");
                 assert_eq!(traced.outputs[at * 2..][..2], moment.outputs, "seed {seed}");
             }
         }

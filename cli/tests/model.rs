@@ -452,13 +452,14 @@ fn check_team<'a>(
             let mut borderline = false;
             let slack;
             let wanted = if agent < leaders {
+                let found: [f32; 8] = trace.inputs_of(step, team, agent).try_into().expect("8 inputs");
                 let mut inputs = model.sense(&states, agent, &mut borderline);
                 if borderline {
-                    inputs = actual.inputs.map(f64::from);
+                    inputs = found.map(f64::from);
                 } else {
-                    tally.compare(0, &actual.inputs, &inputs, INPUT, &place);
+                    tally.compare(0, &found, &inputs, INPUT, &place);
                 }
-                let sensed = actual.inputs.map(f64::from);
+                let sensed = found.map(f64::from);
                 let wanted = if config.policy.actions == Actions::Behaviours {
                     let chosen = model.choose(policy(agent), sensed);
                     match chosen {
@@ -636,8 +637,9 @@ actions = 'behaviours'";
     };
     let trace = Cpu::default().trace(&group).unwrap();
     assert_eq!(trace.moment(1, 0, 0).outputs, front_right);
-    assert_eq!(trace.moment(1, 0, 0).inputs[0], 0.0);
-    assert_eq!(trace.moment(1, 0, 0).inputs[1], trace.moment(1, 0, 0).inputs[2]);
+    let inputs = trace.inputs_of(1, 0, 0);
+    assert_eq!(inputs[0], 0.0);
+    assert_eq!(inputs[1], inputs[2]);
 }
 
 /// Compares worlds of more than 32 agents, whose pairs are found with bounds. Sizes are around multiples of words and

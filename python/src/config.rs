@@ -85,7 +85,7 @@ impl Config {
     /// Widths of a policy's layers, inputs and outputs included.
     #[getter]
     fn widths(&self) -> Vec<usize> {
-        self.0.policy.widths()
+        self.0.policy.widths(self.0.inputs())
     }
 
     #[getter]

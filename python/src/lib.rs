@@ -43,7 +43,6 @@ mod _native {
         module.add("__version__", env!("CARGO_PKG_VERSION"))?;
         module.add("COMMIT", flotilla::COMMIT)?;
         module.add("FITNESSES", Fitness::names().collect::<Vec<_>>())?;
-        module.add("INPUTS", flotilla::world::INPUTS)?;
         module.add("OUTPUTS", flotilla::world::OUTPUTS)
     }
 }

@@ -9,7 +9,7 @@ use flotilla::evaluate::{self, Batch, Spread, Starts};
 use flotilla::evolve::{self, MAX_WEIGHT};
 use flotilla::front::{self, ActionNoise, Failure, Played};
 use flotilla::model::policy::{MAX_HIDDEN_LAYERS, PolicyConstants};
-use flotilla::world::{INPUTS, OUTPUTS, World};
+use flotilla::world::{OUTPUTS, World};
 use flotilla_app::choice::Work;
 use glam::Vec2;
 use numpy::{
@@ -285,12 +285,12 @@ pub fn forward(
     padded[..widths.len()].copy_from_slice(&widths);
     let parameters: u32 = widths.windows(2).map(|widths| (widths[0] + 1) * widths[1]).sum();
     let policy = PolicyConstants { layers: widths.len() as u32 - 1, widths: padded, parameters };
-    let fits = widths[0] as usize == INPUTS && policy.actions().is_some();
+    let fits = policy.actions().is_some_and(|actions| actions == flotilla::config::Actions::Direct || widths[0] >= 8);
     let (count, rows) = (policies.shape()[0], inputs.shape()[0]);
     let chosen = chosen.as_slice()?;
     if !fits
         || policies.shape()[1] != parameters as usize
-        || inputs.shape()[1] != INPUTS
+        || inputs.shape()[1] != widths[0] as usize
         || outputs.shape() != [rows, OUTPUTS]
         || chosen.len() != rows
         || !chosen.iter().all(|&policy| (0..count as i64).contains(&policy))

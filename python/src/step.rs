@@ -5,7 +5,7 @@ use std::sync::{Mutex, MutexGuard, TryLockError};
 use flotilla::config::{Choice, Fitness};
 use flotilla::front;
 use flotilla::stepping;
-use flotilla::world::{INPUTS, OUTPUTS};
+use flotilla::world::OUTPUTS;
 use flotilla_app::report::map::{self, Marker, Poi, Team, Viewport};
 use flotilla_app::report::scene::Scene;
 use glam::{DVec2, Vec2};
@@ -143,14 +143,14 @@ impl Stepper {
         workers::aside(py, || self.stepper()?.fitness(fitness, scores).raise())
     }
 
-    /// Writes what every leader senses to `out`, `[teams, leaders, 8]`.
+    /// Writes what every leader senses to `out`, `[teams, leaders, inputs]`.
     ///
     /// The interpreter's lock is held meanwhile, so no Python thread reads a half-written array.
     fn read_inputs(&self, mut out: PyReadwriteArray3<'_, f32>) -> PyResult<()> {
         let stepper = self.stepper()?;
-        let shape = [stepper.teams(), stepper.world().leaders(), INPUTS];
+        let shape = [stepper.teams(), stepper.world().leaders(), stepper.world().inputs()];
         if out.shape() != shape {
-            let text = format!("out is {:?}, allowed is [teams, leaders, 8] = {shape:?}", out.shape());
+            let text = format!("out is {:?}, allowed is [teams, leaders, inputs] = {shape:?}", out.shape());
             return Err(PyValueError::new_err(text));
         }
         contiguous("out", out.as_slice_mut())?.copy_from_slice(stepper.inputs());
@@ -234,8 +234,9 @@ fn team_of(stepper: &mut stepping::Stepper, team: usize) -> Team {
     let places: Vec<_> = (0..agents).map(|agent| (at(states.positions, agent), at(states.headings, agent))).collect();
     let world = stepper.world();
     let (pois, words) = (world.pois.len(), world.constants.words as usize);
-    let near =
-        |poi: usize| world.rule.count(stepper.agents_at_poi()[(team * pois + poi) * words..][..words].iter().copied());
+    let near = |poi: usize| {
+        world.rule.count(poi, stepper.agents_at_poi()[(team * pois + poi) * words..][..words].iter().copied())
+    };
     let (step, observed) = (stepper.steps()[team].max(1), &stepper.observed()[team * pois..][..pois]);
     let agent = |(agent, (place, heading))| {
         let group = (agent < leaders).then_some(agent);

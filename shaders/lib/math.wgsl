@@ -84,6 +84,17 @@ fn ln(x: f32) -> f32 {
     return (k - 32.0) * 0.6931472 + f * (f * p + 1.0);
 }
 
+// exp(-x) for x from 0.
+fn exp_negative(x: f32) -> f32 {
+    let limited = select(60.0, x, x < 60.0);
+    let whole = 12582912.0;
+    let raised = limited * 1.442695 + whole;
+    let k = raised - whole;
+    let r = (limited - k * 0.693359375) + k * 2.12194440e-4;
+    let p = (((((r * 1.3888889e-3 - 8.3333333e-3) * r + 4.1666668e-2) * r - 0.16666667) * r + 0.5) * r - 1.0) * r + 1.0;
+    return bitcast<f32>(bitcast<i32>(p) - (less_base(raised, whole) << 23u));
+}
+
 // A standard normal deviate from two uniform words.
 fn normal(a: u32, b: u32) -> f32 {
     let u = f32((a >> 8u) + 1u) * 5.9604645e-8;

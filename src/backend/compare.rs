@@ -2,11 +2,10 @@
 
 use std::fmt;
 
-use super::{Backend, BackendError, Group, GroupScores, Moment, Trace};
+use super::{Backend, BackendError, Group, GroupScores, MOMENT_WORDS, Trace};
 use crate::config::Learning;
 use crate::evolve::{Breeding, Key, Purpose, UNCHANGED};
-use crate::model::sense;
-use crate::world::{INPUTS, World};
+use crate::world::World;
 
 /// The quantities of a step, in the order in which a step computes them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -137,7 +136,7 @@ pub(crate) fn compare_breeding(
 
 /// Returns the first difference of two traces of the same group: by step, then stage, then team.
 fn first_mismatch(world: &World, expected: &Trace, found: &Trace) -> Option<Mismatch> {
-    if expected == found && bits(expected) == bits(found) {
+    if expected == found && bits(expected) == bits(found) && inputs(expected) == inputs(found) {
         return None;
     }
     let mut first: Option<Mismatch> = None;
@@ -151,9 +150,15 @@ fn first_mismatch(world: &World, expected: &Trace, found: &Trace) -> Option<Mism
         }
     };
     compare(bits(expected), bits(found), &|index| {
-        let (moment, (stage, name)) = (index / WORDS, field(index % WORDS));
+        let (moment, (stage, name)) = (index / MOMENT_WORDS, field(index % MOMENT_WORDS));
         let (agent, team) = (moment % expected.agents, moment / expected.agents % expected.teams);
         (moment / expected.agents / expected.teams, stage, team, format!("agent {agent}, {name}"))
+    });
+    let (leaders, width) = (world.leaders(), world.inputs());
+    compare(inputs(expected), inputs(found), &|index| {
+        let (leader, step) = (index / width, index / width / leaders / expected.teams);
+        let place = format!("agent {}, input {}", leader % leaders, index % width);
+        (step, Quantity::Sense, leader / leaders % expected.teams, place)
     });
     let (pois, words) = (world.pois.len(), world.constants.words as usize);
     compare(&expected.sets, &found.sets, &|index| {
@@ -167,7 +172,6 @@ fn first_mismatch(world: &World, expected: &Trace, found: &Trace) -> Option<Mism
         let place = format!("follower {}, leaders from {}", row % followers, index % words * 32);
         (row / followers + 1, Quantity::Sight, index / of_team, place)
     });
-    let leaders = world.leaders();
     compare(&expected.seen, &found.seen, &|index| {
         let (team, pair) = (index / (leaders * followers), index % (leaders * followers));
         let place = format!("follower {}, leader {}", pair / leaders, pair % leaders);
@@ -178,7 +182,7 @@ fn first_mismatch(world: &World, expected: &Trace, found: &Trace) -> Option<Mism
 
 /// Returns the quantity and the name of each word of a [`Moment`].
 fn field(word: usize) -> (Quantity, &'static str) {
-    const OTHERS: [(Quantity, &str); WORDS - INPUTS] = [
+    const FIELDS: [(Quantity, &str); MOMENT_WORDS] = [
         (Quantity::Policy, "turn"),
         (Quantity::Policy, "speed"),
         (Quantity::Follow, "force x"),
@@ -189,14 +193,13 @@ fn field(word: usize) -> (Quantity, &'static str) {
         (Quantity::Move, "heading y"),
         (Quantity::Move, "speed"),
     ];
-    match word.checked_sub(INPUTS) {
-        None => (Quantity::Sense, sense::NAMES[word]),
-        Some(other) => OTHERS[other],
-    }
+    FIELDS[word]
 }
-
-const WORDS: usize = size_of::<Moment>() / size_of::<u32>();
 
 fn bits(trace: &Trace) -> &[u32] {
     bytemuck::cast_slice(&trace.moments)
+}
+
+fn inputs(trace: &Trace) -> &[u32] {
+    bytemuck::cast_slice(&trace.inputs)
 }

@@ -33,6 +33,7 @@ pub(crate) use size::{BATCH_BYTES, PACKED_FROM, held_bytes, state_bytes, weight_
 pub use size::{HELD_FROM, record_bytes};
 #[cfg(feature = "gpu")]
 use size::{VECTOR, WeightVector, check_sizes, record_words, weight_vectors};
+pub(crate) use trace::MOMENT_WORDS;
 pub use trace::{Moment, Trace};
 
 /// Plays episodes and scores them. Every implementation returns the same bits.

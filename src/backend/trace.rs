@@ -2,18 +2,16 @@
 
 use crate::credit::Episode;
 use crate::gpu_struct::gpu_struct;
-use crate::world::{INPUTS, OUTPUTS, World};
+use crate::world::{OUTPUTS, World};
 
 gpu_struct! {
     /// The floats of one agent at one step of a [`Trace`], in this order.
     ///
-    /// Only leaders have inputs and outputs, only followers a force. Other agents, and step 0 (the start), have zeros.
+    /// Only leaders have outputs, only followers a force. Other agents, and step 0 (the start), have zeros.
     pub struct Moment {
-        /// Sensed densities.
-        pub inputs: [f32; INPUTS],
         /// The outputs of the policy, each in -1..1.
         pub outputs: [f32; OUTPUTS],
-        /// The sum of attraction, repulsion and wall push.
+        /// The sum of the terms of its rule and of the push of walls.
         pub force: [f32; 2],
         /// The position after the step, x and y in units.
         pub position: [f32; 2],
@@ -24,6 +22,9 @@ gpu_struct! {
     }
 }
 
+/// 32-bit words of a [`Moment`].
+pub(crate) const MOMENT_WORDS: usize = size_of::<Moment>() / size_of::<u32>();
+
 /// All quantities of every step: `moments[(step * teams + team) * agents + agent]`, steps `0..=steps`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Trace {
@@ -31,8 +32,12 @@ pub struct Trace {
     pub teams: usize,
     /// Agents of a team.
     pub agents: usize,
+    /// The agents that learn.
+    pub leaders: usize,
     /// `[steps + 1][teams][agents]`.
     pub moments: Vec<Moment>,
+    /// The inputs of the leaders' policies, `[steps + 1][teams][leaders][inputs]`; zeros at step 0.
+    pub inputs: Vec<f32>,
     /// The agents at each POI after each step, one bit per agent, `[teams][steps][pois][words]`.
     pub sets: Vec<u32>,
     /// The number of steps at which each follower saw each leader, `[teams][followers][leaders]`.
@@ -47,6 +52,12 @@ impl Trace {
     /// Returns what one agent of one team did at one step.
     pub fn moment(&self, step: usize, team: usize, agent: usize) -> &Moment {
         &self.moments[(step * self.teams + team) * self.agents + agent]
+    }
+
+    /// Returns the inputs of one leader's policy at one step.
+    pub fn inputs_of(&self, step: usize, team: usize, leader: usize) -> &[f32] {
+        let inputs = self.inputs.len() / (self.moments.len() / self.agents * self.leaders);
+        &self.inputs[((step * self.teams + team) * self.leaders + leader) * inputs..][..inputs]
     }
 
     /// Returns the record of one team, which credit is computed from.

@@ -167,17 +167,19 @@ pub(super) fn play_segments(world: &World, teams: &[(&[f32], &[Vec<Vec2>])]) -> 
     let Some((_, starts)) = teams.first() else { return Ok(observed) };
     let mut stepper = Stepper::new(world.clone(), teams.len(), Recording::None).map_err(failed)?;
     let (steps, mut actions) = (world.steps(), Vec::new());
-    // The largest turn per step, as a fraction of a half turn.
-    let most = world.constants.motion.max_turn / std::f32::consts::PI;
+    // The largest turn per step of a leader, as a fraction of a half turn.
+    let most = |leader: usize| world.class_of(leader).constants.motion.max_turn / std::f32::consts::PI;
     for episode in 0..starts.len() {
         let starts: Vec<f32> =
             teams.iter().flat_map(|(_, starts)| &starts[episode]).flat_map(|place| place.to_array()).collect();
         stepper.reset_to(&starts).map_err(failed)?;
         for step in 0..steps {
             let segment = step * SEGMENTS / steps;
-            let turned = most * (step - (segment * steps).div_ceil(SEGMENTS)) as f32;
+            let turns = (step - (segment * steps).div_ceil(SEGMENTS)) as f32;
             actions.clear();
-            for leader in teams.iter().flat_map(|(team, _)| team.chunks_exact(SEGMENTS * OUTPUTS)) {
+            let leaders = teams.iter().flat_map(|(team, _)| team.chunks_exact(SEGMENTS * OUTPUTS).enumerate());
+            for (index, leader) in leaders {
+                let turned = most(index) * turns;
                 let [turn, speed] = [0, 1].map(|output| leader[segment * OUTPUTS + output]);
                 actions.extend([turn.signum() * (turn.abs() - turned).max(0.0), speed]);
             }

@@ -230,7 +230,7 @@ impl Config {
         let coupling = world.coupling.of_each(world.pois.len());
         let one = |(poi, at): (usize, &[f64; 2])| {
             let window = world.windows.get(poi).map_or(&[][..], std::slice::from_ref);
-            let coupling = Coupling::Same(coupling[poi] as usize);
+            let coupling = Coupling::Same(coupling[poi]);
             let after = world.after[poi].iter().map(|&other| name(other)).collect();
             PoiGroup { after, ..group(name(poi), std::slice::from_ref(at), coupling, window) }
         };

@@ -238,9 +238,15 @@ impl Config {
         self.learning.teams() + self.hall_teams(1) + 1
     }
 
+    /// Returns the number of inputs of a policy: the most that any class has.
+    pub fn inputs(&self) -> usize {
+        let inputs = |class: &AgentClass| class.senses.iter().map(|channel| channel.sectors).sum();
+        self.classes().agents.iter().map(inputs).max().unwrap_or(0)
+    }
+
     /// Returns the number of weights in one policy, including biases.
     pub fn parameters(&self) -> usize {
-        self.policy.parameters()
+        self.policy.parameters(self.inputs())
     }
 
     /// Returns the size of the policies of all trials, in bytes.

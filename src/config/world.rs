@@ -102,6 +102,6 @@ impl WorldConfig {
 
     /// Returns each agent's heading at the start in radians, leaders first.
     pub fn headings(&self) -> Vec<f64> {
-        self.heading.of_each(&self.leaders, &self.followers)
+        self.heading.of_agents(&self.leaders, &self.followers)
     }
 }

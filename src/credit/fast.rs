@@ -89,13 +89,13 @@ impl Credit {
         for (poi, &coupling) in world.coupling.iter().enumerate() {
             let largest_set_with = self.largest_set_with[poi * world.leaders() + leader];
             if !self.observed[poi] && largest_set_with > 0 {
-                self.completed[(coupling - largest_set_with) as usize] += 1;
-                at_most += 1;
+                self.completed[(coupling - largest_set_with) as usize] += world.worth[poi];
+                at_most += world.worth[poi];
             }
         }
         // Fewer copies than the largest coupling are ever needed.
         let mut gain = 0;
-        stepping_stone(self.lost[leader], most, at_most, world.pois.len(), |copies| {
+        stepping_stone(self.lost[leader], most, at_most, world.total_worth, |copies| {
             gain += self.completed[copies as usize];
             gain
         })
@@ -111,17 +111,19 @@ impl Credit {
         self.critical.extend((0..world.pois.len() * words).map(|index| of_word(index % words)));
     }
 
-    pub(super) fn count_observed(&self) -> u32 {
-        self.observed.iter().filter(|&&observed| observed).count() as u32
+    /// Returns what the observed POIs are worth.
+    pub(super) fn observed_worth(&self, world: &World) -> u32 {
+        self.observed.iter().zip(&world.worth).filter(|(observed, _)| **observed).map(|(_, worth)| worth).sum()
     }
 
-    /// Counts the observed POIs that each leader is critical to.
+    /// Adds up what the observed POIs are worth that each leader is critical to.
     pub(super) fn count_lost(&mut self, world: &World) {
         let (leaders, words) = (world.leaders(), world.constants.words as usize);
         self.lost.clear();
         self.lost.resize(leaders, 0);
-        for (critical, _) in self.critical.chunks_exact(words).zip(&self.observed).filter(|&(_, &observed)| observed) {
-            bits(critical).for_each(|leader| self.lost[leader] += 1);
+        let pois = self.critical.chunks_exact(words).zip(&world.worth).zip(&self.observed);
+        for ((critical, worth), _) in pois.filter(|(_, observed)| **observed) {
+            bits(critical).for_each(|leader| self.lost[leader] += worth);
         }
     }
 }

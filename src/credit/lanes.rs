@@ -16,17 +16,21 @@ use crate::world::World;
 /// So one pass is enough, which skips the sets that the kept set before or the next set contains.
 pub(crate) struct LaneCredit<S: Simd> {
     simd: S,
-    /// POIs observed.
+    /// What the observed POIs are worth.
     observed: S::u32s,
-    /// POIs lost without each leader, or without its group, `[leaders]`.
+    /// What the POIs are worth that are lost without each leader, or without its group, `[leaders]`.
     lost: Vec<S::u32s>,
     /// The leaders without whom, or without whose groups, the POI is lost, `[words]`.
     critical: Vec<S::u32s>,
     /// The agents of each leader's group, `[leaders][words]`.
     groups: Vec<S::u32s>,
-    /// Each number of POIs as a share of all, `[pois + 1]`.
+    /// What all POIs are worth, and each worth as a share of it, `[total + 1]`; empty if that is large.
+    total: u32,
     shares: Vec<f32>,
 }
+
+/// Maximum number of shares that are computed in advance.
+const MOST_SHARES: u32 = 1024;
 
 /// The agents that are taken out for a score: nobody (G), a leader (D), or a leader with its followers (Df).
 const NOBODY: u32 = 0;
@@ -35,14 +39,15 @@ const GROUP: u32 = 2;
 
 impl<S: Simd> LaneCredit<S> {
     pub(crate) fn new(simd: S, world: &World) -> LaneCredit<S> {
-        let (zero, words, pois) = (S::u32s::splat(simd, 0), world.constants.words as usize, world.pois.len());
+        let (zero, words, total) = (S::u32s::splat(simd, 0), world.constants.words as usize, world.total_worth);
         LaneCredit {
             simd,
             observed: zero,
             lost: vec![zero; world.leaders()],
             critical: vec![zero; words],
             groups: vec![zero; world.leaders() * words],
-            shares: (0..=pois as u32).map(|count| share(count, pois)).collect(),
+            total,
+            shares: if total > MOST_SHARES { vec![] } else { (0..=total).map(|worth| share(worth, total)).collect() },
         }
     }
 
@@ -82,9 +87,11 @@ impl<S: Simd> LaneCredit<S> {
                 Fitness::G => self.score_poi::<NOBODY>(sets, coupling, candidate),
                 _ => self.score_poi::<LEADER>(sets, coupling, candidate),
             };
-            self.observed += observed & 1;
+            let worth = S::u32s::splat(self.simd, world.worth[poi]);
+            self.observed += observed & worth;
             for (leader, lost) in self.lost.iter_mut().enumerate() {
-                *lost += (self.critical[leader / 32] >> (leader % 32) as u32) & observed & 1;
+                let is_critical = zero - ((self.critical[leader / 32] >> (leader % 32) as u32) & 1);
+                *lost += is_critical & observed & worth;
             }
         }
         if fitness == Fitness::G {
@@ -92,14 +99,18 @@ impl<S: Simd> LaneCredit<S> {
         }
     }
 
-    /// Returns the number of POIs that one lane's team observed.
+    /// Returns what the POIs are worth that one lane's team observed.
     pub(crate) fn observed(&self, lane: usize) -> u32 {
         self.observed[lane]
     }
 
     /// Returns the scores of one lane's leaders.
     pub(crate) fn scores(&self, lane: usize) -> impl Iterator<Item = f32> {
-        self.lost.iter().map(move |lost| self.shares[lost[lane] as usize])
+        let of = move |lost: &S::u32s| {
+            let lost = lost[lane];
+            self.shares.get(lost as usize).copied().unwrap_or_else(|| share(lost, self.total))
+        };
+        self.lost.iter().map(of)
     }
 
     /// Puts each follower into the group of the leader that it saw at most steps, ties to the lower index.

@@ -1,6 +1,7 @@
 //! Structural credit assignment: what each leader was worth to its team, from the record of one episode.
 //!
-//! Every fitness is a share of the world's P POIs, so it is counted in whole POIs and divided once. Nothing is
+//! Every fitness is a share of what the world's POIs are [worth](crate::world::WorldParts::worth), so it is added up in
+//! whole numbers and divided once. Nothing is
 //! simulated again. The record of who was at a POI at which step determines what would have been observed without a
 //! leader, without its whole group, without those that it led at each step, or with more copies of it.
 //!
@@ -28,9 +29,10 @@ use crate::world::World;
 /// Every fitness of one team. Each difference is `[leaders]`.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Scores {
-    /// POIs observed. Under the default rule: those with enough agents within the observation radius at some step.
+    /// What the observed POIs are [worth](crate::world::WorldParts::worth); their number if they have equal values. Under the
+    /// default rule: those with enough agents within the observation radius at some step.
     pub observed: u32,
-    /// G: observed POIs over P, the same for every leader (paper, Equation 1).
+    /// G: what the observed POIs are worth as a share of all, the same for every leader (paper, Equation 1).
     pub g: f32,
     /// D: G minus G without the leader (paper, Equation 5; "leader trajectory removal").
     pub d: Vec<f32>,
@@ -52,7 +54,7 @@ pub struct Credit {
     observed: Vec<bool>,
     /// The leaders without whom (D), or without whose groups (Df), an observed POI is lost, `[pois][words]`.
     critical: Vec<u32>,
-    /// POIs lost without the leader, `[leaders]`.
+    /// What the POIs are worth that are lost without the leader, `[leaders]`.
     lost: Vec<u32>,
     /// The leader that each agent belongs to, or [`UNASSIGNED`], `[agents]`.
     owner: Vec<u32>,
@@ -60,7 +62,7 @@ pub struct Credit {
     groups: Vec<u32>,
     /// The largest set at the POI that has the leader in it, `[pois][leaders]`.
     largest_set_with: Vec<u32>,
-    /// Unobserved POIs that this number of copies of one leader would complete, `[copies]`.
+    /// What the unobserved POIs are worth that this number of copies of one leader would complete, `[copies]`.
     completed: Vec<u32>,
     /// One set, and the set of the step before, `[2][words]`.
     sets: Vec<u32>,
@@ -73,19 +75,19 @@ pub struct Credit {
 }
 
 impl Credit {
-    /// Scores every leader of the team by `fitness` into `scores`, `[leaders]`, and returns how many POIs the team
-    /// observed. The episode must be of `world`, with the [record](RecordRequest) that the fitness needs.
+    /// Scores every leader of the team by `fitness` into `scores`, `[leaders]`, and returns what the POIs are worth that
+    /// the team observed. The episode must be of `world`, with the [record](RecordRequest) that the fitness needs.
     pub fn score(&mut self, episode: &Episode<'_>, world: &World, fitness: Fitness, scores: &mut [f32]) -> u32 {
         if !world.rule.is_plain() || fitness == Fitness::Dt {
             return self.replay(episode, world, fitness, scores);
         }
         self.observed.clear();
         self.observed.resize(world.pois.len(), false);
-        let pois = world.pois.len();
+        let total = world.total_worth;
         match fitness {
             Fitness::G => {
                 self.observe(episode, world);
-                scores.fill(share(self.count_observed(), pois));
+                scores.fill(share(self.observed_worth(world), total));
             }
             Fitness::D | Fitness::Df => {
                 match fitness == Fitness::Df && world.followers() > 0 {
@@ -93,7 +95,7 @@ impl Credit {
                     false => self.find_critical_leaders(episode, world),
                 }
                 self.count_lost(world);
-                scores.iter_mut().zip(&self.lost).for_each(|(score, &lost)| *score = share(lost, pois));
+                scores.iter_mut().zip(&self.lost).for_each(|(score, &lost)| *score = share(lost, total));
             }
             Fitness::Dt => unreachable!("it was replayed"),
             Fitness::Dpp => {
@@ -104,7 +106,7 @@ impl Credit {
                 }
             }
         }
-        self.count_observed()
+        self.observed_worth(world)
     }
 
     /// Returns every fitness of every leader. The episode must be of `world`, with the [record](RecordRequest) that D++
@@ -122,33 +124,33 @@ impl Credit {
             (_, true) => vec![],
             (_, false) => by(Fitness::Dt).1,
         };
-        Scores { observed, g: share(observed, world.pois.len()), d, df, dpp, dt }
+        Scores { observed, g: share(observed, world.total_worth), d, df, dpp, dt }
     }
 }
 
-/// Returns D++ of a leader whose removal loses `lost` POIs. `gain(n)` is how many POIs n copies add; `at_most` is
-/// `gain(most)`.
+/// Returns D++ of a leader whose removal loses POIs worth `lost`, of `total`. `gain(n)` is the worth of the POIs that n
+/// copies add; `at_most` is `gain(most)`.
 ///
 /// That is D if it is at least D++(most). Otherwise it is the first `D++(n) = gain(n) / n`, n = 1, 2, …, that D++(n +
 /// 1) does not exceed.
 #[inline(always)]
-fn stepping_stone(lost: u32, most: u32, at_most: u32, pois: usize, mut gain: impl FnMut(u32) -> u32) -> f32 {
+fn stepping_stone(lost: u32, most: u32, at_most: u32, total: u32, mut gain: impl FnMut(u32) -> u32) -> f32 {
     if u64::from(lost) * u64::from(most) >= u64::from(at_most) {
-        return share(lost, pois);
+        return share(lost, total);
     }
     let mut now = gain(1);
     for copies in 1..most {
         let next = gain(copies + 1);
         if u64::from(next) * u64::from(copies) <= u64::from(now) * (u64::from(copies) + 1) {
-            return share(now, pois * copies as usize);
+            return share(now, total * copies);
         }
         now = next;
     }
-    share(now, pois * most as usize)
+    share(now, total * most)
 }
 
-/// Returns a ratio of two counts, each exact in f32.
-fn share(count: u32, of: usize) -> f32 {
+/// Returns a ratio of two numbers, each exact in f32 up to 2^24.
+fn share(count: u32, of: u32) -> f32 {
     count as f32 / of as f32
 }
 

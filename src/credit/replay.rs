@@ -13,10 +13,10 @@ impl Credit {
     /// Computes [`Credit::score`] by each fitness's definition.
     pub(super) fn replay(&mut self, episode: &Episode<'_>, world: &World, fitness: Fitness, scores: &mut [f32]) -> u32 {
         let Credit { owner, groups, observed_at, counterfactual, led, .. } = self;
-        let (pois, words, leaders) = (world.pois.len(), world.constants.words as usize, world.leaders());
+        let (total, words, leaders) = (world.total_worth, world.constants.words as usize, world.leaders());
         let replay = Replay { sets: episode.sets, world };
         replay.observe(observed_at);
-        let observed = count(observed_at);
+        let observed = worth(world, observed_at);
         // Without followers, Df and Dt are D. If nothing was observed, nothing can be lost.
         let taken = if world.followers() == 0 || observed == 0 { Fitness::D } else { fitness };
         match taken {
@@ -49,18 +49,18 @@ impl Credit {
                         replay.observe_without(observed_at, alone, counterfactual);
                     }
                 }
-                observed - count(counterfactual)
+                observed - worth(world, counterfactual)
             };
             *score = match fitness {
-                Fitness::G => share(observed, pois),
-                Fitness::D | Fitness::Df | Fitness::Dt => share(lost(), pois),
+                Fitness::G => share(observed, total),
+                Fitness::D | Fitness::Df | Fitness::Dt => share(lost(), total),
                 Fitness::Dpp => {
                     let (lost, most) = (lost(), world.coupling.iter().copied().max().unwrap_or(0));
                     let mut gain = |copies| {
                         replay.observe_with(observed_at, leader, copies, counterfactual);
-                        count(counterfactual) - observed
+                        worth(world, counterfactual) - observed
                     };
-                    stepping_stone(lost, most, gain(most), pois, gain)
+                    stepping_stone(lost, most, gain(most), total, gain)
                 }
             };
         }
@@ -81,7 +81,7 @@ impl Replay<'_> {
         let Replay { sets, world } = self;
         let words = world.constants.words as usize;
         let first = ((step as usize - 1) * world.pois.len() + poi) * words;
-        world.rule.count((0..words).map(|word| stay(word, sets.get(first + word))))
+        world.rule.count(poi, (0..words).map(|word| stay(word, sets.get(first + word))))
     }
 
     /// Writes the step at which each POI is observed: the first of the steps to test, `steps_to_test(poi, open)`, with
@@ -125,9 +125,9 @@ impl Replay<'_> {
     }
 }
 
-/// Counts the observed POIs.
-fn count(observed_at: &[u32]) -> u32 {
-    observed_at.iter().filter(|&&step| step != NEVER).count() as u32
+/// Returns what the observed POIs are worth.
+fn worth(world: &World, observed_at: &[u32]) -> u32 {
+    observed_at.iter().zip(&world.worth).filter(|(step, _)| **step != NEVER).map(|(_, worth)| worth).sum()
 }
 
 /// Returns the step, from 1, at which each POI is observed, if any, `[pois]`. `sets` has the agents at each POI,

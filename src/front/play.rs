@@ -10,7 +10,7 @@ use crate::config::{Config, Fitness, MAX_POPULATION};
 use crate::evaluate::{self, Evaluation, MAX_EPISODES, Starts};
 use crate::evolve::{self, Key, Purpose};
 use crate::stepping::{Recording, Stepper};
-use crate::world::{INPUTS, OUTPUTS, World};
+use crate::world::{OUTPUTS, World};
 
 /// The scores of teams, averaged over episodes.
 #[derive(Clone, Debug, PartialEq)]
@@ -174,7 +174,7 @@ pub fn trace(
     }
     let world = &checked.world;
     let (states, inputs) = (teams * (world.steps() + 1) * world.agents(), teams * world.steps() * world.leaders());
-    let words = states * 5 + inputs * (INPUTS + OUTPUTS) + teams * world.set_words();
+    let words = states * 5 + inputs * (world.inputs() + OUTPUTS) + teams * world.set_words();
     let bytes = words as u128 * 4;
     let fits = usize::try_from(bytes).is_ok_and(|bytes| Vec::<u8>::new().try_reserve_exact(bytes).is_ok());
     if !fits {
@@ -184,7 +184,7 @@ pub fn trace(
         positions: vec![0.0; states * 2],
         headings: vec![0.0; states * 2],
         speeds: vec![0.0; states],
-        inputs: vec![0.0; inputs * INPUTS],
+        inputs: vec![0.0; inputs * world.inputs()],
         outputs: vec![0.0; inputs * OUTPUTS],
         agents_at_poi: vec![0; teams * world.set_words()],
     };

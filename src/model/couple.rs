@@ -3,8 +3,7 @@
 
 use fearless_simd::Simd;
 
-use super::{LONGEST, Lanes};
-use crate::gpu_struct::gpu_struct;
+use super::LONGEST;
 use crate::kernels::math::within;
 use crate::reader::{Reader, between};
 
@@ -17,23 +16,8 @@ pub(crate) fn observation_radius(r: &mut Reader<'_>) -> f64 {
         .number(between(0.01, LONGEST), 5.0)
 }
 
-gpu_struct! {
-    /// Constants of coupling.
-    pub struct CoupleConstants as CoupleLanes {
-        /// The observation radius, squared.
-        pub observation_radius2: f32,
-    }
-}
-
-impl CoupleConstants {
-    /// Computes the constants.
-    pub fn new(observation_radius: f64) -> CoupleConstants {
-        CoupleConstants { observation_radius2: (observation_radius * observation_radius) as f32 }
-    }
-}
-
-/// Returns the lanes in which the POI at offset (`dx`, `dy`) is within its observation radius.
+/// Returns the lanes in which the POI at offset (`dx`, `dy`) is within its observation radius, given squared.
 #[inline(always)]
-pub fn observes<S: Simd>(world: &Lanes<S>, dx: S::f32s, dy: S::f32s) -> S::mask32s {
-    within::<S>(dx, dy, world.couple.observation_radius2)
+pub fn observes<S: Simd>(radius2: S::f32s, dx: S::f32s, dy: S::f32s) -> S::mask32s {
+    within::<S>(dx, dy, radius2)
 }

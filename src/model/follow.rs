@@ -1,13 +1,19 @@
-//! The followers' preset behaviour: attraction to agents in sight, repulsion from close ones and walls (paper, Section
-//! 4.1, Figure 2b).
+//! The rule of agents that do not learn: a force from other agents and walls. The paper's followers are attracted by agents
+//! in sight and repelled by close ones (Section 4.1, Figure 2b).
+
+use std::ops::Range;
 
 use fearless_simd::{Simd, prelude::*};
 
-use super::{LONGEST, Lanes, TINY, motion::GRID, motion::rotate};
+use super::class::ClassLanes;
+use super::motion::{GRID, MapLanes, MotionLanes, rotate};
+use super::sense::NOTHING;
+use super::{LONGEST, Ranges, TINY, ranges};
+use crate::config::{AGENTS, AgentClass, Term};
 use crate::gpu_struct::gpu_struct;
 use crate::kernels::{
     larger,
-    math::{flush, lattice, nearest_f32, on_lattice, recip, rsqrt, within},
+    math::{flush, lattice, nearest_f32, recip, rsqrt},
     select, splat, zero_unless,
 };
 use crate::reader::{Reader, between, section};
@@ -17,6 +23,8 @@ pub(crate) const WGSL: &str = include_str!("../../shaders/follow.wgsl");
 
 /// Maximum gain of a force.
 const MAX_GAIN: f64 = 1e3;
+/// The finest lattice of headings, on which they are added: 2^-20.
+const FINEST_HEADING: f64 = 1.0 / 1_048_576.0;
 
 section! {
     /// `[follow]`: the followers' preset behaviour.
@@ -52,94 +60,110 @@ impl Follow {
 }
 
 gpu_struct! {
-    /// Constants of following.
-    pub struct FollowConstants as FollowLanes {
-        /// The attraction radius, squared.
-        pub attraction_radius2: f32,
-        /// The repulsion radius, squared.
-        pub repulsion_radius2: f32,
+    /// The parts of a rule's term that kernels are specialised for.
+    #[derive(Eq, Hash, Ord, PartialOrd)]
+    pub struct TermShape as itself {
+        /// Not 0 if it aligns headings, 0 if it pulls towards positions.
+        pub aligns: u32,
+        /// The agents that count.
+        pub ranges: Ranges,
+    }
+
+    /// Constants of a rule's term.
+    pub struct TermConstants as TermLanes {
+        /// What kernels are specialised for.
+        pub shape: TermShape,
+        /// The squared distance above which agents count.
+        pub inner2: f32,
+        /// The squared distance up to which agents count.
+        pub outer2: f32,
+        /// The gain over the outer distance, or of an alignment, per lattice distance.
+        pub scale: f32,
+    }
+
+    /// Constants of a rule besides its terms.
+    pub struct RuleConstants as RuleLanes {
         /// The distance within which walls push.
-        pub repulsion_radius: f32,
+        pub wall_radius: f32,
+        /// The push per unit that a wall is nearer than that.
+        pub wall_gain: f32,
         /// The base of the lattice of offsets, on which they are added.
         pub offset_base: f32,
-        /// The attraction gain over the attraction radius, per lattice distance.
-        pub attraction_scale: f32,
-        /// The repulsion gain over the repulsion radius, per lattice distance.
-        pub repulsion_scale: f32,
-        /// The push per unit that a wall is nearer than the repulsion radius.
-        pub wall_gain: f32,
+        /// The base of the lattice of headings.
+        pub heading_base: f32,
     }
 }
 
-impl FollowConstants {
-    /// Computes the constants of a valid section for teams of so many agents.
-    pub fn new(follow: &Follow, agents: usize) -> FollowConstants {
-        let squared = |radius: f64| (radius * radius) as f32;
-        // Within a radius, which is squared and rounded, an offset may exceed it by rounding.
-        let [offset_base, distance] = lattice(agents, follow.attraction_radius * 1.01, 1.0 / f64::from(GRID));
-        let scale = |gain: f64, radius: f64| (gain / radius * f64::from(distance)) as f32;
-        FollowConstants {
-            attraction_radius2: squared(follow.attraction_radius),
-            repulsion_radius2: squared(follow.repulsion_radius),
-            repulsion_radius: follow.repulsion_radius as f32,
+/// The lattice of offsets within these terms, in teams of so many agents, and that of headings: bases and distances.
+fn lattices(terms: &[Term], agents: usize) -> [[f32; 2]; 2] {
+    let farthest = terms.iter().map(|term| term.to).fold(0.0, f64::max);
+    // Within a radius, which is squared and rounded, an offset may exceed it by rounding.
+    [lattice(agents, farthest * 1.01, 1.0 / f64::from(GRID)), lattice(agents, 1.01, FINEST_HEADING)]
+}
+
+impl RuleConstants {
+    /// Computes the constants of a class's rule, in teams of so many agents.
+    pub(crate) fn new(class: &AgentClass, agents: usize) -> RuleConstants {
+        let [[offset_base, _], [heading_base, _]] = lattices(&class.rule, agents);
+        RuleConstants {
+            wall_radius: class.wall_radius as f32,
+            wall_gain: class.wall_gain as f32,
             offset_base,
-            attraction_scale: scale(follow.attraction_gain, follow.attraction_radius),
-            repulsion_scale: scale(follow.repulsion_gain, follow.repulsion_radius),
-            wall_gain: follow.wall_gain as f32,
+            heading_base,
         }
     }
 }
 
-/// Sums, in lattice distances, and counts of the offsets to agents within a follower's radii.
-#[derive(Clone, Copy)]
-pub struct Sums<S: Simd> {
-    /// The sum of x within the repulsion radius.
-    pub repel_x: S::i32s,
-    /// The sum of y within the repulsion radius.
-    pub repel_y: S::i32s,
-    /// The number of agents within the repulsion radius.
-    pub repel_count: S::i32s,
-    /// The sum of x within the attraction radius but not the repulsion radius.
-    pub attract_x: S::i32s,
-    /// The sum of y of the same agents.
-    pub attract_y: S::i32s,
-    /// The number of the same agents.
-    pub attract_count: S::i32s,
-}
-
-impl<S: Simd> Sums<S> {
-    /// Returns empty sums.
-    #[inline(always)]
-    pub fn new(simd: S) -> Sums<S> {
-        let none = S::i32s::splat(simd, 0);
-        Sums { repel_x: none, repel_y: none, repel_count: none, attract_x: none, attract_y: none, attract_count: none }
+impl TermConstants {
+    /// Computes the constants of each term of a class's rule, in teams of so many agents. `of` returns the agents of a
+    /// class.
+    pub(crate) fn all(class: &AgentClass, of: &dyn Fn(&str) -> Range<usize>, agents: usize) -> Vec<TermConstants> {
+        let [[_, offset], [_, heading]] = lattices(&class.rule, agents);
+        let term = |term: &Term| {
+            let ranges =
+                if term.of == [AGENTS] { ranges([0..agents]) } else { ranges(term.of.iter().map(|name| of(name))) };
+            let scale = match term.align {
+                Some(gain) => gain * f64::from(heading),
+                None => term.gain.unwrap_or(0.0) / term.to * f64::from(offset),
+            };
+            TermConstants {
+                shape: TermShape { aligns: term.align.is_some().into(), ranges },
+                inner2: if term.from == 0.0 { NOTHING } else { (term.from * term.from) as f32 },
+                outer2: (term.to * term.to) as f32,
+                scale: scale as f32,
+            }
+        };
+        class.rule.iter().map(term).collect()
     }
 }
 
-/// Returns the lanes in which a follower sees the agent at offset (`dx`, `dy`): it is within the attraction radius.
-#[inline(always)]
-pub(crate) fn sees<S: Simd>(world: &Lanes<S>, dx: S::f32s, dy: S::f32s) -> S::mask32s {
-    within::<S>(dx, dy, world.follow.attraction_radius2)
+/// The sum over the agents that count for a term, in lattice distances, and their number.
+#[derive(Clone, Copy)]
+pub(crate) struct Sum<S: Simd> {
+    x: S::i32s,
+    y: S::i32s,
+    count: S::i32s,
 }
 
-/// Adds the agent at offset (`dx`, `dy`), and returns the lanes in which the follower sees it.
-#[inline(always)]
-pub(crate) fn influence<S: Simd>(world: &Lanes<S>, dx: S::f32s, dy: S::f32s, sums: &mut Sums<S>) -> S::mask32s {
-    let near = within::<S>(dx, dy, world.follow.repulsion_radius2);
-    let seen = within::<S>(dx, dy, world.follow.attraction_radius2);
-    let (repels, attracts) = (near.to_vector(), (seen & !near).to_vector());
-    let base = world.follow.offset_base;
-    let [dx, dy] = [on_lattice::<S>(dx, base), on_lattice::<S>(dy, base)];
-    sums.repel_x += dx & repels;
-    sums.repel_y += dy & repels;
-    sums.repel_count -= repels;
-    sums.attract_x += dx & attracts;
-    sums.attract_y += dy & attracts;
-    sums.attract_count -= attracts;
-    seen
+impl<S: Simd> Sum<S> {
+    #[inline(always)]
+    pub(crate) fn new(simd: S) -> Sum<S> {
+        let none = S::i32s::splat(simd, 0);
+        Sum { x: none, y: none, count: none }
+    }
+
+    /// Adds an agent's offset or heading, on its lattice, where the squared distance is within the term's.
+    #[inline(always)]
+    pub(crate) fn add(&mut self, term: &TermLanes<S>, d2: S::f32s, [x, y]: [S::i32s; 2]) {
+        // Equal to the shader's comparison of bits, because no squared distance is negative.
+        let counts = (d2.simd_le(term.outer2) & d2.simd_gt(term.inner2)).to_vector();
+        self.x += x & counts;
+        self.y += y & counts;
+        self.count -= counts;
+    }
 }
 
-/// The force on a follower.
+/// The force on an agent that obeys a rule.
 #[derive(Clone, Copy)]
 pub struct SteeringForce<S: Simd> {
     /// Along x, in units per second.
@@ -151,29 +175,38 @@ pub struct SteeringForce<S: Simd> {
 }
 
 /// Returns the push of the two walls of one axis, at 0 and at `size`, and a number that is not negative if either is
-/// within the repulsion radius.
+/// within their radius.
 #[inline(always)]
-fn walls<S: Simd>(world: &Lanes<S>, at: S::f32s, size: S::f32s) -> (S::f32s, S::f32s) {
+fn walls<S: Simd>(rule: &RuleLanes<S>, at: S::f32s, size: S::f32s) -> (S::f32s, S::f32s) {
     let zero = splat(at.token(), 0.0);
-    let low = world.follow.repulsion_radius - at;
-    let high = world.follow.repulsion_radius - (size - at);
-    ((larger::<S>(low, zero) - larger::<S>(high, zero)) * world.follow.wall_gain, larger::<S>(low, high))
+    let low = rule.wall_radius - at;
+    let high = rule.wall_radius - (size - at);
+    ((larger::<S>(low, zero) - larger::<S>(high, zero)) * rule.wall_gain, larger::<S>(low, high))
 }
 
-/// Returns the sum of repulsion, attraction and wall push at a position. Each mean offset is scaled by gain over
-/// radius.
+/// Returns the sum of a rule's terms, each the scaled mean of what it adds, and of the walls' push at a position.
 #[inline(always)]
-pub fn force<S: Simd>(world: &Lanes<S>, sums: &Sums<S>, x: S::f32s, y: S::f32s) -> SteeringForce<S> {
-    let repel = recip::<S>(sums.repel_count.max(1).to_float()) * world.follow.repulsion_scale;
-    let attract = recip::<S>(sums.attract_count.max(1).to_float()) * world.follow.attraction_scale;
-    let (push_x, near_x) = walls::<S>(world, x, world.motion.map_x);
-    let (push_y, near_y) = walls::<S>(world, y, world.motion.map_y);
-    let force_x = nearest_f32::<S>(sums.attract_x) * attract - nearest_f32::<S>(sums.repel_x) * repel + push_x;
-    let force_y = nearest_f32::<S>(sums.attract_y) * attract - nearest_f32::<S>(sums.repel_y) * repel + push_y;
+pub fn force<S: Simd>(
+    class: &ClassLanes<S>,
+    map: &MapLanes<S>,
+    sums: &[Sum<S>],
+    x: S::f32s,
+    y: S::f32s,
+) -> SteeringForce<S> {
+    let simd = x.token();
+    let (mut force_x, mut force_y, mut count) = (splat(simd, 0.0), splat(simd, 0.0), S::i32s::splat(simd, 0));
+    for (term, sum) in class.terms.iter().zip(sums) {
+        let scale = recip::<S>(nearest_f32::<S>(sum.count.max(1))) * term.scale;
+        force_x += nearest_f32::<S>(sum.x) * scale;
+        force_y += nearest_f32::<S>(sum.y) * scale;
+        count += sum.count;
+    }
+    let (push_x, near_x) = walls::<S>(&class.constants.rule, x, map.map_x);
+    let (push_y, near_y) = walls::<S>(&class.constants.rule, y, map.map_y);
     SteeringForce {
-        x: flush::<S>(force_x, TINY),
-        y: flush::<S>(force_y, TINY),
-        influenced: (sums.repel_count + sums.attract_count).simd_gt(0) | larger::<S>(near_x, near_y).simd_ge(0.0),
+        x: flush::<S>(force_x + push_x, TINY),
+        y: flush::<S>(force_y + push_y, TINY),
+        influenced: count.simd_gt(0) | larger::<S>(near_x, near_y).simd_ge(0.0),
     }
 }
 
@@ -194,7 +227,7 @@ pub fn sizes<S: Simd>(force: &SteeringForce<S>) -> (S::f32s, S::f32s) {
 /// maximum turn is small.
 #[inline(always)]
 pub(crate) fn steer<S: Simd, const BY_SINE: bool>(
-    world: &Lanes<S>,
+    motion: &MotionLanes<S>,
     force: &SteeringForce<S>,
     (force2, inverse): (S::f32s, S::f32s),
     hx: S::f32s,
@@ -206,19 +239,19 @@ pub(crate) fn steer<S: Simd, const BY_SINE: bool>(
     let uy = force.y * inverse;
     let along = hx * ux + hy * uy;
     let across = hx * uy - hy * ux;
-    let sine = select::<S>(zero - world.motion.max_turn_sin, world.motion.max_turn_sin, across.simd_ge(zero));
-    let (turned_x, turned_y) = rotate::<S>(hx, hy, world.motion.max_turn_cos, sine);
+    let sine = select::<S>(zero - motion.max_turn_sin, motion.max_turn_sin, across.simd_ge(zero));
+    let (turned_x, turned_y) = rotate::<S>(hx, hy, motion.max_turn_cos, sine);
     let has_force = force2.simd_gt(zero);
     // Without a force, `along` is 0.
     let reached = if BY_SINE {
-        along.simd_gt(zero) & across.abs().simd_le(world.motion.max_turn_sin)
+        along.simd_gt(zero) & across.abs().simd_le(motion.max_turn_sin)
     } else {
-        along.simd_ge(world.motion.max_turn_cos) & has_force
+        along.simd_ge(motion.max_turn_cos) & has_force
     };
     // The order matters for speed only: with the heading selected last, the compiler would emit a slow masked store.
     let next_x = select::<S>(select::<S>(hx, turned_x, has_force), ux, reached);
     let next_y = select::<S>(select::<S>(hy, turned_y, has_force), uy, reached);
-    let ahead = select::<S>(world.motion.min_speed, force2 * inverse, along.simd_gt(zero));
+    let ahead = select::<S>(motion.min_speed, force2 * inverse, along.simd_gt(zero));
     let wanted = select::<S>(speed, zero_unless::<S>(ahead, has_force), force.influenced);
     (next_x, next_y, wanted)
 }
@@ -229,6 +262,7 @@ mod tests {
 
     use super::*;
     use crate::config::Config;
+    use crate::model::Lanes;
     use crate::world::World;
 
     /// Each component of a force is at most the two gains, as each mean offset is within its radius, and the push of
@@ -249,8 +283,9 @@ mod tests {
         let config = Config::parse(&text, "largest.toml").expect("the largest values are valid");
         let world = World::new(&config.validate().unwrap());
         fn squared<S: Simd>(simd: S, world: &World) -> f32 {
-            let (lanes, zero) = (Lanes::new(simd, world.constants), splat(simd, 0.0));
-            let force2 = sizes::<S>(&force::<S>(&lanes, &Sums::new(simd), zero, zero)).0;
+            let (lanes, zero) = (Lanes::new(simd, world.constants, &world.classes), splat(simd, 0.0));
+            let sums = [Sum::new(simd); 2];
+            let force2 = sizes::<S>(&force::<S>(&lanes.classes[1], &lanes.map, &sums, zero, zero)).0;
             force2[0]
         }
         let found = f64::from(dispatch!(Level::new(), simd => squared(simd, &world)));

@@ -3,10 +3,14 @@
 //! Formulas are pure functions over lanes of teams. Each has a twin in `shaders/*.wgsl` with the same names and the
 //! same order of operations. Constants are computed once from the config, in f64, and rounded once.
 
+use std::ops::Range;
+
 use fearless_simd::Simd;
 
-use crate::gpu_struct::{Field, GpuStruct, gpu_constants, gpu_struct};
+use crate::config::Control;
+use crate::gpu_struct::{GpuStruct, gpu_constants, gpu_struct};
 
+pub mod class;
 pub(crate) mod couple;
 pub(crate) mod follow;
 pub(crate) mod motion;
@@ -15,11 +19,11 @@ pub mod rule;
 pub mod sense;
 pub mod start;
 
-use couple::{CoupleConstants, CoupleLanes};
-use follow::{FollowConstants, FollowLanes};
-use motion::{GRID, INVERSE_GRID, MotionConstants, MotionLanes};
+use class::{Class, ClassConstants, ClassLanes, ClassShape};
+use follow::{TermConstants, TermShape};
+use motion::{GRID, INVERSE_GRID, MapConstants, MapLanes};
 use policy::{BEHAVIOURS, PolicyConstants};
-use sense::{Density, INPUTS, SenseConstants, SenseLanes};
+use sense::{ChannelConstants, ChannelShape, Combine, Frame, Measure};
 
 /// The maximum length of a map side, radius or range. Its square is far from f32's overflow.
 pub(crate) const LONGEST: f64 = 1e4;
@@ -28,12 +32,45 @@ pub(crate) const LEAST: f64 = 1e-6;
 /// Sums, forces and components of a heading smaller than this (2^-30) are flushed to 0, so that no denormal follows.
 pub(crate) const TINY: f32 = 1.0 / 1_073_741_824.0;
 
+/// Maximum number of separate runs of agents or POIs that a channel or a term names.
+pub const MAX_RANGES: usize = 4;
+
+/// Runs of agents or POIs, ascending: the first of each, and the one after its last. Unused runs are empty.
+pub type Ranges = [u32; 2 * MAX_RANGES];
+
+/// Joins runs that meet.
+///
+/// # Panics
+/// There are more than [`MAX_RANGES`] separate ones.
+pub(crate) fn ranges(runs: impl IntoIterator<Item = Range<usize>>) -> Ranges {
+    let mut runs: Vec<Range<usize>> = runs.into_iter().filter(|run| !run.is_empty()).collect();
+    runs.sort_by_key(|run| run.start);
+    runs.dedup_by(|next, run| {
+        let meet = next.start <= run.end;
+        if meet {
+            run.end = run.end.max(next.end);
+        }
+        meet
+    });
+    let mut joined = [0; 2 * MAX_RANGES];
+    for (to, run) in joined.chunks_exact_mut(2).zip(&runs) {
+        to.copy_from_slice(&[run.start as u32, run.end as u32]);
+    }
+    assert!(runs.len() <= MAX_RANGES, "a valid config names fewer runs");
+    joined
+}
+
+/// Returns the runs that are not empty.
+pub fn each(ranges: &Ranges) -> impl Iterator<Item = Range<usize>> {
+    ranges.chunks_exact(2).map(|run| run[0] as usize..run[1] as usize).filter(|run| !run.is_empty())
+}
+
 gpu_struct! {
-    /// The constants of a world. In the shaders the fields of all parts are fields of this struct.
+    /// The constants of a world, without its classes. In the shaders the fields of all parts are fields of this struct.
     pub struct Constants {
-        /// Leaders of a team, agents 0 on.
+        /// Agents of a team that learn, agents 0 on.
         pub leaders: u32,
-        /// Followers of a team, the agents after the leaders.
+        /// The other agents of a team.
         pub followers: u32,
         /// Points of interest.
         pub pois: u32,
@@ -41,72 +78,51 @@ gpu_struct! {
         pub steps: u32,
         /// u32 words in a set of agents.
         pub words: u32,
-        /// The initial speed, in units per second.
-        pub speed: f32,
-        /// Choices that kernels are specialised for.
-        pub variant: Variant,
+        /// Classes of agents.
+        pub class_count: u32,
+        /// The index of its first class on a GPU.
+        pub first_class: u32,
+        /// The map and the length of a step.
+        pub map: MapConstants,
         /// The sizes of a policy.
         pub policy: PolicyConstants,
-        /// Constants of motion.
-        pub motion: MotionConstants,
-        /// Constants of coupling.
-        pub couple: CoupleConstants,
-        /// Constants of following.
-        pub follow: FollowConstants,
-        /// Constants of sensing.
-        pub sense: SenseConstants,
-    }
-
-    /// Choices between formulas. In a specialised kernel they are constants.
-    #[derive(Eq, Hash, Ord, PartialOrd)]
-    pub struct Variant as VariantLanes {
-        /// A [`Density`], by its number.
-        pub density: u32,
-        /// See [`MotionConstants::by_sine`].
-        pub by_sine: u32,
     }
 }
 
-impl Variant {
-    /// Returns the density.
-    pub fn density(&self) -> Density {
-        Density::of(self.density)
-    }
-}
-
-/// A world's constants, and every float of the parts in all lanes.
-#[derive(Clone, Copy)]
+/// A world's constants and classes, and every float of them in all lanes.
+#[derive(Clone)]
 pub struct Lanes<S: Simd> {
     /// The constants.
     pub constants: Constants,
-    /// Motion.
-    pub motion: MotionLanes<S>,
-    /// Coupling.
-    pub couple: CoupleLanes<S>,
-    /// Following.
-    pub follow: FollowLanes<S>,
-    /// Sensing.
-    pub sense: SenseLanes<S>,
+    /// The map and the length of a step.
+    pub map: MapLanes<S>,
+    /// `[classes]`.
+    pub classes: Vec<ClassLanes<S>>,
 }
 
 impl<S: Simd> Lanes<S> {
     /// Copies every float to all lanes.
-    pub fn new(simd: S, constants: Constants) -> Lanes<S> {
-        let Constants { motion, couple, follow, sense, .. } = constants;
-        Lanes {
-            constants,
-            motion: motion.lanes(simd),
-            couple: couple.lanes(simd),
-            follow: follow.lanes(simd),
-            sense: sense.lanes(simd),
-        }
+    pub fn new(simd: S, constants: Constants, classes: &[Class]) -> Lanes<S> {
+        use crate::gpu_struct::Field;
+        let classes = classes.iter().map(|class| class.lanes(simd)).collect();
+        Lanes { constants, map: constants.map.lanes(simd), classes }
     }
 }
 
 /// Returns the WGSL of the structs and constants that the parts' shaders use.
 pub(crate) fn declarations() -> String {
-    let constants = gpu_constants!(INPUTS, BEHAVIOURS, TINY, GRID, INVERSE_GRID);
-    [Constants::wgsl(), Variant::wgsl(), Density::wgsl(), constants].concat()
+    let constants = gpu_constants!(BEHAVIOURS, TINY, GRID, INVERSE_GRID, MAX_RANGES);
+    let structs = [
+        Constants::wgsl(),
+        ChannelShape::wgsl(),
+        ChannelConstants::wgsl(),
+        TermShape::wgsl(),
+        TermConstants::wgsl(),
+        ClassShape::wgsl(),
+        ClassConstants::wgsl(),
+        Class::wgsl(),
+    ];
+    [structs.concat(), Measure::wgsl(), Combine::wgsl(), Frame::wgsl(), Control::wgsl(), constants].concat()
 }
 
 /// The parts' shaders.

@@ -4,7 +4,8 @@ use std::f64::consts::{FRAC_PI_2, PI};
 
 use fearless_simd::{Simd, prelude::*};
 
-use super::{LEAST, Lanes, TINY};
+use super::{LEAST, TINY};
+use crate::config::Mobility;
 use crate::gpu_struct::gpu_struct;
 use crate::kernels::{
     clamp_to,
@@ -77,14 +78,20 @@ pub(crate) fn resolution(map: [f64; 2]) -> f64 {
 }
 
 gpu_struct! {
-    /// Constants of motion.
-    pub struct MotionConstants as MotionLanes {
+    /// The space and the time that all agents move in.
+    pub struct MapConstants as MapLanes {
         /// Width of the map, in units.
         pub map_x: f32,
         /// Height of the map, in units.
         pub map_y: f32,
         /// The length of a step, in seconds.
         pub dt: f32,
+    }
+
+    /// Constants of a class's motion. With free motion only the maximum speed counts.
+    pub struct MotionConstants as MotionLanes {
+        /// The speed at the start, in units per second.
+        pub speed: f32,
         /// The minimum speed, in units per second.
         pub min_speed: f32,
         /// The maximum speed, in units per second.
@@ -100,15 +107,25 @@ gpu_struct! {
     }
 }
 
+impl MapConstants {
+    /// Computes the constants for steps of `dt` seconds on a map.
+    pub(crate) fn new(map: [f64; 2], dt: f64) -> MapConstants {
+        MapConstants { map_x: map[0] as f32, map_y: map[1] as f32, dt: dt as f32 }
+    }
+}
+
 impl MotionConstants {
-    /// Computes the constants for a step of `dt` seconds on a map.
-    pub fn new(motion: &Motion, dt: f64, map: [f64; 2]) -> MotionConstants {
+    /// Computes the constants for steps of `dt` seconds.
+    pub(crate) fn new(mobility: &Mobility, speed: f64, dt: f64) -> MotionConstants {
+        let free = |max_speed| Motion { min_speed: 0.0, max_speed, max_acceleration: 0.0, max_turn_rate: 0.0 };
+        let motion = match mobility {
+            Mobility::Steered(motion) => motion.clone(),
+            Mobility::Free { max_speed } => free(*max_speed),
+        };
         let turn = (motion.max_turn_rate * dt).min(PI);
         let any_turn = turn >= PI;
         MotionConstants {
-            map_x: map[0] as f32,
-            map_y: map[1] as f32,
-            dt: dt as f32,
+            speed: speed as f32,
             min_speed: motion.min_speed as f32,
             max_speed: motion.max_speed as f32,
             max_speed_change: (motion.max_acceleration * dt) as f32,
@@ -138,8 +155,8 @@ pub(crate) fn rotate<S: Simd>(hx: S::f32s, hy: S::f32s, cosine: S::f32s, sine: S
 
 /// Turns a heading by a wanted angle (radians, to the left), at most the maximum turn.
 #[inline(always)]
-pub fn turn<S: Simd>(world: &Lanes<S>, hx: S::f32s, hy: S::f32s, wanted: S::f32s) -> (S::f32s, S::f32s) {
-    let angle = clamp_to::<S>(wanted, -world.motion.max_turn, world.motion.max_turn);
+pub fn turn<S: Simd>(motion: &MotionLanes<S>, hx: S::f32s, hy: S::f32s, wanted: S::f32s) -> (S::f32s, S::f32s) {
+    let angle = clamp_to::<S>(wanted, -motion.max_turn, motion.max_turn);
     let (sine, cosine) = sin_cos::<S>(angle);
     rotate::<S>(hx, hy, cosine, sine)
 }
@@ -153,13 +170,13 @@ pub(crate) fn renormalize<S: Simd>(hx: S::f32s, hy: S::f32s) -> (S::f32s, S::f32
 
 /// Changes the speed towards the wanted one, within the limits.
 #[inline(always)]
-pub(crate) fn accelerate<S: Simd>(world: &Lanes<S>, speed: S::f32s, wanted: S::f32s) -> S::f32s {
-    let limit = world.motion.max_speed_change;
+pub(crate) fn accelerate<S: Simd>(motion: &MotionLanes<S>, speed: S::f32s, wanted: S::f32s) -> S::f32s {
+    let limit = motion.max_speed_change;
     let change = clamp_to::<S>(wanted - speed, -limit, limit);
-    clamp_to::<S>(speed + change, world.motion.min_speed, world.motion.max_speed)
+    clamp_to::<S>(speed + change, motion.min_speed, motion.max_speed)
 }
 
-/// Moves one coordinate along the heading, clamped to the map and rounded to the grid.
+/// Moves one coordinate by a distance along one component of a heading, clamped to the map and rounded to the grid.
 #[inline(always)]
 pub fn advance<S: Simd>(at: S::f32s, step: S::f32s, heading: S::f32s, size: S::f32s) -> S::f32s {
     clamp_to::<S>(snap::<S>(at + step * heading), splat(at.token(), 0.0), size)

@@ -3,7 +3,7 @@
 
 use fearless_simd::{Simd, prelude::*};
 
-use super::{Lanes, TINY, sense::INPUTS};
+use super::{TINY, motion::MotionLanes};
 use crate::config_enum::config_enum;
 use crate::gpu_struct::gpu_struct;
 use crate::kernels::{math, select, splat};
@@ -63,13 +63,13 @@ impl Policy {
     }
 
     /// Returns the widths of all layers, from inputs to outputs.
-    pub fn widths(&self) -> Vec<usize> {
-        [&[INPUTS], &self.hidden[..], &[self.actions.outputs()]].concat()
+    pub fn widths(&self, inputs: usize) -> Vec<usize> {
+        [&[inputs], &self.hidden[..], &[self.actions.outputs()]].concat()
     }
 
-    /// Returns the weights of one policy, biases included.
-    pub fn parameters(&self) -> usize {
-        self.widths().windows(2).map(|w| (w[0] + 1) * w[1]).sum()
+    /// Returns the weights of one policy with so many inputs, biases included.
+    pub fn parameters(&self, inputs: usize) -> usize {
+        self.widths(inputs).windows(2).map(|w| (w[0] + 1) * w[1]).sum()
     }
 }
 
@@ -86,13 +86,13 @@ gpu_struct! {
 }
 
 impl PolicyConstants {
-    /// Computes the sizes for a valid section.
-    pub fn new(policy: &Policy) -> PolicyConstants {
+    /// Computes the sizes for a valid section and a number of inputs.
+    pub fn new(policy: &Policy, inputs: usize) -> PolicyConstants {
         let mut widths = [0; MAX_HIDDEN_LAYERS + 2];
-        for (width, units) in widths.iter_mut().zip(policy.widths()) {
+        for (width, units) in widths.iter_mut().zip(policy.widths(inputs)) {
             *width = units as u32;
         }
-        PolicyConstants { layers: policy.hidden.len() as u32 + 1, widths, parameters: policy.parameters() as u32 }
+        PolicyConstants { layers: policy.hidden.len() as u32 + 1, widths, parameters: policy.parameters(inputs) as u32 }
     }
 
     /// Returns what the outputs are, or `None` if their number is neither.
@@ -108,7 +108,12 @@ impl PolicyConstants {
 
     /// Returns the words per leader in a vector of teams: weights, inputs, two layers and outputs.
     pub fn words(&self) -> usize {
-        self.parameters as usize + INPUTS + 2 * self.widest() + OUTPUTS
+        self.parameters as usize + self.inputs() + 2 * self.widest() + OUTPUTS
+    }
+
+    /// Returns the number of inputs.
+    pub fn inputs(&self) -> usize {
+        self.widths[0] as usize
     }
 }
 
@@ -136,9 +141,10 @@ pub(crate) fn clamp_preactivation<S: Simd>(sum: S::f32s) -> S::f32s {
 /// Returns the actions of the most wanted behaviour: the first of the largest `wanted`, each in -1..1.
 ///
 /// Behaviours: hold; towards or away from the quadrant with the highest density of POIs; towards or away from the one
-/// of agents. Ties go to the first quadrant. If nothing is sensed, the leader goes straight ahead.
+/// of agents. The first inputs are the densities of POIs by quadrant, then those of agents. Ties go to the first quadrant.
+/// If nothing is sensed, the leader goes straight ahead.
 #[inline(always)]
-pub fn choose<S: Simd>(inputs: &[S::f32s; INPUTS], wanted: &[S::f32s; BEHAVIOURS]) -> [S::f32s; OUTPUTS] {
+pub fn choose<S: Simd>(inputs: &[S::f32s], wanted: &[S::f32s; BEHAVIOURS]) -> [S::f32s; OUTPUTS] {
     let simd = wanted[0].token();
     let number = |number: f32| splat(simd, number);
     let (mut most, mut behaviour) = (wanted[0], number(0.0));
@@ -174,6 +180,6 @@ pub(crate) fn wanted_turn<S: Simd>(output: S::f32s) -> S::f32s {
 
 /// Converts the second output, in -1..1, to a wanted speed.
 #[inline(always)]
-pub(crate) fn wanted_speed<S: Simd>(world: &Lanes<S>, output: S::f32s) -> S::f32s {
-    (output + 1.0) * 0.5 * world.motion.max_speed
+pub(crate) fn wanted_speed<S: Simd>(motion: &MotionLanes<S>, output: S::f32s) -> S::f32s {
+    (output + 1.0) * 0.5 * motion.max_speed
 }

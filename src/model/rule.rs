@@ -20,14 +20,6 @@ impl Coupling {
         )
         .one_or_each(between(1, agents).because(because), pois.map_or(0..=usize::MAX, |pois| pois..=pois), 3)
     }
-
-    /// Returns the coupling of each POI, `[pois]`.
-    pub fn of_each(&self, pois: usize) -> Vec<u32> {
-        match self {
-            Coupling::Same(count) => vec![*count as u32; pois],
-            Coupling::Each(counts) => counts.iter().map(|&count| count as u32).collect(),
-        }
-    }
 }
 
 config_enum! {
@@ -151,8 +143,9 @@ fn cycle(after: &[Vec<usize>]) -> Option<Vec<usize>> {
 /// By default all agents are observers, at any step and in any order.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Rule {
-    /// One bit per agent, set if it is an observer, `[words]`. Empty if all are.
+    /// One bit per agent, set if it is an observer of the POI, `[pois][words]`. Empty if all are of all.
     counted: Vec<u32>,
+    words: usize,
     /// The first and last step of each POI, `[pois]`. Empty without windows.
     windows: Vec<[u32; 2]>,
     /// The POIs that each one comes after, `[pois]`, and a topological order of all. Empty without orders.
@@ -164,18 +157,23 @@ pub struct Rule {
 pub(crate) const NEVER: u32 = u32::MAX;
 
 impl Rule {
-    /// Creates a rule from the observers, of `agents`, the windows, `[pois]`, and the POIs that each comes after,
-    /// `[pois]`. Either list may be empty.
-    pub(crate) fn new(counted: Range<usize>, agents: usize, windows: &[[usize; 2]], after: &[Vec<usize>]) -> Rule {
-        let mut bits = vec![0; agents.div_ceil(32)];
-        counted.clone().for_each(|agent| bits[agent / 32] |= 1 << (agent % 32));
-        let after = if after.iter().all(Vec::is_empty) { vec![] } else { after.to_vec() };
-        Rule {
-            counted: if counted.len() == agents { vec![] } else { bits },
-            windows: windows.iter().map(|window| window.map(|step| step as u32)).collect(),
-            order: sorted(&after).0,
-            after,
+    /// Creates a rule from the observers of each POI, of `agents`, the windows, and the POIs that each one comes after, all
+    /// `[pois]`. Windows and orders may be empty.
+    pub(crate) fn new(
+        observers: impl ExactSizeIterator<Item = Vec<Range<usize>>>,
+        agents: usize,
+        windows: Vec<[u32; 2]>,
+        after: Vec<Vec<usize>>,
+    ) -> Rule {
+        let words = agents.div_ceil(32);
+        let mut counted = vec![0; observers.len() * words];
+        let mut all = true;
+        for (bits, observers) in counted.chunks_exact_mut(words).zip(observers) {
+            all &= observers.iter().map(Range::len).sum::<usize>() == agents;
+            observers.into_iter().flatten().for_each(|agent| bits[agent / 32] |= 1 << (agent % 32));
         }
+        let after = if after.iter().all(Vec::is_empty) { vec![] } else { after };
+        Rule { counted: if all { vec![] } else { counted }, words, windows, order: sorted(&after).0, after }
     }
 
     /// Reports whether the rule is consistent with the words of a set and the number of POIs: sizes match, windows
@@ -183,7 +181,7 @@ impl Rule {
     #[cfg(test)]
     pub(crate) fn fits(&self, words: usize, pois: usize) -> bool {
         let fits = |len: usize, wanted: usize| len == 0 || len == wanted;
-        fits(self.counted.len(), words)
+        fits(self.counted.len(), words * pois)
             && fits(self.windows.len(), pois)
             && fits(self.after.len(), pois)
             && self.windows.iter().all(|&[first, _]| first > 0)
@@ -200,21 +198,27 @@ impl Rule {
         !self.windows.is_empty() || !self.after.is_empty()
     }
 
-    /// Reports whether an agent is an observer.
+    /// Reports whether an agent is an observer of any POI.
     pub fn counts(&self, agent: usize) -> bool {
-        self.counted(agent / 32, 1 << (agent % 32)) != 0
+        let mut sets = self.counted.chunks_exact(self.words.max(1));
+        self.counted.is_empty() || sets.any(|set| set[agent / 32] >> (agent % 32) & 1 != 0)
     }
 
-    /// Masks a word of a set to the observers.
-    #[inline]
-    pub(crate) fn counted(&self, word: usize, agents: u32) -> u32 {
-        agents & self.counted.get(word).copied().unwrap_or(u32::MAX)
+    /// Reports whether an agent is an observer of a POI.
+    pub fn counts_at(&self, poi: usize, agent: usize) -> bool {
+        self.counted(poi, agent / 32, 1 << (agent % 32)) != 0
     }
 
-    /// Counts the observers in a set, `[words]`.
+    /// Masks a word of the set of a POI to its observers.
     #[inline]
-    pub fn count(&self, set: impl IntoIterator<Item = u32>) -> u32 {
-        set.into_iter().enumerate().map(|(word, agents)| self.counted(word, agents).count_ones()).sum()
+    pub(crate) fn counted(&self, poi: usize, word: usize, agents: u32) -> u32 {
+        agents & self.counted.get(poi * self.words + word).copied().unwrap_or(u32::MAX)
+    }
+
+    /// Counts the observers in the set of a POI, `[words]`.
+    #[inline]
+    pub fn count(&self, poi: usize, set: impl IntoIterator<Item = u32>) -> u32 {
+        set.into_iter().enumerate().map(|(word, agents)| self.counted(poi, word, agents).count_ones()).sum()
     }
 
     /// Returns the first and last step of a POI's window, if it has one.

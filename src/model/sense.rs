@@ -1,39 +1,32 @@
-//! Sensing: the density of POIs and of agents in four quadrants around a leader's heading (paper, Section 3.1).
+//! Sensing: what agents and POIs add to the inputs of a policy, by channel and sector. The paper's leaders sense the
+//! density of POIs and of agents in four quadrants around their heading (Section 3.1).
+
+use std::ops::Range;
 
 use fearless_simd::{Simd, prelude::*};
 
-use super::{LONGEST, Lanes};
+use super::{LONGEST, Ranges, ranges};
+use crate::config::{AGENTS, Channel, MAX_SECTORS, POIS};
 use crate::config_enum::{Choice, config_enum};
 use crate::gpu_struct::gpu_struct;
 use crate::kernels::{
     larger,
-    math::{exact_sqrt, lattice, less_base, nearest_f32, on_lattice, recip, rsqrt},
+    math::{exact_sqrt, exp_negative, lattice, less_base, nearest_f32, on_lattice, recip, rsqrt},
     select, splat,
 };
 use crate::reader::{Reader, between, section};
 
 /// The shader of this part.
 pub(crate) const WGSL: &str = include_str!("../../shaders/sense.wgsl");
-// The shader takes every density except the first for an inverse one.
-const _: () = assert!(Density::ALL.len() == 3, "add the new density to shaders/sense.wgsl, too, and raise this number");
+// The shader has a case for each, and takes the last for the other one.
+const _: () = assert!(Measure::ALL.len() == 6, "add the new measure to shaders/sense.wgsl, too, and raise this number");
 
-/// Inputs of a policy: POI and agent density in four quadrants each.
-pub const INPUTS: usize = 8;
-/// The inputs' names, in order.
-pub(crate) const NAMES: [&str; INPUTS] = [
-    "POIs back right",
-    "POIs front right",
-    "POIs front left",
-    "POIs back left",
-    "agents back right",
-    "agents front right",
-    "agents front left",
-    "agents back left",
-];
-/// The finest lattice of densities, on which they are added: 2^-20.
+/// The finest lattice of measures, on which they are added: 2^-20.
 const FINEST: f64 = 1.0 / 1_048_576.0;
 /// A squared range that exceeds every distance on a map.
 const UNLIMITED: f32 = 1e30;
+/// A squared range within which nothing is.
+pub(crate) const NOTHING: f32 = -1.0;
 
 section! {
     /// `[sense]`: what a leader senses. An infinite range is unlimited; a config file says so with `inf`. With a range
@@ -119,59 +112,153 @@ config_enum! {
 }
 
 gpu_struct! {
-    /// Constants of sensing.
-    pub struct SenseConstants as SenseLanes {
-        /// The squared range of POIs.
-        pub poi_range2: f32,
-        /// The squared range of agents.
-        pub agent_range2: f32,
-        /// The base of the lattice of densities.
-        pub density_base: f32,
-        /// Multiplies a sum over POIs, in lattice distances: gain/P, or the gain if densities are means, times the
-        /// distance; 0 if no POI is sensed.
-        pub poi_share: f32,
-        /// The same for sums over agents.
-        pub agent_share: f32,
-        /// 1/D with D = √2·max(map).
-        pub inverse_diagonal: f32,
+    /// The parts of a channel that kernels are specialised for.
+    #[derive(Eq, Hash, Ord, PartialOrd)]
+    pub struct ChannelShape as itself {
+        /// Not 0 if it senses POIs, 0 if agents.
+        pub of_pois: u32,
+        /// The POIs or agents that it senses.
+        pub ranges: Ranges,
+        /// Sectors.
+        pub sectors: u32,
+        /// A [`Frame`], by its number.
+        pub frame: u32,
+        /// A [`Measure`], by its number.
+        pub measure: u32,
+        /// A [`Combine`], by its number.
+        pub combine: u32,
+        /// Not 0 if the entities of each sector are counted.
+        pub counts: u32,
+        /// The first of its inputs.
+        pub input: u32,
+    }
+
+    /// Constants of a channel.
+    pub struct ChannelConstants as ChannelLanes {
+        /// What kernels are specialised for.
+        pub shape: ChannelShape,
+        /// The squared range.
+        pub range2: f32,
+        /// The base of the lattice of measures.
+        pub base: f32,
+        /// The change of a linear measure per unit: 1/D with D = √2·max(map), or 1/range.
+        pub slope: f32,
+        /// The squared distance below which inverse measures do not grow.
+        pub nearest2: f32,
+        /// Multiplies a sum, a mean or a maximum in lattice distances.
+        pub scale: f32,
+        /// The input of an empty sector.
+        pub empty: f32,
+        /// The direction at which each sector begins, x and y, relative to the frame.
+        pub boundaries: [f32; 2 * MAX_SECTORS],
     }
 }
 
-impl SenseConstants {
-    /// Computes the constants for so many agents and POIs on a map.
-    pub fn new(sense: &Sense, agents: usize, pois: usize, map: [f64; 2]) -> SenseConstants {
-        // No density exceeds 1 by more than rounding.
-        let [density_base, distance] = lattice(agents.max(pois), 1.01, FINEST);
-        // A range of 0 still reaches what is at the same place: that weighs nothing, on every backend alike.
-        let share = |range: f64, count: usize| match sense.density {
-            _ if range == 0.0 => 0.0,
-            Density::Mean => (sense.gain * f64::from(distance)) as f32,
-            Density::Linear | Density::Inverse => (sense.gain * f64::from(distance) / count as f64) as f32,
+impl ChannelConstants {
+    /// Computes the constants. `of` returns the agents of a class and the POIs of a group; `values` are those of the POIs,
+    /// and `agents` is the number of agents.
+    pub(crate) fn new(
+        channel: &Channel,
+        input: usize,
+        (class, group): (&dyn Fn(&str) -> Range<usize>, &dyn Fn(&str) -> Range<usize>),
+        values: &[f32],
+        agents: usize,
+        map: [f64; 2],
+    ) -> ChannelConstants {
+        let Channel { of, pois, sectors, frame, range, measure, nearest, combine, empty, gain } = channel;
+        let of_pois = of == &[POIS];
+        let ranges = match of_pois {
+            true if pois.is_empty() => ranges([0..values.len()]),
+            true => ranges(pois.iter().map(|name| group(name))),
+            false if of == &[AGENTS] => ranges([0..agents]),
+            false => ranges(of.iter().map(|name| class(name))),
         };
-        let range2 = |range: f64| if range.is_infinite() { UNLIMITED } else { (range * range) as f32 };
-        SenseConstants {
-            poi_range2: range2(sense.poi_range),
-            agent_range2: range2(sense.agent_range),
-            density_base,
-            poi_share: share(sense.poi_range, pois),
-            agent_share: share(sense.agent_range, agents),
-            inverse_diagonal: (1.0 / (2f64.sqrt() * map[0].max(map[1]))) as f32,
+        let value = if of_pois { values.iter().copied().fold(0.0, f32::max) } else { 1.0 };
+        let largest = match measure {
+            Measure::Inverse => 1.0 / nearest,
+            Measure::InverseSquared => 1.0 / (nearest * nearest),
+            _ => 1.0,
+        };
+        // No measure exceeds the largest by more than rounding.
+        let size = 1.01 * largest * f64::from(value);
+        let [base, distance] = lattice(agents.max(values.len()), size, FINEST);
+        let count = super::each(&ranges).map(|range| range.len()).sum::<usize>();
+        let scale = gain * f64::from(distance) / if *combine == Combine::Share { count as f64 } else { 1.0 };
+        let mut boundaries = [0.0; 2 * MAX_SECTORS];
+        for (sector, boundary) in boundaries.chunks_exact_mut(2).take(*sectors).enumerate() {
+            boundary.copy_from_slice(&boundary_of(sector, *sectors, *frame));
+        }
+        ChannelConstants {
+            shape: ChannelShape {
+                of_pois: of_pois.into(),
+                ranges,
+                sectors: *sectors as u32,
+                frame: *frame as u32,
+                measure: *measure as u32,
+                combine: *combine as u32,
+                counts: (matches!(combine, Combine::Mean | Combine::Closest) || *empty != 0.0).into(),
+                input: input as u32,
+            },
+            range2: match range {
+                _ if range.is_infinite() => UNLIMITED,
+                0.0 => NOTHING,
+                _ => (range * range) as f32,
+            },
+            base,
+            slope: match measure {
+                Measure::Distance | Measure::Closeness => (1.0 / range) as f32,
+                _ => (1.0 / (2f64.sqrt() * map[0].max(map[1]))) as f32,
+            },
+            nearest2: (nearest * nearest) as f32,
+            scale: scale as f32,
+            empty: *empty as f32,
+            boundaries,
         }
     }
 }
 
-/// Returns the density of an entity at offset (`dx`, `dy`) in lattice distances. The caller checks that it is in range.
-#[inline(always)]
-pub(crate) fn density<S: Simd, const DENSITY: u32>(world: &Lanes<S>, dx: S::f32s, dy: S::f32s) -> S::i32s {
-    let (one, base) = (splat(dx.token(), 1.0), world.sense.density_base);
-    let d2 = dx * dx + dy * dy;
-    match const { Density::of(DENSITY) } {
-        Density::Linear => less_base::<S>(one + base - exact_sqrt::<S>(d2) * world.sense.inverse_diagonal, base),
-        Density::Inverse | Density::Mean => on_lattice::<S>(rsqrt::<S>(select::<S>(one, d2, d2.simd_gt(one))), base),
-    }
+/// Returns the direction at which a sector begins. Components smaller than 1e-9 become 0, so that the axes are exact.
+fn boundary_of(sector: usize, sectors: usize, frame: Frame) -> [f32; 2] {
+    let behind = if frame == Frame::Heading { 0.5 } else { 0.0 };
+    let angle = std::f64::consts::TAU * (sector as f64 / sectors as f64 + behind);
+    [libm::cos(angle), libm::sin(angle)].map(|component| if component.abs() < 1e-9 { 0.0 } else { component as f32 })
 }
 
-/// The entities of one class around a leader: sums over all, over those on the left, in front, and both.
+/// Returns what an entity of this value at offset (`dx`, `dy`) counts, in lattice distances: 0 out of range.
+#[inline(always)]
+pub(crate) fn measured<S: Simd>(
+    channel: &ChannelLanes<S>,
+    measure: Measure,
+    value: S::f32s,
+    dx: S::f32s,
+    dy: S::f32s,
+) -> (S::i32s, S::mask32s) {
+    let ChannelLanes { base, slope, .. } = *channel;
+    let d2 = dx * dx + dy * dy;
+    let measured = match measure {
+        Measure::Linear | Measure::Closeness => {
+            less_base::<S>(value + base - exact_sqrt::<S>(d2) * (slope * value), base)
+        }
+        Measure::Distance => on_lattice::<S>(exact_sqrt::<S>(d2) * (slope * value), base),
+        Measure::Inverse => on_lattice::<S>(rsqrt::<S>(larger::<S>(d2, channel.nearest2)) * value, base),
+        Measure::InverseSquared => {
+            let inverse = rsqrt::<S>(larger::<S>(d2, channel.nearest2));
+            on_lattice::<S>(inverse * inverse * value, base)
+        }
+        Measure::Exponential => on_lattice::<S>(exp_negative::<S>(exact_sqrt::<S>(d2)) * value, base),
+    };
+    // Equal to the shader's comparison of bits, because no number is negative but a range of nothing.
+    let within = d2.simd_le(channel.range2);
+    (measured & within.to_vector(), within)
+}
+
+/// Returns an offset relative to a heading: along it, and to its left. What is at the same place is straight ahead.
+#[inline(always)]
+fn turned<S: Simd>(dx: S::f32s, dy: S::f32s, hx: S::f32s, hy: S::f32s) -> (S::f32s, S::f32s) {
+    (dx * hx + dy * hy, dy * hx - dx * hy)
+}
+
+/// Sums over the entities around an agent: over all, over those on the left, in front, and both.
 #[derive(Clone, Copy)]
 struct Halves<S: Simd> {
     all: S::i32s,
@@ -189,76 +276,146 @@ impl<S: Simd> Halves<S> {
         self.both += number & left & front;
     }
 
-    /// Returns the sum of each quadrant, in the order of the policy's inputs: back right, front right, front left, back
-    /// left.
+    /// Returns the sum of each quadrant: back right, front right, front left, back left.
     #[inline(always)]
-    fn quadrants(self) -> [S::f32s; 4] {
+    fn quadrants(self) -> [S::i32s; 4] {
         let Halves { all, left, front, both } = self;
-        [all - left - front + both, front - both, both, left - both].map(nearest_f32::<S>)
+        [all - left - front + both, front - both, both, left - both]
     }
 }
 
-/// The entities of one class around a leader, by quadrant.
+/// A channel of four sectors, which are the quadrants around a heading. It needs fewer operations than [`Sectors`], and
+/// gives the same bits.
 #[derive(Clone, Copy)]
-pub struct Quadrants<S: Simd> {
-    /// The sums of their densities, in lattice distances.
-    densities: Halves<S>,
-    /// The number of entities sensed. Only means need it.
+pub(crate) struct Quadrants<S: Simd> {
+    /// The sums of measures, in lattice distances.
+    sums: Halves<S>,
+    /// The number of entities sensed.
     counts: Halves<S>,
 }
 
 impl<S: Simd> Quadrants<S> {
-    /// Returns empty quadrants.
     #[inline(always)]
-    pub fn new(simd: S) -> Quadrants<S> {
+    pub(crate) fn new(simd: S) -> Quadrants<S> {
         let none = S::i32s::splat(simd, 0);
         let empty = Halves { all: none, left: none, front: none, both: none };
-        Quadrants { densities: empty, counts: empty }
+        Quadrants { sums: empty, counts: empty }
     }
 
-    /// Adds an entity with this density, which is 0 out of range, at offset (`dx`, `dy`) from a leader with heading
-    /// (`hx`, `hy`).
+    /// Adds an entity with this measure at offset (`dx`, `dy`) from an agent with heading (`hx`, `hy`).
     ///
     /// The signs of the offset along the heading and to its left determine the quadrant. A tie goes to the
     /// counterclockwise quadrant, so that each boundary belongs to exactly one.
     #[inline(always)]
-    pub fn add<const DENSITY: u32>(&mut self, density: S::i32s, dx: S::f32s, dy: S::f32s, hx: S::f32s, hy: S::f32s) {
+    pub(crate) fn add<const COUNTS: bool>(
+        &mut self,
+        (measured, within): (S::i32s, S::mask32s),
+        [dx, dy]: [S::f32s; 2],
+        [hx, hy]: [S::f32s; 2],
+    ) {
         let zero = splat(dx.token(), 0.0);
-        let fx = dx * hx + dy * hy;
-        let fy = dy * hx - dx * hy;
+        let (fx, fy) = turned::<S>(dx, dy, hx, hy);
         let left = (fy.simd_gt(zero) | (fy.simd_ge(zero) & fx.simd_ge(zero))).to_vector();
         let front = (fx.simd_gt(zero) | (fx.simd_ge(zero) & !fy.simd_gt(zero))).to_vector();
-        self.densities.add(density, left, front);
-        if const { matches!(Density::of(DENSITY), Density::Mean) } {
-            self.counts.add(density.min(1), left, front);
+        self.sums.add(measured, left, front);
+        if COUNTS {
+            self.counts.add(-within.to_vector(), left, front);
         }
     }
 
-    /// Returns the inputs: the sums, or the means, times a constant.
+    /// Writes the channel's inputs.
     #[inline(always)]
-    fn inputs<const DENSITY: u32>(self, share: S::f32s) -> [S::f32s; 4] {
-        let [sums, counts] = [self.densities.quadrants(), self.counts.quadrants()];
-        std::array::from_fn(
-            #[inline(always)]
-            |quadrant| match const { Density::of(DENSITY) } {
-                Density::Mean => {
-                    let one = splat(share.token(), 1.0);
-                    sums[quadrant] * recip::<S>(larger::<S>(counts[quadrant], one)) * share
-                }
-                Density::Linear | Density::Inverse => sums[quadrant] * share,
-            },
-        )
+    pub(crate) fn write(self, channel: &ChannelLanes<S>, inputs: &mut [S::f32s]) {
+        let [sums, counts] = [self.sums.quadrants(), self.counts.quadrants()];
+        // Sectors of the map begin at the x axis, which is straight ahead.
+        let first = if channel.shape.frame == Frame::Map as u32 { 2 } else { 0 };
+        for (quadrant, (&sum, &count)) in sums.iter().zip(&counts).enumerate() {
+            inputs[(quadrant + first) % 4] = input::<S>(channel, sum, count);
+        }
     }
 }
 
-/// Returns the policy's inputs: the densities of both kinds, each multiplied by its constant.
+/// A channel of any number of sectors.
+pub(crate) struct Sectors<S: Simd> {
+    /// The sum of the measures of each sector, or the largest of them, in lattice distances.
+    sums: [S::i32s; MAX_SECTORS],
+    /// The number of entities sensed in each sector.
+    counts: [S::i32s; MAX_SECTORS],
+}
+
+/// Less than every measure.
+const NO_MEASURE: i32 = i32::MIN;
+
+impl<S: Simd> Sectors<S> {
+    #[inline(always)]
+    pub(crate) fn new(simd: S, combine: Combine) -> Sectors<S> {
+        let none = S::i32s::splat(simd, if combine == Combine::Closest { NO_MEASURE } else { 0 });
+        Sectors { sums: [none; MAX_SECTORS], counts: [S::i32s::splat(simd, 0); MAX_SECTORS] }
+    }
+
+    /// Adds an entity as [`Quadrants::add`] does.
+    #[inline(always)]
+    pub(crate) fn add(
+        &mut self,
+        channel: &ChannelLanes<S>,
+        (measured, within): (S::i32s, S::mask32s),
+        [dx, dy]: [S::f32s; 2],
+        [hx, hy]: [S::f32s; 2],
+    ) {
+        let simd = dx.token();
+        let (zero, sectors) = (splat(simd, 0.0), channel.shape.sectors as usize);
+        let (fx, fy) = turned::<S>(dx, dy, hx, hy);
+        // What is at the same place is straight ahead.
+        let fx = select::<S>(fx, splat(simd, 1.0), fx.simd_eq(zero) & fy.simd_eq(zero));
+        // Whether the direction is less than half a turn after the beginning of a sector.
+        let after = |sector: usize| {
+            let [bx, by] = [0, 1].map(|axis| splat(simd, channel.boundaries[sector * 2 + axis]));
+            let across = bx * fy - by * fx;
+            across.simd_gt(zero) | (across.simd_ge(zero) & (bx * fx + by * fy).simd_ge(zero))
+        };
+        let first = after(0);
+        let mut begun = first;
+        for sector in 0..sectors {
+            let inside = match sectors {
+                1 => within,
+                2 if sector == 1 => within & !first,
+                2 => within & first,
+                _ => {
+                    let next = if sector + 1 < sectors { after(sector + 1) } else { first };
+                    let inside = within & begun & !next;
+                    begun = next;
+                    inside
+                }
+            };
+            let sum = &mut self.sums[sector];
+            if channel.shape.combine == Combine::Closest as u32 {
+                *sum = inside.select((*sum).max(measured), *sum);
+            } else {
+                *sum += measured & inside.to_vector();
+            }
+            self.counts[sector] -= inside.to_vector();
+        }
+    }
+
+    /// Writes the channel's inputs.
+    #[inline(always)]
+    pub(crate) fn write(&self, channel: &ChannelLanes<S>, inputs: &mut [S::f32s]) {
+        for ((to, &sum), &count) in inputs.iter_mut().zip(&self.sums).zip(&self.counts) {
+            *to = input::<S>(channel, sum, count);
+        }
+    }
+}
+
+/// Returns the input of a sector from the sum, or the largest, of its measures, and the number of its entities.
 #[inline(always)]
-pub(crate) fn scale_inputs<S: Simd, const DENSITY: u32>(
-    world: &Lanes<S>,
-    of_pois: Quadrants<S>,
-    of_agents: Quadrants<S>,
-) -> [S::f32s; INPUTS] {
-    let [p0, p1, p2, p3] = of_pois.inputs::<DENSITY>(world.sense.poi_share);
-    let [a0, a1, a2, a3] = of_agents.inputs::<DENSITY>(world.sense.agent_share);
-    [p0, p1, p2, p3, a0, a1, a2, a3]
+fn input<S: Simd>(channel: &ChannelLanes<S>, sum: S::i32s, count: S::i32s) -> S::f32s {
+    let (sum, simd) = (nearest_f32::<S>(sum), channel.scale.token());
+    let shape = &channel.shape;
+    let value = if shape.combine == Combine::Mean as u32 {
+        sum * recip::<S>(nearest_f32::<S>(count.max(1))) * channel.scale
+    } else {
+        sum * channel.scale
+    };
+    let sensed = count.simd_gt(S::i32s::splat(simd, 0));
+    if shape.counts != 0 { select::<S>(channel.empty, value, sensed) } else { value }
 }

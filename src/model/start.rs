@@ -54,7 +54,7 @@ impl Heading {
     }
 
     /// Returns the heading of each agent in radians, leaders first, from the start positions.
-    pub fn of_each(&self, leaders: &[[f64; 2]], followers: &[[f64; 2]]) -> Vec<f64> {
+    pub fn of_agents(&self, leaders: &[[f64; 2]], followers: &[[f64; 2]]) -> Vec<f64> {
         match self {
             Heading::Same(heading) => vec![*heading; leaders.len() + followers.len()],
             Heading::Each(headings) if headings.len() == leaders.len() => {

@@ -198,6 +198,16 @@ pub enum OneOrEach<T> {
     Each(Vec<T>),
 }
 
+impl<T: Copy> OneOrEach<T> {
+    /// Returns the number of each of `count` items.
+    pub fn of_each(&self, count: usize) -> Vec<T> {
+        match self {
+            OneOrEach::Same(number) => vec![*number; count],
+            OneOrEach::Each(numbers) => numbers.clone(),
+        }
+    }
+}
+
 /// Returns the name of a type without its article.
 fn kind<T: Number>() -> &'static str {
     T::KIND.trim_start_matches("a ")

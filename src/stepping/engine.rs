@@ -15,7 +15,7 @@ use super::state::Saved;
 
 /// The arrays that a stepper shows, of all teams.
 pub(super) struct Observations {
-    /// Inputs of the leaders, `[teams][leaders][8]`.
+    /// Inputs of the leaders, `[teams][leaders][inputs]`.
     pub(super) inputs: Vec<f32>,
     /// The agents at each POI, one bit per agent, `[teams][pois][words]`.
     pub(super) agents_at_poi: Vec<u32>,
@@ -319,7 +319,7 @@ impl<S: Simd> Workspace<S> {
         let rule = &world.rule;
         for (poi, (sets, &coupling)) in self.sets.chunks_exact(words * width).zip(&world.coupling).enumerate() {
             let count = sets.chunks_exact(width).enumerate().fold(S::u32s::splat(simd, 0), |count, (word, sets)| {
-                count + count_ones::<S>(S::u32s::from_slice(simd, sets) & rule.counted(word, u32::MAX))
+                count + count_ones::<S>(S::u32s::from_slice(simd, sets) & rule.counted(poi, word, u32::MAX))
             });
             let mut enough = count.simd_ge(coupling).to_bitmask() & playing;
             while enough != 0 {

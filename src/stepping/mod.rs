@@ -26,7 +26,7 @@ use glam::Vec2;
 use crate::config::{Fitness, MAX_POPULATION};
 use crate::credit::{Credit, Scores};
 use crate::parallel::*;
-use crate::world::{GRID, INPUTS, OUTPUTS, World, on_grid};
+use crate::world::{GRID, OUTPUTS, World, on_grid};
 
 mod engine;
 mod state;
@@ -36,7 +36,7 @@ use engine::{Command, Observations, VECTORS_PER_TASK, Vectors, vectors};
 /// Teams of one world, each at its own step.
 ///
 /// Arrays are flat and keep their addresses from step to step. Shapes are row-major: the last index of
-/// `[teams][leaders][8]` varies fastest. Leaders come before followers.
+/// `[teams][leaders][inputs]` varies fastest. Leaders come before followers.
 pub struct Stepper {
     world: World,
     vectors: Box<dyn Vectors>,
@@ -172,14 +172,15 @@ impl Stepper {
             Recording::Sets => [world.set_words(), 0],
             Recording::SetsAndSights => [world.set_words(), world.sight_words()],
         };
-        let in_vectors = agents * 6 + leaders * (INPUTS + OUTPUTS) + world.followers() * (11 + leaders) + pois * words;
-        let numbers = in_vectors + sets + sights + leaders * INPUTS + agents * 5 + pois * (words + 1) + 1;
+        let in_vectors =
+            agents * 6 + leaders * (world.inputs() + OUTPUTS) + world.followers() * (11 + leaders) + pois * words;
+        let numbers = in_vectors + sets + sights + leaders * world.inputs() + agents * 5 + pois * (words + 1) + 1;
         let bytes = numbers as u128 * 4 * teams as u128;
         let probe = usize::try_from(bytes).ok().and_then(|bytes| Vec::<u8>::new().try_reserve_exact(bytes).ok());
         probe.ok_or(StepError::Memory { teams, bytes })?;
         let vectors = dispatch!(level, simd => vectors(simd, &world, teams, [sets, sights]));
         let observations = Observations {
-            inputs: vec![0.0; teams * leaders * INPUTS],
+            inputs: vec![0.0; teams * leaders * world.inputs()],
             agents_at_poi: vec![0; teams * pois * words],
             newly: vec![false; teams * pois],
             observed: vec![false; teams * pois],
@@ -278,7 +279,7 @@ impl Stepper {
         self.moved.get(team * pois..(team + 1) * pois).unwrap_or(&self.world.pois)
     }
 
-    /// Returns what every leader senses, `[teams][leaders][8]`: the density of POIs, then of agents, in four quadrants
+    /// Returns what every leader senses, `[teams][leaders][inputs]`: the density of POIs, then of agents, in four quadrants
     /// around its heading: back right, front right, front left, back left.
     pub fn inputs(&self) -> &[f32] {
         &self.observations.inputs

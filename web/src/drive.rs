@@ -67,8 +67,13 @@ impl Drive {
         let step = self.stepper.steps()[0];
         let words = self.stepper.agents_at_poi().len() / self.observed.len();
         let rule = &self.stepper.world().rule;
-        let near: Vec<u32> =
-            self.stepper.agents_at_poi().chunks(words).map(|set| rule.count(set.iter().copied())).collect();
+        let near: Vec<u32> = self
+            .stepper
+            .agents_at_poi()
+            .chunks(words)
+            .enumerate()
+            .map(|(poi, set)| rule.count(poi, set.iter().copied()))
+            .collect();
         let scores = self.stepper.is_over(0).then(|| self.stepper.scores(0)).transpose().map_err(refuse)?;
         let states = self.stepper.states();
         Ok(json!({

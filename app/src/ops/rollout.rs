@@ -13,17 +13,35 @@ use crate::record::{folder, policies, tensors};
 use crate::report::map;
 use crate::report::replay::numbered;
 use crate::report::runs::ReadError;
-use flotilla::backend::{Backend, Group, Moment};
+use flotilla::backend::{Backend, Group};
 use flotilla::config::{self, Config, Override};
 use flotilla::escape::PathExt;
 use flotilla::evaluate::{self, Batch, Evaluation, Spread, Starts};
 use flotilla::file;
-use flotilla::world::World;
+use flotilla::model::class::Class;
+use flotilla::model::sense::{ChannelConstants, ChannelShape, Frame};
+use flotilla::world::{OUTPUTS, World};
 
-/// Columns of a trace. Only leaders fill `SENSED`: the eight inputs and two outputs of their policies.
+/// Columns of a trace. Only agents that learn fill the others: the inputs and outputs of their policies.
 const STATES: &str = "team,step,agent,role,x,y,heading_x,heading_y,speed";
-const SENSED: &str = "pois_back_right,pois_front_right,pois_front_left,pois_back_left,\
-                      agents_back_right,agents_front_right,agents_front_left,agents_back_left,turn_output,speed_output";
+/// The inputs of one class that senses POIs and agents by quadrants.
+const QUADRANTS: &str = "pois_back_right,pois_front_right,pois_front_left,pois_back_left,\
+                         agents_back_right,agents_front_right,agents_front_left,agents_back_left";
+
+/// Returns the columns of what policies sense and answer. The inputs of several classes have numbers.
+fn sensed(world: &World) -> String {
+    let by_quadrants = |channels: &[ChannelConstants]| {
+        let is_quadrants = |channel: &ChannelShape| channel.sectors == 4 && channel.frame == Frame::Heading as u32;
+        matches!(channels, [pois, agents] if pois.shape.of_pois != 0 && agents.shape.of_pois == 0)
+            && channels.iter().all(|channel| is_quadrants(&channel.shape))
+    };
+    let mut learning = world.classes.iter().map(Class::channels).filter(|channels| !channels.is_empty());
+    let inputs = match learning.all(by_quadrants) {
+        true => QUADRANTS.into(),
+        false => (0..world.inputs()).map(|input| format!("input_{input}")).collect::<Vec<_>>().join(","),
+    };
+    format!("{inputs},turn_output,speed_output")
+}
 
 /// RolloutRequest of a rollout.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -258,7 +276,7 @@ fn write_trace(
     let (whole, episodes) = (group.team_count(), starts.episodes());
     let mut failed = None;
     let written = output::write_with(path, |file| {
-        writeln!(file, "{STATES},{SENSED}{}", if episodes > 1 { ",episode" } else { "" })?;
+        writeln!(file, "{STATES},{}{}", sensed(group.world), if episodes > 1 { ",episode" } else { "" })?;
         for episode in 0..episodes {
             let starts = starts.of(episode, group.world);
             let last = if episodes > 1 { format!(",{episode}") } else { String::new() };
@@ -279,12 +297,12 @@ fn write_trace(
                             let index = first + team;
                             write!(file, "{index},{step},{agent},{role},{x},{y},{hx},{hy},{speed}")?;
                             // The inputs and outputs of a leader in this state are stored with the next state.
-                            let next = (agent < leaders && step < steps).then(|| trace.moment(step + 1, team, agent));
-                            match next {
-                                Some(Moment { inputs, outputs, .. }) => {
-                                    inputs.iter().chain(outputs).try_for_each(|value| write!(file, ",{value}"))?;
-                                }
-                                None => write!(file, ",,,,,,,,,,")?,
+                            if agent < leaders && step < steps {
+                                let inputs = trace.inputs_of(step + 1, team, agent).iter();
+                                let outputs = &trace.moment(step + 1, team, agent).outputs;
+                                inputs.chain(outputs).try_for_each(|value| write!(file, ",{value}"))?;
+                            } else {
+                                write!(file, "{}", ",".repeat(group.world.inputs() + OUTPUTS))?;
                             }
                             writeln!(file, "{last}")?;
                         }

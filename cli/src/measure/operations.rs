@@ -7,64 +7,79 @@
 //! | entities in reach of an agent of their team | tests of pairs that are out of reach |
 
 use flotilla::backend::Trace;
-use flotilla::model::Constants;
+use flotilla::config::Control;
+use flotilla::model;
+use flotilla::model::class::Class;
 use flotilla::model::policy::{Actions, PolicyConstants};
-use flotilla::model::sense::Density;
-use flotilla::world::{INPUTS, World};
+use flotilla::model::sense::{ChannelConstants, Combine, Measure};
+use flotilla::world::World;
 
 /// Numbers of entities in reach of agents, as means over a trace's teams and steps.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Reach {
-    /// POIs within the range of a leader, summed over leaders.
-    pub sensed_pois: f64,
-    /// Agents within the range of a leader, summed over leaders.
-    pub sensed_agents: f64,
-    /// Agents within the attraction radius of a follower, summed over followers.
-    pub drawn: f64,
-    /// How many of those are leaders.
+    /// Entities within the range of each channel, summed over the agents of its class, `[classes][channels]`.
+    pub sensed: Vec<Vec<f64>>,
+    /// Agents within the distance of each term, summed over the agents of its class, `[classes][terms]`.
+    pub met: Vec<Vec<f64>>,
+    /// Leaders within the distance of influence, summed over followers.
     pub seen: f64,
-    /// Pairs of agents of which one senses or is drawn to the other, each counted once.
+    /// Pairs of agents of which one matters to the other, each counted once.
     pub pairs: f64,
 }
 
 impl Reach {
     /// Computes the means of a trace, from the state before each step.
     pub fn of(world: &World, trace: &Trace) -> Reach {
-        let Constants { sense, follow, .. } = world.constants;
-        let (agents, leaders) = (world.agents(), world.leaders());
-        let [mut sensed_pois, mut sensed_agents, mut drawn, mut seen, mut pairs] = [0u64; 5];
+        let agents = world.agents();
+        let zeros = |of: &dyn Fn(&Class) -> usize| -> Vec<Vec<f64>> {
+            world.classes.iter().map(|class| vec![0.0; of(class)]).collect()
+        };
+        let (mut sensed, mut met) = (zeros(&|class| class.channels().len()), zeros(&|class| class.terms().len()));
+        let [mut seen, mut pairs] = [0.0; 2];
+        let share = 1.0 / (world.steps() * trace.teams) as f64;
+        let class_of: Vec<usize> =
+            world.classes.iter().enumerate().flat_map(|(index, class)| vec![index; class.agents().len()]).collect();
         for moments in trace.moments.chunks_exact(agents).take(world.steps() * trace.teams) {
             let d2 = |[ax, ay]: [f32; 2], [bx, by]: [f32; 2]| {
                 let (dx, dy) = (bx - ax, by - ay);
                 dx * dx + dy * dy
             };
+            let mut matters = vec![false; agents * agents];
             for (i, a) in moments.iter().enumerate() {
-                if i < leaders {
-                    let near = world.pois.iter().filter(|poi| d2(a.position, poi.to_array()) <= sense.poi_range2);
-                    sensed_pois += near.count() as u64;
+                let class = &world.classes[class_of[i]];
+                let others =
+                    |ranges: &model::Ranges| model::each(ranges).flatten().filter(|&j| j != i).collect::<Vec<_>>();
+                for (channel, sensed) in class.channels().iter().zip(&mut sensed[class_of[i]]) {
+                    if channel.shape.of_pois != 0 {
+                        let pois = model::each(&channel.shape.ranges).flatten();
+                        let near = pois.filter(|&poi| d2(a.position, world.pois[poi].to_array()) <= channel.range2);
+                        *sensed += near.count() as f64 * share;
+                        continue;
+                    }
+                    for j in others(&channel.shape.ranges) {
+                        let near = d2(a.position, moments[j].position) <= channel.range2;
+                        *sensed += f64::from(u8::from(near)) * share;
+                        matters[i * agents + j] |= near;
+                    }
                 }
-                for (j, b) in moments.iter().enumerate().skip(i + 1) {
-                    let d2 = d2(a.position, b.position);
-                    let (senses, draws) = (d2 <= sense.agent_range2, d2 <= follow.attraction_radius2);
-                    // The first of the two is a leader if either is.
-                    let (first_leads, second_leads) = (i < leaders, j < leaders);
-                    let sensing = u64::from(senses && first_leads) + u64::from(senses && second_leads);
-                    let drawing = u64::from(draws && !first_leads) + u64::from(draws && !second_leads);
-                    sensed_agents += sensing;
-                    drawn += drawing;
-                    seen += u64::from(draws && first_leads && !second_leads);
-                    pairs += u64::from(sensing + drawing > 0);
+                for (term, met) in class.terms().iter().zip(&mut met[class_of[i]]) {
+                    for j in others(&term.shape.ranges) {
+                        let d2 = d2(a.position, moments[j].position);
+                        *met += f64::from(u8::from(d2 <= term.outer2 && d2 > term.inner2)) * share;
+                        matters[i * agents + j] |= d2 <= term.outer2;
+                    }
+                }
+                for j in (0..world.leaders()).filter(|_| i >= world.leaders()) {
+                    let influence2 = world.classes[class_of[j]].constants.influence2[class_of[i]];
+                    let sees = d2(a.position, moments[j].position) <= influence2;
+                    seen += f64::from(u8::from(sees)) * share;
+                    matters[i * agents + j] |= sees;
                 }
             }
+            let both = |(i, j): &(usize, usize)| matters[i * agents + j] || matters[j * agents + i];
+            pairs += (0..agents).flat_map(|i| (0..i).map(move |j| (i, j))).filter(both).count() as f64 * share;
         }
-        let mean = |count: u64| count as f64 / (world.steps() * trace.teams) as f64;
-        Reach {
-            sensed_pois: mean(sensed_pois),
-            sensed_agents: mean(sensed_agents),
-            drawn: mean(drawn),
-            seen: mean(seen),
-            pairs: mean(pairs),
-        }
+        Reach { sensed, met, seen, pairs }
     }
 }
 
@@ -82,6 +97,8 @@ mod kernel {
         + 3 + 4 + 6; // the sum of their squares, its rough reciprocal, the quotient
     /// [`sin_cos`](flotilla::kernels::math::sin_cos).
     pub(crate) const SIN_COS: u32 = 26;
+    /// [`exp_negative`](flotilla::kernels::math::exp_negative).
+    pub(crate) const EXP: u32 = 25;
     /// [`flush`](flotilla::kernels::math::flush).
     pub(crate) const FLUSH: u32 = 3;
     /// Minimum and maximum.
@@ -93,8 +110,8 @@ mod kernel {
 }
 use kernel::*;
 
-/// A leader converts and scales its 8 sums. The quadrants follow from the halves by 5 differences and sums per kind.
-const SCALE_INPUTS: u32 = 2 * INPUTS as u32 + 2 * 5;
+/// A channel of quadrants converts and scales its 4 sums. These follow from the halves by 5 differences and sums.
+const SCALE_QUADRANTS: u32 = 2 * 4 + 5;
 /// A leader turns.
 const TURN: u32 = CLAMP + SIN_COS + ROTATE;
 /// An agent moves.
@@ -102,28 +119,32 @@ const MOVE: u32 = 3 + 2 + 2 + 2 * FLUSH // heading: square, scale, 2 products, 2
     + 2 + 2 * CLAMP // speed: a change within limits
     + 1 // a product that both axes share
     + 2 * (2 + 4 + CLAMP); // position, per axis: step, rounding to the grid, map
+/// An agent moves freely, per axis: step, rounding to the grid, map.
+const MOVE_FREELY: u32 = 2 * (2 + 4 + CLAMP);
 /// A leader chooses a behaviour.
 const CHOOSE: u32 = 4 * 3 // the largest output: 4 comparisons with 2 selections each
     + 2 * (3 * 3 + 3 + 2) // per kind of entity: the largest quadrant, the opposite one, whether there is any
     + 8; // kind, direction, the two actions
-/// A follower meets an agent within the attraction radius.
-const INFLUENCE: u32 = SQUARED_DISTANCE + 3 // 2 tests and their difference
+/// An agent meets another that counts for one of its terms.
+const MEET: u32 = SQUARED_DISTANCE + 3 // 2 tests, both of them
     + 2 * LATTICE // both offsets
-    + 4 + 4 // 4 selections, 4 sums
-    + 2; // 2 counts
+    + 2 + 2 // 2 selections, 2 sums
+    + 1; // a count
 /// A number is put on a lattice: a sum, a difference.
 const LATTICE: u32 = 2;
 /// A follower counts a leader that it sees.
 const SEE: u32 = 1;
 /// A follower steers, whoever it met.
-const FOLLOW: u32 = FORCE + INFLUENCED + STEER;
-/// The force on a follower.
-const FORCE: u32 = 2 * (RECIP + 3) // means: the reciprocal of a count of at least 1, scaled
-    + 2 * (2 + 4) // per axis: two sums, converted and weighted
-    + 2 * (3 + 2 + 1 + 1) // per axis, walls: 3 differences, 2 maxima, a difference, a gain
+const FOLLOW: u32 = WALLS + INFLUENCED + STEER;
+/// The force of a term: the reciprocal of a count of at least 1, scaled; per axis a sum, converted, weighted and added; and
+/// the sum of the counts.
+const TERM: u32 = RECIP + 3 + 2 * 3 + 1;
+/// The push of walls, and the whole force.
+const WALLS: u32 = 2 * (3 + 2 + 1 + 1) // per axis: 3 differences, 2 maxima, a difference, a gain
+    + 2 // the sums
     + 2 * FLUSH;
 /// The test whether anything is near.
-const INFLUENCED: u32 = 2 // the sum of the counts, its test
+const INFLUENCED: u32 = 1 // the test of the sum of the counts
     + 3 + 1 // the nearest of 4 walls, its test
     + 1; // either of them
 /// A follower turns towards the force.
@@ -138,21 +159,39 @@ const WITHIN: u32 = 3;
 /// An agent is tested for a POI and added to its set: a test, a selection, a union.
 const OBSERVE: u32 = SQUARED_DISTANCE + 3;
 
-/// Returns the operations of a leader that senses one entity.
-fn sense(density: Density) -> u32 {
-    let density = match density {
+/// Returns the operations of an agent that senses one entity.
+fn sense(channel: &ChannelConstants) -> u32 {
+    let valued = if channel.shape.of_pois != 0 { 1 } else { 0 };
+    let measure = match Measure::of(channel.shape.measure) {
         // A root, scaled and subtracted from 1 on the lattice.
-        Density::Linear => SQRT + LATTICE + 1,
+        Measure::Linear | Measure::Closeness => SQRT + LATTICE + 1 + valued,
+        Measure::Distance => SQRT + LATTICE + 1 + valued,
         // An inverse root of at least 1.
-        Density::Inverse => RSQRT + 2 + LATTICE,
-        // Also a count: at most 1, its selections and sums.
-        Density::Mean => RSQRT + 2 + LATTICE + 1 + 3 + 4,
+        Measure::Inverse => RSQRT + 1 + LATTICE + valued,
+        Measure::InverseSquared => RSQRT + 2 + LATTICE + valued,
+        Measure::Exponential => SQRT + EXP + LATTICE + valued,
+    };
+    // The number, its selections and sums.
+    let counted = if channel.shape.counts != 0 { 1 + 3 + 4 } else { 0 };
+    let sectors = match (channel.shape.sectors, Combine::of(channel.shape.combine)) {
+        // 4 tests, their combinations, 3 selections of halves, 4 sums.
+        (4, Combine::Share | Combine::Sum | Combine::Mean) => 4 + 4 + 3 + 4 + counted,
+        // Per sector: two products, their difference, as many for the tie, its tests, selections and sums.
+        (sectors, _) => sectors * (3 + 3 + 3 + 2 + 4),
     };
     SQUARED_DISTANCE + ROTATE
         + 2 // the range: a test, a selection
-        + 4 + 4 // the quadrant: 4 tests, their combinations
-        + 3 + 4 // 3 selections of halves, 4 sums
-        + density
+        + sectors
+        + measure
+}
+
+/// Returns the operations of an agent that turns the sums of a channel into inputs.
+fn scale(channel: &ChannelConstants) -> u32 {
+    let of_mean = if channel.shape.combine == Combine::Mean as u32 { RECIP + 3 } else { 0 };
+    match channel.shape.sectors {
+        4 => SCALE_QUADRANTS + 4 * of_mean,
+        sectors => sectors * (2 + of_mean),
+    }
 }
 
 /// Returns the operations of one leader's policy: a product and a sum per weight, an activation per unit, and the
@@ -160,21 +199,33 @@ fn sense(density: Density) -> u32 {
 fn decide(policy: &PolicyConstants) -> u32 {
     let layers = policy.widths[..=policy.layers as usize].windows(2);
     let chosen = if policy.actions() == Some(Actions::Behaviours) { CHOOSE } else { 0 };
-    layers.map(|widths| widths[1] * (2 * widths[0] + FLUSH + TANH)).sum::<u32>() + chosen + 1 + 3
+    layers.map(|widths| widths[1] * (2 * widths[0] + FLUSH + TANH)).sum::<u32>() + chosen + 1
 }
 
 /// Returns the lane operations per team-step.
 pub fn per_team_step(world: &World, reach: &Reach) -> f64 {
-    let Constants { variant, policy, .. } = world.constants;
-    let count = |count: usize, operations: u32| count as f64 * f64::from(operations);
-    let sensed = (reach.sensed_pois + reach.sensed_agents) * f64::from(sense(variant.density()));
-    let met = reach.drawn * f64::from(INFLUENCE) + reach.seen * f64::from(SEE);
-    sensed
-        + met
-        + count(world.leaders(), SCALE_INPUTS + decide(&policy) + TURN)
-        + count(world.followers(), FOLLOW)
-        + count(world.agents(), MOVE)
-        + count(world.agents() * world.pois.len(), OBSERVE)
+    let count = |count: f64, operations: u32| count * f64::from(operations);
+    let per_class = |(index, class): (usize, &Class)| {
+        let agents = class.agents().len() as f64;
+        let channels = class.channels().iter().zip(&reach.sensed[index]);
+        let sensing: f64 =
+            channels.map(|(channel, &sensed)| count(sensed, sense(channel)) + count(agents, scale(channel))).sum();
+        let met: f64 = reach.met[index].iter().map(|&met| count(met, MEET) + count(agents, TERM)).sum();
+        let control = match (class.constants.shape.control(), class.constants.shape.free != 0) {
+            (Control::Policy, free) => {
+                decide(&world.constants.policy)
+                    + if free { 2 } else { TURN + 3 }
+                    + if free { MOVE_FREELY } else { MOVE }
+            }
+            (Control::Follow, true) => WALLS + INFLUENCED + 2 * CLAMP + MOVE_FREELY,
+            (Control::Follow, false) => FOLLOW + MOVE,
+            (Control::Still, _) => 0,
+        };
+        sensing + met + count(agents, control)
+    };
+    world.classes.iter().enumerate().map(per_class).sum::<f64>()
+        + count(reach.seen, SEE + SQUARED_DISTANCE + 1)
+        + count((world.agents() * world.pois.len()) as f64, OBSERVE)
 }
 
 #[cfg(test)]
@@ -208,10 +259,11 @@ mod tests {
     fn an_agent_alone() {
         let world = world("[world]\nleaders = [[10, 5]]\npois = [[10, 15], [40, 40]]\nsteps = 1\ncoupling = 1\n");
         let reach = reach(&world, 3);
-        assert_eq!(reach, Reach { sensed_pois: 2.0, ..Reach::default() });
+        let expected = Reach { sensed: vec![vec![2.0, 0.0]], met: vec![vec![]], ..Reach::default() };
+        assert_eq!(reach, expected);
         // 2 POIs sensed; 8 inputs; 10 units of 8 inputs and 2 of 10; the turn and the speed; the move; 2 POIs tested.
         let units = 10.0 * (16.0 + 27.0) + 2.0 * (20.0 + 27.0);
-        assert_eq!(per_team_step(&world, &reach), 2.0 * 43.0 + 26.0 + units + 38.0 + 36.0 + 2.0 * 8.0);
+        assert_eq!(per_team_step(&world, &reach), 2.0 * 44.0 + 26.0 + units + 38.0 + 36.0 + 2.0 * 8.0);
     }
 
     #[test]
@@ -224,7 +276,8 @@ mod tests {
         );
         let reach = reach(&world, 2);
         // The follower stands 3 from the second leader, who senses it; both leaders sense each other.
-        let expected = Reach { sensed_pois: 1.0, sensed_agents: 3.0, drawn: 1.0, seen: 1.0, pairs: 2.0 };
+        let expected =
+            Reach { sensed: vec![vec![1.0, 3.0], vec![]], met: vec![vec![], vec![0.0, 1.0]], seen: 1.0, pairs: 2.0 };
         assert_eq!(reach, expected);
     }
 }

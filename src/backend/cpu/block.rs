@@ -1,5 +1,7 @@
 //! The state of one vector of teams, and one step of it.
 
+use std::ops::Range;
+
 use fearless_simd::{Simd, prelude::*};
 use glam::Vec2;
 
@@ -7,11 +9,15 @@ use super::agent::Agent;
 use super::neighbours::{self, Bounds};
 use super::pois::PoiPosition;
 use crate::backend::Moment;
+use crate::config::{Control, MAX_TERMS, Measure};
 use crate::config_enum::ConstDispatch;
-use crate::kernels::math::within;
-use crate::kernels::splat;
-use crate::model::{Lanes, follow, motion, policy, sense};
-use crate::world::{INPUTS, OUTPUTS, World};
+use crate::kernels::math::{on_lattice, within};
+use crate::kernels::{clamp_to, splat};
+use crate::model::class::ClassLanes;
+use crate::model::follow::{self, Sum};
+use crate::model::sense::{self, ChannelLanes, Combine, Frame};
+use crate::model::{self, Lanes, motion, policy};
+use crate::world::{OUTPUTS, World};
 
 /// The state of one vector of teams, one team per lane, with scratch memory for a step. A step reads only the
 /// previous state.
@@ -20,19 +26,28 @@ pub(crate) struct Block<S: Simd> {
     pub(super) world: Lanes<S>,
     /// `[agents]`, leaders first.
     pub agents: Vec<Agent<S>>,
-    /// Inputs of the leaders, `[leaders]`.
-    pub inputs: Vec<[S::f32s; INPUTS]>,
+    /// Inputs of the leaders, `[leaders][inputs]`.
+    pub inputs: Vec<S::f32s>,
     /// Outputs of the leaders' policies, `[leaders]`.
     pub outputs: Vec<[S::f32s; OUTPUTS]>,
-    /// Wanted speeds in units per second, `[agents]`.
-    pub(super) wanted: Vec<S::f32s>,
+    /// Wanted speeds of agents that steer, `[agents]`, and velocities of those that move freely, `[agents]`, in units per
+    /// second.
+    wanted: Vec<S::f32s>,
+    velocities: Vec<[S::f32s; 2]>,
+    /// The headings before the step, `[agents]`; empty unless a rule aligns them.
+    headings: Vec<[S::f32s; 2]>,
     /// `[followers]`.
-    pub(super) followers: Vec<Follower<S>>,
+    followers: Vec<Follower<S>>,
     /// The number of steps at which each follower saw each leader, `[followers][leaders]`.
     pub counts: Vec<S::u32s>,
     /// The pairs of agents that may be in reach in some lane, one bit each, `[words][agents]`.
     pub(super) near: Vec<u64>,
     pub(super) bounds: Vec<Bounds<S>>,
+    /// The largest squared distance at which others matter to each agent, `[agents]`.
+    reach2: Vec<f32>,
+    /// The squared observation radius and the value of each POI, `[pois]`.
+    pub(super) radii2: Vec<f32>,
+    pub(super) values: Vec<f32>,
 }
 
 /// The part of a [`Block`] that the next step depends on, after [`Block::sense`].
@@ -45,7 +60,7 @@ pub(crate) struct BlockState<S: Simd> {
 
 #[derive(Clone, Copy)]
 pub(super) struct Follower<S: Simd> {
-    sums: follow::Sums<S>,
+    sums: [Sum<S>; MAX_TERMS],
     force: follow::SteeringForce<S>,
     /// The squared size of the force, and the inverse of its size.
     sizes: (S::f32s, S::f32s),
@@ -58,15 +73,20 @@ impl<S: Simd> Block<S> {
         let force = follow::SteeringForce { x: zero, y: zero, influenced: S::mask32s::splat(simd, false) };
         Block {
             simd,
-            world: Lanes::new(simd, world.constants),
+            world: Lanes::new(simd, world.constants, &world.classes),
             agents: vec![Agent { x: zero, y: zero, hx: zero, hy: zero, speed: zero }; agents],
-            inputs: vec![[zero; INPUTS]; leaders],
+            inputs: vec![zero; leaders * world.inputs()],
             outputs: vec![[zero; OUTPUTS]; leaders],
             wanted: vec![zero; agents],
-            followers: vec![Follower { sums: follow::Sums::new(simd), force, sizes: (zero, zero) }; followers],
+            velocities: vec![[zero; 2]; agents],
+            headings: vec![[zero; 2]; if world.aligns() { agents } else { 0 }],
+            followers: vec![Follower { sums: [Sum::new(simd); MAX_TERMS], force, sizes: (zero, zero) }; followers],
             counts: vec![S::u32s::splat(simd, 0); followers * leaders],
             near: vec![0; agents.div_ceil(64) * agents],
             bounds: vec![Bounds::nowhere(simd); agents.div_ceil(S::f32s::LEN)],
+            reach2: world.classes.iter().flat_map(|class| vec![class.reach2(); class.agents().len()]).collect(),
+            radii2: world.radii2.clone(),
+            values: world.values.clone(),
         }
     }
 
@@ -101,8 +121,8 @@ impl<S: Simd> Block<S> {
     #[inline(always)]
     pub fn start(&mut self) {
         let Block { simd, world, agents, counts, .. } = self;
-        for agent in agents {
-            agent.speed = splat(*simd, world.constants.speed);
+        for class in &world.classes {
+            agents[class.agents()].iter_mut().for_each(|agent| agent.speed = class.constants.motion.speed);
         }
         counts.fill(S::u32s::splat(*simd, 0));
     }
@@ -110,19 +130,32 @@ impl<S: Simd> Block<S> {
     /// [`Block::start`] of one lane.
     #[inline(always)]
     pub fn start_lane(&mut self, lane: usize) {
-        let speed = self.world.constants.speed;
-        for agent in &mut self.agents {
-            agent.speed[lane] = speed;
+        let Block { world, agents, counts, .. } = self;
+        for class in &world.classes {
+            let speed = class.constants.motion.speed[lane];
+            agents[class.agents()].iter_mut().for_each(|agent| agent.speed[lane] = speed);
         }
-        self.counts.iter_mut().for_each(|count| count[lane] = 0);
+        counts.iter_mut().for_each(|count| count[lane] = 0);
     }
 
-    /// Computes the inputs of the leaders' policies: leaders sense all POIs, then the other agents, each in ascending
-    /// order.
+    /// Computes the inputs of the leaders' policies, channel by channel.
     #[inline(always)]
     pub fn sense(&mut self, pois: &[impl PoiPosition<S>]) {
-        neighbours::find_near(&self.world, &self.agents, &mut self.near, &mut self.bounds);
-        self.world.constants.variant.density().dispatch(Sensing { block: self, pois });
+        let Block { simd, world, agents, near, bounds, reach2, values, inputs, .. } = self;
+        neighbours::find_near(reach2, agents, near, bounds);
+        let width = world.constants.policy.inputs();
+        for class in &world.classes {
+            let shape = &class.constants.shape;
+            for channel in &class.channels[..shape.channel_count as usize] {
+                let scene = Scene { simd: *simd, channel, pois, values, agents, near };
+                let (observers, inputs) = (shape.agents(), Inputs { all: &mut *inputs, width });
+                if channel.shape.sectors == 4 && channel.shape.combine != Combine::Closest as u32 {
+                    Measure::of(channel.shape.measure).dispatch(Quartering { scene, observers, inputs });
+                } else {
+                    scene.sense_sectors(observers, inputs);
+                }
+            }
+        }
     }
 
     /// Plays a step by the leaders' outputs. Writes which leaders each follower sees before it moves, unless `sights` is
@@ -138,109 +171,134 @@ impl<S: Simd> Block<S> {
         self.record_poi_sets(pois, sets);
     }
 
-    #[inline(always)]
-    fn sense_by<P: PoiPosition<S>, const DENSITY: u32>(&mut self, pois: &[P]) {
-        let Block { simd, world, agents, near, inputs, .. } = self;
-        for (leader, (agent, inputs)) in agents.iter().zip(inputs).enumerate() {
-            let &Agent { x, y, hx, hy, .. } = agent;
-            let mut of_pois = sense::Quadrants::new(*simd);
-            let (fours, rest) = pois.as_chunks::<4>();
-            for pois in fours {
-                let mut densities = [S::i32s::splat(*simd, 0); 4];
-                for (density, poi) in densities.iter_mut().zip(pois) {
-                    let [px, py] = poi.lanes(*simd);
-                    let [dx, dy] = [px - x, py - y];
-                    *density = sensed::<S, DENSITY>(world, world.sense.poi_range2, dx, dy);
-                }
-                for (&density, poi) in densities.iter().zip(pois) {
-                    let [px, py] = poi.lanes(*simd);
-                    let [dx, dy] = [px - x, py - y];
-                    of_pois.add::<DENSITY>(density, dx, dy, hx, hy);
-                }
-            }
-            for poi in rest {
-                let [px, py] = poi.lanes(*simd);
-                let [dx, dy] = [px - x, py - y];
-                let density = sensed::<S, DENSITY>(world, world.sense.poi_range2, dx, dy);
-                of_pois.add::<DENSITY>(density, dx, dy, hx, hy);
-            }
-            let mut of_agents = sense::Quadrants::new(*simd);
-            neighbours::each_near(
-                near,
-                agents,
-                leader,
-                #[inline(always)]
-                |_, other| {
-                    let (dx, dy) = (other.x - x, other.y - y);
-                    let density = sensed::<S, DENSITY>(world, world.sense.agent_range2, dx, dy);
-                    of_agents.add::<DENSITY>(density, dx, dy, hx, hy);
-                },
-            );
-            *inputs = sense::scale_inputs::<S, DENSITY>(world, of_pois, of_agents);
-        }
-    }
-
-    /// Leaders turn, and set their wanted speed, by their policies' outputs.
+    /// Leaders turn, and set their wanted speed or their velocity, by their policies' outputs.
     #[inline(always)]
     fn lead(&mut self) {
-        let Block { world, agents, outputs, wanted, .. } = self;
-        for ((agent, wanted), &[turn, speed]) in agents.iter_mut().zip(wanted).zip(&*outputs) {
-            (agent.hx, agent.hy) = motion::turn::<S>(world, agent.hx, agent.hy, policy::wanted_turn::<S>(turn));
-            *wanted = policy::wanted_speed::<S>(world, speed);
+        let Block { world, agents, outputs, wanted, velocities, headings, .. } = self;
+        headings.iter_mut().zip(&*agents).for_each(|(heading, agent)| *heading = [agent.hx, agent.hy]);
+        for class in world.classes.iter().filter(|class| class.control() == Control::Policy) {
+            let (shape, motion) = (&class.constants.shape, &class.constants.motion);
+            let own = shape.agents();
+            if shape.free != 0 {
+                for (velocity, outputs) in velocities[own.clone()].iter_mut().zip(&outputs[own]) {
+                    *velocity = outputs.map(|output| output * motion.max_speed);
+                }
+                continue;
+            }
+            let moved = agents[own.clone()].iter_mut().zip(&mut wanted[own.clone()]);
+            for ((agent, wanted), &[turn, speed]) in moved.zip(&outputs[own]) {
+                (agent.hx, agent.hy) = motion::turn::<S>(motion, agent.hx, agent.hy, policy::wanted_turn::<S>(turn));
+                *wanted = policy::wanted_speed::<S>(motion, speed);
+            }
         }
     }
 
-    /// Followers count the leaders they see, and follow the agents near them.
+    /// Followers count the leaders they see, and obey their class's rule.
     #[inline(always)]
     fn follow(&mut self) {
-        let Block { simd, world, agents, wanted, near, followers, counts, .. } = self;
+        self.count_leaders();
+        let Block { world, agents, wanted, velocities, headings, near, followers, .. } = self;
         let leaders = world.constants.leaders as usize;
-        for (index, (follower, counts)) in followers.iter_mut().zip(counts.chunks_exact_mut(leaders)).enumerate() {
-            let &Agent { x, y, .. } = &agents[leaders + index];
-            let mut sums = follow::Sums::new(*simd);
-            neighbours::each_near(
-                near,
-                agents,
-                leaders + index,
-                #[inline(always)]
-                |index, other| {
-                    let seen = follow::influence::<S>(world, other.x - x, other.y - y, &mut sums);
-                    if let Some(count) = counts.get_mut(index) {
-                        *count -= seen.to_vector().bitcast::<S::u32s>();
-                    }
-                },
-            );
-            follower.sums = sums;
-        }
-        let (agents, wanted) = (&mut agents[leaders..], &mut wanted[leaders..]);
-        if world.constants.variant.by_sine != 0 {
-            steer::<S, true>(world, agents, followers, wanted);
-        } else {
-            steer::<S, false>(world, agents, followers, wanted);
+        for class in world.classes.iter().filter(|class| class.control() == Control::Follow) {
+            let (shape, motion) = (&class.constants.shape, &class.constants.motion);
+            let (own, terms) = (shape.agents(), &class.terms[..shape.term_count as usize]);
+            let followers = &mut followers[own.start - leaders..own.end - leaders];
+            let mut first = 0;
+            for terms in terms.chunk_by(|a, b| a.shape == b.shape).flat_map(|terms| terms.chunks(4)) {
+                let part = Attraction { class, terms, first, agents, headings, near };
+                match terms.len() {
+                    1 => part.add::<1>(own.clone(), followers),
+                    2 => part.add::<2>(own.clone(), followers),
+                    3 => part.add::<3>(own.clone(), followers),
+                    _ => part.add::<4>(own.clone(), followers),
+                }
+                first += terms.len();
+            }
+            for (agent, follower) in agents[own.clone()].iter().zip(&mut *followers) {
+                let sums = &follower.sums[..terms.len()];
+                follower.force = follow::force::<S>(class, &world.map, sums, agent.x, agent.y);
+            }
+            if shape.free != 0 {
+                for (velocity, follower) in velocities[own].iter_mut().zip(followers) {
+                    let follow::SteeringForce { x, y, .. } = follower.force;
+                    *velocity = [x, y].map(|force| clamp_to::<S>(force, -motion.max_speed, motion.max_speed));
+                }
+                continue;
+            }
+            let (agents, wanted) = (&mut agents[own.clone()], &mut wanted[own]);
+            if shape.by_sine != 0 {
+                steer::<S, true>(motion, agents, followers, wanted);
+            } else {
+                steer::<S, false>(motion, agents, followers, wanted);
+            }
         }
     }
 
-    /// Moves all agents along their headings.
+    /// Counts the leaders that each follower sees.
+    #[inline(always)]
+    fn count_leaders(&mut self) {
+        let Block { simd, world, agents, near, counts, .. } = self;
+        let leaders = world.constants.leaders as usize;
+        let leading = |class: &&ClassLanes<S>| class.agents().start < leaders;
+        for (class, led) in world.classes.iter().enumerate().filter(|(_, class)| class.agents().start >= leaders) {
+            for leading in world.classes.iter().take_while(leading) {
+                let influence2 = splat(*simd, leading.constants.influence2[class]);
+                for agent in led.agents() {
+                    let (x, y) = (agents[agent].x, agents[agent].y);
+                    let counts = &mut counts[(agent - leaders) * leaders..][..leaders];
+                    neighbours::each_near(
+                        near,
+                        agents,
+                        agent,
+                        leading.agents(),
+                        #[inline(always)]
+                        |leader, other| {
+                            let sees = within::<S>(other.x - x, other.y - y, influence2);
+                            counts[leader] -= sees.to_vector().bitcast::<S::u32s>();
+                        },
+                    );
+                }
+            }
+        }
+    }
+
+    /// Moves all agents.
     #[inline(always)]
     fn move_agents(&mut self) {
-        let world = &self.world;
-        for (agent, &wanted) in self.agents.iter_mut().zip(&self.wanted) {
-            (agent.hx, agent.hy) = motion::renormalize::<S>(agent.hx, agent.hy);
-            agent.speed = motion::accelerate::<S>(world, agent.speed, wanted);
-        }
-        for agent in &mut self.agents {
-            let step = agent.speed * world.motion.dt;
-            agent.x = motion::advance::<S>(agent.x, step, agent.hx, world.motion.map_x);
-            agent.y = motion::advance::<S>(agent.y, step, agent.hy, world.motion.map_y);
+        let Block { world, agents, wanted, velocities, .. } = self;
+        let map = &world.map;
+        for class in &world.classes {
+            let (shape, motion) = (&class.constants.shape, &class.constants.motion);
+            let own = shape.agents();
+            if shape.control() == Control::Still {
+                continue;
+            }
+            if shape.free != 0 {
+                for (agent, &[x, y]) in agents[own.clone()].iter_mut().zip(&velocities[own]) {
+                    agent.x = motion::advance::<S>(agent.x, map.dt, x, map.map_x);
+                    agent.y = motion::advance::<S>(agent.y, map.dt, y, map.map_y);
+                }
+                continue;
+            }
+            let agents = &mut agents[own.clone()];
+            for (agent, &wanted) in agents.iter_mut().zip(&wanted[own]) {
+                (agent.hx, agent.hy) = motion::renormalize::<S>(agent.hx, agent.hy);
+                agent.speed = motion::accelerate::<S>(motion, agent.speed, wanted);
+            }
+            for agent in agents {
+                let step = agent.speed * map.dt;
+                agent.x = motion::advance::<S>(agent.x, step, agent.hx, map.map_x);
+                agent.y = motion::advance::<S>(agent.y, step, agent.hy, map.map_y);
+            }
         }
     }
 
-    /// Writes the moments of one lane's agents. Before the first step nothing has been sensed.
-    pub(super) fn moments(&self, lane: usize, sensed: bool, moments: &mut [Moment]) {
+    /// Writes the moments of one lane's agents, and the inputs of its leaders, `[leaders][inputs]`. Before the first step
+    /// nothing has been sensed.
+    pub(super) fn moments(&self, lane: usize, sensed: bool, moments: &mut [Moment], inputs: &mut [f32]) {
         let leaders = self.outputs.len();
         for (index, (agent, moment)) in self.agents.iter().zip(moments).enumerate() {
             if sensed && index < leaders {
-                moment.inputs = self.inputs[index].map(|input| input[lane]);
                 moment.outputs = self.outputs[index].map(|output| output[lane]);
             } else if sensed {
                 let follower = &self.followers[index - leaders];
@@ -250,21 +308,213 @@ impl<S: Simd> Block<S> {
             moment.heading = [agent.hx[lane], agent.hy[lane]];
             moment.speed = agent.speed[lane];
         }
+        if sensed {
+            inputs.iter_mut().zip(&self.inputs).for_each(|(to, input)| *to = input[lane]);
+        }
     }
 }
 
-/// [`Block::sense_by`] with the density as a constant.
-struct Sensing<'a, S: Simd, P> {
-    block: &'a mut Block<S>,
-    pois: &'a [P],
+/// The inputs of all leaders, `[leaders][width]`.
+struct Inputs<'a, S: Simd> {
+    all: &'a mut [S::f32s],
+    width: usize,
 }
 
-impl<S: Simd, P: PoiPosition<S>> ConstDispatch for Sensing<'_, S, P> {
+impl<S: Simd> Inputs<'_, S> {
+    /// Returns the inputs of one leader's channel.
+    #[inline(always)]
+    fn of(&mut self, leader: usize, channel: &ChannelLanes<S>) -> &mut [S::f32s] {
+        &mut self.all[leader * self.width + channel.shape.input as usize..][..channel.shape.sectors as usize]
+    }
+}
+
+/// What one channel senses.
+struct Scene<'a, S: Simd, P> {
+    simd: S,
+    channel: &'a ChannelLanes<S>,
+    pois: &'a [P],
+    values: &'a [f32],
+    agents: &'a [Agent<S>],
+    near: &'a [u64],
+}
+
+impl<S: Simd, P: PoiPosition<S>> Scene<'_, S, P> {
+    /// Returns the heading that an agent's sectors turn with.
+    #[inline(always)]
+    fn heading(&self, agent: &Agent<S>) -> [S::f32s; 2] {
+        match self.channel.shape.frame == Frame::Map as u32 {
+            true => [splat(self.simd, 1.0), splat(self.simd, 0.0)],
+            false => [agent.hx, agent.hy],
+        }
+    }
+
+    /// Returns the offset of a POI from a place.
+    #[inline(always)]
+    fn offset(&self, poi: &P, x: S::f32s, y: S::f32s) -> [S::f32s; 2] {
+        let [px, py] = poi.lanes(self.simd);
+        [px - x, py - y]
+    }
+
+    /// Returns what an entity at an offset counts.
+    #[inline(always)]
+    fn measured<const MEASURE: u32>(&self, value: f32, [dx, dy]: [S::f32s; 2]) -> (S::i32s, S::mask32s) {
+        sense::measured::<S>(self.channel, const { Measure::of(MEASURE) }, splat(self.simd, value), dx, dy)
+    }
+
+    /// Senses by quadrants.
+    #[inline(always)]
+    fn sense_quadrants<const MEASURE: u32, const COUNTS: bool>(
+        &self,
+        observers: Range<usize>,
+        mut inputs: Inputs<'_, S>,
+    ) {
+        let &Scene { simd, channel, pois, values, agents, near } = self;
+        for observer in observers {
+            let &Agent { x, y, .. } = &agents[observer];
+            let heading = self.heading(&agents[observer]);
+            let mut quadrants = sense::Quadrants::new(simd);
+            for range in model::each(&channel.shape.ranges) {
+                if channel.shape.of_pois == 0 {
+                    neighbours::each_near(
+                        near,
+                        agents,
+                        observer,
+                        range,
+                        #[inline(always)]
+                        |_, other| {
+                            let offset = [other.x - x, other.y - y];
+                            let measured = self.measured::<MEASURE>(1.0, offset);
+                            quadrants.add::<COUNTS>(measured, offset, heading);
+                        },
+                    );
+                    continue;
+                }
+                let (fours, rest) = pois[range.clone()].as_chunks::<4>();
+                let (values, last) = values[range].as_chunks::<4>();
+                for (pois, values) in fours.iter().zip(values) {
+                    let mut four = [(S::i32s::splat(simd, 0), S::mask32s::splat(simd, false)); 4];
+                    for ((to, poi), &value) in four.iter_mut().zip(pois).zip(values) {
+                        *to = self.measured::<MEASURE>(value, self.offset(poi, x, y));
+                    }
+                    for (&measured, poi) in four.iter().zip(pois) {
+                        quadrants.add::<COUNTS>(measured, self.offset(poi, x, y), heading);
+                    }
+                }
+                for (poi, &value) in rest.iter().zip(last) {
+                    let offset = self.offset(poi, x, y);
+                    quadrants.add::<COUNTS>(self.measured::<MEASURE>(value, offset), offset, heading);
+                }
+            }
+            quadrants.write(channel, inputs.of(observer, channel));
+        }
+    }
+
+    /// Senses by any number of sectors.
+    #[inline(always)]
+    fn sense_sectors(&self, observers: Range<usize>, mut inputs: Inputs<'_, S>) {
+        let &Scene { simd, channel, pois, values, agents, near } = self;
+        let measure = Measure::of(channel.shape.measure);
+        for observer in observers {
+            let &Agent { x, y, .. } = &agents[observer];
+            let heading = self.heading(&agents[observer]);
+            let mut sectors = sense::Sectors::new(simd, Combine::of(channel.shape.combine));
+            for range in model::each(&channel.shape.ranges) {
+                if channel.shape.of_pois == 0 {
+                    neighbours::each_near(
+                        near,
+                        agents,
+                        observer,
+                        range,
+                        #[inline(always)]
+                        |_, other| {
+                            let offset = [other.x - x, other.y - y];
+                            let one = splat(simd, 1.0);
+                            let measured = sense::measured::<S>(channel, measure, one, offset[0], offset[1]);
+                            sectors.add(channel, measured, offset, heading);
+                        },
+                    );
+                    continue;
+                }
+                for (poi, &value) in pois[range.clone()].iter().zip(&values[range]) {
+                    let offset = self.offset(poi, x, y);
+                    let measured = sense::measured::<S>(channel, measure, splat(simd, value), offset[0], offset[1]);
+                    sectors.add(channel, measured, offset, heading);
+                }
+            }
+            sectors.write(channel, inputs.of(observer, channel));
+        }
+    }
+}
+
+/// [`Scene::sense_quadrants`] with the measure as a constant.
+struct Quartering<'a, 'b, S: Simd, P> {
+    scene: Scene<'a, S, P>,
+    observers: Range<usize>,
+    inputs: Inputs<'b, S>,
+}
+
+impl<S: Simd, P: PoiPosition<S>> ConstDispatch for Quartering<'_, '_, S, P> {
     type Output = ();
 
     #[inline(always)]
-    fn with<const DENSITY: u32>(self) {
-        self.block.sense_by::<P, DENSITY>(self.pois);
+    fn with<const MEASURE: u32>(self) {
+        match self.scene.channel.shape.counts != 0 {
+            true => self.scene.sense_quadrants::<MEASURE, true>(self.observers, self.inputs),
+            false => self.scene.sense_quadrants::<MEASURE, false>(self.observers, self.inputs),
+        }
+    }
+}
+
+/// Terms of a rule that count the same agents and add the same quantity, the first of them with this index.
+struct Attraction<'a, S: Simd> {
+    class: &'a ClassLanes<S>,
+    terms: &'a [follow::TermLanes<S>],
+    first: usize,
+    agents: &'a [Agent<S>],
+    headings: &'a [[S::f32s; 2]],
+    near: &'a [u64],
+}
+
+impl<S: Simd> Attraction<'_, S> {
+    /// Computes the sums of so many terms for the agents of `own`.
+    #[inline(always)]
+    fn add<const TERMS: usize>(&self, own: Range<usize>, followers: &mut [Follower<S>]) {
+        match self.terms[0].shape.aligns != 0 {
+            true => self.add_quantity::<TERMS, true>(own, followers),
+            false => self.add_quantity::<TERMS, false>(own, followers),
+        }
+    }
+
+    #[inline(always)]
+    fn add_quantity<const TERMS: usize, const ALIGNS: bool>(&self, own: Range<usize>, followers: &mut [Follower<S>]) {
+        let &Attraction { class, terms, first, agents, headings, near } = self;
+        let rule = &class.constants.rule;
+        let terms: &[follow::TermLanes<S>; TERMS] = terms.as_array().expect("the caller counts the terms");
+        for (index, follower) in own.zip(followers) {
+            let &Agent { x, y, .. } = &agents[index];
+            let mut sums = [Sum::new(x.token()); TERMS];
+            for range in model::each(&terms[0].shape.ranges) {
+                neighbours::each_near(
+                    near,
+                    agents,
+                    index,
+                    range,
+                    #[inline(always)]
+                    |index, other| {
+                        let (dx, dy) = (other.x - x, other.y - y);
+                        let d2 = dx * dx + dy * dy;
+                        let quantity = match ALIGNS {
+                            true => headings[index].map(|part| on_lattice::<S>(part, rule.heading_base)),
+                            false => [dx, dy].map(|part| on_lattice::<S>(part, rule.offset_base)),
+                        };
+                        for (sum, term) in sums.iter_mut().zip(terms) {
+                            sum.add(term, d2, quantity);
+                        }
+                    },
+                );
+            }
+            follower.sums[first..first + TERMS].copy_from_slice(&sums);
+        }
     }
 }
 
@@ -272,26 +522,17 @@ impl<S: Simd, P: PoiPosition<S>> ConstDispatch for Sensing<'_, S, P> {
 /// they are short.
 #[inline(always)]
 fn steer<S: Simd, const BY_SINE: bool>(
-    world: &Lanes<S>,
+    motion: &motion::MotionLanes<S>,
     agents: &mut [Agent<S>],
     followers: &mut [Follower<S>],
     wanted: &mut [S::f32s],
 ) {
-    for (agent, follower) in agents.iter().zip(&mut *followers) {
-        follower.force = follow::force::<S>(world, &follower.sums, agent.x, agent.y);
-    }
     for follower in &mut *followers {
         follower.sizes = follow::sizes::<S>(&follower.force);
     }
     for ((agent, wanted), follower) in agents.iter_mut().zip(wanted).zip(followers) {
         let &mut Agent { hx, hy, speed, .. } = agent;
         let &mut Follower { force, sizes, .. } = follower;
-        (agent.hx, agent.hy, *wanted) = follow::steer::<S, BY_SINE>(world, &force, sizes, hx, hy, speed);
+        (agent.hx, agent.hy, *wanted) = follow::steer::<S, BY_SINE>(motion, &force, sizes, hx, hy, speed);
     }
-}
-
-/// Returns the density that an entity at offset (`dx`, `dy`) adds to its quadrant, in lattice distances: 0 out of range.
-#[inline(always)]
-fn sensed<S: Simd, const DENSITY: u32>(world: &Lanes<S>, range2: S::f32s, dx: S::f32s, dy: S::f32s) -> S::i32s {
-    sense::density::<S, DENSITY>(world, dx, dy) & within::<S>(dx, dy, range2).to_vector()
 }

@@ -9,6 +9,7 @@ use super::network::Network;
 use super::pois::{load_pois, with_pois};
 use crate::config::Fitness;
 use crate::credit::{Episode, LaneCredit, Seen, Strided};
+use crate::model::class::Class;
 use crate::world::World;
 
 /// Follows the episodes of one vector of teams. By default nothing is done.
@@ -29,6 +30,7 @@ pub(super) trait Observer<S: Simd> {
 
 /// Whole episodes of one vector of teams: their state, policies and record.
 pub(super) struct EpisodeBlock<S: Simd> {
+    classes: Vec<Class>,
     block: Block<S>,
     network: Network<S>,
     /// The group and team of each lane.
@@ -51,6 +53,7 @@ pub(super) fn sight_words(world: &World, sighted: bool) -> usize {
 impl<S: Simd> EpisodeBlock<S> {
     pub(super) fn new(simd: S, world: &World, sighted: bool) -> EpisodeBlock<S> {
         EpisodeBlock {
+            classes: world.classes.clone(),
             block: Block::new(simd, world),
             network: Network::new(simd, &world.constants.policy, world.leaders()),
             places: Vec::with_capacity(S::f32s::LEN),
@@ -64,7 +67,10 @@ impl<S: Simd> EpisodeBlock<S> {
 
     /// Reports whether it has the sizes and constants of a world and its record.
     pub(super) fn fits(&self, world: &World, sighted: bool) -> bool {
-        self.block.world.constants == world.constants && self.sights.len() == sight_words(world, sighted) * S::f32s::LEN
+        bytemuck::cast_slice::<_, u8>(&self.classes) == bytemuck::cast_slice::<_, u8>(&world.classes)
+            && self.block.world.constants == world.constants
+            && [&self.block.radii2, &self.block.values] == [&world.radii2, &world.values]
+            && self.sights.len() == sight_words(world, sighted) * S::f32s::LEN
     }
 
     /// Puts teams at their start, see [`EpisodeBlock::play`].

@@ -7,11 +7,11 @@ use super::transpose::transpose_rows;
 use crate::kernels::splat;
 use crate::model::policy::PolicyConstants;
 use crate::parallel::*;
-use crate::world::{INPUTS, OUTPUTS};
+use crate::world::OUTPUTS;
 
 /// Computes the outputs of policies for given inputs, with the bits of an episode.
 ///
-/// `weights` are `[policies][parameters]`, each 0 or of size 2^-30 to 2^20. `inputs` are `[rows][8]`. Row `i` is answered
+/// `weights` are `[policies][parameters]`, each 0 or of size 2^-30 to 2^20. `inputs` are `[rows][inputs]`. Row `i` is answered
 /// by policy `of(i)`. Writes `outputs`, `[rows][2]`.
 ///
 /// # Panics
@@ -23,7 +23,7 @@ pub fn forward(
     of: &(impl Fn(usize) -> usize + Sync),
     outputs: &mut [f32],
 ) {
-    assert_eq!(inputs.len() / INPUTS, outputs.len() / OUTPUTS);
+    assert_eq!(inputs.len() / policy.inputs(), outputs.len() / OUTPUTS);
     dispatch!(Level::new(), simd => forward_rows(simd, policy, weights, inputs, of, outputs));
 }
 
@@ -39,25 +39,25 @@ fn forward_rows<S: Simd>(
     outputs: &mut [f32],
 ) {
     outputs.par_chunks_mut(ROWS_PER_TASK * OUTPUTS).enumerate().for_each(|(part, outputs)| {
-        let (width, parameters) = (S::f32s::LEN, policy.parameters as usize);
+        let (width, size, parameters) = (S::f32s::LEN, policy.inputs(), policy.parameters as usize);
         let mut network = Network::new(simd, policy, 1);
-        let mut loaded = None;
+        let (mut loaded, mut sensed) = (None, vec![splat(simd, 0.0); size]);
         let zero = splat(simd, 0.0);
         for (chunk, outputs) in outputs.chunks_mut(width * OUTPUTS).enumerate() {
             let (first, rows) = (part * ROWS_PER_TASK + chunk * width, outputs.len() / OUTPUTS);
             let row = |lane: usize| first + if lane < rows { lane } else { 0 };
-            let mut sensed = [[zero; INPUTS]];
+            sensed.fill(zero);
             let mut answers = [[zero; OUTPUTS]];
             simd.vectorize(
                 #[inline(always)]
                 || {
                     for quad in (0..width).step_by(4) {
-                        let rows = [0, 1, 2, 3].map(|lane| &inputs[row(quad + lane) * INPUTS..][..INPUTS]);
+                        let rows = [0, 1, 2, 3].map(|lane| &inputs[row(quad + lane) * size..][..size]);
                         transpose_rows(
                             simd,
                             rows,
                             #[inline(always)]
-                            |column, lanes| sensed[0][column].as_mut_slice()[quad..quad + 4].copy_from_slice(lanes),
+                            |column, lanes| sensed[column].as_mut_slice()[quad..quad + 4].copy_from_slice(lanes),
                         );
                     }
                     let one = of(first);

@@ -189,11 +189,13 @@ fn trace<S: Simd>(simd: S, group: &Group<'_>) -> Trace {
     let (teams, agents, steps) = (group.team_count(), world.agents(), world.steps());
     let batch = WorldBatch::new(std::slice::from_ref(group), 0);
     let mut moments = vec![bytemuck::Zeroable::zeroed(); (steps + 1) * teams * agents];
+    let of_team = world.leaders() * world.inputs();
+    let mut inputs = vec![0.0; (steps + 1) * teams * of_team];
     let (mut sets, mut seen, mut sights) = (Vec::new(), Vec::new(), Vec::new());
     let mut episodes = EpisodeBlock::new(simd, world, batch.sighted);
     for first in (0..teams).step_by(S::f32s::LEN) {
         let lanes = S::f32s::LEN.min(teams - first);
-        let mut observer = Moments { moments: &mut moments, teams, first, lanes };
+        let mut observer = Moments { moments: &mut moments, inputs: &mut inputs, of_team, teams, first, lanes };
         simd.vectorize(
             #[inline(always)]
             || episodes.play(&batch, first, lanes, &mut observer),
@@ -205,12 +207,15 @@ fn trace<S: Simd>(simd: S, group: &Group<'_>) -> Trace {
             sights.extend(episode.sights.iter());
         }
     }
-    Trace { teams, agents, moments, sets, seen, sights }
+    Trace { teams, agents, leaders: world.leaders(), moments, inputs, sets, seen, sights }
 }
 
-/// Writes the moments of a vector of teams to those of all teams, `[steps + 1][teams][agents]`.
+/// Writes the moments of a vector of teams to those of all teams, `[steps + 1][teams][agents]`, and the inputs, of which
+/// each team has `of_team`.
 struct Moments<'a> {
     moments: &'a mut [Moment],
+    inputs: &'a mut [f32],
+    of_team: usize,
     teams: usize,
     first: usize,
     lanes: usize,
@@ -221,7 +226,10 @@ impl Moments<'_> {
         let agents = block.agents.len();
         let at = (row * self.teams + self.first) * agents;
         let moments = self.moments[at..at + self.lanes * agents].chunks_exact_mut(agents);
-        moments.enumerate().for_each(|(lane, moments)| block.moments(lane, row > 0, moments));
+        let inputs = self.inputs[(row * self.teams + self.first) * self.of_team..].chunks_exact_mut(self.of_team);
+        for (lane, (moments, inputs)) in moments.zip(inputs).enumerate() {
+            block.moments(lane, row > 0, moments, inputs);
+        }
     }
 }
 

@@ -1,31 +1,31 @@
 //! Finding agents that may be in reach of each other, in any lane.
 
+use std::ops::Range;
+
 use fearless_simd::{Simd, SimdMask, prelude::*};
 
 use super::agent::Agent;
 use crate::kernels::math::within;
 use crate::kernels::splat;
-use crate::model::Lanes;
 
-/// Marks the pairs of agents that are close enough in any lane: one may sense the other, or be attracted by it.
+/// Marks the pairs of agents that are close enough in any lane that one matters to the other. `reach2` is the largest
+/// squared distance at which others matter to each agent, `[agents]`.
 ///
 /// Writes one bit per agent to `near`, `[words][agents]`. `bounds` is scratch memory, with one element per vector of
 /// agents.
 #[inline(always)]
-pub(super) fn find_near<S: Simd>(world: &Lanes<S>, agents: &[Agent<S>], near: &mut [u64], bounds: &mut [Bounds<S>]) {
+pub(super) fn find_near<S: Simd>(reach2: &[f32], agents: &[Agent<S>], near: &mut [u64], bounds: &mut [Bounds<S>]) {
     near.fill(0);
-    let (count, leaders) = (agents.len(), world.constants.leaders as usize);
-    let drawn = world.constants.follow.attraction_radius2;
-    let sensed = world.constants.sense.agent_range2.max(drawn);
-    let reach2 = |agent: usize| if agent < leaders { sensed } else { drawn };
+    let count = agents.len();
+    let pair2 = |i: usize, j: usize| reach2[i].max(reach2[j]);
     if count > MAX_UNBOUNDED_AGENTS {
         let lanes = S::f32s::LEN;
         for (bounds, agents) in bounds.iter_mut().zip(agents.chunks(lanes)) {
             bounds.enclose(agents);
         }
+        let farthest = reach2.iter().copied().fold(0.0, f32::max);
         for (i, agent) in agents.iter().enumerate() {
-            let reach2 = reach2(i);
-            let own = bounds[i / lanes].around(i % lanes, reach2);
+            let own = bounds[i / lanes].around(i % lanes, farthest);
             for (vector, bounds) in bounds.iter().enumerate().skip(i / lanes) {
                 let first = vector * lanes;
                 let mut bits = bounds.meet(own);
@@ -37,7 +37,7 @@ pub(super) fn find_near<S: Simd>(world: &Lanes<S>, agents: &[Agent<S>], near: &m
                     let j = first + bits.trailing_zeros() as usize;
                     // Branch-free, because the branch predictor cannot guess which of the agents in overlapping boxes
                     // are in reach.
-                    let within = u64::from(meet::<S>(agent, &agents[j], reach2));
+                    let within = u64::from(meet::<S>(agent, &agents[j], pair2(i, j)));
                     row |= within << (j % 64);
                     near[i / 64 * count + j] |= within << (i % 64);
                     bits &= bits - 1;
@@ -48,10 +48,9 @@ pub(super) fn find_near<S: Simd>(world: &Lanes<S>, agents: &[Agent<S>], near: &m
     } else {
         let near = &mut near[..count];
         for (i, agent) in agents.iter().enumerate() {
-            let reach2 = reach2(i);
             let mut row = 0;
             for j in i + 1..count {
-                if meet::<S>(agent, &agents[j], reach2) {
+                if meet::<S>(agent, &agents[j], pair2(i, j)) {
                     row |= 1 << j;
                     near[j] |= 1 << i;
                 }
@@ -119,17 +118,25 @@ impl<S: Simd> Bounds<S> {
 /// With more agents than this, pairs are first tested by their bounding boxes.
 const MAX_UNBOUNDED_AGENTS: usize = 32;
 
-/// Calls `f` with the index and the state of each agent that may be in reach of this one, ascending.
+/// Calls `f` with the index and the state of each agent of `range` that may be in reach of this one, ascending.
 #[inline(always)]
-pub(super) fn each_near<T>(near: &[u64], agents: &[T], agent: usize, mut f: impl FnMut(usize, &T)) {
-    let (mut at, mut first) = (agent, 0);
-    while let Some(&near) = near.get(at) {
-        let mut bits = near;
+pub(super) fn each_near<T>(
+    near: &[u64],
+    agents: &[T],
+    agent: usize,
+    range: Range<usize>,
+    mut f: impl FnMut(usize, &T),
+) {
+    for first in (range.start / 64 * 64..range.end).step_by(64) {
+        let mut bits = near[first / 64 * agents.len() + agent];
+        bits &= u64::MAX << range.start.saturating_sub(first);
+        if range.end < first + 64 {
+            bits &= !(u64::MAX << (range.end - first));
+        }
         while bits != 0 {
             let index = first + bits.trailing_zeros() as usize;
             f(index, &agents[index]);
             bits &= bits - 1;
         }
-        (at, first) = (at + agents.len(), first + 64);
     }
 }

@@ -7,7 +7,7 @@ use super::transpose::transpose_rows;
 use crate::kernels::{math, splat};
 use crate::model::policy;
 use crate::model::policy::PolicyConstants;
-use crate::world::{INPUTS, OUTPUTS};
+use crate::world::OUTPUTS;
 
 /// The leaders' policies of one vector of teams.
 pub(super) struct Network<S: Simd> {
@@ -86,19 +86,19 @@ impl<S: Simd> Network<S> {
 
     /// Computes the leaders' outputs.
     #[inline(always)]
-    pub(super) fn decide(&mut self, inputs: &[[S::f32s; INPUTS]], outputs: &mut [[S::f32s; OUTPUTS]]) {
+    pub(super) fn decide(&mut self, inputs: &[S::f32s], outputs: &mut [[S::f32s; OUTPUTS]]) {
         let Network { weights, hidden, leaders, constants, .. } = self;
         let (leaders, &mut PolicyConstants { layers, widths, parameters }) = (*leaders, constants);
         let mut first = 0;
         let [mut to, mut from] = hidden.each_mut().map(|units| &mut units[..]);
         for (layer, widths) in widths[..=layers as usize].windows(2).enumerate() {
             let [rows, columns] = [widths[0] as usize, widths[1] as usize];
-            let inputs = if layer == 0 { inputs.as_flattened() } else { &*from };
+            let inputs = if layer == 0 { inputs } else { &*from };
             let units = &mut to[..leaders * columns];
             let weights = (0..leaders).map(|leader| &weights[leader * parameters as usize + first..]);
             match (rows, columns) {
                 // The paper's network, with constant sizes.
-                (INPUTS, 10) => affine_layer::<S, INPUTS, 10>(inputs, units, weights),
+                (8, 10) => affine_layer::<S, 8, 10>(inputs, units, weights),
                 (10, OUTPUTS) => affine_layer::<S, 10, OUTPUTS>(inputs, units, weights),
                 _ => {
                     let leaders = inputs.chunks_exact(rows).zip(units.chunks_exact_mut(columns));
@@ -131,7 +131,9 @@ impl<S: Simd> Network<S> {
         if widths[layers as usize] as usize == OUTPUTS {
             return outputs.copy_from_slice(&from.as_chunks::<OUTPUTS>().0[..leaders]);
         }
-        for ((answer, inputs), wanted) in outputs.iter_mut().zip(inputs).zip(from.as_chunks().0) {
+        for ((answer, inputs), wanted) in
+            outputs.iter_mut().zip(inputs.chunks_exact(widths[0] as usize)).zip(from.as_chunks().0)
+        {
             *answer = policy::choose::<S>(inputs, wanted);
         }
     }

@@ -12,7 +12,7 @@ use crate::credit;
 use crate::evolve::{self, Key};
 use crate::kernels::{clamp_to, splat};
 use crate::parallel::*;
-use crate::world::{INPUTS, OUTPUTS, World};
+use crate::world::{OUTPUTS, World};
 
 /// Arrays for every step of every team. Empty arrays are not written.
 ///
@@ -26,7 +26,7 @@ pub struct StepArrays<'a> {
     pub headings: &'a mut [f32],
     /// `[teams][steps + 1][agents]`, in units per second.
     pub speeds: &'a mut [f32],
-    /// Inputs of the leaders, `[teams][steps][leaders][8]`.
+    /// Inputs of the leaders, `[teams][steps][leaders][inputs]`.
     pub inputs: &'a mut [f32],
     /// Outputs of their policies, `[teams][steps][leaders][2]`.
     pub outputs: &'a mut [f32],
@@ -41,7 +41,7 @@ pub struct StepArrays<'a> {
 /// Numbers that one team has in each of [`StepArrays`], in their order, with so many states and steps.
 pub(crate) fn step_sizes(world: &World, states: usize, steps: usize) -> [usize; 8] {
     let (states, leaders) = (states * world.agents(), steps * world.leaders());
-    let (inputs, outputs, sets) = (leaders * INPUTS, leaders * OUTPUTS, steps * world.words_per_step());
+    let (inputs, outputs, sets) = (leaders * world.inputs(), leaders * OUTPUTS, steps * world.words_per_step());
     [states * 2, states * 2, states, inputs, outputs, outputs, sets, world.pois.len()]
 }
 
@@ -117,7 +117,7 @@ impl StepArrays<'_> {
     /// Writes what the leaders sense.
     #[inline(always)]
     pub(crate) fn write_inputs<S: Simd>(&mut self, block: &Block<S>, row: (usize, usize)) {
-        write_columns(block.simd, block.inputs.as_flattened(), row, self.inputs);
+        write_columns(block.simd, &block.inputs, row, self.inputs);
     }
 
     /// Writes the agents at each POI, `[pois][words][lanes]`.

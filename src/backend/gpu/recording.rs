@@ -37,8 +37,10 @@ pub enum Buffer {
     Weights,
     /// The record of a batch.
     Record,
-    /// The moments of a trace.
-    Moments,
+    /// The moments and inputs of a trace.
+    Traced,
+    /// The classes of a batch's worlds.
+    Classes,
     /// The agents' states between two dispatches.
     States,
     /// The minimum sizes of packed sets.

@@ -1,21 +1,25 @@
 //! Kernels of episodes: what each is compiled for, and how teams are packed into its workgroups.
 
 use std::cmp::Reverse;
-use std::collections::{BTreeMap, HashSet};
+use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::fmt;
+use std::sync::Mutex;
 
 use glam::Vec2;
 
 use crate::backend::Group;
 use crate::config::MAX_HIDDEN_LAYERS;
+use crate::model::Constants;
+use crate::model::class::{Class, ClassShape};
+use crate::model::follow::TermShape;
 use crate::model::policy::{Actions, PolicyConstants};
-use crate::model::{Constants, Variant};
+use crate::model::sense::ChannelShape;
+use crate::parallel::lock;
 use crate::world::World;
 
 /// Maximum bytes of a buffer, because offsets are u32 words.
 pub(super) const MAX_OFFSET: u64 = 1 << 33;
-/// Threads of a warp on most GPUs. Leaders and followers start at multiples of it, so that they rarely share a
-/// warp.
+/// Threads of a warp on most GPUs. Classes start at multiples of it, so that two rarely share a warp.
 pub(super) const ROLE: usize = 32;
 /// Workgroup sizes that the generic kernel may have. Every WebGPU device allows them.
 pub(super) const WORKGROUPS: [usize; 3] = [64, 128, 256];
@@ -80,11 +84,40 @@ impl Recorded {
 /// The sizes that a kernel is compiled for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Sizes {
-    /// The widest layer, inputs included and rounded up to save compilations, and whether the outputs choose a
-    /// behaviour.
-    Any { widest: usize, chooses: bool },
+    /// The widest layer, inputs included and rounded up to save compilations, whether the outputs choose a behaviour,
+    /// and whether any rule aligns headings.
+    Any { widest: usize, chooses: bool, aligns: bool },
     /// Everything that the code depends on.
-    Fixed { teams: usize, leaders: u32, agents: u32, pois: u32, widths: [u32; WIDTHS], variant: Variant },
+    Fixed { teams: usize, leaders: u32, agents: u32, pois: u32, widths: [u32; WIDTHS], kinds: &'static [ClassKind] },
+}
+
+/// The shapes of a class, its channels and its terms.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct ClassKind {
+    pub(super) shape: ClassShape,
+    pub(super) channels: Vec<ChannelShape>,
+    pub(super) terms: Vec<TermShape>,
+}
+
+impl ClassKind {
+    /// Returns the kinds of all classes of a world. Each list is kept for as long as the process runs, so that a [`Shape`]
+    /// is small.
+    fn of(world: &World) -> &'static [ClassKind] {
+        static KEPT: Mutex<BTreeSet<&'static [ClassKind]>> = Mutex::new(BTreeSet::new());
+        let kind = |class: &Class| ClassKind {
+            shape: class.constants.shape,
+            channels: class.channels().iter().map(|channel| channel.shape).collect(),
+            terms: class.terms().iter().map(|term| term.shape).collect(),
+        };
+        let kinds: Vec<ClassKind> = world.classes.iter().map(kind).collect();
+        let mut kept = lock(&KEPT);
+        if let Some(kinds) = kept.get(&kinds[..]) {
+            return kinds;
+        }
+        let kinds: &'static [ClassKind] = kinds.leak();
+        kept.insert(kinds);
+        kinds
+    }
 }
 
 pub(super) const WIDTHS: usize = MAX_HIDDEN_LAYERS + 2;
@@ -99,17 +132,16 @@ impl Shape {
     pub(super) fn generic(world: &World, capacity: Capacity, records: Recorded) -> (Shape, Workgroup) {
         let (workgroup, policy) = (Workgroup::generic(world, capacity.workgroup), &world.constants.policy);
         let chooses = policy.actions() == Some(Actions::Behaviours);
-        let sizes = Sizes::Any { widest: policy.widest().next_power_of_two(), chooses };
+        let sizes = Sizes::Any { widest: policy.widest().next_power_of_two(), chooses, aligns: world.aligns() };
         (Shape { workgroup: workgroup.threads, slots: workgroup.slots, records, sizes }, workgroup)
     }
 
     /// Returns the kernel that plays worlds of these sizes only, if one is possible.
     pub(super) fn specialised(world: &World, capacity: Capacity, records: Recorded) -> Option<(Shape, Workgroup)> {
         let workgroup = Workgroup::specialised(world, capacity)?;
-        let Constants { leaders, followers, pois, variant, policy: PolicyConstants { widths, .. }, .. } =
-            world.constants;
-        let sizes =
-            Sizes::Fixed { teams: workgroup.teams, leaders, agents: leaders + followers, pois, widths, variant };
+        let Constants { leaders, followers, pois, policy: PolicyConstants { widths, .. }, .. } = world.constants;
+        let (teams, agents, kinds) = (workgroup.teams, leaders + followers, ClassKind::of(world));
+        let sizes = Sizes::Fixed { teams, leaders, agents, pois, widths, kinds };
         Some((Shape { workgroup: workgroup.threads, slots: workgroup.slots, records, sizes }, workgroup))
     }
 }
@@ -149,9 +181,10 @@ pub(super) struct Workgroup {
     pub(super) teams: usize,
 }
 
-/// Returns the threads that `teams` teams need.
+/// Returns the threads that `teams` teams need: each class starts at a multiple of [`ROLE`].
 fn threads_needed(world: &World, teams: usize) -> usize {
-    (teams * world.leaders()).next_multiple_of(ROLE) + teams * world.followers()
+    let add = |threads: usize, class: &Class| threads.next_multiple_of(ROLE) + teams * class.agents().len();
+    world.classes.iter().fold(0, add)
 }
 
 impl Workgroup {

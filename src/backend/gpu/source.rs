@@ -4,14 +4,17 @@ use std::collections::HashSet;
 use std::fmt::Write;
 
 use super::exact;
-use super::shape::{ROLE, Recorded, Shape, Sizes, TEAMS, WIDTHS, WORKGROUPS};
-use crate::backend::{Moment, VECTOR};
-use crate::config::MAX_AGENTS;
+use super::shape::{Capacity, ClassKind, MAX_THREADS, ROLE, Recorded, Shape, Sizes, TEAMS, WIDTHS, WORKGROUPS};
+use crate::backend::{MOMENT_WORDS, VECTOR};
+use crate::config::{Config, MAX_AGENTS, MAX_SECTORS, Policy};
 use crate::evolve::{MAX_WEIGHT, MIN_WEIGHT, UNCHANGED};
 use crate::gpu_struct::{GpuStruct, gpu_constants, gpu_struct};
+use crate::model;
+use crate::model::class::{ClassConstants, ClassShape};
+use crate::model::follow::TermShape;
 use crate::model::policy::Actions;
-use crate::model::{self, Variant};
-use crate::world::{INPUTS, OUTPUTS};
+use crate::model::sense::ChannelShape;
+use crate::world::{OUTPUTS, World};
 
 /// Maximum leaders whose sightings a follower counts in registers.
 const MAX_COUNTED_LEADERS: usize = 8;
@@ -42,8 +45,8 @@ gpu_struct! {
         pub sets: u32,
         /// The offset of the numbers of steps at which followers saw leaders.
         pub counts: u32,
-        /// The offset of a trace's moments.
-        pub moments: u32,
+        /// The offset of a trace.
+        pub traced: u32,
         /// The offset of the agents' states between two dispatches.
         pub states: u32,
         /// The number of teams.
@@ -187,7 +190,7 @@ impl Pipeline {
             Pipeline::Breed => &[Read, Read, Read, Write, Write],
             Pipeline::Gather => &[Read, Read, Read, Write, Read, Read, Read],
             Pipeline::Pack => &[Read, Read, Read, Write, Write],
-            Pipeline::Episode(_) => &[Read, Read, Read, Read, Write, Write, Write],
+            Pipeline::Episode(_) => &[Read, Read, Read, Read, Write, Write, Write, Read],
         }
     }
 
@@ -219,18 +222,19 @@ impl Pipeline {
 
 /// Returns the structs of episodes and records.
 fn declarations() -> String {
-    [model::declarations(), Task::wgsl(), State::wgsl(), Moment::wgsl()].concat()
+    [model::declarations(), Task::wgsl(), State::wgsl()].concat()
 }
 
 /// Returns the episode's shader for a shape.
 fn episode(shape: Shape) -> String {
     let Shape { workgroup, slots, records: Recorded { trace, sightings }, sizes } = shape;
-    let (shared, in_registers, counted) = match sizes {
+    let (shared, in_registers, counted, aligns) = match sizes {
         // The agents of one large team, or of several small ones.
-        Sizes::Any { .. } => ((workgroup * slots).min(MAX_AGENTS), false, 1),
-        Sizes::Fixed { teams, leaders, agents, .. } => {
+        Sizes::Any { aligns, .. } => ((workgroup * slots).min(MAX_AGENTS), false, 1, aligns),
+        Sizes::Fixed { teams, leaders, agents, kinds, .. } => {
             let in_registers = leaders < agents && leaders as usize <= MAX_COUNTED_LEADERS;
-            (teams * agents as usize, in_registers, if in_registers { leaders } else { 1 })
+            let aligns = kinds.iter().flat_map(|kind| &kind.terms).any(|term| term.aligns != 0);
+            (teams * agents as usize, in_registers, if in_registers { leaders } else { 1 }, aligns)
         }
     };
     let constants = gpu_constants!(
@@ -242,28 +246,85 @@ fn episode(shape: Shape) -> String {
         SIGHTINGS = sightings,
         COUNTS_IN_REGISTERS = in_registers,
         COUNTED_LEADERS = counted,
+        ALIGNS = aligns,
+        MAX_SECTORS,
+        MOMENT_WORDS,
+    );
+    let own = format!(
+        "fn class_constants(class_number: u32) -> ClassConstants {{ return {}; }}\n",
+        ClassConstants::copied_from("classes[class_number]")
     );
     let front = match sizes {
-        Sizes::Any { widest, chooses } => {
-            let variant = Variant::copied_from("world");
-            let generic = include_str!("../../../shaders/generic.wgsl");
+        Sizes::Any { widest, chooses, .. } => [
+            gpu_constants!(INPUTS = widest, CHOOSES = chooses),
+            getter("shape_of", "class_number: u32", &ClassShape::copied_from("classes[class_number]"), "ClassShape"),
+            getter(
+                "channel_of",
+                "class_number: u32, index: u32",
+                &ChannelShape::copied_from("classes[class_number].channels[index]"),
+                "ChannelShape",
+            ),
+            getter(
+                "term_of",
+                "class_number: u32, index: u32",
+                &TermShape::copied_from("classes[class_number].terms[index]"),
+                "TermShape",
+            ),
+            include_str!("../../../shaders/generic.wgsl").into(),
+        ]
+        .concat(),
+        Sizes::Fixed { teams, leaders, agents, pois, widths, kinds } => {
+            let (words, classes, inputs) = (agents.div_ceil(32), kinds.len(), widths[0]);
             format!(
-                "{}fn world_variant() -> Variant {{ return {variant}; }}\n{generic}",
-                gpu_constants!(WIDEST = widest, CHOOSES = chooses)
+                "{}const shape = Shape({leaders}u, {agents}u, {pois}u, {words}u, {classes}u, {inputs}u, {teams}u);\n\
+                 fn set_shape(task: Task) {{}}\n{}{}",
+                gpu_constants!(INPUTS = inputs),
+                straight_classes(kinds),
+                straight_policy(&widths)
             )
         }
-        Sizes::Fixed { teams, leaders, agents, pois, widths, variant } => format!(
-            "const shape = Shape({leaders}u, {agents}u, {pois}u, {words}u, {teams}u);\nconst variant = {variant};\n\
-             fn set_shape(task: Task) {{}}\n{}",
-            straight_policy(&widths),
-            words = agents.div_ceil(32),
-            variant = variant.value()
-        ),
     };
     let structs = declarations();
     let libraries = [include_str!("../../../shaders/lib/layout.wgsl"), include_str!("../../../shaders/lib/math.wgsl")];
-    let parts = [&*constants, &front, &structs].into_iter().chain(libraries).chain(model::WGSL);
+    let parts = [&*constants, &front, &own, &structs].into_iter().chain(libraries).chain(model::WGSL);
     exact::assemble(&parts.chain([include_str!("../../../shaders/episode.wgsl")]).collect::<Vec<_>>())
+}
+
+/// Returns a function that returns an expression.
+fn getter(name: &str, parameters: &str, expression: &str, kind: &str) -> String {
+    format!("fn {name}({parameters}) -> {kind} {{ return {expression}; }}\n")
+}
+
+/// Returns the functions of `shaders/generic.wgsl` that depend on the classes, with their loops unrolled and all shapes as
+/// constants.
+fn straight_classes(kinds: &[ClassKind]) -> String {
+    let mut text = String::from("fn class_shape(index: u32) -> ClassShape {\n");
+    let (last, others) = kinds.split_last().expect("a world has a class");
+    for (index, kind) in others.iter().enumerate() {
+        text += &format!("    if index == {index}u {{ return {}; }}\n", kind.shape.literal());
+    }
+    text += &format!("    return {};\n}}\n", last.shape.literal());
+    let parameters = "task: Task, first: u32, me: ptr<function, Agent>";
+    text += &format!("fn sense_all({parameters}, inputs: ptr<function, array<f32, INPUTS>>) {{\n");
+    for (class, kind) in kinds.iter().enumerate().filter(|(_, kind)| !kind.channels.is_empty()) {
+        text += &format!("    if (*me).class_index == {class}u {{\n");
+        for (index, channel) in kind.channels.iter().enumerate() {
+            text += &format!("        sense_channel(task, first, {}, {index}u, me, inputs);\n", channel.literal());
+        }
+        text += "    }\n";
+    }
+    text += &format!("}}\nfn obey_all({parameters}, force: ptr<function, SteeringForce>) {{\n");
+    for (class, kind) in kinds.iter().enumerate().filter(|(_, kind)| !kind.terms.is_empty()) {
+        text += &format!("    if (*me).class_index == {class}u {{\n");
+        let mut index = 0;
+        for terms in kind.terms.chunk_by(|a, b| a == b).flat_map(|terms| terms.chunks(2)) {
+            let (term, pair) = (terms[0].literal(), terms.len() == 2);
+            text += &format!("        obey_terms(task, first, {term}, {index}u, {pair}, me, force);\n");
+            index += terms.len();
+        }
+        text += "    }\n";
+    }
+    text + "}\n"
 }
 
 /// Returns a policy of these widths as straight-line code: `decide` of `shaders/generic.wgsl` with its loops unrolled.
@@ -273,7 +334,7 @@ fn straight_policy(widths: &[u32; WIDTHS]) -> String {
     let mut text = String::from("fn decide(start: u32, stride: u32, inputs: array<f32, INPUTS>) -> vec2<f32> {\n");
     let mut line = |line: std::fmt::Arguments<'_>| writeln!(text, "    {line}").expect("a string takes a line");
     let mut read = HashSet::new();
-    let mut inputs: Vec<String> = (0..INPUTS).map(|input| format!("inputs[{input}]")).collect();
+    let mut inputs: Vec<String> = (0..widths[0]).map(|input| format!("inputs[{input}]")).collect();
     let mut first = 0;
     let layers = widths.windows(2).take_while(|pair| pair[1] > 0);
     for (layer, pair) in layers.enumerate() {
@@ -314,13 +375,16 @@ pub fn shaders() -> Vec<(&'static str, String)> {
     const SIGHTINGS: Recorded = Recorded { sightings: true, ..PLAIN };
     const TRACE: Recorded = Recorded { trace: true, sightings: true };
     let generic = |workgroup, slots, widest, records: Recorded| {
-        Pipeline::Episode(Shape { workgroup, slots, records, sizes: Sizes::Any { widest, chooses: records.trace } })
+        let sizes = Sizes::Any { widest, chooses: records.trace, aligns: records.trace };
+        Pipeline::Episode(Shape { workgroup, slots, records, sizes })
     };
     let specialised = |records, actions: Actions| {
-        let widths = [INPUTS as u32, 10, actions.outputs() as u32, 0, 0];
-        let variant = Variant { density: 0, by_sine: 1 };
-        let sizes = Sizes::Fixed { teams: 32, leaders: 4, agents: 12, pois: 4, widths, variant };
-        Pipeline::Episode(Shape { workgroup: 384, slots: 1, records, sizes })
+        let text = include_str!("../../../configs/generally_forward.toml");
+        let config = Config::parse(text, "generally_forward.toml").expect("the project's own config");
+        let config = Config { policy: Policy { actions, ..config.policy }, ..config };
+        let world = World::new(&config.validate().expect("the project's own config"));
+        let shape = Shape::specialised(&world, Capacity::of_workgroups(MAX_THREADS), records);
+        Pipeline::Episode(shape.expect("the paper's layouts have specialised kernels").0)
     };
     let all = [
         ("probe", Pipeline::Probe),

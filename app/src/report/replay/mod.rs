@@ -475,7 +475,7 @@ pub fn one(group: &Group<'_>, backend: &mut dyn Backend) -> Result<Replayed, Bac
 /// Counts the observers in a set.
 fn near(world: &World, sets: &Strided<'_>, set: usize) -> u32 {
     let words = world.constants.words as usize;
-    world.rule.count((set * words..(set + 1) * words).map(|word| sets.get(word)))
+    world.rule.count(set % world.pois.len(), (set * words..(set + 1) * words).map(|word| sets.get(word)))
 }
 
 /// An episode without some agents: the same motion, and what the others observe.

@@ -10,7 +10,7 @@ use crate::report::map::{GROUPS, GROUPS_DARK};
 use crate::report::scene::hex;
 use flotilla::config::Config;
 use flotilla::credit::{self, Strided};
-use flotilla::world::{INPUTS, OUTPUTS};
+use flotilla::world::OUTPUTS;
 
 /// Maximum number of bytes of motion in a page, before base64 adds a third. Longer motion is thinned out.
 const MOTION_BYTES: usize = 1_300_000;
@@ -43,7 +43,7 @@ pub(crate) const STAGE: &str = include_str!("../stage.js");
 
 /// Returns [`data`], and per episode D++, the senses and actions of leaders, and what the team observes without them.
 ///
-/// Per episode that adds `dpp`, `[leaders]`; `senses`, base64 of f32 `[shown][leaders][8 inputs, 2 outputs]`; and
+/// Per episode that adds `dpp`, `[leaders]`; `senses`, base64 of f32 `[shown][leaders][inputs, 2 outputs]`; and
 /// `without`, `[leaders]`. Its entries `alone` and `group` (with the followers that the leader led) have `observed` and
 /// `near` like the episode. Very long episodes have neither of the last two.
 pub fn detailed(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Value {
@@ -53,11 +53,12 @@ pub fn detailed(name: &str, config: &Config, played: &[Replayed]) -> serde_json:
             episode["shown"].as_array().into_iter().flatten().flat_map(|step| Some(step.as_u64()? as usize)).collect();
         let (leaders, pois) = (played.world.leaders(), played.world.pois.len());
         episode["dpp"] = json!(played.scores.dpp);
-        if shown.len() * leaders * (INPUTS + OUTPUTS) * size_of::<f32>() <= DETAIL_BYTES {
+        if shown.len() * leaders * (played.world.inputs() + OUTPUTS) * size_of::<f32>() <= DETAIL_BYTES {
             let moments = shown.iter().flat_map(|&step| (0..leaders).map(move |leader| (step, leader)));
             let senses = moments.flat_map(|(step, leader)| {
-                let moment = played.trace.moment(step, 0, leader);
-                moment.inputs.iter().chain(&moment.outputs).flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>()
+                let inputs = played.trace.inputs_of(step, 0, leader).iter();
+                let outputs = &played.trace.moment(step, 0, leader).outputs;
+                inputs.chain(outputs).flat_map(|value| value.to_le_bytes()).collect::<Vec<u8>>()
             });
             episode["senses"] = BASE64_STANDARD.encode(senses.collect::<Vec<u8>>()).into();
         }

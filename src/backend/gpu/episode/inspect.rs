@@ -27,9 +27,9 @@ pub struct WorkgroupBuffers {
     pub threads: usize,
     /// Teams that it plays.
     pub teams: usize,
-    /// The words of each binding: the guard (empty), worlds, tasks, positions, weights; and the outputs record, moments
-    /// (empty) and states.
-    pub buffers: [Vec<u32>; 8],
+    /// The words of each binding: the guard (empty), worlds, tasks, positions, weights; the outputs record, trace
+    /// (empty) and states; and the classes.
+    pub buffers: [Vec<u32>; 9],
 }
 
 /// Returns the workgroup that plays a group's first teams in one dispatch, with policies on the host. It writes the
@@ -64,6 +64,7 @@ pub fn workgroup_of(group: &Group<'_>, kernel: Kernel, threads: usize) -> Result
             vec![0; task.status as usize + 1],
             Vec::new(),
             vec![0; agents * size_of::<State>() / 4],
+            words(bytemuck::cast_slice(&batch.classes)),
         ],
     })
 }

@@ -25,8 +25,8 @@ use super::shape::{Capacity, MAX_OFFSET, specialised_shapes};
 use super::source::{NOWHERE, Pipeline, Task};
 use crate::backend::scores::ScoreTable;
 use crate::backend::{
-    BATCH_BYTES, Backend, BackendError, DevicePopulation, Group, GroupScores, HELD_FROM, Moment, PACKED_FROM, Trace,
-    WeightVector, Weights, check_sizes,
+    BATCH_BYTES, Backend, BackendError, DevicePopulation, Group, GroupScores, HELD_FROM, MOMENT_WORDS, Moment,
+    PACKED_FROM, Trace, WeightVector, Weights, check_sizes,
 };
 use crate::credit::{Episode, Seen, Strided};
 use crate::host::Instant;
@@ -117,8 +117,8 @@ enum RecordWords<'a> {
     Packed(&'a [u32]),
 }
 
-/// Called for each task with the record and the moments of its batch.
-type Done<'a> = dyn Fn(&PlannedTask, RecordWords<'_>, &[Moment]) + Sync + 'a;
+/// Called for each task with the record and the trace of its batch.
+type Done<'a> = dyn Fn(&PlannedTask, RecordWords<'_>, &[f32]) + Sync + 'a;
 
 /// A submitted batch.
 struct Submitted<'a> {
@@ -271,7 +271,7 @@ impl GpuBackend {
         Ok(Some(population))
     }
 
-    /// Plays all tasks, and calls `done` for each with the record and the moments of its batch.
+    /// Plays all tasks, and calls `done` for each with the record and the trace of its batch.
     fn play_tasks(&mut self, groups: &[Group<'_>], trace: bool, done: &Done<'_>) -> Result<(), BackendError> {
         let (start, before, capacity) = (Instant::now(), self.gpu().traffic(), self.capacity());
         let populations = groups.iter().map(|group| self.population(group)).collect::<Result<Vec<_>, _>>()?;
@@ -385,7 +385,7 @@ impl GpuBackend {
         submitted: &Submitted<'_>,
         done: &Done<'_>,
     ) -> Result<(Option<usize>, Option<Duration>), DeviceError> {
-        let Submitted { plan, workspace, last, readback, ranges: BatchReadback { moments, packed, record }, .. } =
+        let Submitted { plan, workspace, last, readback, ranges: BatchReadback { traced, packed, record }, .. } =
             submitted;
         self.executor.read(last.clone(), &self.workspaces[*workspace], readback, |bytes| {
             let words = |range: &Range<usize>| bytemuck::cast_slice::<u8, u32>(&bytes[range.clone()]);
@@ -398,8 +398,8 @@ impl GpuBackend {
                 (_, Some(range)) => RecordWords::Whole(words(range)),
                 _ => return (used, None),
             };
-            let (start, moments) = (Instant::now(), bytemuck::cast_slice(&bytes[moments.clone()]));
-            plan.tasks.par_iter().for_each(|planned| done(planned, record, moments));
+            let (start, traced) = (Instant::now(), bytemuck::cast_slice(&bytes[traced.clone()]));
+            plan.tasks.par_iter().for_each(|planned| done(planned, record, traced));
             (used, Some(start.elapsed()))
         })
     }
@@ -450,26 +450,36 @@ impl Backend for GpuBackend {
         let world = group.world;
         let (teams, agents, steps) = (group.team_count(), world.agents(), world.steps());
         let (set_words, seen_words) = (world.set_words(), world.leaders() * world.followers());
+        let inputs = world.leaders() * world.inputs();
         let sight_words = if group.records().sights() { world.sight_words() } else { 0 };
         let trace = Mutex::new(Trace {
             teams,
             agents,
+            leaders: world.leaders(),
             moments: vec![Moment::zeroed(); (steps + 1) * teams * agents],
+            inputs: vec![0.0; (steps + 1) * teams * inputs],
             sets: vec![0; teams * set_words],
             seen: vec![0; teams * seen_words],
             sights: vec![0; teams * sight_words],
         });
-        self.play_tasks(std::slice::from_ref(group), true, &|planned, record, moments| {
+        self.play_tasks(std::slice::from_ref(group), true, &|planned, record, traced| {
             let RecordWords::Whole(record) = record else { unreachable!("no trace is packed") };
-            let Trace { moments: all_moments, sets, seen, sights, .. } = &mut *lock(&trace);
-            let Task { teams: stride, moments: first_moment, sets: first_set, counts: first_count, .. } = planned.task;
-            let [stride, first_moment, first_set, first_count] =
-                [stride, first_moment, first_set, first_count].map(|number| number as usize);
-            for step in 0..=steps {
-                let from = first_moment + step * stride * agents;
-                let to = (step * teams + planned.first_team) * agents;
-                all_moments[to..to + stride * agents].copy_from_slice(&moments[from..from + stride * agents]);
+            let all = &mut *lock(&trace);
+            let Task { teams: stride, traced: first_word, sets: first_set, counts: first_count, .. } = planned.task;
+            let [stride, first_word, first_set, first_count] =
+                [stride, first_word, first_set, first_count].map(|number| number as usize);
+            // The moments of all steps, then the inputs.
+            let mut from = &traced[first_word..];
+            let parts: [(&mut [f32], usize); 2] =
+                [(bytemuck::cast_slice_mut(&mut all.moments), agents * MOMENT_WORDS), (&mut all.inputs, inputs)];
+            for (all, size) in parts {
+                let part;
+                (part, from) = from.split_at((steps + 1) * stride * size);
+                for (step, words) in part.chunks_exact(stride * size).enumerate() {
+                    all[(step * teams + planned.first_team) * size..][..words.len()].copy_from_slice(words);
+                }
             }
+            let Trace { sets, seen, sights, .. } = all;
             // Copies words that are interleaved by team.
             let scatter = |from: usize, words: usize, all: &mut [u32]| {
                 for (word, numbers) in record[from..].chunks_exact(stride).take(words).enumerate() {

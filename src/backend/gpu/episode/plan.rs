@@ -10,10 +10,12 @@ use crate::backend::gpu::population::Held;
 use crate::backend::gpu::recording::{BINDING_ALIGNMENT, Buffer, Command, Recording, Slice, grid};
 use crate::backend::gpu::shape::{Capacity, MAX_THREADS, Recorded, Shape, WORKGROUPS, Workgroup};
 use crate::backend::gpu::source::{GatherJob, LEADERS_PER_GATHER, NOWHERE, PACK_WORKGROUP, Pipeline, State, Task};
-use crate::backend::{BackendError, Group, Moment, VECTOR, WeightVector, Weights, record_words, weight_vectors};
+use crate::backend::{BackendError, Group, MOMENT_WORDS, VECTOR, WeightVector, Weights, record_words, weight_vectors};
 use crate::credit::{RecordRequest, owner_bits};
 use crate::model::Constants;
+use crate::model::class::Class;
 use crate::model::policy::PolicyConstants;
+use crate::model::sense::ChannelConstants;
 use crate::parallel::*;
 use crate::world::World;
 
@@ -34,8 +36,20 @@ const SPARE_PACKED_WORDS: usize = 256;
 fn iterations_per_step(world: &World, workgroup: Workgroup, records: Recorded) -> usize {
     let Constants { words, policy: PolicyConstants { widths, .. }, .. } = world.constants;
     let network: u32 = widths.windows(2).map(|w| (w[0] + 2) * w[1]).sum();
-    // A leader iterates over all agents, and again over those in reach.
-    let agent = world.pois.len() + 2 * world.agents() + words as usize + network as usize + 20;
+    // Each channel iterates over all agents, again over those in reach, or over all POIs, and over sectors for each; each
+    // term over all agents.
+    let channel = |channel: &ChannelConstants| {
+        let entities = match channel.shape.of_pois {
+            0 => 2 * world.agents() + words as usize,
+            _ => world.pois.len(),
+        };
+        let sectors = channel.shape.sectors as usize;
+        if sectors == 4 { entities } else { entities * (1 + sectors) + 2 * sectors }
+    };
+    let class =
+        |class: &Class| class.channels().iter().map(channel).sum::<usize>() + class.terms().len() * world.agents();
+    let busiest = world.classes.iter().map(class).max().unwrap_or(0);
+    let agent = busiest + world.leaders() + network as usize + 20 + world.classes.len() * 4;
     let sights = if records.sightings { world.followers() * world.leader_words() } else { 0 };
     let items = |rows: usize| (rows * workgroup.teams).div_ceil(workgroup.threads);
     let items = items(world.pois.len() * words as usize) + items(sights);
@@ -54,11 +68,18 @@ pub fn state_bytes(world: &World, request: RecordRequest<'_>) -> u64 {
     let generic = Workgroup::generic(world, WORKGROUPS[2]);
     let specialised = Workgroup::specialised(world, Capacity::of_workgroups(MAX_THREADS));
     let is_parted = |workgroup| world.steps() > steps_per_dispatch(world, workgroup, recorded);
-    if is_parted(generic) || specialised.is_some_and(is_parted) {
+    if world.aligns() {
+        (2 * world.agents() * size_of::<State>()) as u64
+    } else if is_parted(generic) || specialised.is_some_and(is_parted) {
         (world.agents() * size_of::<State>()) as u64
     } else {
         0
     }
+}
+
+/// Returns the words of one step of a team's trace: moments, then inputs.
+fn traced_words(world: &World) -> usize {
+    world.agents() * MOMENT_WORDS + world.leaders() * world.inputs()
 }
 
 /// A task and where its teams come from.
@@ -112,8 +133,8 @@ struct Elements {
     record: usize,
     /// Vectors of weights.
     weights: usize,
-    /// Moments of a trace.
-    moments: usize,
+    /// Words of a trace.
+    traced: usize,
     /// States between two dispatches.
     states: usize,
 }
@@ -125,15 +146,15 @@ impl Elements {
         [
             bytes(self.record, size_of::<u32>()),
             bytes(self.weights, size_of::<WeightVector>()),
-            bytes(self.moments, size_of::<Moment>()),
+            bytes(self.traced, size_of::<f32>()),
             bytes(self.states, size_of::<State>()),
         ]
     }
 
-    /// Returns the bytes of the largest buffer. One buffer takes both records and moments to the host.
+    /// Returns the bytes of the largest buffer. One buffer takes both records and traces to the host.
     fn largest(self) -> u64 {
-        let [record, weights, moments, states] = self.bytes();
-        weights.max(states).max(record + moments)
+        let [record, weights, traced, states] = self.bytes();
+        weights.max(states).max(record + traced)
     }
 }
 
@@ -165,8 +186,12 @@ impl<'a> GroupPlan<'a> {
         let per_team = Elements {
             record: record_words(world, group.records()),
             weights: weight_vectors(world),
-            moments: if trace { (world.steps() + 1) * world.agents() } else { 0 },
-            states: if world.steps() > steps_per_dispatch { world.agents() } else { 0 },
+            traced: if trace { (world.steps() + 1) * traced_words(world) } else { 0 },
+            states: match world.aligns() {
+                true => 2 * world.agents(),
+                false if world.steps() > steps_per_dispatch => world.agents(),
+                false => 0,
+            },
         };
         let bytes_per_team = Elements { record: per_team.record + STATUS, ..per_team }.largest();
         if bytes_per_team > capacity.buffer {
@@ -194,6 +219,7 @@ impl<'a> GroupPlan<'a> {
 pub(super) struct BatchPlan {
     pub(super) tasks: Vec<PlannedTask>,
     pub(super) worlds: Vec<Constants>,
+    pub(super) classes: Vec<Class>,
     pub(super) places: Vec<Vec2>,
     /// The elements that its tasks use.
     used: Elements,
@@ -209,10 +235,11 @@ impl BatchPlan {
     fn is_full(&self, plan: &GroupPlan<'_>, teams: usize, capacity: Capacity) -> bool {
         let more = teams as u64 * plan.bytes_per_team;
         let world = plan.group.world;
-        let places = self.places.len() + plan.group.starts.len() + world.pois.len() + world.headings.len();
+        let places = self.places.len() + plan.group.starts.len() + 2 * world.pois.len() + world.headings.len();
         let of_groups = [
             places * size_of::<Vec2>(),
             (self.worlds.len() + 1) * size_of::<Constants>(),
+            (self.classes.len() + world.classes.len()) * size_of::<Class>(),
             (self.tasks.len() + 1) * size_of::<Task>(),
         ];
         self.used.largest() + more > capacity.target()
@@ -227,9 +254,11 @@ impl BatchPlan {
         if plan.group.moved_pois().is_none() {
             self.places.extend(&world.pois);
         }
-        // The shader finds headings behind the POIs.
+        // The shader finds headings behind the POIs, and then more about these.
         self.places.extend(&world.headings);
-        self.worlds.push(world.constants);
+        self.places.extend(world.radii2.iter().zip(&world.values).map(|(&radius2, &value)| Vec2::new(radius2, value)));
+        self.worlds.push(Constants { first_class: self.classes.len() as u32, ..world.constants });
+        self.classes.extend(&world.classes);
         let (pois, end) = (first + world.agents() as u32, world.constants.steps);
         Task { world: index, starts: first, pois, end, ..Task::default() }
     }
@@ -241,7 +270,7 @@ impl BatchPlan {
             weights: used.weights as u32,
             sets: used.record as u32,
             counts: (used.record + sets) as u32,
-            moments: used.moments as u32,
+            traced: used.traced as u32,
             states: used.states as u32,
             teams: teams as u32,
             status: (used.record + per_team.record * teams) as u32,
@@ -249,7 +278,7 @@ impl BatchPlan {
         };
         used.record += per_team.record * teams + STATUS;
         used.weights += per_team.weights * teams;
-        used.moments += per_team.moments * teams;
+        used.traced += per_team.traced * teams;
         used.states += per_team.states * teams;
         self.sets += sets;
         self.tasks.push(PlannedTask { first_team, task, ..plan.template });
@@ -314,18 +343,15 @@ impl BatchPlan {
     pub(super) fn record<'a>(&'a self, options: &RecordingOptions<'a>) -> (Recording<'a>, BatchReadback) {
         let &RecordingOptions { groups, held, weights: staging, trace, nonce, .. } = options;
         let mut recording = Recording::new("episodes");
-        let [record, weights, moments, states] = self.used.bytes();
+        let [record, weights, traced, states] = self.used.bytes();
         let (tasks, runs) = self.lay_out(nonce);
         let worlds = recording.input(Buffer::Worlds, &self.worlds);
         recording.input(Buffer::Tasks, tasks);
         let places = recording.input(Buffer::Places, &self.places);
-        let [weights, record, moments, states] = [
-            (Buffer::Weights, weights),
-            (Buffer::Record, record),
-            (Buffer::Moments, moments),
-            (Buffer::States, states),
-        ]
-        .map(|(buffer, bytes)| recording.buffer(buffer, bytes));
+        let classes = recording.input(Buffer::Classes, &self.classes);
+        let [weights, record, traced, states] =
+            [(Buffer::Weights, weights), (Buffer::Record, record), (Buffer::Traced, traced), (Buffer::States, states)]
+                .map(|(buffer, bytes)| recording.buffer(buffer, bytes));
         for tasks in self.tasks.chunk_by(|a, b| is_on_host(groups, a) == is_on_host(groups, b)) {
             if is_on_host(groups, &tasks[0]) {
                 let part = tasks[0].weights(groups).start..tasks[tasks.len() - 1].weights(groups).end;
@@ -363,7 +389,7 @@ impl BatchPlan {
                     packing.push(Command::Dispatch { pipeline: Pipeline::Pack, bindings, grid, iterations: 0 });
                 }
                 let bindings =
-                    [&worlds, &tasks, &places, &weights, &record, &moments, &states].map(Slice::clone).into();
+                    [&worlds, &tasks, &places, &weights, &record, &traced, &states, &classes].map(Slice::clone).into();
                 let pipeline = Pipeline::Episode(shape);
                 recording.commands.push(Command::Dispatch { pipeline, bindings, grid, iterations: work });
             }
@@ -373,14 +399,14 @@ impl BatchPlan {
         }
         recording.commands.extend(packing);
         // The record is read back last, because its status words stand for everything before it.
-        let [.., moment_bytes, _] = self.used.bytes();
-        let moments = if trace { recording.read_back(first(Buffer::Moments, moment_bytes)) } else { 0..0 };
+        let [.., traced_bytes, _] = self.used.bytes();
+        let traced = if trace { recording.read_back(first(Buffer::Traced, traced_bytes)) } else { 0..0 };
         for tasks in self.tasks.chunk_by(|a, b| a.group == b.group) {
             if let Some(held) = held[tasks[0].group] {
                 recording.read_status(Buffer::GroupStatus(tasks[0].group), &held.status);
             }
         }
-        let mut readback = BatchReadback { moments, ..BatchReadback::default() };
+        let mut readback = BatchReadback { traced, ..BatchReadback::default() };
         if let Some((room, ..)) = packed {
             // If nearly all sets are kept, packing only measures when that changes.
             let kept = if Some(room) == self.head { 0 } else { room };
@@ -533,7 +559,7 @@ pub(super) struct RecordingOptions<'a> {
 /// The places of a batch's results in [`Buffer::Readback`], in bytes.
 #[derive(Default)]
 pub(super) struct BatchReadback {
-    pub(super) moments: Range<usize>,
+    pub(super) traced: Range<usize>,
     /// The words that a packed record has room for, and what is copied of it: all of it, or only its header.
     pub(super) packed: Option<(usize, Range<usize>)>,
     /// The whole record.

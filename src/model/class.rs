@@ -1,0 +1,160 @@
+//! Classes of agents, as kernels and shaders read them: everything that agents of a class have in common.
+
+use std::ops::Range;
+
+use bytemuck::Zeroable;
+use fearless_simd::Simd;
+
+use super::follow::{RuleConstants, TermConstants};
+use super::motion::MotionConstants;
+use super::sense::{ChannelConstants, NOTHING};
+use crate::config::{AgentClass, Control, MAX_CHANNELS, MAX_CLASSES, MAX_TERMS, Mobility};
+use crate::gpu_struct::gpu_struct;
+
+gpu_struct! {
+    /// The parts of a class that kernels are specialised for.
+    #[derive(Eq, Hash, Ord, PartialOrd)]
+    pub struct ClassShape as itself {
+        /// The first of its agents.
+        pub first_agent: u32,
+        /// The agent after its last.
+        pub end_agent: u32,
+        /// A [`Control`], by its number.
+        pub control: u32,
+        /// Not 0 if it moves freely, 0 if it steers.
+        pub free: u32,
+        /// See [`MotionConstants::by_sine`].
+        pub by_sine: u32,
+        /// Channels of its senses.
+        pub channel_count: u32,
+        /// Terms of its rule.
+        pub term_count: u32,
+    }
+
+    /// Constants of a class, without its channels and terms.
+    pub struct ClassConstants as ClassConstantsLanes {
+        /// What kernels are specialised for.
+        pub shape: ClassShape,
+        /// Constants of motion.
+        pub motion: MotionConstants,
+        /// Constants of its rule.
+        pub rule: RuleConstants,
+        /// The squared distance up to which its agents lead those of each class; below 0 if they do not.
+        pub influence2: [f32; MAX_CLASSES],
+    }
+
+    /// A class.
+    pub struct Class as ClassLanes {
+        /// Its constants.
+        pub constants: ClassConstants,
+        /// The channels of its senses.
+        pub channels: [ChannelConstants; MAX_CHANNELS],
+        /// The terms of its rule.
+        pub terms: [TermConstants; MAX_TERMS],
+    }
+}
+
+impl Class {
+    /// Computes the constants of all classes of a valid config. `groups` are its POI groups by name; `values` are those
+    /// of the POIs.
+    pub(crate) fn all(
+        classes: &[AgentClass],
+        groups: &[(String, Range<usize>)],
+        values: &[f32],
+        map: [f64; 2],
+        dt: f64,
+    ) -> Vec<Class> {
+        let mut end = 0;
+        let mut place = |class: &AgentClass| {
+            end += class.at.len();
+            end - class.at.len()..end
+        };
+        let places: Vec<Range<usize>> = classes.iter().map(&mut place).collect();
+        let index = |name: &str| classes.iter().position(|class| class.name == name);
+        let of_class = |name: &str| index(name).map_or(0..0, |index| places[index].clone());
+        let of_group = |name: &str| groups.iter().find(|group| group.0 == name).map_or(0..0, |group| group.1.clone());
+        let class = |(class, place): (&AgentClass, &Range<usize>)| {
+            let mut channels = [ChannelConstants::zeroed(); MAX_CHANNELS];
+            let mut input = 0;
+            for (to, channel) in channels.iter_mut().zip(&class.senses) {
+                *to = ChannelConstants::new(channel, input, (&of_class, &of_group), values, end, map);
+                input += channel.sectors;
+            }
+            let mut terms = [TermConstants::zeroed(); MAX_TERMS];
+            let own = TermConstants::all(class, &of_class, end);
+            terms[..own.len()].copy_from_slice(&own);
+            let motion = MotionConstants::new(&class.motion, class.speed, dt);
+            let mut influence2 = [NOTHING; MAX_CLASSES];
+            for led in class.leads.iter().filter_map(|name| index(name)) {
+                let farthest = classes[led].rule.iter().map(|term| term.to).fold(0.0, f64::max);
+                let radius = class.influence_radius.unwrap_or(farthest);
+                influence2[led] = (radius * radius) as f32;
+            }
+            let shape = ClassShape {
+                first_agent: place.start as u32,
+                end_agent: place.end as u32,
+                control: class.control as u32,
+                free: matches!(class.motion, Mobility::Free { .. }).into(),
+                by_sine: motion.by_sine().into(),
+                channel_count: class.senses.len() as u32,
+                term_count: class.rule.len() as u32,
+            };
+            let constants = ClassConstants { shape, motion, rule: RuleConstants::new(class, end), influence2 };
+            Class { constants, channels, terms }
+        };
+        classes.iter().zip(&places).map(class).collect()
+    }
+}
+
+impl Class {
+    /// Returns its agents.
+    pub fn agents(&self) -> Range<usize> {
+        self.constants.shape.agents()
+    }
+
+    /// Returns the channels of its senses.
+    pub fn channels(&self) -> &[ChannelConstants] {
+        &self.channels[..self.constants.shape.channel_count as usize]
+    }
+
+    /// Returns the terms of its rule.
+    pub fn terms(&self) -> &[TermConstants] {
+        &self.terms[..self.constants.shape.term_count as usize]
+    }
+
+    /// Returns the number of inputs of its policies.
+    pub fn inputs(&self) -> usize {
+        self.channels().iter().map(|channel| channel.shape.sectors as usize).sum()
+    }
+
+    /// Returns the largest squared distance at which another agent matters to one of its agents.
+    pub(crate) fn reach2(&self) -> f32 {
+        let sensed = self.channels().iter().filter(|channel| channel.shape.of_pois == 0).map(|channel| channel.range2);
+        let counted = self.terms().iter().map(|term| term.outer2);
+        sensed.chain(counted).chain(self.constants.influence2).fold(NOTHING, f32::max)
+    }
+}
+
+impl<S: Simd> ClassLanes<S> {
+    /// Returns its agents.
+    pub(crate) fn agents(&self) -> Range<usize> {
+        self.constants.shape.agents()
+    }
+
+    /// Returns what decides how its agents move.
+    pub(crate) fn control(&self) -> Control {
+        self.constants.shape.control()
+    }
+}
+
+impl ClassShape {
+    /// Returns its agents.
+    pub fn agents(&self) -> Range<usize> {
+        self.first_agent as usize..self.end_agent as usize
+    }
+
+    /// Returns what decides how its agents move.
+    pub fn control(&self) -> Control {
+        Control::of(self.control)
+    }
+}
