@@ -10,6 +10,7 @@ mod fit;
 mod golden;
 #[path = "support/mod.rs"]
 mod helpers;
+mod influence;
 mod math;
 mod parity;
 mod stepping;

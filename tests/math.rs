@@ -21,6 +21,7 @@ enum Function {
     Sin,
     Cos,
     Ln,
+    ExpNegative,
 }
 use Function::*;
 
@@ -39,6 +40,7 @@ fn apply<S: Simd>(simd: S, function: Function, input: &[f32], output: &mut [f32]
                     Sin => math::sin_cos::<S>(x).0,
                     Cos => math::sin_cos::<S>(x).1,
                     Ln => math::ln::<S>(x),
+                    ExpNegative => math::exp_negative::<S>(x),
                 }
                 .store_slice(output);
             }
@@ -128,6 +130,13 @@ fn exact_sqrt_is_within_2_1_ulp() {
 #[test]
 fn recip_is_within_2_ulp() {
     assert!(sweep(Recip, power(-40), power(40), |x| 1.0 / x).ulp < 2.0);
+}
+
+#[test]
+fn exp_negative_has_its_documented_error() {
+    assert!(sweep(ExpNegative, power(-40), 60.0, |x| (-x).exp()).relative < 2.4e-7);
+    let ends = run(Level::new(), ExpNegative, &[0.0, 60.0, 61.0, 1e30].repeat(4));
+    assert!(ends[0] == 1.0 && ends[1] == ends[2] && ends[2] == ends[3], "{ends:?}");
 }
 
 #[test]
@@ -446,6 +455,7 @@ fn twins_have_the_same_numbers() {
         "whole_tanh",
         "sin_cos",
         "ln",
+        "exp_negative",
     ] {
         let twin = numbers(WGSL, &format!("{function}("));
         assert!(!twin.is_empty(), "{function}");

@@ -1,4 +1,4 @@
-//! The fast path: every fitness but Dt, under the default rule, in one pass over the sets.
+//! The fast path: every fitness but Dt, unless it matters when agents are at a POI, in one pass over the sets.
 
 use super::assignment::{assign, gather};
 use super::{Credit, Episode, Strided, each_bit, stepping_stone};
@@ -128,7 +128,7 @@ impl Credit {
     }
 }
 
-/// Calls `visit(poi, size, set)` for every set of at least `enough(poi)` agents that differs from the POI's set of the
+/// Calls `visit(poi, size, set)` for every set of at least `enough(poi)` observers that differs from the POI's set of the
 /// step before, because repetition changes no fitness. Goes POI by POI, in order of steps.
 #[inline(always)]
 fn each_set(
@@ -150,7 +150,7 @@ fn each_set(
         if words == 1 {
             let mut before = 0;
             for step in steps {
-                let set = step[0];
+                let set = world.rule.counted(poi, 0, step[0]);
                 if set != before && set.count_ones() >= enough {
                     visit(poi, set.count_ones(), &[set]);
                 }
@@ -161,7 +161,9 @@ fn each_set(
         let (mut set, mut before) = scratch.split_at_mut(words);
         before.fill(0);
         for step in steps {
-            set.iter_mut().zip(step.iter().step_by(sets.stride)).for_each(|(word, now)| *word = *now);
+            for (index, (word, &now)) in set.iter_mut().zip(step.iter().step_by(sets.stride)).enumerate() {
+                *word = world.rule.counted(poi, index, now);
+            }
             let size = set.iter().map(|word| word.count_ones()).sum();
             if set != before && size >= enough {
                 visit(poi, size, set);

@@ -1,5 +1,5 @@
-//! G, D and Df of a whole vector of teams at once, under the default rule. [`Credit::score`](super::Credit::score) is
-//! the plain twin.
+//! G, D and Df of a whole vector of teams at once, unless it matters when agents are at a POI.
+//! [`Credit::score`](super::Credit::score) is the plain twin.
 
 use std::slice::Chunks;
 
@@ -53,7 +53,7 @@ impl<S: Simd> LaneCredit<S> {
 
     /// Reports whether a world's teams can be scored by a fitness.
     pub(crate) fn can_score(world: &World, fitness: Fitness) -> bool {
-        world.rule.is_plain() && matches!(fitness, Fitness::G | Fitness::D | Fitness::Df)
+        !world.rule.is_timed() && matches!(fitness, Fitness::G | Fitness::D | Fitness::Df)
     }
 
     /// Scores episodes. `sets` has the agents at each POI after each step, `[steps][pois][words][lanes]`, and `seen` the
@@ -83,9 +83,9 @@ impl<S: Simd> LaneCredit<S> {
             let sets = sets[poi * words..].chunks(world.pois.len() * words);
             self.critical.fill(!zero);
             let observed = match fitness {
-                Fitness::Df if by_group => self.score_poi::<GROUP>(sets, coupling, candidate),
-                Fitness::G => self.score_poi::<NOBODY>(sets, coupling, candidate),
-                _ => self.score_poi::<LEADER>(sets, coupling, candidate),
+                Fitness::Df if by_group => self.score_poi::<GROUP>(sets, (world, poi), coupling, candidate),
+                Fitness::G => self.score_poi::<NOBODY>(sets, (world, poi), coupling, candidate),
+                _ => self.score_poi::<LEADER>(sets, (world, poi), coupling, candidate),
             };
             let worth = S::u32s::splat(self.simd, world.worth[poi]);
             self.observed += observed & worth;
@@ -143,6 +143,7 @@ impl<S: Simd> LaneCredit<S> {
     fn score_poi<const TAKEN: u32>(
         &mut self,
         sets: Chunks<'_, u32>,
+        place: (&World, usize),
         coupling: u32,
         candidate: &mut [S::u32s],
     ) -> S::u32s {
@@ -163,31 +164,40 @@ impl<S: Simd> LaneCredit<S> {
             }
             let maximal = replaced & !less.simd_eq(zero);
             if maximal.any_true() {
-                observed |= self.count::<TAKEN>(coupling, mask::<S>(maximal), candidate);
+                observed |= self.count::<TAKEN>(place, coupling, mask::<S>(maximal), candidate);
             }
             for (now, candidate) in now.zip(&mut *candidate) {
                 *candidate = replaced.select(S::u32s::from_slice(self.simd, now), *candidate);
             }
         }
-        observed | self.count::<TAKEN>(coupling, !zero, candidate)
+        observed | self.count::<TAKEN>(place, coupling, !zero, candidate)
     }
 
     /// Keeps the leaders as critical without whom, or without whose group, the set of some lanes has too few agents.
     /// Returns the lanes in which the set has enough.
     #[inline(always)]
-    fn count<const TAKEN: u32>(&mut self, coupling: u32, lanes: S::u32s, set: &[S::u32s]) -> S::u32s {
+    fn count<const TAKEN: u32>(
+        &mut self,
+        (world, poi): (&World, usize),
+        coupling: u32,
+        lanes: S::u32s,
+        set: &[S::u32s],
+    ) -> S::u32s {
         let zero = S::u32s::splat(self.simd, 0);
+        // A set that contains another also contains its observers, so only here others are left out.
+        let simd = self.simd;
+        let observers = |word: usize| S::u32s::splat(simd, world.rule.counted(poi, word, u32::MAX));
         let mut size = zero;
-        for &word in set {
-            size += count_ones::<S>(word);
+        for (word, &set) in set.iter().enumerate() {
+            size += count_ones::<S>(set & observers(word));
         }
         let enough = mask::<S>(size.simd_ge(S::u32s::splat(self.simd, coupling))) & lanes;
         let spare = size - S::u32s::splat(self.simd, coupling);
         if TAKEN == LEADER {
             // A set with agents to spare needs nobody.
             let needed = mask::<S>(spare.simd_eq(zero));
-            for (critical, &set) in self.critical.iter_mut().zip(set) {
-                *critical &= (set & needed) | !enough;
+            for (word, (critical, &set)) in self.critical.iter_mut().zip(set).enumerate() {
+                *critical &= (set & observers(word) & needed) | !enough;
             }
         }
         if TAKEN == GROUP && !enough.simd_eq(zero).all_true() {
@@ -198,8 +208,8 @@ impl<S: Simd> LaneCredit<S> {
                     continue;
                 }
                 let mut members = zero;
-                for (&group, &set) in group.iter().zip(set) {
-                    members += count_ones::<S>(group & set);
+                for (word, (&group, &set)) in group.iter().zip(set).enumerate() {
+                    members += count_ones::<S>(group & set & observers(word));
                 }
                 *critical &= !(bit & enough & mask::<S>(members.simd_le(spare)));
             }
@@ -231,7 +241,7 @@ mod tests {
         let (lanes, mut found) = (S::f32s::LEN, [0; 3]);
         for seed in 0..300 {
             let world = World::new(&sample::world(seed).validate().unwrap());
-            if !world.rule.is_plain() {
+            if world.rule.is_timed() {
                 continue;
             }
             let (agents, words) = (world.agents(), world.constants.words as usize);

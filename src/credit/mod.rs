@@ -29,8 +29,8 @@ use crate::world::World;
 /// Every fitness of one team. Each difference is `[leaders]`.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Scores {
-    /// What the observed POIs are [worth](crate::world::WorldParts::worth); their number if they have equal values. Under the
-    /// default rule: those with enough agents within the observation radius at some step.
+    /// What the observed POIs are [worth](crate::world::WorldParts::worth); their number if they have equal values. Without
+    /// windows and orders: those with enough observers within their radius at some step.
     pub observed: u32,
     /// G: what the observed POIs are worth as a share of all, the same for every leader (paper, Equation 1).
     pub g: f32,
@@ -78,7 +78,7 @@ impl Credit {
     /// Scores every leader of the team by `fitness` into `scores`, `[leaders]`, and returns what the POIs are worth that
     /// the team observed. The episode must be of `world`, with the [record](RecordRequest) that the fitness needs.
     pub fn score(&mut self, episode: &Episode<'_>, world: &World, fitness: Fitness, scores: &mut [f32]) -> u32 {
-        if !world.rule.is_plain() || fitness == Fitness::Dt {
+        if world.rule.is_timed() || fitness == Fitness::Dt {
             return self.replay(episode, world, fitness, scores);
         }
         self.observed.clear();

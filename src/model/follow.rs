@@ -5,7 +5,6 @@ use std::ops::Range;
 
 use fearless_simd::{Simd, prelude::*};
 
-use super::class::ClassLanes;
 use super::motion::{GRID, MapLanes, MotionLanes, rotate};
 use super::sense::NOTHING;
 use super::{LONGEST, Ranges, TINY, ranges};
@@ -174,6 +173,35 @@ pub struct SteeringForce<S: Simd> {
     pub influenced: S::mask32s,
 }
 
+impl<S: Simd> SteeringForce<S> {
+    /// Returns no force.
+    #[inline(always)]
+    pub(crate) fn none(simd: S) -> SteeringForce<S> {
+        SteeringForce { x: splat(simd, 0.0), y: splat(simd, 0.0), influenced: S::mask32s::splat(simd, false) }
+    }
+
+    /// Adds terms, each the scaled mean of its sum.
+    #[inline(always)]
+    pub(crate) fn add(&mut self, terms: &[TermLanes<S>], sums: &[Sum<S>]) {
+        for (term, sum) in terms.iter().zip(sums) {
+            let scale = recip::<S>(nearest_f32::<S>(sum.count.max(1))) * term.scale;
+            self.x += nearest_f32::<S>(sum.x) * scale;
+            self.y += nearest_f32::<S>(sum.y) * scale;
+            self.influenced |= sum.count.simd_gt(0);
+        }
+    }
+
+    /// Adds the walls' push at a position, after all terms.
+    #[inline(always)]
+    pub(crate) fn add_walls(&mut self, rule: &RuleLanes<S>, map: &MapLanes<S>, x: S::f32s, y: S::f32s) {
+        let (push_x, near_x) = walls::<S>(rule, x, map.map_x);
+        let (push_y, near_y) = walls::<S>(rule, y, map.map_y);
+        self.x = flush::<S>(self.x + push_x, TINY);
+        self.y = flush::<S>(self.y + push_y, TINY);
+        self.influenced |= larger::<S>(near_x, near_y).simd_ge(0.0);
+    }
+}
+
 /// Returns the push of the two walls of one axis, at 0 and at `size`, and a number that is not negative if either is
 /// within their radius.
 #[inline(always)]
@@ -182,32 +210,6 @@ fn walls<S: Simd>(rule: &RuleLanes<S>, at: S::f32s, size: S::f32s) -> (S::f32s, 
     let low = rule.wall_radius - at;
     let high = rule.wall_radius - (size - at);
     ((larger::<S>(low, zero) - larger::<S>(high, zero)) * rule.wall_gain, larger::<S>(low, high))
-}
-
-/// Returns the sum of a rule's terms, each the scaled mean of what it adds, and of the walls' push at a position.
-#[inline(always)]
-pub fn force<S: Simd>(
-    class: &ClassLanes<S>,
-    map: &MapLanes<S>,
-    sums: &[Sum<S>],
-    x: S::f32s,
-    y: S::f32s,
-) -> SteeringForce<S> {
-    let simd = x.token();
-    let (mut force_x, mut force_y, mut count) = (splat(simd, 0.0), splat(simd, 0.0), S::i32s::splat(simd, 0));
-    for (term, sum) in class.terms.iter().zip(sums) {
-        let scale = recip::<S>(nearest_f32::<S>(sum.count.max(1))) * term.scale;
-        force_x += nearest_f32::<S>(sum.x) * scale;
-        force_y += nearest_f32::<S>(sum.y) * scale;
-        count += sum.count;
-    }
-    let (push_x, near_x) = walls::<S>(&class.constants.rule, x, map.map_x);
-    let (push_y, near_y) = walls::<S>(&class.constants.rule, y, map.map_y);
-    SteeringForce {
-        x: flush::<S>(force_x + push_x, TINY),
-        y: flush::<S>(force_y + push_y, TINY),
-        influenced: count.simd_gt(0) | larger::<S>(near_x, near_y).simd_ge(0.0),
-    }
 }
 
 /// Returns the squared size of a force, and the inverse of its size.
@@ -284,8 +286,10 @@ mod tests {
         let world = World::new(&config.validate().unwrap());
         fn squared<S: Simd>(simd: S, world: &World) -> f32 {
             let (lanes, zero) = (Lanes::new(simd, world.constants, &world.classes), splat(simd, 0.0));
-            let sums = [Sum::new(simd); 2];
-            let force2 = sizes::<S>(&force::<S>(&lanes.classes[1], &lanes.map, &sums, zero, zero)).0;
+            let (class, mut force) = (&lanes.classes[1], SteeringForce::none(simd));
+            force.add(&class.terms, &[Sum::new(simd); 2]);
+            force.add_walls(&class.constants.rule, &lanes.map, zero, zero);
+            let force2 = sizes::<S>(&force).0;
             force2[0]
         }
         let found = f64::from(dispatch!(Level::new(), simd => squared(simd, &world)));

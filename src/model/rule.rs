@@ -188,11 +188,6 @@ impl Rule {
             && self.order.len() == self.after.len()
     }
 
-    /// Reports whether this is the default rule.
-    pub(crate) fn is_plain(&self) -> bool {
-        self.counted.is_empty() && !self.is_timed()
-    }
-
     /// Reports whether it matters when agents are at a POI.
     pub fn is_timed(&self) -> bool {
         !self.windows.is_empty() || !self.after.is_empty()

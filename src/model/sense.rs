@@ -302,12 +302,13 @@ impl<S: Simd> Quadrants<S> {
         Quadrants { sums: empty, counts: empty }
     }
 
-    /// Adds an entity with this measure at offset (`dx`, `dy`) from an agent with heading (`hx`, `hy`).
+    /// Adds an entity with this measure at offset (`dx`, `dy`) from an agent with heading (`hx`, `hy`). `PLAIN` channels
+    /// count no entities.
     ///
     /// The signs of the offset along the heading and to its left determine the quadrant. A tie goes to the
     /// counterclockwise quadrant, so that each boundary belongs to exactly one.
     #[inline(always)]
-    pub(crate) fn add<const COUNTS: bool>(
+    pub(crate) fn add<const PLAIN: bool>(
         &mut self,
         (measured, within): (S::i32s, S::mask32s),
         [dx, dy]: [S::f32s; 2],
@@ -318,7 +319,7 @@ impl<S: Simd> Quadrants<S> {
         let left = (fy.simd_gt(zero) | (fy.simd_ge(zero) & fx.simd_ge(zero))).to_vector();
         let front = (fx.simd_gt(zero) | (fx.simd_ge(zero) & !fy.simd_gt(zero))).to_vector();
         self.sums.add(measured, left, front);
-        if COUNTS {
+        if !PLAIN {
             self.counts.add(-within.to_vector(), left, front);
         }
     }

@@ -9,7 +9,7 @@ use super::agent::Agent;
 use super::neighbours::{self, Bounds};
 use super::pois::PoiPosition;
 use crate::backend::Moment;
-use crate::config::{Control, MAX_TERMS, Measure};
+use crate::config::{Control, Measure};
 use crate::config_enum::ConstDispatch;
 use crate::kernels::math::{on_lattice, within};
 use crate::kernels::{clamp_to, splat};
@@ -43,7 +43,7 @@ pub(crate) struct Block<S: Simd> {
     /// The pairs of agents that may be in reach in some lane, one bit each, `[words][agents]`.
     pub(super) near: Vec<u64>,
     pub(super) bounds: Vec<Bounds<S>>,
-    /// The largest squared distance at which others matter to each agent, `[agents]`.
+    /// See [`neighbours::find_near`].
     reach2: Vec<f32>,
     /// The squared observation radius and the value of each POI, `[pois]`.
     pub(super) radii2: Vec<f32>,
@@ -60,7 +60,6 @@ pub(crate) struct BlockState<S: Simd> {
 
 #[derive(Clone, Copy)]
 pub(super) struct Follower<S: Simd> {
-    sums: [Sum<S>; MAX_TERMS],
     force: follow::SteeringForce<S>,
     /// The squared size of the force, and the inverse of its size.
     sizes: (S::f32s, S::f32s),
@@ -70,7 +69,7 @@ impl<S: Simd> Block<S> {
     pub fn new(simd: S, world: &World) -> Block<S> {
         let zero = splat(simd, 0.0);
         let (agents, leaders, followers) = (world.agents(), world.leaders(), world.followers());
-        let force = follow::SteeringForce { x: zero, y: zero, influenced: S::mask32s::splat(simd, false) };
+        let force = follow::SteeringForce::none(simd);
         Block {
             simd,
             world: Lanes::new(simd, world.constants, &world.classes),
@@ -80,11 +79,11 @@ impl<S: Simd> Block<S> {
             wanted: vec![zero; agents],
             velocities: vec![[zero; 2]; agents],
             headings: vec![[zero; 2]; if world.aligns() { agents } else { 0 }],
-            followers: vec![Follower { sums: [Sum::new(simd); MAX_TERMS], force, sizes: (zero, zero) }; followers],
+            followers: vec![Follower { force, sizes: (zero, zero) }; followers],
             counts: vec![S::u32s::splat(simd, 0); followers * leaders],
             near: vec![0; agents.div_ceil(64) * agents],
             bounds: vec![Bounds::nowhere(simd); agents.div_ceil(S::f32s::LEN)],
-            reach2: world.classes.iter().flat_map(|class| vec![class.reach2(); class.agents().len()]).collect(),
+            reach2: reach2(world),
             radii2: world.radii2.clone(),
             values: world.values.clone(),
         }
@@ -197,26 +196,26 @@ impl<S: Simd> Block<S> {
     #[inline(always)]
     fn follow(&mut self) {
         self.count_leaders();
-        let Block { world, agents, wanted, velocities, headings, near, followers, .. } = self;
+        let Block { simd, world, agents, wanted, velocities, headings, near, followers, .. } = self;
         let leaders = world.constants.leaders as usize;
         for class in world.classes.iter().filter(|class| class.control() == Control::Follow) {
             let (shape, motion) = (&class.constants.shape, &class.constants.motion);
             let (own, terms) = (shape.agents(), &class.terms[..shape.term_count as usize]);
             let followers = &mut followers[own.start - leaders..own.end - leaders];
-            let mut first = 0;
+            for follower in &mut *followers {
+                follower.force = follow::SteeringForce::none(*simd);
+            }
             for terms in terms.chunk_by(|a, b| a.shape == b.shape).flat_map(|terms| terms.chunks(4)) {
-                let part = Attraction { class, terms, first, agents, headings, near };
+                let part = Attraction { class, terms, agents, headings, near };
                 match terms.len() {
                     1 => part.add::<1>(own.clone(), followers),
                     2 => part.add::<2>(own.clone(), followers),
                     3 => part.add::<3>(own.clone(), followers),
                     _ => part.add::<4>(own.clone(), followers),
                 }
-                first += terms.len();
             }
             for (agent, follower) in agents[own.clone()].iter().zip(&mut *followers) {
-                let sums = &follower.sums[..terms.len()];
-                follower.force = follow::force::<S>(class, &world.map, sums, agent.x, agent.y);
+                follower.force.add_walls(&class.constants.rule, &world.map, agent.x, agent.y);
             }
             if shape.free != 0 {
                 for (velocity, follower) in velocities[own].iter_mut().zip(followers) {
@@ -314,6 +313,16 @@ impl<S: Simd> Block<S> {
     }
 }
 
+/// Returns the largest squared distance at which each agent and any after it matter to each other, `[agents]`.
+fn reach2(world: &World) -> Vec<f32> {
+    let mut reach2: Vec<f32> =
+        world.classes.iter().flat_map(|class| vec![class.reach2(); class.agents().len()]).collect();
+    for agent in (1..reach2.len()).rev() {
+        reach2[agent - 1] = reach2[agent].max(reach2[agent - 1]);
+    }
+    reach2
+}
+
 /// The inputs of all leaders, `[leaders][width]`.
 struct Inputs<'a, S: Simd> {
     all: &'a mut [S::f32s],
@@ -355,25 +364,31 @@ impl<S: Simd, P: PoiPosition<S>> Scene<'_, S, P> {
         [px - x, py - y]
     }
 
-    /// Returns what an entity at an offset counts.
+    /// Returns what an entity at an offset counts. `PLAIN` ones have value 1.
     #[inline(always)]
-    fn measured<const MEASURE: u32>(&self, value: f32, [dx, dy]: [S::f32s; 2]) -> (S::i32s, S::mask32s) {
-        sense::measured::<S>(self.channel, const { Measure::of(MEASURE) }, splat(self.simd, value), dx, dy)
+    fn measured<const MEASURE: u32, const PLAIN: bool>(
+        &self,
+        value: f32,
+        [dx, dy]: [S::f32s; 2],
+    ) -> (S::i32s, S::mask32s) {
+        let value = splat(self.simd, if PLAIN { 1.0 } else { value });
+        sense::measured::<S>(self.channel, const { Measure::of(MEASURE) }, value, dx, dy)
     }
 
-    /// Senses by quadrants.
+    /// Senses by quadrants. `PLAIN` channels count no entities, and sense POIs of value 1 only.
     #[inline(always)]
-    fn sense_quadrants<const MEASURE: u32, const COUNTS: bool>(
+    fn sense_quadrants<const MEASURE: u32, const PLAIN: bool>(
         &self,
         observers: Range<usize>,
         mut inputs: Inputs<'_, S>,
     ) {
         let &Scene { simd, channel, pois, values, agents, near } = self;
+        let (runs, used) = model::runs(&channel.shape.ranges);
         for observer in observers {
             let &Agent { x, y, .. } = &agents[observer];
             let heading = self.heading(&agents[observer]);
             let mut quadrants = sense::Quadrants::new(simd);
-            for range in model::each(&channel.shape.ranges) {
+            for range in runs[..used].iter().cloned() {
                 if channel.shape.of_pois == 0 {
                     neighbours::each_near(
                         near,
@@ -383,8 +398,8 @@ impl<S: Simd, P: PoiPosition<S>> Scene<'_, S, P> {
                         #[inline(always)]
                         |_, other| {
                             let offset = [other.x - x, other.y - y];
-                            let measured = self.measured::<MEASURE>(1.0, offset);
-                            quadrants.add::<COUNTS>(measured, offset, heading);
+                            let measured = self.measured::<MEASURE, true>(1.0, offset);
+                            quadrants.add::<PLAIN>(measured, offset, heading);
                         },
                     );
                     continue;
@@ -394,15 +409,15 @@ impl<S: Simd, P: PoiPosition<S>> Scene<'_, S, P> {
                 for (pois, values) in fours.iter().zip(values) {
                     let mut four = [(S::i32s::splat(simd, 0), S::mask32s::splat(simd, false)); 4];
                     for ((to, poi), &value) in four.iter_mut().zip(pois).zip(values) {
-                        *to = self.measured::<MEASURE>(value, self.offset(poi, x, y));
+                        *to = self.measured::<MEASURE, PLAIN>(value, self.offset(poi, x, y));
                     }
                     for (&measured, poi) in four.iter().zip(pois) {
-                        quadrants.add::<COUNTS>(measured, self.offset(poi, x, y), heading);
+                        quadrants.add::<PLAIN>(measured, self.offset(poi, x, y), heading);
                     }
                 }
                 for (poi, &value) in rest.iter().zip(last) {
                     let offset = self.offset(poi, x, y);
-                    quadrants.add::<COUNTS>(self.measured::<MEASURE>(value, offset), offset, heading);
+                    quadrants.add::<PLAIN>(self.measured::<MEASURE, PLAIN>(value, offset), offset, heading);
                 }
             }
             quadrants.write(channel, inputs.of(observer, channel));
@@ -414,11 +429,12 @@ impl<S: Simd, P: PoiPosition<S>> Scene<'_, S, P> {
     fn sense_sectors(&self, observers: Range<usize>, mut inputs: Inputs<'_, S>) {
         let &Scene { simd, channel, pois, values, agents, near } = self;
         let measure = Measure::of(channel.shape.measure);
+        let (runs, used) = model::runs(&channel.shape.ranges);
         for observer in observers {
             let &Agent { x, y, .. } = &agents[observer];
             let heading = self.heading(&agents[observer]);
             let mut sectors = sense::Sectors::new(simd, Combine::of(channel.shape.combine));
-            for range in model::each(&channel.shape.ranges) {
+            for range in runs[..used].iter().cloned() {
                 if channel.shape.of_pois == 0 {
                     neighbours::each_near(
                         near,
@@ -458,25 +474,26 @@ impl<S: Simd, P: PoiPosition<S>> ConstDispatch for Quartering<'_, '_, S, P> {
 
     #[inline(always)]
     fn with<const MEASURE: u32>(self) {
-        match self.scene.channel.shape.counts != 0 {
+        let Scene { channel, values, .. } = &self.scene;
+        let is_plain = channel.shape.counts == 0 && values.iter().all(|&value| value == 1.0);
+        match is_plain {
             true => self.scene.sense_quadrants::<MEASURE, true>(self.observers, self.inputs),
             false => self.scene.sense_quadrants::<MEASURE, false>(self.observers, self.inputs),
         }
     }
 }
 
-/// Terms of a rule that count the same agents and add the same quantity, the first of them with this index.
+/// Terms of a rule that count the same agents and add the same quantity.
 struct Attraction<'a, S: Simd> {
     class: &'a ClassLanes<S>,
     terms: &'a [follow::TermLanes<S>],
-    first: usize,
     agents: &'a [Agent<S>],
     headings: &'a [[S::f32s; 2]],
     near: &'a [u64],
 }
 
 impl<S: Simd> Attraction<'_, S> {
-    /// Computes the sums of so many terms for the agents of `own`.
+    /// Adds so many terms to the forces on the agents of `own`.
     #[inline(always)]
     fn add<const TERMS: usize>(&self, own: Range<usize>, followers: &mut [Follower<S>]) {
         match self.terms[0].shape.aligns != 0 {
@@ -487,13 +504,14 @@ impl<S: Simd> Attraction<'_, S> {
 
     #[inline(always)]
     fn add_quantity<const TERMS: usize, const ALIGNS: bool>(&self, own: Range<usize>, followers: &mut [Follower<S>]) {
-        let &Attraction { class, terms, first, agents, headings, near } = self;
+        let &Attraction { class, terms, agents, headings, near } = self;
         let rule = &class.constants.rule;
         let terms: &[follow::TermLanes<S>; TERMS] = terms.as_array().expect("the caller counts the terms");
+        let (runs, used) = model::runs(&terms[0].shape.ranges);
         for (index, follower) in own.zip(followers) {
             let &Agent { x, y, .. } = &agents[index];
             let mut sums = [Sum::new(x.token()); TERMS];
-            for range in model::each(&terms[0].shape.ranges) {
+            for range in runs[..used].iter().cloned() {
                 neighbours::each_near(
                     near,
                     agents,
@@ -513,7 +531,7 @@ impl<S: Simd> Attraction<'_, S> {
                     },
                 );
             }
-            follower.sums[first..first + TERMS].copy_from_slice(&sums);
+            follower.force.add(terms, &sums);
         }
     }
 }

@@ -9,7 +9,7 @@ use crate::kernels::math::within;
 use crate::kernels::splat;
 
 /// Marks the pairs of agents that are close enough in any lane that one matters to the other. `reach2` is the largest
-/// squared distance at which others matter to each agent, `[agents]`.
+/// squared distance at which each agent and any after it matter to each other, `[agents]`.
 ///
 /// Writes one bit per agent to `near`, `[words][agents]`. `bounds` is scratch memory, with one element per vector of
 /// agents.
@@ -17,15 +17,13 @@ use crate::kernels::splat;
 pub(super) fn find_near<S: Simd>(reach2: &[f32], agents: &[Agent<S>], near: &mut [u64], bounds: &mut [Bounds<S>]) {
     near.fill(0);
     let count = agents.len();
-    let pair2 = |i: usize, j: usize| reach2[i].max(reach2[j]);
     if count > MAX_UNBOUNDED_AGENTS {
         let lanes = S::f32s::LEN;
         for (bounds, agents) in bounds.iter_mut().zip(agents.chunks(lanes)) {
             bounds.enclose(agents);
         }
-        let farthest = reach2.iter().copied().fold(0.0, f32::max);
-        for (i, agent) in agents.iter().enumerate() {
-            let own = bounds[i / lanes].around(i % lanes, farthest);
+        for ((i, agent), &reach2) in agents.iter().enumerate().zip(reach2) {
+            let own = bounds[i / lanes].around(i % lanes, reach2);
             for (vector, bounds) in bounds.iter().enumerate().skip(i / lanes) {
                 let first = vector * lanes;
                 let mut bits = bounds.meet(own);
@@ -37,7 +35,7 @@ pub(super) fn find_near<S: Simd>(reach2: &[f32], agents: &[Agent<S>], near: &mut
                     let j = first + bits.trailing_zeros() as usize;
                     // Branch-free, because the branch predictor cannot guess which of the agents in overlapping boxes
                     // are in reach.
-                    let within = u64::from(meet::<S>(agent, &agents[j], pair2(i, j)));
+                    let within = u64::from(meet::<S>(agent, &agents[j], reach2));
                     row |= within << (j % 64);
                     near[i / 64 * count + j] |= within << (i % 64);
                     bits &= bits - 1;
@@ -47,10 +45,10 @@ pub(super) fn find_near<S: Simd>(reach2: &[f32], agents: &[Agent<S>], near: &mut
         }
     } else {
         let near = &mut near[..count];
-        for (i, agent) in agents.iter().enumerate() {
+        for ((i, agent), &reach2) in agents.iter().enumerate().zip(reach2) {
             let mut row = 0;
             for j in i + 1..count {
-                if meet::<S>(agent, &agents[j], pair2(i, j)) {
+                if meet::<S>(agent, &agents[j], reach2) {
                     row |= 1 << j;
                     near[j] |= 1 << i;
                 }
@@ -127,9 +125,12 @@ pub(super) fn each_near<T>(
     range: Range<usize>,
     mut f: impl FnMut(usize, &T),
 ) {
-    for first in (range.start / 64 * 64..range.end).step_by(64) {
+    let mut first = range.start / 64 * 64;
+    while first < range.end {
         let mut bits = near[first / 64 * agents.len() + agent];
-        bits &= u64::MAX << range.start.saturating_sub(first);
+        if first < range.start {
+            bits &= u64::MAX << (range.start - first);
+        }
         if range.end < first + 64 {
             bits &= !(u64::MAX << (range.end - first));
         }
@@ -138,5 +139,6 @@ pub(super) fn each_near<T>(
             f(index, &agents[index]);
             bits &= bits - 1;
         }
+        first += 64;
     }
 }

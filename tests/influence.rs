@@ -1,0 +1,124 @@
+//! The authors' later program, influence shaping, as the reference: what its own sensors gave in random scenes.
+
+use std::fmt::Write;
+
+use flotilla::config::Config;
+use flotilla::stepping::{Recording, Stepper};
+use flotilla::world::World;
+use serde_json::Value;
+
+/// 200 scenes with the outputs of the authors' program (github.com/AADILab/influence-shaping), rounded to nine digits. Each
+/// has agents with sensors of their own, and POIs, some of which only some agents sense.
+const SCENES: &str = include_str!("data/influence_inputs.jsonl");
+const MAP: f64 = 100.0;
+
+fn text<'a>(value: &'a Value, key: &str) -> &'a str {
+    value[key].as_str().unwrap()
+}
+
+/// Returns an upper bound of the distances below which the inverse measures would stop growing: the smallest distance from
+/// an agent to anything.
+fn nearest(agents: &[Value], pois: &[Value]) -> f64 {
+    let at = |of: &Value| [0, 1].map(|axis| of["at"][axis].as_f64().unwrap());
+    let mut nearest = 1.0f64;
+    for (index, agent) in agents.iter().enumerate() {
+        for other in agents.iter().skip(index + 1).chain(pois) {
+            let ([ax, ay], [bx, by]) = (at(agent), at(other));
+            nearest = nearest.min((ax - bx).hypot(ay - by));
+        }
+    }
+    (nearest * 0.99).max(0.01)
+}
+
+/// Returns a scene as a config in which every agent is a class, and which kinds each agent's channels sense.
+fn config(scene: &Value) -> (String, Vec<Vec<usize>>) {
+    let (agents, pois) = (scene["agents"].as_array().unwrap(), scene["pois"].as_array().unwrap());
+    let sectors = 360 / scene["resolution_degrees"].as_u64().unwrap();
+    let nearest = nearest(agents, pois);
+    let mut config = format!("[world]\nmap = [{MAP}, {MAP}]\nsteps = 1\n");
+    let mut channels = vec![];
+    for (index, agent) in agents.iter().enumerate() {
+        let measure = match text(agent, "measure") {
+            "inverse_distance" => "inverse",
+            "inverse_distance_squared" => "inverse-squared",
+            "exponential_negative_distance" => "exponential",
+            "distance_over_observation_radius" => "distance",
+            "one_minus_inverse_distance_over_observation_radius" => "closeness",
+            other => panic!("the measure {other} is new"),
+        };
+        let combine = if text(agent, "accumulate") == "sum" { "sum" } else { "mean" };
+        let (range, empty) = (&agent["radius"], &agent["default"]);
+        let channel = |of: &str| {
+            format!(
+                "  {{ {of}, sectors = {sectors}, frame = \"map\", range = {range}, measure = \"{measure}\", \
+                 nearest = {nearest}, combine = \"{combine}\", empty = {empty} }},\n"
+            )
+        };
+        let of_type = |kind: &str| -> Vec<String> {
+            let is_one = |(_, other): &(usize, &Value)| text(other, "type") == kind;
+            agents.iter().enumerate().filter(is_one).map(|(other, _)| format!("\"agent{other}\"")).collect()
+        };
+        // Rovers never sense hidden POIs, and others only those of their subtypes.
+        let is_sensed = |poi: &Value| {
+            let listed = || agent["senses_subtypes"].as_array().unwrap().contains(&poi["subtype"]);
+            text(poi, "type") != "hidden" || text(agent, "type") != "rover" && (text(poi, "subtype") == "" || listed())
+        };
+        let sensed: Vec<String> =
+            pois.iter().enumerate().filter(|(_, poi)| is_sensed(poi)).map(|(poi, _)| format!("\"poi{poi}\"")).collect();
+        let mut senses = String::new();
+        let mut kinds = vec![];
+        for (kind, names) in [of_type("rover"), of_type("uav"), sensed].into_iter().enumerate() {
+            if !names.is_empty() {
+                kinds.push(kind);
+                let names = format!("[{}]", names.join(", "));
+                let of = if kind == 2 { format!("of = \"pois\", pois = {names}") } else { format!("of = {names}") };
+                senses += &channel(&of);
+            }
+        }
+        channels.push(kinds);
+        let at = &agent["at"];
+        write!(
+            config,
+            "[[agents]]\nname = \"agent{index}\"\nat = [{at}]\nmotion = {{ kind = \"free\" }}\nsenses = [\n{senses}]\n"
+        )
+        .unwrap();
+    }
+    for (index, poi) in pois.iter().enumerate() {
+        let (at, value) = (&poi["at"], &poi["value"]);
+        write!(config, "[[pois]]\nname = \"poi{index}\"\nat = [{at}]\nvalue = {value}\ncoupling = 1\n").unwrap();
+    }
+    // A world has at least one POI. Nobody senses this one.
+    config += "[[pois]]\nname = \"unseen\"\nat = [[0, 0]]\ncoupling = 1\n";
+    (config, channels)
+}
+
+#[test]
+fn sensors_measure_what_the_authors_program_measures() {
+    let mut compared = 0;
+    for (line, scene) in SCENES.lines().enumerate() {
+        let scene: Value = serde_json::from_str(scene).unwrap();
+        let (text, channels) = config(&scene);
+        let config = Config::parse(&text, "scene.toml").unwrap_or_else(|error| panic!("scene {line}: {error}\n{text}"));
+        let world = World::new(&config.validate().unwrap());
+        let (agents, width) = (world.agents(), world.inputs());
+        let stepper = Stepper::new(world, 1, Recording::None).unwrap();
+        let sectors = 360 / scene["resolution_degrees"].as_u64().unwrap() as usize;
+        for agent in 0..agents {
+            let found = &stepper.inputs()[agent * width..][..width];
+            let expected = scene["inputs"][agent].as_array().unwrap();
+            assert_eq!(expected.len(), 3 * sectors);
+            for (place, &kind) in channels[agent].iter().enumerate() {
+                for sector in 0..sectors {
+                    let expected = expected[kind * sectors + sector].as_f64().unwrap();
+                    let found = f64::from(found[place * sectors + sector]);
+                    assert!(
+                        (found - expected).abs() <= 1e-5 * expected.abs().max(1.0),
+                        "scene {line}, agent {agent}, kind {kind}, sector {sector}: {found}, not {expected}\n{text}"
+                    );
+                    compared += 1;
+                }
+            }
+        }
+    }
+    assert!(compared > 10_000, "{compared} inputs");
+}
