@@ -83,7 +83,7 @@ impl World {
             words: agents.div_ceil(32) as u32,
             speed: world.speed as f32,
             variant: Variant { density: sense.density as u32, by_sine: motion.by_sine().into() },
-            policy: PolicyConstants::new(policy),
+            policy: PolicyConstants::new(policy, config.as_ref().inputs()),
             motion,
             couple: CoupleConstants::new(world.observation_radius),
             follow: FollowConstants::new(follow, agents),

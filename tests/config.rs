@@ -85,6 +85,8 @@ fn every_key_but_leaders_and_pois_has_its_default() {
             seed: 0,
         },
         checkpoint: CheckpointConfig { generations: 0, seconds: 30.0 },
+        agents: vec![],
+        pois: vec![],
         stages: vec![],
     };
     assert_eq!(config, expected);
@@ -356,7 +358,18 @@ fn configs() -> impl Strategy<Value = Config> {
             if learning.paradigm == Paradigm::AllLeaders && world.observers == Observers::Followers {
                 world.observers = Observers::Leaders;
             }
-            let mut config = Config { world, motion, follow, sense, policy, learning, checkpoint, stages: vec![] };
+            let mut config = Config {
+                world,
+                motion,
+                follow,
+                sense,
+                policy,
+                learning,
+                checkpoint,
+                agents: vec![],
+                pois: vec![],
+                stages: vec![],
+            };
             if config.populations() == 1 {
                 config.learning.hall_of_fame = 0;
             }

@@ -62,14 +62,14 @@ impl Policy {
         }
     }
 
-    /// Returns the widths of all layers, from inputs to outputs.
-    pub fn widths(&self) -> Vec<usize> {
-        [&[INPUTS], &self.hidden[..], &[self.actions.outputs()]].concat()
+    /// Returns the widths of all layers, from these inputs to outputs.
+    pub fn widths(&self, inputs: usize) -> Vec<usize> {
+        [&[inputs], &self.hidden[..], &[self.actions.outputs()]].concat()
     }
 
     /// Returns the weights of one policy, biases included.
-    pub fn parameters(&self) -> usize {
-        self.widths().windows(2).map(|w| (w[0] + 1) * w[1]).sum()
+    pub fn parameters(&self, inputs: usize) -> usize {
+        self.widths(inputs).windows(2).map(|w| (w[0] + 1) * w[1]).sum()
     }
 }
 
@@ -86,13 +86,13 @@ gpu_struct! {
 }
 
 impl PolicyConstants {
-    /// Computes the sizes for a valid section.
-    pub fn new(policy: &Policy) -> PolicyConstants {
+    /// Computes the sizes for a valid section and this number of inputs.
+    pub fn new(policy: &Policy, inputs: usize) -> PolicyConstants {
         let mut widths = [0; MAX_HIDDEN_LAYERS + 2];
-        for (width, units) in widths.iter_mut().zip(policy.widths()) {
+        for (width, units) in widths.iter_mut().zip(policy.widths(inputs)) {
             *width = units as u32;
         }
-        PolicyConstants { layers: policy.hidden.len() as u32 + 1, widths, parameters: policy.parameters() as u32 }
+        PolicyConstants { layers: policy.hidden.len() as u32 + 1, widths, parameters: policy.parameters(inputs) as u32 }
     }
 
     /// Returns what the outputs are, or `None` if their number is neither.

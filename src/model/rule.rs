@@ -130,7 +130,7 @@ fn sorted(after: &[Vec<usize>]) -> (Vec<usize>, Vec<usize>) {
 }
 
 /// Returns POIs of which each comes after the next, and the last after the first.
-fn cycle(after: &[Vec<usize>]) -> Option<Vec<usize>> {
+pub(crate) fn cycle(after: &[Vec<usize>]) -> Option<Vec<usize>> {
     let (_, left) = sorted(after);
     let mut path = vec![*left.first()?];
     loop {
