@@ -5,9 +5,11 @@
 
 use std::fmt::{self, Display};
 
-use crate::config::{Control, MAX_STEPS, Observers, StageConfig};
-use crate::model::rule::NEVER;
-use crate::world::{GRID, World};
+use glam::DVec2;
+
+use crate::config::{AgentClass, Classes, Config, Control, MAX_STEPS, Mobility, StageConfig, WorldConfig};
+use crate::model::rule::{NEVER, Rule};
+use crate::world::{GRID, on_grid};
 
 /// Rounding of headings, speeds and squared distances, relative to their size.
 const ROUNDING: f64 = 1e-5;
@@ -28,8 +30,8 @@ pub enum Why {
     Far {
         /// Number of agents that must be there in the same step.
         needed: usize,
-        /// The name of the agents that count: "agent", "leader" or "follower".
-        who: &'static str,
+        /// The name of the agents that count: "agent", or their class if there are others.
+        who: String,
         /// Start distance between the POI and the farthest agent needed, less jitter, in units.
         distance: f64,
         /// The observation radius in units.
@@ -84,96 +86,141 @@ impl Display for Unreachable {
     }
 }
 
-/// Returns the maximum distance that an agent of any class travels after each step, in units: `[steps + 1]`, 0 at the
-/// start.
+/// Returns the maximum distance that an agent of a class travels after each step, in units: `[steps + 1]`, 0 at the start.
 ///
 /// The agent accelerates as fast as it can and never turns. Walls can only shorten its path.
-pub fn travel(world: &World, steps: usize) -> Vec<f64> {
-    let [largest, dt] = [world.map().max_element(), world.constants.map.dt].map(f64::from);
+pub fn travel(config: &Config, class: &AgentClass, steps: usize) -> Vec<f64> {
+    let WorldConfig { map, dt, .. } = config.world;
     // Positions are rounded to f32 and then to the grid, on both axes.
-    let rounding = 2f64.sqrt() * (1.0 / f64::from(GRID) + largest * f64::from(f32::EPSILON));
-    let mut farthest = vec![0.0; steps + 1];
-    for class in world.classes.iter().map(|class| &class.constants) {
-        let motion = &class.motion;
-        let [start, change, min, max] =
-            [motion.speed, motion.max_speed_change, motion.min_speed, motion.max_speed].map(f64::from);
-        let (mut speed, mut far) = (start, 0.0);
-        for farthest in &mut farthest[1..] {
-            speed = match (class.shape.control(), class.shape.free) {
-                (Control::Still, _) => 0.0,
-                // The maximum holds for each axis.
-                (_, 1..) => max * 2f64.sqrt(),
-                _ => (speed + change).max(min).min(max),
-            };
-            far += speed * dt * (1.0 + ROUNDING) + rounding;
-            *farthest = far.max(*farthest);
+    let rounding = 2f64.sqrt() * (1.0 / f64::from(GRID) + map[0].max(map[1]) * f64::from(f32::EPSILON));
+    let (mut speed, mut far) = (class.speed, 0.0);
+    let step = |_| {
+        speed = match &class.motion {
+            _ if class.control == Control::Still => return far,
+            Mobility::Steered(motion) => {
+                (speed + motion.max_acceleration * dt).max(motion.min_speed).min(motion.max_speed)
+            }
+            Mobility::Free { max_speed } => 2f64.sqrt() * max_speed,
+        };
+        far += speed * dt * (1.0 + ROUNDING) + rounding;
+        far
+    };
+    std::iter::once(0.0).chain((0..steps).map(step)).collect()
+}
+
+/// How far agents travel, and how far from each POI its observers start.
+struct Distances {
+    /// The maximum distance that an agent of each class travels, `[classes][steps + 1]`.
+    travel: Vec<Vec<f64>>,
+    /// The class of each observer and its start distance less jitter in units, `[pois]`.
+    observers: Vec<Vec<(usize, f64)>>,
+    /// The number of observers that each POI needs, `[pois]`.
+    couplings: Vec<u32>,
+    /// The observation radius of each POI in units, `[pois]`.
+    radii: Vec<f64>,
+}
+
+impl Distances {
+    fn new(config: &StageConfig, classes: &Classes, steps: usize) -> Distances {
+        // Jitter moves agent and POI, each by up to this much per axis.
+        let jitter = 2f64.sqrt() * (config.learning.start_jitter + config.learning.poi_jitter);
+        let map = DVec2::from(config.world.map).as_vec2();
+        let on_grid = |places: Vec<[f64; 2]>| -> Vec<DVec2> {
+            places.into_iter().map(|at| on_grid(DVec2::from(at).as_vec2(), map).as_dvec2()).collect()
+        };
+        let (starts, of_class) = (on_grid(classes.starts()), classes.class_of_each());
+        let groups = classes.group_of_each();
+        let observers = |(place, &group): (DVec2, &usize)| {
+            let counted = starts.iter().zip(&of_class).filter(|(_, class)| classes.observes(**class, group));
+            counted.map(|(start, &class)| (class, (start.distance(place) - jitter).max(0.0))).collect()
+        };
+        Distances {
+            travel: classes.agents.iter().map(|class| travel(config, class, steps)).collect(),
+            observers: on_grid(classes.places()).into_iter().zip(&groups).map(observers).collect(),
+            couplings: classes.couplings(),
+            radii: groups.iter().map(|&group| classes.pois[group].radius).collect(),
         }
     }
-    farthest
+
+    /// Returns class and distance of the last observer that a POI needs at a step, if they come as near as they can.
+    fn last(&self, poi: usize, step: usize) -> (usize, f64) {
+        let mut observers = self.observers[poi].clone();
+        let left = |&(class, distance): &(usize, f64)| distance - self.travel[class][step];
+        observers.sort_by(|a, b| left(a).total_cmp(&left(b)));
+        let last = (self.couplings[poi] as usize).saturating_sub(1);
+        observers.get(last).copied().unwrap_or((0, f64::INFINITY))
+    }
+
+    /// Returns the first step at which enough observers can be within a POI's radius, times this factor.
+    fn first(&self, poi: usize, factor: f64) -> Option<usize> {
+        let there = |step: usize| {
+            let (class, distance) = self.last(poi, step);
+            distance <= self.travel[class][step] + self.radii[poi] * factor
+        };
+        let steps = self.travel[0].len() - 1;
+        let (mut from, mut to) = (0, steps + 1);
+        while from < to {
+            let middle = (from + to) / 2;
+            if there(middle) { to = middle } else { from = middle + 1 }
+        }
+        (from <= steps).then_some(from)
+    }
 }
 
 /// Returns the POIs that no team can observe in any episode. Uses the config's own keys and ignores its stages.
 pub fn unreachable(config: &StageConfig) -> Vec<Unreachable> {
-    let world = World::new(config);
-    let steps = world.steps();
-    let travel = travel(&world, steps);
-    let radius = |poi: usize| f64::from(world.radii2[poi]).sqrt();
-    // Jitter moves agent and POI, each by up to this much per axis.
-    let jitter = 2f64.sqrt() * (config.learning.start_jitter + config.learning.poi_jitter);
-    let who = match config.world.observers {
-        Observers::All => "agent",
-        Observers::Leaders => "leader",
-        Observers::Followers => "follower",
+    let (classes, steps) = (config.classes(), config.world.steps);
+    let distances = Distances::new(config, &classes, steps);
+    let (pois, agents) = (distances.radii.len(), classes.class_of_each().len());
+    let rule = Rule::new(&vec![vec![0..agents]; pois], agents, &classes.windows(steps), &classes.after());
+    let first: Vec<_> = (0..pois).map(|poi| distances.first(poi, 1.0 + ROUNDING)).collect();
+    let there = |poi: usize, step: u32| first[poi].is_some_and(|first| first <= step as usize);
+    let mut observed = vec![NEVER; pois];
+    rule.observe(steps as u32, &mut observed, |poi, mut open| open.find(|&step| there(poi, step)));
+    let groups = classes.group_of_each();
+    let who = |poi: usize| {
+        let counted = (0..classes.agents.len()).filter(|&class| classes.observes(class, groups[poi]));
+        match counted.collect::<Vec<_>>()[..] {
+            [class] if classes.agents.len() > 1 => classes.agents[class].name.clone(),
+            _ => "agent".into(),
+        }
     };
-    // Distance to the farthest agent that a POI needs.
-    let distance = |poi: usize| {
-        let from = |agent: usize| world.starts[agent].as_dvec2().distance(world.pois[poi].as_dvec2());
-        let mut distances: Vec<f64> =
-            (0..world.agents()).filter(|&agent| world.rule.counts_at(poi, agent)).map(from).collect();
-        distances.sort_by(f64::total_cmp);
-        let last = (world.coupling[poi] as usize).saturating_sub(1);
-        (distances.get(last).copied().unwrap_or(f64::INFINITY) - jitter).max(0.0)
-    };
-    let distances: Vec<f64> = (0..world.pois.len()).map(distance).collect();
-    let there = |poi: usize, step: u32| distances[poi] <= travel[step as usize] + radius(poi) * (1.0 + ROUNDING);
-    let mut observed = vec![NEVER; world.pois.len()];
-    world.rule.observe(steps as u32, &mut observed, |poi, mut open| open.find(|&step| there(poi, step)));
     let why = |poi: usize| {
-        let last = world.rule.window(poi).map_or(steps as u32, |[_, last]| last.min(steps as u32));
-        let latest = world.rule.after(poi).iter().copied().max_by_key(|&other| observed[other]);
+        let last = rule.window(poi).map_or(steps as u32, |[_, last]| last.min(steps as u32));
+        let latest = rule.after(poi).iter().copied().max_by_key(|&other| observed[other]);
         match latest {
             Some(other) if there(poi, last) => {
                 Why::After { other, observed: (observed[other] != NEVER).then_some(observed[other] as usize) }
             }
-            _ => Why::Far {
-                needed: world.coupling[poi] as usize,
-                who,
-                distance: distances[poi],
-                radius: radius(poi),
-                travel: travel[last as usize],
-                steps: last as usize,
-            },
+            _ => {
+                let (class, distance) = distances.last(poi, last as usize);
+                Why::Far {
+                    needed: distances.couplings[poi] as usize,
+                    who: who(poi),
+                    distance,
+                    radius: distances.radii[poi],
+                    travel: distances.travel[class][last as usize],
+                    steps: last as usize,
+                }
+            }
         }
     };
-    let never = (0..world.pois.len()).filter(|&poi| observed[poi] == NEVER);
+    let never = (0..pois).filter(|&poi| observed[poi] == NEVER);
     never.map(|poi| Unreachable { poi, why: why(poi) }).collect()
 }
 
 /// Returns the smallest number of steps in which every POI could be reached. None if longer episodes would not help.
 pub fn fewest_steps(config: &StageConfig, unreachable: &[Unreachable]) -> Option<usize> {
-    let far = unreachable.iter().filter_map(|unreachable| match unreachable.why {
-        Why::Far { distance, radius, .. } => Some(distance - radius),
-        Why::After { .. } => None,
-    });
-    let farthest = far.reduce(f64::max)?;
-    let steps = travel(&World::new(config), MAX_STEPS).iter().position(|&travel| travel >= farthest)?;
-    (steps > config.world.steps).then_some(steps)
+    let far = unreachable.iter().filter(|unreachable| matches!(unreachable.why, Why::Far { .. }));
+    let distances = Distances::new(config, &config.classes(), MAX_STEPS);
+    let steps: Option<Vec<usize>> = far.map(|unreachable| distances.first(unreachable.poi, 1.0)).collect();
+    steps?.into_iter().max().filter(|&steps| steps > config.world.steps)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::{Config, ValidConfig};
+    use crate::config::ValidConfig;
 
     fn config(keys: &str) -> ValidConfig {
         let text = format!(
@@ -188,12 +235,16 @@ mod tests {
 
     #[test]
     fn an_agent_accelerates_to_its_largest_speed() {
-        let far = travel(&World::new(&config("coupling = 1\n")), 25);
+        let travelled = |keys: &str, steps: usize| {
+            let config = config(keys);
+            travel(&config, &config.classes().agents[0], steps)
+        };
+        let far = travelled("coupling = 1\n", 25);
         // 1, 2 and then 3 units per second, for 0.2 s each.
         for (steps, expected) in [(0, 0.0), (1, 0.2), (2, 0.6), (3, 1.2), (25, 14.4)] {
             assert!(far[steps] >= expected && far[steps] < expected + 1e-3, "{steps}: {}", far[steps]);
         }
-        let still = travel(&World::new(&config("coupling = 1\nspeed = 3\n[motion]\nmax_acceleration = 0\n")), 10);
+        let still = travelled("coupling = 1\nspeed = 3\n[motion]\nmax_acceleration = 0\n", 10);
         assert!(still[10] >= 6.0 && still[10] < 6.001, "{still:?}");
     }
 
@@ -227,6 +278,54 @@ mod tests {
             followers.len() == 1 && followers[0].1.contains("the nearest follower is 30.1 units away"),
             "{followers:?}"
         );
+    }
+
+    /// Slow, fast and still classes, POIs with radii and observers of their own.
+    #[test]
+    fn classes_have_their_speeds_and_groups_their_radii() {
+        let found = |pois: &str| {
+            let text = format!(
+                "[world]\nsteps = 25\n\
+                 [[agents]]\nname = \"fast\"\nat = [[0, 10]]\nmotion = {{ kind = \"free\", max_speed = 1 }}\n\
+                 senses = [{{ of = \"pois\" }}]\n\
+                 [[agents]]\nname = \"slow\"\nat = [[0, 20]]\nmotion = {{ max_speed = 0.2 }}\nsenses = [{{ of = \"pois\" }}]\n\
+                 [[agents]]\nname = \"stone\"\nat = [[0, 30]]\ncontrol = \"still\"\n{pois}"
+            );
+            let config = Config::parse(&text, "test").unwrap().validate().unwrap();
+            let found = unreachable(config.as_ref());
+            let fewest = fewest_steps(config.as_ref(), &found);
+            (found.into_iter().map(|found| found.to_string()).collect::<Vec<_>>(), fewest)
+        };
+        let group =
+            |name: &str, at: [u32; 2], keys: &str| format!("[[pois]]\nname = \"{name}\"\nat = [{at:?}]\n{keys}\n");
+        // In 25 steps of 0.2 s: 7.1 units, 1.0 units and none.
+        let near = [
+            group("a", [12, 10], "coupling = 1\nobservers = \"fast\""),
+            group("b", [5, 20], "coupling = 1\nradius = 4.1\nobservers = \"slow\""),
+            group("c", [0, 35], "coupling = 1\nobservers = \"stone\""),
+        ];
+        assert_eq!(found(&near.concat()), (vec![], None));
+        let far = [
+            group("a", [13, 10], "coupling = 1\nobservers = \"fast\""),
+            group("b", [5, 20], "coupling = 1\nradius = 3.9\nobservers = \"slow\""),
+        ];
+        let (lines, fewest) = found(&far.concat());
+        assert!(
+            lines[0].contains("the nearest fast is 13.0 units away, and an agent travels at most 7.1 units"),
+            "{lines:?}"
+        );
+        assert!(
+            lines[1].contains("the nearest slow is 5.0 units away, and an agent travels at most 1.0 units"),
+            "{lines:?}"
+        );
+        assert_eq!((lines.len(), fewest), (2, Some(29)));
+        // The stone is needed, and never comes nearer.
+        let (lines, fewest) = found(&group("c", [6, 20], "coupling = 3"));
+        assert!(
+            lines[0].contains("by the 3 agents that it needs: at best the last of them is 11.7 units away"),
+            "{lines:?}"
+        );
+        assert_eq!(fewest, None);
     }
 
     #[test]

@@ -288,6 +288,251 @@ fn plain_world(seed: u64) -> Config {
     }
 }
 
+/// Returns a valid config with 1 to 5 classes of agents and 1 to 4 groups of POIs, a pure function of the seed.
+///
+/// Places, map and learning are those of [`world`] for the same seed, so layouts are as degenerate. A hundred consecutive
+/// seeds cover every control, motion, frame, measure and combination, terms with gains and with alignments, and groups with
+/// values, radii, observers, windows and orders.
+pub fn classes_world(seed: u64) -> Config {
+    let mut config = plain_world(seed);
+    let rng = &mut ChaCha8Rng::seed_from_u64(seed ^ 0x636c_6173);
+    let starts = [&config.world.leaders[..], &config.world.followers].concat();
+    let classes = rng.random_range(1..=starts.len().min(5));
+    let learning = rng.random_range(1..=classes);
+    let groups = rng.random_range(1..=config.world.pois.len().min(4));
+    let names: Vec<String> =
+        ["rover", "uav", "sheep-1", "dog_2", "X"][..classes].iter().map(|name| (*name).into()).collect();
+    let group_names: Vec<String> = ["near", "far", "p-3", "q_4"][..groups].iter().map(|name| (*name).into()).collect();
+    // In exact layouts, distances equal these exactly.
+    let lengths = Lengths {
+        pool: [
+            config.follow.attraction_radius,
+            config.follow.repulsion_radius,
+            config.world.observation_radius,
+            Some(config.sense.agent_range).filter(|range| range.is_finite()).unwrap_or(5.0),
+            1.0,
+            2.5,
+        ],
+    };
+    let is_behaviours = config.policy.actions == Actions::Behaviours;
+    let controls: Vec<Control> = (0..classes)
+        .map(|class| match class < learning {
+            true => Control::Policy,
+            false => {
+                if rng.random_bool(0.8) {
+                    Control::Follow
+                } else {
+                    Control::Still
+                }
+            }
+        })
+        .collect();
+    let parts = split(rng, &starts, classes);
+    let class = |(index, at): (usize, Vec<[f64; 2]>)| {
+        let control = controls[index];
+        let motion = if rng.random_bool(0.35) && !(is_behaviours && control == Control::Policy) {
+            Mobility::Free { max_speed: [0.0, 0.5, 1.0, 3.0][rng.random_range(0..4)] }
+        } else {
+            let max_speed = [0.5, 3.0, 5.0][rng.random_range(0..3)];
+            Mobility::Steered(Motion {
+                min_speed: [0.0, 0.0, 0.25][rng.random_range(0..3)],
+                max_speed,
+                max_acceleration: [0.5, 5.0, 100.0][rng.random_range(0..3)],
+                max_turn_rate: [0.0, 1.0, std::f64::consts::FRAC_PI_2, 100.0][rng.random_range(0..4)],
+            })
+        };
+        let [slow, fast] = match &motion {
+            Mobility::Steered(motion) => [motion.min_speed, motion.max_speed],
+            Mobility::Free { max_speed } => [0.0, *max_speed],
+        };
+        let is_free = matches!(motion, Mobility::Free { .. });
+        let heading = |rng: &mut ChaCha8Rng| match rng.random_bool(0.5) {
+            true => std::f64::consts::FRAC_PI_2 * f64::from(rng.random_range(-2..=2)),
+            false => rng.random_range(-4.0..4.0),
+        };
+        let heading = match rng.random_bool(0.5) {
+            true => Heading::Same(heading(rng)),
+            false => Heading::Each(at.iter().map(|_| heading(rng)).collect()),
+        };
+        let mut senses = vec![];
+        if control == Control::Policy {
+            let count = rng.random_range(1..=4);
+            senses.extend((0..count).map(|_| channel(rng, is_free, &names, &group_names, &lengths)));
+            if is_behaviours {
+                let quadrants = |of: &str, channel: &Channel| Channel {
+                    of: vec![of.into()],
+                    pois: vec![],
+                    sectors: 4,
+                    frame: Frame::Heading,
+                    ..channel.clone()
+                };
+                let [pois, agents] = [POIS, AGENTS].map(|of| quadrants(of, &senses[0]));
+                senses.splice(0..0, [pois, agents]);
+            }
+            while senses.iter().map(|channel| channel.sectors).sum::<usize>() > MAX_INPUTS {
+                senses.pop();
+            }
+        }
+        let mut rule = vec![];
+        if control == Control::Follow {
+            let count = rng.random_range(1..=4);
+            rule.extend((0..count).map(|_| term(rng, &names, &lengths)));
+        }
+        let others = names.iter().zip(&controls).filter(|(_, control)| **control != Control::Policy);
+        let leads: Vec<String> = match control {
+            Control::Policy => others.filter(|_| rng.random_bool(0.6)).map(|(name, _)| name.clone()).collect(),
+            _ => vec![],
+        };
+        let needs_radius =
+            names.iter().zip(&controls).any(|(name, control)| leads.contains(name) && *control == Control::Still);
+        let influence_radius = (!leads.is_empty() && (needs_radius || rng.random_bool(0.5))).then(|| lengths.draw(rng));
+        AgentClass {
+            name: names[index].clone(),
+            at,
+            heading,
+            speed: if rng.random_bool(0.5) { slow } else { fast },
+            control,
+            motion,
+            senses,
+            rule,
+            wall_radius: if rng.random_bool(0.3) { 0.0 } else { lengths.draw(rng) },
+            wall_gain: [0.0, 1.0, 4.0][rng.random_range(0..3)],
+            leads,
+            influence_radius,
+            observes: rng.random_bool(0.8),
+        }
+    };
+    let agents: Vec<AgentClass> = parts.into_iter().enumerate().map(class).collect();
+    let mut order: Vec<usize> = (0..groups).collect();
+    order.rotate_left(rng.random_range(0..groups));
+    let steps = config.world.steps;
+    let parts = split(rng, &config.world.pois, groups);
+    let group = |(index, at): (usize, Vec<[f64; 2]>)| {
+        let mut observers: Vec<String> = vec![];
+        if rng.random_bool(0.4) {
+            observers.extend(names.iter().filter(|_| rng.random_bool(0.5)).cloned());
+        }
+        let count = |observers: &[String]| {
+            let counted = |class: &&AgentClass| match observers {
+                [] => class.observes,
+                _ => observers.contains(&class.name),
+            };
+            agents.iter().filter(counted).map(|class| class.at.len()).sum::<usize>()
+        };
+        if count(&observers) == 0 {
+            observers = vec![names[0].clone()];
+        }
+        let most = count(&observers).min(5);
+        let coupling = match rng.random_bool(0.5) {
+            true => Coupling::Same(rng.random_range(1..=most)),
+            false => Coupling::Each(at.iter().map(|_| rng.random_range(1..=most)).collect()),
+        };
+        let windows = match rng.random_bool(0.3) {
+            true => {
+                let window = |_: &_| {
+                    let first = rng.random_range(1..=steps);
+                    [first, rng.random_range(first..=steps)]
+                };
+                at.iter().map(window).collect()
+            }
+            false => vec![],
+        };
+        let place = order.iter().position(|&other| other == index).unwrap_or(0);
+        let before = order[..place].iter().filter(|_| rng.random_bool(0.3));
+        let after = before.map(|&other| group_names[other].clone()).collect();
+        PoiGroup {
+            name: group_names[index].clone(),
+            value: [1.0, 0.5, 3.0][rng.random_range(0..3)],
+            coupling,
+            radius: lengths.draw(rng),
+            observers,
+            windows,
+            after,
+            at,
+        }
+    };
+    let pois = parts.into_iter().enumerate().map(group).collect();
+    if config.learning.sharing == Sharing::Group {
+        let learners = agents.iter().filter(|class| class.learns()).map(|class| class.at.len()).sum();
+        let of_group = |group: usize| (0..learners).filter(|learner| learner % 2 == group).collect();
+        config.learning.groups = (0..learners.min(2)).map(of_group).collect();
+    }
+    (config.agents, config.pois) = (agents, pois);
+    config.without_replaced()
+}
+
+/// Lengths for radii and ranges.
+struct Lengths {
+    pool: [f64; 6],
+}
+
+impl Lengths {
+    fn draw(&self, rng: &mut ChaCha8Rng) -> f64 {
+        if rng.random_bool(0.7) { self.pool[rng.random_range(0..self.pool.len())] } else { rng.random_range(0.2..15.0) }
+    }
+}
+
+/// Splits places into consecutive parts, none of which is empty.
+fn split(rng: &mut ChaCha8Rng, places: &[[f64; 2]], parts: usize) -> Vec<Vec<[f64; 2]>> {
+    let mut rest = places;
+    let part = |index: usize| {
+        let most = rest.len() - (parts - 1 - index);
+        let (part, others) = rest.split_at(if index + 1 == parts { rest.len() } else { rng.random_range(1..=most) });
+        rest = others;
+        part.to_vec()
+    };
+    (0..parts).map(part).collect()
+}
+
+/// Returns some names of classes, at least one.
+fn some_names(rng: &mut ChaCha8Rng, names: &[String]) -> Vec<String> {
+    let mut some: Vec<String> = names.iter().filter(|_| rng.random_bool(0.4)).cloned().collect();
+    if some.is_empty() {
+        some.push(names[rng.random_range(0..names.len())].clone());
+    }
+    some
+}
+
+fn channel(rng: &mut ChaCha8Rng, is_free: bool, names: &[String], groups: &[String], lengths: &Lengths) -> Channel {
+    let of = match rng.random_range(0..3) {
+        0 => vec![POIS.into()],
+        1 => vec![AGENTS.into()],
+        _ => some_names(rng, names),
+    };
+    let measure = word(rng);
+    let is_finite = matches!(measure, Measure::Distance | Measure::Closeness);
+    Channel {
+        pois: if of == [POIS] && rng.random_bool(0.3) { some_names(rng, groups) } else { vec![] },
+        of,
+        sectors: [4, 4, 4, 1, 2, 3, 8, MAX_SECTORS][rng.random_range(0..8)],
+        frame: if is_free || rng.random_bool(0.3) { Frame::Map } else { Frame::Heading },
+        range: match rng.random_range(0..10) {
+            0 => 0.0,
+            1..=3 if !is_finite => f64::INFINITY,
+            _ => lengths.draw(rng),
+        },
+        measure,
+        nearest: [1.0, 0.5, 2.0][rng.random_range(0..3)],
+        combine: word(rng),
+        empty: [0.0, 0.0, -1.0, 1.0][rng.random_range(0..4)],
+        gain: [1.0, 0.5, 3.0][rng.random_range(0..3)],
+    }
+}
+
+fn term(rng: &mut ChaCha8Rng, names: &[String], lengths: &Lengths) -> Term {
+    let [a, b] = [lengths.draw(rng), lengths.draw(rng)];
+    let size = if rng.random_bool(0.1) { 0.0 } else { rng.random_range(0.1..10.0) };
+    let size = if rng.random_bool(0.4) { 0.0 - size } else { size };
+    let is_gain = rng.random_bool(0.7);
+    Term {
+        of: if rng.random_bool(0.5) { vec![AGENTS.into()] } else { some_names(rng, names) },
+        from: if rng.random_bool(0.5) { 0.0 } else { a.min(b) },
+        to: a.max(b),
+        gain: is_gain.then_some(size),
+        align: (!is_gain).then_some(size),
+    }
+}
+
 /// Returns a random word of a choice.
 fn word<T: Choice>(rng: &mut ChaCha8Rng) -> T {
     T::ALL[rng.random_range(0..T::ALL.len())].1

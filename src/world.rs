@@ -4,7 +4,7 @@ use std::ops::{Deref, Range};
 
 use glam::{DVec2, Vec2};
 
-use crate::config::{AgentClass, Classes, Config, Control, LedBy, MAX_STEPS, PoiGroup, StageConfig};
+use crate::config::{Config, Control, LedBy, PoiGroup, StageConfig};
 use crate::model::class::Class;
 use crate::model::motion::MapConstants;
 use crate::model::policy::PolicyConstants;
@@ -81,24 +81,17 @@ impl World {
     /// Builds the world of a valid config.
     pub fn new(config: &impl AsRef<StageConfig>) -> World {
         let Config { world, policy, learning, .. } = &**config.as_ref();
-        let Classes { agents: classes, pois: groups } = config.as_ref().classes();
+        let described = config.as_ref().classes();
         let map = Vec2::new(world.map[0] as f32, world.map[1] as f32);
-        let on_grid = |&at: &[f64; 2]| on_grid(DVec2::from(at).as_vec2(), map);
-        let starts: Vec<Vec2> = classes.iter().flat_map(|class| &class.at).map(on_grid).collect();
-        let headings = classes.iter().flat_map(|class| class.heading.of_each(class.at.len()));
-        let agents = starts.len();
-        let of_each = |of: &dyn Fn(&PoiGroup) -> f64| -> Vec<f64> {
-            groups.iter().flat_map(|group| vec![of(group); group.at.len()]).collect()
-        };
-        let values = of_each(&|group| group.value);
-        let (worth, total_worth) = worth(&values);
-        let values: Vec<f32> = values.into_iter().map(|value| value as f32).collect();
-        let places = places(&groups);
-        let radii2 = of_each(&|group| group.radius * group.radius).into_iter().map(|radius2| radius2 as f32).collect();
-        let classes_of_world = Class::all(&classes, &places, &values, world.map, world.dt);
+        let on_grid = |at: [f64; 2]| on_grid(DVec2::from(at).as_vec2(), map);
+        let of_each: Vec<&PoiGroup> = described.group_of_each().into_iter().map(|group| &described.pois[group]).collect();
+        let (worth, total_worth) = worth(of_each.iter().map(|group| group.value));
+        let values: Vec<f32> = of_each.iter().map(|group| group.value as f32).collect();
+        let classes = Class::all(&described, &values, world.map, world.dt);
         let learns = |class: &&Class| class.constants.shape.control() == Control::Policy;
-        let leaders = classes_of_world.iter().filter(learns).map(|class| class.agents().len()).sum::<usize>();
-        let inputs = classes_of_world.iter().map(Class::inputs).max().unwrap_or(0);
+        let leaders = classes.iter().filter(learns).map(|class| class.agents().len()).sum::<usize>();
+        let starts: Vec<Vec2> = described.starts().into_iter().map(on_grid).collect();
+        let agents = starts.len();
         let constants = Constants {
             leaders: leaders as u32,
             followers: (agents - leaders) as u32,
@@ -108,26 +101,30 @@ impl World {
             class_count: classes.len() as u32,
             first_class: 0,
             map: MapConstants::new(world.map, world.dt),
-            policy: PolicyConstants::new(policy, inputs),
+            policy: PolicyConstants::new(policy, config.as_ref().inputs()),
         };
+        let observers: Vec<Vec<Range<usize>>> = described
+            .group_of_each()
+            .into_iter()
+            .map(|group| {
+                let counted = (0..classes.len()).filter(|&class| described.observes(class, group));
+                counted.map(|class| classes[class].agents()).collect()
+            })
+            .collect();
         World(WorldParts {
             constants,
             starts,
-            headings: headings.map(unit).collect(),
-            pois: groups.iter().flat_map(|group| &group.at).map(on_grid).collect(),
-            radii2,
+            headings: described.headings().into_iter().map(unit).collect(),
+            pois: described.places().into_iter().map(on_grid).collect(),
+            radii2: of_each.iter().map(|group| (group.radius * group.radius) as f32).collect(),
             values,
             worth,
             total_worth,
-            coupling: groups
-                .iter()
-                .flat_map(|group| group.coupling.of_each(group.at.len()))
-                .map(|c| c as u32)
-                .collect(),
+            coupling: described.couplings(),
             populations: config.as_ref().population_of_each(),
             led: Led { within: learning.led_within, by: learning.led_by },
-            rule: rule(&classes, &classes_of_world, &groups, &places, agents),
-            classes: classes_of_world,
+            rule: Rule::new(&observers, agents, &described.windows(world.steps), &described.after()),
+            classes,
         })
     }
 
@@ -207,60 +204,14 @@ impl World {
     }
 }
 
-/// Returns the POIs of each group, by its name.
-fn places(groups: &[PoiGroup]) -> Vec<(String, Range<usize>)> {
-    let mut end = 0;
-    let place = |group: &PoiGroup| {
-        end += group.at.len();
-        (group.name.clone(), end - group.at.len()..end)
-    };
-    groups.iter().map(place).collect()
-}
-
-/// Returns the rule of observation of some groups, which are at `places`.
-fn rule(
-    classes: &[AgentClass],
-    of_world: &[Class],
-    groups: &[PoiGroup],
-    places: &[(String, Range<usize>)],
-    agents: usize,
-) -> Rule {
-    let observers = |group: &PoiGroup| -> Vec<Range<usize>> {
-        let counts = |class: &AgentClass| match group.observers.is_empty() {
-            true => class.observes,
-            false => group.observers.contains(&class.name),
-        };
-        let counted = classes.iter().zip(of_world).filter(|(class, _)| counts(class));
-        counted.map(|(_, class)| class.agents()).collect()
-    };
-    let each = |of: &dyn Fn(&PoiGroup) -> Vec<Range<usize>>| -> Vec<Vec<Range<usize>>> {
-        groups.iter().flat_map(|group| vec![of(group); group.at.len()]).collect()
-    };
-    let after = |group: &PoiGroup| -> Vec<Range<usize>> {
-        let before = places.iter().filter(|(name, _)| group.after.contains(name));
-        before.map(|(_, place)| place.clone()).collect()
-    };
-    let always = [1, MAX_STEPS];
-    let windows = match groups.iter().all(|group| group.windows.is_empty()) {
-        true => vec![],
-        false => groups
-            .iter()
-            .flat_map(|group| (0..group.at.len()).map(|poi| group.windows.get(poi).copied().unwrap_or(always)))
-            .map(|window| window.map(|step| step as u32))
-            .collect(),
-    };
-    let after = each(&after).into_iter().map(|places| places.into_iter().flatten().collect()).collect();
-    Rule::new(each(&observers).into_iter(), agents, windows, after)
-}
-
 /// Returns values as whole multiples of a common unit, as small as possible, and their sum, at most 2^22. With equal values
 /// each is 1.
-fn worth(values: &[f64]) -> (Vec<u32>, u32) {
+fn worth(values: impl Iterator<Item = f64> + Clone) -> (Vec<u32>, u32) {
     let mut units = f64::from(1 << 20);
-    while values.iter().sum::<f64>() * units > f64::from(1 << 22) {
+    while values.clone().sum::<f64>() * units > f64::from(1 << 22) {
         units /= 2.0;
     }
-    let multiples: Vec<u32> = values.iter().map(|value| ((value * units).round() as u32).max(1)).collect();
+    let multiples: Vec<u32> = values.map(|value| ((value * units).round() as u32).max(1)).collect();
     let common = multiples.iter().copied().fold(0, greatest_common_divisor);
     let worth: Vec<u32> = multiples.into_iter().map(|multiple| multiple / common).collect();
     let total = worth.iter().sum();

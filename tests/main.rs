@@ -3,6 +3,7 @@
 #[cfg(feature = "gpu")]
 #[path = "support/adapters.rs"]
 mod adapters;
+mod classes;
 mod config;
 mod credit;
 mod evolve;

@@ -206,6 +206,7 @@ fn samples(function: Function, count: u32) -> Vec<f32> {
         Tanh => (power(-40), power(10)),
         Sin | Cos => (power(-40), std::f32::consts::PI),
         Ln => (power(-24), 1.0),
+        ExpNegative => (power(-40), 100.0),
     };
     let span = (high.to_bits() - low.to_bits()) as u64;
     (0..count)
@@ -220,7 +221,7 @@ fn samples(function: Function, count: u32) -> Vec<f32> {
 #[test]
 fn levels_give_the_same_bits() {
     let bits = |values: Vec<f32>| values.into_iter().map(f32::to_bits).collect::<Vec<_>>();
-    for function in [Rsqrt, Root, Recip, Tanh, Sin, Cos, Ln] {
+    for function in [Rsqrt, Root, Recip, Tanh, Sin, Cos, Ln, ExpNegative] {
         let input = samples(function, 1 << 20);
         let expected = bits(run(Level::new(), function, &input));
         for level in levels() {

@@ -129,8 +129,7 @@ fn generation(config: &Config) -> f64 {
 
 /// Returns the agent-steps of one team's episode. This is an estimate, which ignores stages.
 fn team(config: &Config) -> f64 {
-    let world = &config.world;
-    ((world.leaders.len() + world.followers.len()) * world.steps) as f64
+    (config.agent_count() * config.world.steps) as f64
 }
 
 #[cfg(test)]

@@ -7,7 +7,7 @@ use std::f32::consts::PI;
 
 use serde::{Deserialize, Serialize};
 
-use flotilla::config::{Config, StageConfig};
+use flotilla::config::{Config, Mobility, StageConfig};
 use flotilla::evaluate::Starts;
 use flotilla::stepping::{Recording, StepError, Stepper};
 use flotilla::world::World;
@@ -85,12 +85,22 @@ impl Script {
         let mut stepper = Stepper::new(World::new(config), 1, Recording::None)?;
         let places = starts.of(episode, stepper.world());
         stepper.reset_to(&places.iter().flat_map(|place| place.to_array()).collect::<Vec<_>>())?;
-        let (leaders, max_speed) = (config.learners(), config.motion.max_speed as f32);
-        let mut first = vec![None; config.world.pois.len()];
+        let (leaders, classes) = (config.learners(), config.classes());
+        let class_of = classes.class_of_each();
+        // Actions of a leader that stays where it is.
+        let rest: Vec<[f32; 2]> = class_of[..leaders]
+            .iter()
+            .map(
+                |&class| {
+                    if matches!(classes.agents[class].motion, Mobility::Free { .. }) { [0.0; 2] } else { [0.0, -1.0] }
+                },
+            )
+            .collect();
+        let mut first = vec![None; config.poi_count()];
         while !stepper.is_over(0) {
             let step = stepper.steps()[0];
             let states = stepper.states();
-            let mut actions = [0.0, -1.0].repeat(leaders);
+            let mut actions = rest.concat();
             for (leader, action) in actions.chunks_exact_mut(2).enumerate() {
                 let leg = self.0.iter().find(|leg| leg.leader == leader && step < leg.until);
                 let Some(leg) = leg else { continue };
@@ -100,8 +110,19 @@ impl Script {
                 // `libm` gives the same bits on every system.
                 let turn = libm::atan2f(hx * dy - hy * dx, hx * dx + hy * dy);
                 // Slow down near the place, and if it is not ahead.
-                let speed = leg.speed.min(2.0 * libm::hypotf(dx, dy)) * libm::cosf(turn).max(0.0);
-                action.copy_from_slice(&[turn / PI, (2.0 * speed / max_speed - 1.0).clamp(-1.0, 1.0)]);
+                let away = libm::hypotf(dx, dy);
+                let speed = leg.speed.min(2.0 * away);
+                match &classes.agents[class_of[leader]].motion {
+                    Mobility::Steered(motion) => {
+                        let speed = speed * libm::cosf(turn).max(0.0);
+                        let wanted = 2.0 * speed / motion.max_speed as f32 - 1.0;
+                        action.copy_from_slice(&[turn / PI, wanted.clamp(-1.0, 1.0)]);
+                    }
+                    Mobility::Free { max_speed } => {
+                        let share = speed / (away * *max_speed as f32).max(f32::MIN_POSITIVE);
+                        action.copy_from_slice(&[dx, dy].map(|offset| (offset * share).clamp(-1.0, 1.0)));
+                    }
+                }
             }
             stepper.step(&actions)?;
             for (first, &observed) in first.iter_mut().zip(stepper.observed()) {

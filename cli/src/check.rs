@@ -1,4 +1,4 @@
-//! `flotilla check`: prints the resolved config, and the cost of a run.
+//! `flotilla check`: prints the resolved config, and the cost of a run, or the config in full.
 
 use std::path::PathBuf;
 
@@ -13,6 +13,9 @@ pub struct Args {
     /// Print one JSON object with `config`, `cost` and `notes` (an unlimited range is null)
     #[arg(long)]
     json: bool,
+    /// Print the config in full, with its classes of agents as [[agents]] and its groups of POIs as [[pois]]
+    #[arg(long, conflicts_with_all = ["json", "out"])]
+    expand: bool,
     /// Draw the layout before any training: .svg, .pdf or .png
     #[arg(long, short, value_name = "FILE")]
     out: Option<PathBuf>,
@@ -21,8 +24,13 @@ pub struct Args {
 /// Prints the config with the cost as comments below it, so that standard output is a config file again.
 pub fn run(args: Args) -> Result<(), Error> {
     backend::start_threads(None);
-    let Args { config, json, out } = args;
+    let Args { config, json, expand, out } = args;
     output::check(&[("--out", out.as_deref())], &[&config.file.path])?;
+    if expand {
+        let text = config.text(vec![])?;
+        let found = console::run_without_backend(false, |context| check::expand(&text, context))?;
+        return print(&found.to_toml());
+    }
     let request = CheckRequest { name: config.name(), config: config.text(vec![])?, out };
     let found = console::run_without_backend(false, |context| check::run(&request, context))?;
     if json {

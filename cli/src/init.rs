@@ -108,7 +108,8 @@ fn commented(from: &str, config: &Config) -> String {
         text += &comment(&key);
         text += &format!("{leaf} = {}\n", written(&values[section][leaf]));
     }
-    text
+    text + "\n# Classes of agents, [[agents]], and groups of POIs, [[pois]], can take the place of many of these keys:\n\
+            # `flotilla check --expand FILE` prints this config with them.\n"
 }
 
 /// Returns a key's comment. Meaning and facts are on separate lines if they do not fit on one.

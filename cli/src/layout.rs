@@ -7,7 +7,6 @@ use glam::DVec2;
 
 use flotilla::config::{Config, ConfigError, MAX_AGENTS, MAX_POIS};
 use flotilla::reach;
-use flotilla::world::World;
 use flotilla_app::report::map::counted;
 
 /// The arrangement of groups and POIs.
@@ -78,7 +77,7 @@ impl StartLayout {
         };
         let farthest = short.world.pois.iter().map(nearest).fold(0.0, f64::max);
         let most = flotilla::config::MAX_STEPS;
-        let travel = reach::travel(&World::new(&short.validate()?), most);
+        let travel = reach::travel(&short, &short.classes().agents[0], most);
         let enough = travel.iter().position(|&travel| travel >= 1.5 * farthest + BEHIND).unwrap_or(most);
         let text = self.with_steps(enough.next_multiple_of(5).clamp(25, most));
         Config::parse(&text, "layout").map(|_| text)

@@ -13,6 +13,7 @@ mod support {
 }
 
 mod claims;
+mod classes;
 mod cli;
 mod cluster;
 mod compare;

@@ -11,8 +11,8 @@ const OPENING: &str = "\
 For users who write configs: every key, its unit, range, default and meaning.
 
 A config is a TOML file with the sections below. `world.leaders` and `world.pois` are required; every other key has the default shown
-here. `flotilla check CONFIG` prints all values and reports every error at once, with its line. Lengths are in map units, times in seconds,
-angles in radians.
+here. [Classes of agents](#agents) and [groups of POIs](#pois) can take the place of some of these keys. `flotilla check CONFIG` prints all
+values and reports every error at once, with its line. Lengths are in map units, times in seconds, angles in radians.
 
 [The model](../explain/model.md) has the equations. The last column is the section and equation of the paper, *Structural Credit
 Assignment for Multiagent Leader-Based Learning*. It is empty if the paper does not mention the key. The paper gives numbers for hardly any
@@ -20,6 +20,55 @@ key; [choices](../explain/choices.md) explains how the others were chosen.
 
 This page is made from the program's table of keys by `FLOTILLA_WRITE=1 cargo test reference::`.
 ";
+
+/// The heading and the text above the table of each list or table.
+const TABLES: [(&str, &str); 5] = [
+    (
+        "agents",
+        "\
+## `[[agents]]`
+
+Classes of agents, in the place of `world.leaders`, `followers`, `heading`, `speed` and `observers`, `[motion]`, `[follow]`, `[sense]` and
+`learning.paradigm`. A config that has them cannot have these keys. `flotilla check --expand CONFIG` prints a config with them. There are
+up to 8 classes.
+",
+    ),
+    (
+        "agents.motion",
+        "\
+### `motion`
+
+`motion = { kind = \"free\", max_speed = 1.0 }`. A free agent has `max_speed` only.
+",
+    ),
+    (
+        "agents.senses",
+        "\
+### `senses`
+
+A list of channels: `senses = [{ of = \"pois\", range = 10.0 }, { of = \"agents\" }]`. An agent never senses itself. In all channels of a
+class there are up to 64 sectors. Policies of classes with fewer than others have zeros as their last inputs.
+",
+    ),
+    (
+        "agents.rule",
+        "\
+### `rule`
+
+A list of terms: `rule = [{ of = \"agents\", to = 5.0, gain = -1.0 }]`. The force on an agent is the sum of its terms and of the push of
+the walls. The agent turns towards it, with the force's size as its wanted speed.
+",
+    ),
+    (
+        "pois",
+        "\
+## `[[pois]]`
+
+Groups of POIs, in the place of `world.pois`, `coupling`, `observation_radius`, `observers`, `windows` and `after`. A config that has them
+cannot have these keys.
+",
+    ),
+];
 
 const CLOSING: &str = "
 ## `[[stages]]`
@@ -30,7 +79,7 @@ Any number of stages, in order of `from`. Each starts from the file's own keys a
 | key | unit | type | range | default | meaning | paper |
 |---|---|---|---|---|---|---|
 | `from` | generations | whole number | 0 to learning.generations, more than that of the stage before | none: it has to be given | the first generation of the stage; it lasts until that of the next | 2.1 |
-| `set` |  | table of keys | any of the keys above but `policy.*`, `checkpoint.*`, `learning.paradigm`, `sharing`, `groups`, `population`, `elites`, `parents`, `method`, `search_sigma`, `generations`, `trials` and `seed`; as many leaders learn | `{}` | the keys that differ from the file, `{ \"world.coupling\" = 1 }` | 2.1 |
+| `set` |  | table of keys | any of the keys of sections but `policy.*`, `checkpoint.*`, `learning.paradigm`, `sharing`, `groups`, `population`, `elites`, `parents`, `method`, `search_sigma`, `generations`, `trials` and `seed`; as many leaders learn | `{}` | the keys that differ from the file, `{ \"world.coupling\" = 1 }` | 2.1 |
 ";
 
 /// Returns text as a cell of a Markdown table.
@@ -48,6 +97,24 @@ fn page() -> String {
             let leaf = name.split_once('.').map_or(*name, |(_, leaf)| leaf);
             let default = default.as_ref().map_or("none: it has to be given".into(), |default| format!("`{default}`"));
             let cells = [&format!("`{leaf}`"), *unit, kind, range, &default, meaning, paper].map(cell);
+            let _ = writeln!(page, "| {} |", cells.join(" | "));
+        }
+    }
+    let tables = config::table_keys();
+    assert_eq!(tables.iter().map(|(name, _)| *name).collect::<Vec<_>>(), TABLES.map(|(name, _)| name));
+    for ((_, keys), (_, opening)) in tables.iter().zip(TABLES) {
+        let _ =
+            write!(page, "\n{opening}\n| key | unit | type | range | default | meaning |\n|---|---|---|---|---|---|\n");
+        for Definition { name, unit, kind, range, default, meaning, .. } in keys {
+            let leaf = name.rsplit('.').next().unwrap_or_default();
+            let is_value = |text: &&String| format!("x = {text}").parse::<toml::Table>().is_ok();
+            let default = match default {
+                None => "none: it has to be given".into(),
+                Some(default) => {
+                    Some(default).filter(is_value).map_or(default.clone(), |default| format!("`{default}`"))
+                }
+            };
+            let cells = [&format!("`{leaf}`"), *unit, kind, range, &default, meaning].map(cell);
             let _ = writeln!(page, "| {} |", cells.join(" | "));
         }
     }

@@ -205,9 +205,14 @@ class Config(Mapping[str, Any]):
         def count(number: int, what: str) -> str:
             return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
+        if "agents" in sections:
+            agents = ", ".join(f"{len(group['at'])} {group['name']}" for group in sections["agents"])
+            who = count(self.num_learners, "learner")
+        else:
+            agents = f"{count(len(world['leaders']), 'leader')}, {count(len(world['followers']), 'follower')}"
+            who = learning["paradigm"]
         return (
-            f"<flotilla.Config: {count(len(world['leaders']), 'leader')}, {count(len(world['followers']), 'follower')}, "
-            f"{count(len(world['pois']), 'POI')}; {learning['paradigm']} by {learning['fitness']}, "
+            f"<flotilla.Config: {agents}, {count(self._native.sizes[1], 'POI')}; {who} by {learning['fitness']}, "
             f"{count(learning['population'], 'team')}, {count(learning['generations'], 'generation')}, "
             f"{count(learning['trials'], 'trial')}, seed {learning['seed']}>"
         )

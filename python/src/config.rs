@@ -78,8 +78,7 @@ impl Config {
     /// Numbers of agents, POIs and steps.
     #[getter]
     fn sizes(&self) -> (usize, usize, usize) {
-        let world = &self.0.world;
-        (world.leaders.len() + world.followers.len(), world.pois.len(), world.steps)
+        (self.0.agent_count(), self.0.poi_count(), self.0.world.steps)
     }
 
     /// Widths of a policy's layers, inputs and outputs included.

@@ -122,7 +122,7 @@ impl Stepper {
         workers::aside(py, || {
             let mut stepper = self.stepper()?;
             stepper.step(actions).raise()?;
-            let pois = self.config.world.pois.len();
+            let pois = self.config.poi_count();
             for (team, newly) in rewards
                 .into_iter()
                 .flat_map(|rewards| rewards.chunks_exact_mut(leaders).zip(stepper.newly_observed().chunks_exact(pois)))
@@ -186,7 +186,7 @@ impl Stepper {
 
     /// Returns positions and headings `[teams, agents, 2]` and speeds `[teams, agents]`, leaders first.
     fn states<'py>(&self, py: Python<'py>) -> PyResult<States<'py>> {
-        let (teams, agents) = (self.teams()?, self.config.world.leaders.len() + self.config.world.followers.len());
+        let (teams, agents) = (self.teams()?, self.config.agent_count());
         let [positions, headings, speeds] = workers::aside(py, || {
             let mut stepper = self.stepper()?;
             let stepping::States { positions, headings, speeds } = stepper.states();

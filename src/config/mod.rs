@@ -1,4 +1,5 @@
-//! The config of an experiment. Every key has a default except `world.leaders` and `world.pois`.
+//! The config of an experiment. Every key has a default except `world.leaders` and `world.pois`, or those of the lists
+//! `[[agents]]` and `[[pois]]`, which replace them.
 //!
 //! [`Config::load`] reads a config from a file. [`Config::read`] reads it from text, together with keys that flags or a
 //! sweep set.
@@ -8,9 +9,13 @@
 //! [`crate::model`], the others in this module. All problems of a text are found in one pass and reported by line, see
 //! [`crate::reader`].
 
-use serde::Serialize;
+use std::collections::BTreeMap;
 
-use crate::reader::{self, Document, Reader};
+use serde::ser::SerializeMap;
+use serde::{Serialize, Serializer};
+
+use crate::reader::{self, Document, Keys, Reader, Section};
+use classes::Summary;
 
 pub use crate::config_enum::Choice;
 pub use crate::model::follow::Follow;
@@ -21,8 +26,8 @@ pub use crate::model::sense::{Combine, Density, Frame, Measure, Sense};
 pub use crate::model::start::Heading;
 pub use crate::reader::{Definition, Override, Problem};
 pub use classes::{
-    AGENTS, AgentClass, Channel, Classes, Control, MAX_CHANNELS, MAX_CLASSES, MAX_SECTORS, MAX_TERMS, Mobility, POIS,
-    PoiGroup, Term,
+    AGENTS, AgentClass, Channel, Classes, Control, MAX_CHANNELS, MAX_CLASSES, MAX_INPUTS, MAX_SECTORS, MAX_TERMS,
+    Mobility, POIS, PoiGroup, Term,
 };
 pub use learning::{
     CheckpointConfig, Elites, Fitness, Learning, LedBy, Leniency, MAX_EPISODES, MAX_GENERATIONS, MAX_HALL_OF_FAME,
@@ -61,7 +66,7 @@ pub const VARY: &str = "vary";
 
 /// Returns every key of a config, in the order of [`Config::to_toml`].
 pub fn keys() -> Vec<Definition> {
-    let (config, mut keys) = reader::keys(Config::ask);
+    let (config, Keys { sections: mut keys, .. }) = reader::keys(Config::ask);
     let text = config.to_toml();
     let place = |key: &Definition| {
         let (section, leaf) = key.name.split_once('.')?;
@@ -72,8 +77,13 @@ pub fn keys() -> Vec<Definition> {
     keys
 }
 
+/// Returns the keys of the tables of a config, by the dotted name of each list or table: `agents`, `agents.motion`.
+pub fn table_keys() -> Vec<(&'static str, Vec<Definition>)> {
+    reader::keys(Config::ask).1.tables
+}
+
 /// One experiment, as written in a config file.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Config {
     /// `[world]`: start positions, the length of an episode, and how POIs are observed.
     pub world: WorldConfig,
@@ -90,14 +100,49 @@ pub struct Config {
     /// `[checkpoint]`: how often a run saves.
     pub checkpoint: CheckpointConfig,
     /// `[[agents]]`: classes of agents, written in full. Empty if they are written in short, see [`Config::classes`].
-    #[serde(skip_serializing_if = "Vec::is_empty")]
     pub agents: Vec<AgentClass>,
     /// `[[pois]]`: groups of POIs, written in full. Empty if they are written in short.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
     pub pois: Vec<PoiGroup>,
     /// `[[stages]]`: keys that change from some generation on, see [`ValidConfig::stages`].
-    #[serde(skip_serializing_if = "Vec::is_empty")]
     pub stages: Vec<Stage>,
+}
+
+/// Writes the keys that the config's tables do not replace, then its tables and stages.
+impl Serialize for Config {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let mut map = serializer.serialize_map(None)?;
+        self.serialize_sections(&mut map)?;
+        if !self.agents.is_empty() {
+            map.serialize_entry(AGENTS, &self.agents)?;
+        }
+        if !self.pois.is_empty() {
+            map.serialize_entry(POIS, &self.pois)?;
+        }
+        if !self.stages.is_empty() {
+            map.serialize_entry(STAGES, &self.stages)?;
+        }
+        map.end()
+    }
+}
+
+/// A section of a config without the keys that its tables replace.
+struct Written<'c, T>(&'c T, &'c Config);
+
+impl<T: Section> Serialize for Written<'_, T> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        self.0.serialize_some(serializer, &|key| self.1.is_written(key))
+    }
+}
+
+/// The sections of a config.
+struct Sections<'c>(&'c Config);
+
+impl Serialize for Sections<'_> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let mut map = serializer.serialize_map(None)?;
+        self.0.serialize_sections(&mut map)?;
+        map.end()
+    }
 }
 
 impl Config {
@@ -161,9 +206,29 @@ impl Config {
 
     /// Returns the value of each dotted key, without the stages.
     fn values(&self) -> impl Iterator<Item = (&'static str, reader::Value<'static>)> {
-        let Config { world, motion, follow, sense, policy, learning, checkpoint, agents: _, pois: _, stages: _ } = self;
+        let Config { world, motion, follow, sense, policy, learning, checkpoint, .. } = self;
         let sections = [world.values(), motion.values(), follow.values(), sense.values(), policy.values()];
-        sections.into_iter().chain([learning.values(), checkpoint.values()]).flatten()
+        let values = sections.into_iter().chain([learning.values(), checkpoint.values()]).flatten();
+        let agents = (!self.agents.is_empty()).then(|| (AGENTS, reader::Value::of(&self.agents)));
+        let pois = (!self.pois.is_empty()).then(|| (POIS, reader::Value::of(&self.pois)));
+        values.filter(|(key, _)| self.is_written(key)).chain(agents).chain(pois)
+    }
+
+    fn serialize_sections<M: SerializeMap>(&self, map: &mut M) -> Result<(), M::Error> {
+        fn section<T: Section, M: SerializeMap>(map: &mut M, section: &T, config: &Config) -> Result<(), M::Error> {
+            let mut keys = T::KEYS.iter().map(|leaf| format!("{}.{leaf}", T::NAME));
+            match keys.any(|key| config.is_written(&key)) {
+                true => map.serialize_entry(T::NAME, &Written(section, config)),
+                false => Ok(()),
+            }
+        }
+        section(map, &self.world, self)?;
+        section(map, &self.motion, self)?;
+        section(map, &self.follow, self)?;
+        section(map, &self.sense, self)?;
+        section(map, &self.policy, self)?;
+        section(map, &self.learning, self)?;
+        section(map, &self.checkpoint, self)
     }
 
     /// Returns the text of a config file for this config, with every key written out.
@@ -172,12 +237,22 @@ impl Config {
     /// Panics if a program has set a whole number that TOML cannot represent, which is one above 2⁶³ − 1. Such a config
     /// is invalid, see [`Config::validate`].
     pub fn to_toml(&self) -> String {
-        toml::to_string(self).expect("numbers, words and lists of them under plain keys are TOML")
+        const IS_TOML: &str = "numbers, words and lists of them under plain keys are TOML";
+        let mut parts = vec![toml::to_string(&Sections(self)).expect(IS_TOML)];
+        parts.extend(self.tables_to_toml());
+        if !self.stages.is_empty() {
+            parts.push(toml::to_string(&BTreeMap::from([(STAGES, &self.stages)])).expect(IS_TOML));
+        }
+        parts.join("\n")
     }
 
-    /// Returns the number of agents that learn: the leaders, and in the all-leaders paradigm also the followers.
+    /// Returns the number of agents that learn: those of classes with a policy. In short these are the leaders, and in
+    /// the all-leaders paradigm also the followers.
     pub fn learners(&self) -> usize {
         match self.learning.paradigm {
+            _ if !self.agents.is_empty() => {
+                self.agents.iter().filter(|class| class.learns()).map(|class| class.at.len()).sum()
+            }
             Paradigm::LeaderFollower => self.world.leaders.len(),
             Paradigm::AllLeaders => self.world.leaders.len() + self.world.followers.len(),
         }
@@ -238,12 +313,6 @@ impl Config {
         self.learning.teams() + self.hall_teams(1) + 1
     }
 
-    /// Returns the number of inputs of a policy: the most that any class has.
-    pub fn inputs(&self) -> usize {
-        let inputs = |class: &AgentClass| class.senses.iter().map(|channel| channel.sectors).sum();
-        self.classes().agents.iter().map(inputs).max().unwrap_or(0)
-    }
-
     /// Returns the number of weights in one policy, including biases.
     pub fn parameters(&self) -> usize {
         self.policy.parameters(self.inputs())
@@ -258,10 +327,26 @@ impl Config {
     /// Reads every key. An invalid number reads as the largest allowed one, and an invalid list as empty. This way keys
     /// that depend on them are not reported as well.
     fn ask(r: &mut Reader<'_>) -> Config {
+        let has_agents = r.replace(AGENTS, classes::REPLACED_BY_AGENTS);
+        let has_pois = r.replace(POIS, classes::REPLACED_BY_POIS);
+        let mut summary = Summary::peek(r);
         let (motion, start_speed) = Motion::read(r);
         let paradigm = Paradigm::read(r);
-        let world = WorldConfig::read(r, start_speed, paradigm);
+        let (world, sides) =
+            WorldConfig::read(r, start_speed, paradigm, has_agents.then(|| summary.observers()), has_pois);
+        if !has_agents {
+            summary.classes = world.class_summaries(paradigm);
+        }
+        if !has_pois {
+            summary.groups = world.group_summaries();
+        }
+        let agents = classes::read_agents(r, sides, &summary);
+        if has_agents && !has_pois && summary.observers() == 0 && summary.classes.iter().all(|class| class.agents > 0) {
+            r.report_key(AGENTS, "found no class that observes, allowed one or more with observes = true".into());
+        }
+        let pois = classes::read_pois(r, sides, world.steps, &summary);
         let learners = match paradigm {
+            _ if has_agents => summary.learners(),
             _ if world.leaders.is_empty() => 0,
             Paradigm::LeaderFollower => world.leaders.len(),
             Paradigm::AllLeaders => world.leaders.len() + world.followers.len(),
@@ -274,10 +359,22 @@ impl Config {
             policy: Policy::read(r),
             learning: Learning::read(r, paradigm, learners),
             checkpoint: CheckpointConfig::read(r),
-            agents: vec![],
-            pois: vec![],
+            agents,
+            pois,
             stages: vec![],
         };
+        let needs_quadrants = config.agents.iter().find(|class| class.learns() && !class.senses_quadrants());
+        if let (Actions::Behaviours, Some(class)) = (config.policy.actions, needs_quadrants) {
+            let message = format!(
+                "found \"behaviours\", but the senses of {:?} do not begin with POIs and agents in 4 sectors around the \
+                 heading",
+                class.name
+            );
+            r.report_key("policy.actions", message);
+        }
+        if has_agents && config.learning.sharing == Sharing::Group && !r.has("learning.groups") {
+            r.report_key("learning.sharing", "found \"group\" with [[agents]], which needs learning.groups".into());
+        }
         let Learning { population, hall_of_fame, .. } = config.learning;
         if r.error_count() == 0 && hall_of_fame > 0 {
             let teams = config.max_teams() - 1;
@@ -314,7 +411,7 @@ fn resolve<'a>(
     let invalid = |problems, unlisted| ConfigError::Invalid { name: name.to_string(), problems, unlisted };
     let without_stages = |overrides: &[Override]| {
         let mut reader: Reader<'_> = values()?;
-        reader.set_all(overrides);
+        reader.set_all(overrides, &[AGENTS, POIS]);
         reader.read(Config::ask)
     };
     let (own, mut notes) =

@@ -8,8 +8,8 @@ use std::collections::BTreeMap;
 use serde::Serialize;
 use toml::de::DeValue;
 
-use super::{Config, MAX_GENERATIONS, Override, Problem};
-use crate::reader::{Document, Number, Reader, Value};
+use super::{AGENTS, Config, MAX_GENERATIONS, Override, POIS, Problem};
+use crate::reader::{Document, Number, Reader, Value, includes};
 
 /// The list of stages in a config.
 pub const STAGES: &str = "stages";
@@ -18,7 +18,11 @@ pub const MAX_STAGES: usize = 256;
 /// The key with the length of a run.
 pub const GENERATIONS: &str = "learning.generations";
 /// Keys that stages cannot change. A name that ends with a dot is a whole section.
-const FIXED: [&str; 14] = [
+const FIXED: [&str; 18] = [
+    AGENTS,
+    "agents.",
+    POIS,
+    "pois.",
     "policy.",
     "checkpoint.",
     "learning.paradigm",
@@ -184,7 +188,7 @@ impl UnresolvedStage<'_> {
         let mut reader = Reader::of_values(own.values());
         for (key, (line, value)) in &self.set {
             let name = format!("{name}.set.{key}");
-            if FIXED.iter().any(|fixed| key == fixed || fixed.ends_with('.') && key.starts_with(fixed)) {
+            if FIXED.iter().any(|fixed| includes(fixed, key)) {
                 problems.push(Problem {
                     line: *line,
                     key: name,

@@ -3,7 +3,7 @@
 use std::collections::HashSet;
 use std::ops::Deref;
 
-use super::{Config, ConfigError};
+use super::{AgentClass, Config, ConfigError, Mobility, WorldConfig};
 
 /// A config whose every key is in its range: one that a [`World`](crate::world::World) is made from.
 #[derive(Clone, Debug, PartialEq)]
@@ -89,16 +89,14 @@ impl ValidConfig {
 
     /// Returns the number of POIs, or `None` if it differs between stages.
     pub fn pois(&self) -> Option<usize> {
-        let count = self.stages[0].1.world.pois.len();
-        self.stages.iter().all(|(_, config)| config.world.pois.len() == count).then_some(count)
+        let count = self.stages[0].1.poi_count();
+        self.stages.iter().all(|(_, config)| config.poi_count() == count).then_some(count)
     }
 
     /// Returns a note for each setting that is valid but likely a mistake.
     pub fn notes(&self) -> Vec<String> {
-        let too_short = |config: &Config| config.motion.too_short(config.world.dt, config.world.map);
-        let degrees = |config: &Config| config.world.heading.likely_degrees();
-        let notes = self.stages.iter().flat_map(|(_, config)| [too_short(config), degrees(config)]).flatten();
         let mut shown = HashSet::new();
+        let notes = self.stages.iter().flat_map(|(_, config)| notes(config));
         notes.filter(|note| shown.insert(note.clone())).collect()
     }
 
@@ -112,6 +110,28 @@ impl ValidConfig {
         self.config.0.learning.generations = self.config.0.learning.generations.min(generation);
         self
     }
+}
+
+/// Returns the notes about one stage.
+fn notes(config: &Config) -> Vec<String> {
+    let WorldConfig { map, dt, .. } = config.world;
+    if config.agents.is_empty() {
+        let notes = [config.motion.too_short("motion", dt, map), config.world.heading.likely_degrees("world.heading")];
+        return notes.into_iter().flatten().collect();
+    }
+    let classes = config.classes();
+    let of_class = |(index, class): (usize, &AgentClass)| {
+        let name = format!("agents[{index}]");
+        let too_short = match &class.motion {
+            Mobility::Steered(motion) => motion.too_short(&format!("{name}.motion"), dt, map),
+            Mobility::Free { .. } => None,
+        };
+        let degrees = class.heading.likely_degrees(&format!("{name}.heading"));
+        let blind = class.senses.iter().enumerate().filter(|(_, channel)| channel.is_blind(class, &classes));
+        let blind = blind.map(|(channel, _)| format!("{name}.senses[{channel}] never senses anything in this world"));
+        too_short.into_iter().chain(degrees).chain(blind).collect::<Vec<_>>()
+    };
+    config.agents.iter().enumerate().flat_map(of_class).collect()
 }
 
 #[cfg(test)]

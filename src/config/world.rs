@@ -1,13 +1,14 @@
 //! The section `[world]`: its data and keys.
 
-use super::{Coupling, Observers, Paradigm};
+use super::classes::{ClassSummary, GroupSummary};
+use super::{Control, Coupling, Observers, Paradigm};
 use crate::model::couple::observation_radius;
 use crate::model::rule::{after, windows};
 use crate::model::start::Heading;
 use crate::model::{LEAST, LONGEST};
 use crate::reader::{Allowed, Reader, between, section};
 
-/// Maximum number of agents (leaders and followers) in a team.
+/// Maximum number of agents in a team.
 pub const MAX_AGENTS: usize = 1024;
 /// Maximum number of POIs in a world.
 pub const MAX_POIS: usize = 256;
@@ -54,13 +55,23 @@ section! {
 }
 
 impl WorldConfig {
-    /// Reads the section. `start_speed` limits the agents' start speed.
-    pub(super) fn read(r: &mut Reader<'_>, start_speed: Allowed<f64>, paradigm: Paradigm) -> WorldConfig {
+    /// Reads the section. `start_speed` limits the agents' start speed. `observers` is the number of agents that observe
+    /// if `[[agents]]` replaces leaders and followers, and `has_pois` means that `[[pois]]` replaces POIs. Also returns
+    /// the range of positions on each axis.
+    pub(super) fn read(
+        r: &mut Reader<'_>,
+        start_speed: Allowed<f64>,
+        paradigm: Paradigm,
+        observers_in_full: Option<usize>,
+        has_pois: bool,
+    ) -> (WorldConfig, [Allowed<f64>; 2]) {
+        let none = |replaced: bool| replaced.then(Vec::new);
+        let has_agents = observers_in_full.is_some();
         let map = WorldConfig::map(r).pair(between(1.0, LONGEST), [50.0, 50.0]);
         let sides = map.map(|side| between(LEAST, side).or_zero().because("the map"));
-        let leaders = WorldConfig::leaders(r).positions(1..=MAX_AGENTS, sides, None);
+        let leaders = WorldConfig::leaders(r).positions(1..=MAX_AGENTS, sides, none(has_agents));
         let followers = WorldConfig::followers(r).positions(0..=MAX_AGENTS - 1, sides, Some(vec![]));
-        let pois = WorldConfig::pois(r).positions(1..=MAX_POIS, sides, None);
+        let pois = WorldConfig::pois(r).positions(1..=MAX_POIS, sides, none(has_pois));
         let agents = leaders.as_ref().zip(followers.as_ref()).map_or(MAX_AGENTS, |(l, f)| l.len() + f.len());
         if agents > MAX_AGENTS {
             let message = format!("found {agents} agents with the leaders, allowed 1 to {MAX_AGENTS}");
@@ -68,6 +79,8 @@ impl WorldConfig {
         }
         let observers = Observers::read(r);
         let counted = match (leaders.as_ref(), followers.as_ref(), paradigm) {
+            _ if has_pois => MAX_AGENTS,
+            _ if has_agents => observers_in_full.filter(|&count| count > 0).unwrap_or(MAX_AGENTS),
             (Some(leaders), Some(followers), Paradigm::LeaderFollower) => {
                 observers.among(leaders.len(), followers.len()).len()
             }
@@ -78,12 +91,12 @@ impl WorldConfig {
             let why = if paradigm == Paradigm::AllLeaders { "all agents lead" } else { "there are no followers" };
             r.report_key("world.observers", format!("found \"{observers}\", but {why}, so nobody would observe"));
         }
-        let places = pois.as_ref().map(Vec::len);
+        let places = pois.as_ref().filter(|_| !has_pois).map(Vec::len);
         let steps = WorldConfig::steps(r).number(between(1, MAX_STEPS), 25);
         let counts =
             leaders.as_ref().zip(followers.as_ref()).map(|(leaders, followers)| [leaders.len(), followers.len()]);
         let heading = Heading::read(r, counts);
-        WorldConfig {
+        let world = WorldConfig {
             map,
             coupling: Coupling::read(r, counted.clamp(1, MAX_AGENTS), observers.counted(), places),
             observers,
@@ -97,6 +110,34 @@ impl WorldConfig {
             dt: WorldConfig::dt(r).number(between(1e-4, 10.0), 0.2),
             heading,
             speed: WorldConfig::speed(r).number(start_speed, 0.0),
+        };
+        (world, sides)
+    }
+
+    /// Returns the classes that other tables can refer to.
+    pub(super) fn class_summaries(&self, paradigm: Paradigm) -> Vec<ClassSummary> {
+        let class = |name: &str, control: Control, agents: usize| ClassSummary {
+            name: name.into(),
+            control: Some(control),
+            agents,
+            observes: true,
+            has_rule: control == Control::Follow,
+        };
+        let (leaders, followers) = (self.leaders.len(), self.followers.len());
+        match paradigm {
+            Paradigm::LeaderFollower if followers > 0 => {
+                vec![class("leader", Control::Policy, leaders), class("follower", Control::Follow, followers)]
+            }
+            _ => vec![class("leader", Control::Policy, leaders + followers)],
+        }
+    }
+
+    /// Returns the groups of POIs that other tables can refer to.
+    pub(super) fn group_summaries(&self) -> Vec<GroupSummary> {
+        let group = |name: String, pois: usize| GroupSummary { name, pois };
+        match self.after.iter().all(Vec::is_empty) {
+            true => vec![group("poi".into(), self.pois.len())],
+            false => (0..self.pois.len()).map(|poi| group(format!("poi{poi}"), 1)).collect(),
         }
     }
 

@@ -8,7 +8,7 @@ use fearless_simd::Simd;
 use super::follow::{RuleConstants, TermConstants};
 use super::motion::MotionConstants;
 use super::sense::{ChannelConstants, NOTHING};
-use crate::config::{AgentClass, Control, MAX_CHANNELS, MAX_CLASSES, MAX_TERMS, Mobility};
+use crate::config::{AgentClass, Classes, Control, MAX_CHANNELS, MAX_CLASSES, MAX_TERMS, Mobility};
 use crate::gpu_struct::gpu_struct;
 
 gpu_struct! {
@@ -55,25 +55,21 @@ gpu_struct! {
 }
 
 impl Class {
-    /// Computes the constants of all classes of a valid config. `groups` are its POI groups by name; `values` are those
-    /// of the POIs.
-    pub(crate) fn all(
-        classes: &[AgentClass],
-        groups: &[(String, Range<usize>)],
-        values: &[f32],
-        map: [f64; 2],
-        dt: f64,
-    ) -> Vec<Class> {
-        let mut end = 0;
-        let mut place = |class: &AgentClass| {
-            end += class.at.len();
-            end - class.at.len()..end
+    /// Computes the constants of all classes of a valid config. `values` are those of the POIs.
+    pub(crate) fn all(described: &Classes, values: &[f32], map: [f64; 2], dt: f64) -> Vec<Class> {
+        let classes = &described.agents;
+        let places = runs(classes.iter().map(|class| class.at.len()));
+        let groups = runs(described.pois.iter().map(|group| group.at.len()));
+        let end = places.last().map_or(0, |place| place.end);
+        let of_class = |name: &str| {
+            let index = classes.iter().position(|class| class.name == name);
+            index.map_or(0..0, |index| places[index].clone())
         };
-        let places: Vec<Range<usize>> = classes.iter().map(&mut place).collect();
-        let index = |name: &str| classes.iter().position(|class| class.name == name);
-        let of_class = |name: &str| index(name).map_or(0..0, |index| places[index].clone());
-        let of_group = |name: &str| groups.iter().find(|group| group.0 == name).map_or(0..0, |group| group.1.clone());
-        let class = |(class, place): (&AgentClass, &Range<usize>)| {
+        let of_group = |name: &str| {
+            let index = described.pois.iter().position(|group| group.name == name);
+            index.map_or(0..0, |index| groups[index].clone())
+        };
+        let class = |(index, class): (usize, &AgentClass)| {
             let mut channels = [ChannelConstants::zeroed(); MAX_CHANNELS];
             let mut input = 0;
             for (to, channel) in channels.iter_mut().zip(&class.senses) {
@@ -85,14 +81,14 @@ impl Class {
             terms[..own.len()].copy_from_slice(&own);
             let motion = MotionConstants::new(&class.motion, class.speed, dt);
             let mut influence2 = [NOTHING; MAX_CLASSES];
-            for led in class.leads.iter().filter_map(|name| index(name)) {
-                let farthest = classes[led].rule.iter().map(|term| term.to).fold(0.0, f64::max);
-                let radius = class.influence_radius.unwrap_or(farthest);
-                influence2[led] = (radius * radius) as f32;
+            for (led, influence2) in influence2.iter_mut().enumerate().take(classes.len()) {
+                if let Some(radius) = described.influence_radius(index, led) {
+                    *influence2 = (radius * radius) as f32;
+                }
             }
             let shape = ClassShape {
-                first_agent: place.start as u32,
-                end_agent: place.end as u32,
+                first_agent: places[index].start as u32,
+                end_agent: places[index].end as u32,
                 control: class.control as u32,
                 free: matches!(class.motion, Mobility::Free { .. }).into(),
                 by_sine: motion.by_sine().into(),
@@ -102,8 +98,18 @@ impl Class {
             let constants = ClassConstants { shape, motion, rule: RuleConstants::new(class, end), influence2 };
             Class { constants, channels, terms }
         };
-        classes.iter().zip(&places).map(class).collect()
+        classes.iter().enumerate().map(class).collect()
     }
+}
+
+/// Returns where each of some counts begins and ends, one after the other.
+fn runs(counts: impl Iterator<Item = usize>) -> Vec<Range<usize>> {
+    let mut end = 0;
+    let run = |count| {
+        end += count;
+        end - count..end
+    };
+    counts.map(run).collect()
 }
 
 impl Class {

@@ -34,7 +34,7 @@ section! {
 impl Motion {
     /// Reads the section, and returns the range of start speeds too.
     pub(crate) fn read(r: &mut Reader<'_>) -> (Motion, Allowed<f64>) {
-        let max_speed = Motion::max_speed(r).number(between(LEAST, 1e3).or_zero(), 3.0);
+        let max_speed = Motion::read_max_speed(r);
         let slowest = between(LEAST, max_speed).or_zero().because("motion.max_speed");
         let before = r.error_count();
         let min_speed = Motion::min_speed(r).number(slowest, 0.0);
@@ -49,16 +49,21 @@ impl Motion {
         };
         (motion, start_speed)
     }
+
+    /// Reads the largest speed.
+    pub(crate) fn read_max_speed(r: &mut Reader<'_>) -> f64 {
+        Motion::max_speed(r).number(between(LEAST, 1e3).or_zero(), 3.0)
+    }
 }
 
 impl Motion {
     /// Returns what is wrong with steps of this time on this map, if they are so short that rounding of positions
-    /// shows.
-    pub(crate) fn too_short(&self, dt: f64, map: [f64; 2]) -> Option<String> {
+    /// shows. `motion` is the name of the limits.
+    pub(crate) fn too_short(&self, motion: &str, dt: f64, map: [f64; 2]) -> Option<String> {
         let (step, resolution) = (self.max_speed * dt, resolution(map));
         (step > 0.0 && step < SHORTEST * resolution).then(|| {
             format!(
-                "motion.max_speed times world.dt is {step:.2e} units, and positions on this map are {resolution:.2e} units \
+                "{motion}.max_speed times world.dt is {step:.2e} units, and positions on this map are {resolution:.2e} units \
                  apart: agents stand still or get too far or not far enough; set a larger world.dt or a smaller world.map, \
                  so that a step is at min {:.2e} units",
                 SHORTEST * resolution

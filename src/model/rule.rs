@@ -122,7 +122,7 @@ fn sorted(after: &[Vec<usize>]) -> (Vec<usize>, Vec<usize>) {
 }
 
 /// Returns POIs of which each comes after the next, and the last after the first.
-fn cycle(after: &[Vec<usize>]) -> Option<Vec<usize>> {
+pub(crate) fn cycle(after: &[Vec<usize>]) -> Option<Vec<usize>> {
     let (_, left) = sorted(after);
     let mut path = vec![*left.first()?];
     loop {
@@ -160,20 +160,25 @@ impl Rule {
     /// Creates a rule from the observers of each POI, of `agents`, the windows, and the POIs that each one comes after, all
     /// `[pois]`. Windows and orders may be empty.
     pub(crate) fn new(
-        observers: impl ExactSizeIterator<Item = Vec<Range<usize>>>,
+        observers: &[Vec<Range<usize>>],
         agents: usize,
-        windows: Vec<[u32; 2]>,
-        after: Vec<Vec<usize>>,
+        windows: &[[usize; 2]],
+        after: &[Vec<usize>],
     ) -> Rule {
         let words = agents.div_ceil(32);
         let mut counted = vec![0; observers.len() * words];
-        let mut all = true;
         for (bits, observers) in counted.chunks_exact_mut(words).zip(observers) {
-            all &= observers.iter().map(Range::len).sum::<usize>() == agents;
-            observers.into_iter().flatten().for_each(|agent| bits[agent / 32] |= 1 << (agent % 32));
+            observers.iter().cloned().flatten().for_each(|agent| bits[agent / 32] |= 1 << (agent % 32));
         }
-        let after = if after.iter().all(Vec::is_empty) { vec![] } else { after };
-        Rule { counted: if all { vec![] } else { counted }, words, windows, order: sorted(&after).0, after }
+        let all = observers.iter().all(|observers| observers.iter().map(Range::len).sum::<usize>() == agents);
+        let after = if after.iter().all(Vec::is_empty) { vec![] } else { after.to_vec() };
+        Rule {
+            counted: if all { vec![] } else { counted },
+            words,
+            windows: windows.iter().map(|window| window.map(|step| step as u32)).collect(),
+            order: sorted(&after).0,
+            after,
+        }
     }
 
     /// Reports whether the rule is consistent with the words of a set and the number of POIs: sizes match, windows

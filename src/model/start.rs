@@ -39,15 +39,15 @@ impl Heading {
         heading
     }
 
-    /// Returns a note if a heading is larger than a full turn: it was likely meant in degrees.
-    pub(crate) fn likely_degrees(&self) -> Option<String> {
+    /// Returns a note if a heading is larger than a full turn: it was likely meant in degrees. `key` is its name.
+    pub(crate) fn likely_degrees(&self, key: &str) -> Option<String> {
         let headings = match self {
             Heading::Same(heading) => std::slice::from_ref(heading),
             Heading::Each(headings) => headings,
         };
         let large = headings.iter().find(|heading| heading.abs() > TAU)?;
         Some(format!(
-            "world.heading has {large}, which is more than a full turn: headings are in radians, and {large} degrees \
+            "{key} has {large}, which is more than a full turn: headings are in radians, and {large} degrees \
              would be {:.4}",
             large.to_radians()
         ))

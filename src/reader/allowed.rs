@@ -13,13 +13,20 @@ pub(crate) struct Allowed<T> {
     pub(super) high: T,
     zero: bool,
     unlimited: bool,
+    /// The open interval in which only 0 is allowed, if any.
+    gap: Option<[T; 2]>,
     /// The keys that set the bounds.
     pub(super) because: &'static str,
 }
 
 /// Returns the range from `low` to `high`, both included.
 pub(crate) fn between<T>(low: T, high: T) -> Allowed<T> {
-    Allowed { low, high, zero: false, unlimited: false, because: "" }
+    Allowed { low, high, zero: false, unlimited: false, gap: None, because: "" }
+}
+
+/// Returns the range of 0 and of numbers whose size is from `least` to `most`.
+pub(crate) fn sized(least: f64, most: f64) -> Allowed<f64> {
+    Allowed { gap: Some([-least, least]), ..between(-most, most) }
 }
 
 impl<T: Number> Allowed<T> {
@@ -39,14 +46,18 @@ impl<T: Number> Allowed<T> {
     }
 
     pub(super) fn holds(&self, value: T) -> bool {
-        (self.low..=self.high).contains(&value)
+        (self.low..=self.high).contains(&value) && !self.is_in_gap(value)
             || self.zero && value == T::ZERO
             || self.unlimited && value.is_infinite()
     }
 
-    /// Reports whether the value is above 0 and below the smallest allowed number other than 0.
+    /// Reports whether the value is nearer to 0 than the smallest allowed number other than 0.
     pub(super) fn is_too_small(&self, value: T) -> bool {
-        self.zero && T::ZERO < value && value < self.low
+        self.zero && T::ZERO < value && value < self.low || self.is_in_gap(value)
+    }
+
+    fn is_in_gap(&self, value: T) -> bool {
+        self.gap.is_some_and(|[from, to]| from < value && value < to && value != T::ZERO)
     }
 
     /// Returns the default, or the bound next to it if other keys exclude it.
@@ -71,6 +82,9 @@ impl<T: Number> Allowed<T> {
 
     /// Returns the range, including the gap between 0 and the smallest other number.
     pub(super) fn in_detail(&self) -> String {
+        if let Some([from, to]) = self.gap {
+            return format!("{} to {from} or 0 or {to} to {}", self.low, self.high);
+        }
         match (self.zero, self.low < self.high) {
             (true, true) => format!("0 or {}", Allowed { zero: false, ..*self }),
             _ => self.to_string(),

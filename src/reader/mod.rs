@@ -15,7 +15,7 @@ mod allowed;
 mod request;
 mod value;
 
-pub(crate) use allowed::{Allowed, Number, between};
+pub(crate) use allowed::{Allowed, Number, between, sized};
 pub(crate) use request::KeyRequest;
 pub use request::{CountOrPercentage, OneOrEach};
 pub(crate) use value::Value;
@@ -161,10 +161,27 @@ impl LineNumbers {
 }
 
 /// Returns the result for an empty text, and the keys that `ask` requests, in order.
-pub(crate) fn keys<T>(ask: impl FnOnce(&mut Reader<'_>) -> T) -> (T, Vec<Definition>) {
-    let mut reader = Reader { table: Some(vec![]), ..Reader::default() };
+pub(crate) fn keys<T>(ask: impl FnOnce(&mut Reader<'_>) -> T) -> (T, Keys) {
+    let mut reader = Reader { keys: Some(Keys::default()), ..Reader::default() };
     let read = ask(&mut reader);
-    (read, reader.table.unwrap_or_default())
+    (read, reader.keys.unwrap_or_default())
+}
+
+/// The keys that a config can have.
+#[derive(Default)]
+pub(crate) struct Keys {
+    /// The keys of sections.
+    pub sections: Vec<Definition>,
+    /// The keys of tables in lists and in other tables, by the dotted name of the list or table.
+    pub tables: Vec<(&'static str, Vec<Definition>)>,
+    /// The index of the table that is being read, if any.
+    open: Option<usize>,
+}
+
+impl Keys {
+    fn push(&mut self, key: Definition) {
+        self.open.map_or(&mut self.sections, |table| &mut self.tables[table].1).push(key);
+    }
 }
 
 /// The place of a value. The order of the variants is the order of problems.
@@ -191,6 +208,14 @@ impl Entry<'_> {
     }
 }
 
+/// A table in a list or in another table, while its keys are requested.
+#[derive(Clone)]
+struct Scope {
+    /// The name in errors: `agents[1].senses[0]`.
+    name: String,
+    place: Place,
+}
+
 /// The values of a config that were not requested yet, and the problems of those that were.
 #[derive(Default)]
 pub(crate) struct Reader<'a> {
@@ -209,7 +234,13 @@ pub(crate) struct Reader<'a> {
     /// Notes about keys that were left out.
     notes: Vec<String>,
     /// The definitions of the requested keys, if [`keys`] collects them.
-    table: Option<Vec<Definition>>,
+    keys: Option<Keys>,
+    /// The table whose keys are requested, if they are not keys of a section.
+    scope: Option<Scope>,
+    /// Keys, or whole sections if they end with a dot, each with the list that replaces it in this config.
+    replaced: Vec<(&'static str, &'static str)>,
+    /// The number of unknown keys for which similar ones were searched.
+    hints: usize,
 }
 
 /// Declares a section of a config with the description of its keys. Each entry defines a field, its documentation, and
@@ -229,6 +260,23 @@ macro_rules! section {
                 $(#[doc = concat!("\n\n`", $section, ".", stringify!($field), "`", section!(@source $unit, $paper), ".")])?
                 pub $field: $type,
             )+
+        }
+
+        impl $crate::reader::Section for $name {
+            const NAME: &'static str = $section;
+            const KEYS: &'static [&'static str] = &[$(stringify!($field)),+];
+
+            fn serialize_some<S: serde::Serializer>(
+                &self,
+                serializer: S,
+                is_written: &dyn Fn(&str) -> bool,
+            ) -> Result<S::Ok, S::Error> {
+                let mut map = serializer.serialize_map(None)?;
+                $(if is_written(concat!($section, ".", stringify!($field))) {
+                    serde::ser::SerializeMap::serialize_entry(&mut map, stringify!($field), &self.$field)?;
+                })+
+                serde::ser::SerializeMap::end(map)
+            }
         }
 
         impl $name {
@@ -253,6 +301,47 @@ macro_rules! section {
     (@source $unit:tt, $paper:tt) => { concat!(", in ", $unit, "; Section ", $paper) };
 }
 pub(crate) use section;
+
+/// A section of a config, declared by [`section!`].
+pub(crate) trait Section {
+    /// The section's name.
+    const NAME: &'static str;
+    /// Its keys without their section, in order.
+    const KEYS: &'static [&'static str];
+
+    /// Writes the section without some of its keys.
+    fn serialize_some<S: serde::Serializer>(
+        &self,
+        serializer: S,
+        is_written: &dyn Fn(&str) -> bool,
+    ) -> Result<S::Ok, S::Error>;
+}
+
+/// Declares a table in a list or in another table, as [`section!`] declares a section. Its keys are requested within
+/// [`KeyRequest::tables`] and the like.
+macro_rules! table {
+    ($(#[$($about:tt)*])* $name:ident = $table:literal {
+        $($(#[doc = $words:literal])+ $(#[serde($($serde:tt)+)])? $field:ident: $type:ty $(= $unit:tt)?,)+
+    }) => {
+        $(#[$($about)*])*
+        #[derive(Clone, Debug, PartialEq, serde::Serialize)]
+        pub struct $name {
+            $(
+                $(#[doc = $words])+
+                $(#[doc = concat!("\n\n`", $table, ".", stringify!($field), "`", $crate::reader::section!(@source $unit, ""), ".")])?
+                $(#[serde($($serde)+)])?
+                pub $field: $type,
+            )+
+        }
+
+        impl $name {
+            /// The keys, in order.
+            const KEYS: &[&str] = &[$(stringify!($field)),+];
+            $($crate::reader::section! { @key $table, $field { $($words),+ } $($unit, "")? })+
+        }
+    };
+}
+pub(crate) use table;
 
 impl<'a> Reader<'a> {
     /// Reads a text.
@@ -314,8 +403,15 @@ impl<'a> Reader<'a> {
     }
 
     /// Sets some keys.
-    pub fn set_all(&mut self, overrides: &'a [Override]) {
+    ///
+    /// Lists of tables cannot be set: a flag would have to write out all of them.
+    pub fn set_all(&mut self, overrides: &'a [Override], lists: &[&str]) {
         for Override { key, text, name } in overrides {
+            if let Some(list) = lists.iter().find(|list| section_of(key).split('[').next() == Some(**list)) {
+                let message = format!("[[{list}]] can only be set in a config file");
+                self.report(Place::Outside, name, message);
+                continue;
+            }
             let (value, errors) = DeValue::parse_recoverable(text);
             if let Some(error) = errors.first() {
                 self.report(Place::Outside, name, format!("found {}: {}", shorten(text), error.message().trim()));
@@ -337,7 +433,130 @@ impl<'a> Reader<'a> {
     fn take(&mut self, key: &'static str) -> Option<Entry<'a>> {
         let entry = self.entries.remove(key);
         self.known.insert(key, entry.as_ref().map(|entry| (entry.place(), entry.name.clone())));
-        entry
+        let entry = entry?;
+        match self.replaced.iter().find(|(replaced, _)| self.scope.is_none() && includes(replaced, key)) {
+            Some((_, list)) => {
+                let message = format!(
+                    "found in a config with [[{list}]], which replaces this key; to write a config in full, use \
+                     `flotilla check --expand`"
+                );
+                self.report(entry.place(), &entry.name, message);
+                None
+            }
+            None => Some(entry),
+        }
+    }
+
+    /// Makes each key an error, or of each section whose name ends with a dot, because the config has a list in its
+    /// place. Does nothing if it has no such list. Returns whether it has.
+    pub(crate) fn replace(&mut self, list: &'static str, keys: &[&'static str]) -> bool {
+        let has = self.sections.contains_key(list)
+            || self.entries.contains_key(list)
+            || self.strays.iter().any(|entry| entry.name == list);
+        if has {
+            self.replaced.extend(keys.iter().map(|key| (*key, list)));
+        }
+        has
+    }
+
+    /// Returns the tables of a list of the config without requesting it, or none if it is not such a list.
+    pub(crate) fn peek(&self, list: &str) -> Vec<&[(String, Value<'a>)]> {
+        let stray = self.strays.iter().find(|entry| entry.name == list).or_else(|| self.entries.get(list));
+        let items = stray.and_then(|entry| entry.value.list()).unwrap_or_default();
+        items.iter().map(|item| item.table().unwrap_or_default()).collect()
+    }
+
+    /// Reads a list of tables of the config, `[[list]]`, if it has one. `read` gets the index of each table.
+    pub(crate) fn tables<T>(
+        &mut self,
+        list: &'static str,
+        counts: RangeInclusive<usize>,
+        read: impl FnMut(&mut Reader<'a>, usize) -> T,
+    ) -> Vec<T> {
+        let stray = self.strays.iter().position(|entry| entry.name == list).map(|index| self.strays.remove(index));
+        let entry = stray.or_else(|| self.entries.remove(list));
+        self.known.insert(list, entry.as_ref().map(|entry| (entry.place(), entry.name.clone())));
+        if let Some(start) = self.sections.remove(list) {
+            self.entries.retain(|key, _| section_of(key) != list);
+            self.report(Place::Offset(start), list, format!("found a section, allowed tables [[{list}]]"));
+        }
+        self.tables_of(list, entry, counts, &format!("tables [[{list}]]"), read)
+    }
+
+    fn tables_of<T>(
+        &mut self,
+        list: &'static str,
+        entry: Option<Entry<'a>>,
+        counts: RangeInclusive<usize>,
+        what: &str,
+        mut read: impl FnMut(&mut Reader<'a>, usize) -> T,
+    ) -> Vec<T> {
+        if self.keys.is_some() {
+            self.within([list; 2], None, |r| read(r, 0));
+        }
+        let items = entry.and_then(|entry| self.items(entry, counts, what)).unwrap_or_default();
+        let tables = items.into_iter().enumerate();
+        tables.filter_map(|(index, item)| self.within([list; 2], Some(item), |r| read(r, index))).collect()
+    }
+
+    /// Requests the keys of a table with `read`, as keys of the section `table`. Without an entry, requests them to
+    /// collect their definitions. `key` is the name of the table in these.
+    fn within<T>(
+        &mut self,
+        [key, table]: [&'static str; 2],
+        entry: Option<Entry<'a>>,
+        read: impl FnOnce(&mut Reader<'a>) -> T,
+    ) -> Option<T> {
+        let place = entry.as_ref().map_or(Place::Outside, Entry::place);
+        let (name, outside) = entry.as_ref().map_or((table.into(), false), |entry| (entry.name.clone(), entry.outside));
+        let items = match entry.map(|entry| entry.value) {
+            None => vec![],
+            Some(Value { kind: Kind::Table(items), .. }) => items,
+            Some(value) => {
+                self.report(place, &name, format!("found {}, allowed a table", value.found()));
+                return None;
+            }
+        };
+        let named = |(key, value): (String, Value<'a>)| {
+            (format!("{table}.{key}"), Entry { value, outside, name: format!("{name}.{key}") })
+        };
+        let entries = std::mem::replace(&mut self.entries, items.into_iter().map(named).collect());
+        let known = std::mem::take(&mut self.known);
+        let scope = self.scope.replace(Scope { name, place });
+        let open = self.keys.as_mut().map(|keys| {
+            keys.tables.push((key, vec![]));
+            keys.open.replace(keys.tables.len() - 1)
+        });
+        let read = read(self);
+        if let (Some(keys), Some(open)) = (&mut self.keys, open) {
+            keys.open = open;
+        }
+        let known = std::mem::replace(&mut self.known, known);
+        for (key, entry) in std::mem::replace(&mut self.entries, entries) {
+            let known: Vec<&str> = known.keys().copied().collect();
+            let hint = self.hint(&key, &known, true);
+            self.report(entry.place(), &shorten(&entry.name), format!("unknown key{hint}"));
+        }
+        self.scope = scope;
+        Some(read)
+    }
+
+    /// Returns the name of a key in errors, with the index of its table in a list.
+    fn name_of(&self, key: &str) -> String {
+        let leaf = key.rsplit('.').next().unwrap_or_default();
+        self.scope.as_ref().map_or_else(|| key.into(), |scope| format!("{}.{leaf}", scope.name))
+    }
+
+    /// Reports whether a requested key is in the config.
+    pub(crate) fn has(&self, key: &str) -> bool {
+        self.known.get(key).is_some_and(Option::is_some)
+    }
+
+    /// Returns the hint for an unknown key, unless there were many before. In a table of a list, names are given without
+    /// their section.
+    fn hint(&mut self, name: &str, known: &[&str], in_table: bool) -> String {
+        self.hints += 1;
+        if self.hints > MAX_HINTS { String::new() } else { hint(name, known, in_table) }
     }
 
     /// Returns the number of problems found so far.
@@ -363,6 +582,7 @@ impl<'a> Reader<'a> {
         }
         let nearest = allowed.nearest(default);
         if nearest != default {
+            let key = self.name_of(key);
             self.notes.push(format!(
                 "{key} is not set: {nearest} is used, because the default, {default}, is not in the range allowed here, \
                  {allowed}"
@@ -420,9 +640,10 @@ impl<'a> Reader<'a> {
 
     /// Reports a problem with a requested key; if the key is missing, at the start of its section.
     pub(crate) fn report_key(&mut self, key: &'static str, message: String) {
-        let section = || self.sections.get(section_of(key)).copied().unwrap_or(0);
+        let start = || Place::Offset(self.sections.get(section_of(key)).copied().unwrap_or(0));
+        let start = || self.scope.as_ref().map_or_else(start, |scope| scope.place);
         let known = self.known.get(key).cloned().flatten();
-        let (place, name) = known.unwrap_or_else(|| (Place::Offset(section()), key.to_string()));
+        let (place, name) = known.unwrap_or_else(|| (start(), self.name_of(key)));
         self.report(place, &name, message);
     }
 
@@ -431,30 +652,27 @@ impl<'a> Reader<'a> {
         let known: Vec<&str> = self.known.keys().copied().collect();
         let mut sections: Vec<&str> = known.iter().map(|key| section_of(key)).collect();
         sections.dedup();
-        let (mut hints, mut unknown) = (0, HashSet::new());
-        let mut hint_for = |name: &str, known: &[&str]| {
-            hints += 1;
-            if hints > MAX_HINTS { String::new() } else { hint(name, known) }
-        };
+        let mut unknown = HashSet::new();
         for entry in std::mem::take(&mut self.strays) {
             let name = &entry.name;
             let message = if sections.contains(&name.as_str()) {
                 format!("found {}, allowed a section [{name}]", entry.value.found())
             } else {
-                format!("unknown key{}", hint_for(name, &known))
+                format!("unknown key{}", self.hint(name, &known, false))
             };
             self.report(entry.place(), &shorten(name), message);
         }
         for (name, start) in std::mem::take(&mut self.sections) {
             if !sections.contains(&name.as_str()) {
-                let message = format!("unknown section{}", hint_for(&name, &sections));
+                let message = format!("unknown section{}", self.hint(&name, &sections, false));
                 self.report(Place::Offset(start), &shorten(&name), message);
                 unknown.insert(name);
             }
         }
         for (key, entry) in std::mem::take(&mut self.entries) {
             if entry.outside || !unknown.contains(section_of(&key)) {
-                self.report(entry.place(), &shorten(&entry.name), format!("unknown key{}", hint_for(&key, &known)));
+                let hint = self.hint(&key, &known, false);
+                self.report(entry.place(), &shorten(&entry.name), format!("unknown key{hint}"));
             }
         }
     }
@@ -509,8 +727,13 @@ fn section_of(key: &str) -> &str {
     key.split_once('.').map_or(key, |(section, _)| section)
 }
 
-/// Returns `, did you mean …?` with the known name most similar to an unknown one, or the names of its section.
-fn hint(name: &str, known: &[&str]) -> String {
+/// Reports whether a key is `name`, or in the section `name` if that ends with a dot.
+pub(crate) fn includes(name: &str, key: &str) -> bool {
+    key == name || name.ends_with('.') && key.starts_with(name)
+}
+
+/// Returns `, did you mean …?` with the known name most similar to an unknown one, or the names of its section or table.
+fn hint(name: &str, known: &[&str], in_table: bool) -> String {
     const LONGEST_NAME: usize = 64;
     let last = |key: &'_ str| key.rsplit('.').next().unwrap_or_default().to_lowercase();
     let leaf = last(name);
@@ -521,12 +744,14 @@ fn hint(name: &str, known: &[&str]) -> String {
         // The same name may be in several sections.
         let equal =
             known.iter().filter(|other| **other == *key || distance(key).0 == 0 && distance(other) == distance(key));
-        let names: Vec<String> = equal.map(|key| format!("`{key}`")).collect();
+        let shown = |key: &str| if in_table { last(key) } else { key.into() };
+        let names: Vec<String> = equal.map(|key| format!("`{}`", shown(key))).collect();
         return format!(", did you mean {}?", names.join(" or "));
     }
     let siblings: Vec<String> = known.iter().filter(|key| same_section(key)).map(|key| last(key)).collect();
     match siblings.is_empty() {
         true => String::new(),
+        false if in_table => format!(", allowed {}", siblings.join(", ")),
         false => format!("; [{}] has {}", section_of(name), siblings.join(", ")),
     }
 }

@@ -4,7 +4,8 @@ use std::ops::RangeInclusive;
 
 use serde::{Serialize, Serializer};
 
-use super::{Allowed, Definition, Entry, Number, Reader, between};
+use super::value::Kind;
+use super::{Allowed, Definition, Entry, Number, Reader, Value, between};
 use crate::config_enum::Choice;
 
 /// A requested key, before its allowed values and its default are given.
@@ -19,10 +20,10 @@ pub(crate) struct KeyRequest<'r, 'a> {
 impl<'a> KeyRequest<'_, 'a> {
     /// Takes the value from the config. `about` returns kind, range and default for [`keys`].
     fn take(&mut self, about: impl FnOnce() -> (String, String, Option<String>)) -> Option<Entry<'a>> {
-        if let Some(table) = &mut self.reader.table {
+        if let Some(keys) = &mut self.reader.keys {
             let KeyRequest { name, unit, meaning, paper, .. } = *self;
             let (kind, range, default) = about();
-            table.push(Definition { name, unit, kind, range, default, meaning, paper });
+            keys.push(Definition { name, unit, kind, range, default, meaning, paper });
         }
         self.reader.take(self.name)
     }
@@ -31,6 +32,127 @@ impl<'a> KeyRequest<'_, 'a> {
     pub fn number<T: Number>(mut self, allowed: Allowed<T>, default: T) -> T {
         let entry = self.take(|| (kind::<T>().into(), allowed.in_general(), Some(written(&default))));
         self.reader.number(self.name, entry, allowed, default)
+    }
+
+    /// Returns a number, or `None` if the required key is missing.
+    pub fn required_number<T: Number>(mut self, allowed: Allowed<T>) -> Option<T> {
+        let Some(entry) = self.take(|| (kind::<T>().into(), allowed.in_general(), None)) else {
+            self.reader.report_key(self.name, format!("missing, allowed {allowed}"));
+            return None;
+        };
+        Some(self.reader.check(&entry, allowed))
+    }
+
+    /// Returns a number, or `None` without the key. `default` describes what that means.
+    pub fn optional_number<T: Number>(mut self, allowed: Allowed<T>, default: &str) -> Option<T> {
+        let entry = self.take(|| (kind::<T>().into(), allowed.in_general(), Some(default.into())))?;
+        Some(self.reader.check(&entry, allowed))
+    }
+
+    /// Returns `true` or `false`, or the default without the key.
+    pub fn flag(mut self, default: bool) -> bool {
+        const FLAGS: &str = "true or false";
+        let about = || ("true or false".into(), FLAGS.into(), Some(default.to_string()));
+        let Some(entry) = self.take(about) else { return default };
+        entry.value.flag().unwrap_or_else(|| {
+            self.reader.report(entry.place(), &entry.name, format!("found {}, allowed {FLAGS}", entry.value.found()));
+            default
+        })
+    }
+
+    /// Returns a required name, or an empty one if it is wrong. `check` returns what is wrong with it.
+    pub fn name(mut self, range: &str, check: impl FnOnce(&str) -> Option<String>) -> String {
+        let Some(entry) = self.take(|| ("word".into(), range.into(), None)) else {
+            self.reader.report_key(self.name, format!("missing, allowed {range}"));
+            return String::new();
+        };
+        let message = match entry.value.word() {
+            Some(word) => match check(word) {
+                Some(message) => message,
+                None => return word.into(),
+            },
+            None => format!("found {}, allowed {range}", entry.value.found()),
+        };
+        self.reader.report(entry.place(), &entry.name, message);
+        String::new()
+    }
+
+    /// Returns a list of names, written as such or as one name. By default it is empty, but `is_required` makes that a
+    /// problem. `allowed` are the names that there are, unless they are unknown, and `range` describes them for any
+    /// config. `check` returns what is wrong with one of these names.
+    pub fn names(
+        mut self,
+        range: &str,
+        is_required: bool,
+        allowed: Option<&[&str]>,
+        check: impl Fn(&str) -> Option<String>,
+    ) -> Vec<String> {
+        let words = || match allowed {
+            Some([]) => "none, because there are no others".into(),
+            Some(allowed) => allowed.iter().map(|name| format!("{name:?}")).collect::<Vec<_>>().join(" or "),
+            None => range.into(),
+        };
+        let default = (!is_required).then(|| "[]".into());
+        let Some(entry) = self.take(|| ("name, or a list of names".into(), range.into(), default)) else {
+            if is_required {
+                self.reader.report_key(self.name, format!("missing, allowed {} or a list of names", words()));
+            }
+            return vec![];
+        };
+        let items = match entry.value.list() {
+            Some(_) => {
+                let least = usize::from(is_required);
+                self.reader
+                    .items(entry, least..=allowed.map_or(usize::MAX, <[_]>::len).max(1), "names")
+                    .unwrap_or_default()
+            }
+            None => vec![entry],
+        };
+        let mut names: Vec<String> = Vec::new();
+        for item in items {
+            let (found, word) = (item.value.found(), item.value.word());
+            let message = match word {
+                Some(word) if names.iter().any(|name| name == word) => Some(format!("found {found} again")),
+                Some(word) if allowed.is_none_or(|allowed| allowed.contains(&word)) => check(word),
+                word => {
+                    let hint = similar(word, allowed.unwrap_or_default().iter().copied());
+                    Some(format!("found {found}, allowed {}{hint}", words()))
+                }
+            };
+            match (message, word) {
+                (None, Some(word)) => names.push(word.into()),
+                (message, _) => self.reader.report(item.place(), &item.name, message.unwrap_or_default()),
+            }
+        }
+        names
+    }
+
+    /// Returns the tables of a list, by default an empty one. `read` gets the index of each table.
+    pub fn tables<T>(
+        mut self,
+        counts: RangeInclusive<usize>,
+        what: &str,
+        read: impl FnMut(&mut Reader<'a>, usize) -> T,
+    ) -> Vec<T> {
+        let range = || format!("{} of them", between(*counts.start(), *counts.end()));
+        let entry = self.take(|| (format!("list of {what}"), range(), Some("[]".into())));
+        self.reader.tables_of(self.name, entry, counts, what, read)
+    }
+
+    /// Returns a table, or what `read` makes of an empty one without the key. `table` is the section of its keys.
+    pub fn table<T>(
+        mut self,
+        table: &'static str,
+        range: &str,
+        default: &str,
+        read: impl FnOnce(&mut Reader<'a>) -> T,
+    ) -> Option<T> {
+        let entry = self.take(|| ("table".into(), range.into(), Some(default.into())));
+        let entry = entry.unwrap_or_else(|| {
+            let value = Value { kind: Kind::Table(vec![]), written: None };
+            Entry { value, outside: false, name: self.reader.name_of(self.name) }
+        });
+        self.reader.within([self.name, table], Some(entry), read)
     }
 
     /// Returns a count, or a percentage of the number that bounds it, written as a word such as `"10%"`.
@@ -69,10 +191,7 @@ impl<'a> KeyRequest<'_, 'a> {
         let word = entry.value.word();
         T::ALL.iter().find(|choice| Some(choice.0) == word).map_or_else(
             || {
-                let typed = word.unwrap_or_default().to_lowercase();
-                let distance = |name: &&str| strsim::damerau_levenshtein(&name.to_lowercase(), &typed);
-                let nearest = T::names().min_by_key(distance).filter(|name| distance(name) <= typed.len() / 3);
-                let hint = nearest.map_or(String::new(), |name| format!("; did you mean {name:?}?"));
+                let hint = similar(word, T::names());
                 let message = format!("found {}, allowed {}{hint}", entry.value.found(), words());
                 self.reader.report(entry.place(), &entry.name, message);
                 default
@@ -206,6 +325,14 @@ impl<T: Copy> OneOrEach<T> {
             OneOrEach::Each(numbers) => numbers.clone(),
         }
     }
+}
+
+/// Returns a hint at the name that is most similar to a word, if any is.
+fn similar<'n>(word: Option<&str>, names: impl Iterator<Item = &'n str>) -> String {
+    let typed = word.unwrap_or_default().to_lowercase();
+    let distance = |name: &&str| strsim::damerau_levenshtein(&name.to_lowercase(), &typed);
+    let nearest = names.min_by_key(distance).filter(|name| distance(name) <= typed.len() / 3);
+    nearest.map_or(String::new(), |name| format!("; did you mean {name:?}?"))
 }
 
 /// Returns the name of a type without its article.

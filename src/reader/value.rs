@@ -21,8 +21,10 @@ pub(super) enum Kind<'a> {
     /// Another number. `None` is NaN, or a number that is too large for `f64`.
     Float(Option<f64>),
     Word(Cow<'a, str>),
+    Flag(bool),
     List(Vec<Value<'a>>),
-    Table,
+    /// Keys without dots, each with its value.
+    Table(Vec<(String, Value<'a>)>),
     /// A value of a type that no key has. The text describes it in errors if it was not written.
     Other(String),
 }
@@ -40,8 +42,11 @@ impl<'a> Value<'a> {
             }
             DeValue::String(word) => Kind::Word(word),
             DeValue::Array(items) => Kind::List(items.into_iter().map(|item| Value::of_text(item, text)).collect()),
-            DeValue::Table(_) => Kind::Table,
-            DeValue::Boolean(_) | DeValue::Datetime(_) => Kind::Other(String::new()),
+            DeValue::Table(items) => Kind::Table(
+                items.into_iter().map(|(key, value)| (key.into_inner().into(), Value::of_text(value, text))).collect(),
+            ),
+            DeValue::Boolean(flag) => Kind::Flag(flag),
+            DeValue::Datetime(_) => Kind::Other(String::new()),
         };
         Value { kind, written }
     }
@@ -60,8 +65,18 @@ impl<'a> Value<'a> {
         if let Kind::List(items) = &self.kind { Some(items) } else { None }
     }
 
+    /// Returns the keys of a table.
+    pub(crate) fn table(&self) -> Option<&[(String, Value<'a>)]> {
+        if let Kind::Table(items) = &self.kind { Some(items) } else { None }
+    }
+
+    /// Returns `true` or `false`.
+    pub(crate) fn flag(&self) -> Option<bool> {
+        if let Kind::Flag(flag) = self.kind { Some(flag) } else { None }
+    }
+
     /// Returns a word.
-    pub(super) fn word(&self) -> Option<&str> {
+    pub(crate) fn word(&self) -> Option<&str> {
         if let Kind::Word(word) = &self.kind { Some(word) } else { None }
     }
 
@@ -69,7 +84,7 @@ impl<'a> Value<'a> {
     pub(super) fn found(&self) -> String {
         match (&self.kind, self.written) {
             (Kind::List(items), _) => format!("a list of {}", items.len()),
-            (Kind::Table, _) => "a table".into(),
+            (Kind::Table(_), _) => "a table".into(),
             (_, Some((_, text))) => shorten(text),
             (Kind::Integer(None), None) => format!("a number above {}", i64::MAX),
             (Kind::Float(None), None) => "nan".into(),
@@ -84,8 +99,9 @@ impl<'a> Value<'a> {
             Kind::Integer(number) => i64::try_from((*number)?).ok().map(toml::Value::Integer),
             Kind::Float(number) => number.map(toml::Value::Float),
             Kind::Word(word) => Some(word.clone().into_owned().into()),
+            Kind::Flag(flag) => Some((*flag).into()),
             Kind::List(items) => items.iter().map(Value::to_toml).collect::<Option<Vec<_>>>().map(toml::Value::Array),
-            Kind::Table | Kind::Other(_) => None,
+            Kind::Table(_) | Kind::Other(_) => None,
         }
     }
 }
@@ -97,7 +113,10 @@ impl From<toml::Value> for Value<'_> {
             toml::Value::Float(number) => Kind::Float(Some(number).filter(|number| !number.is_nan())),
             toml::Value::String(word) => Kind::Word(word.into()),
             toml::Value::Array(items) => Kind::List(items.into_iter().map(Value::from).collect()),
-            toml::Value::Table(_) => Kind::Table,
+            toml::Value::Boolean(flag) => Kind::Flag(flag),
+            toml::Value::Table(items) => {
+                Kind::Table(items.into_iter().map(|(key, value)| (key, value.into())).collect())
+            }
             other => Kind::Other(other.to_string()),
         };
         Value { kind, written: None }

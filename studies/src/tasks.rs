@@ -190,7 +190,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
                 trained.push(measure(&config, &disk, &folder, &mut *backend.0)?);
             }
         }
-        let pois = small.world.pois.len();
+        let pois = small.poi_count();
         let scripted = scripted_g.is_some_and(|g| g >= if moves(small) { SOLVED } else { 1.0 });
         let refused = reason(&baselines, &trained, scripted_g, scripted);
         found.push(Found { name: name.clone(), pois, baselines, trained, scripted_g, scripted, refused });
@@ -213,7 +213,7 @@ fn play_script(script: &Script, name: &str, config: &Config) -> Result<f64, Erro
         let played = script.play_from(valid.as_ref(), &starts, episode).map_err(|error| invalid(error.to_string()))?;
         observed += played.iter().flatten().count();
     }
-    Ok(observed as f64 / (config.world.pois.len() * starts.episodes()) as f64)
+    Ok(observed as f64 / (config.poi_count() * starts.episodes()) as f64)
 }
 
 /// Reports whether starts or POIs move.
@@ -238,7 +238,7 @@ pub(crate) fn train(
     }
     let learning = &config.learning;
     let title = format!("{task}, {} policies, {}", learning.population, learning.fitness);
-    let names = vec![(title, Some(config.world.pois.len()))];
+    let names = vec![(title, Some(config.poi_count()))];
     (context.report)(Event::Begin(names, session.generations()[0], learning.generations));
     let mut watch = |now: &Progress<'_>| context.rows(now.generations[0], now.rows);
     let ended = context.train(&mut watch, |options| session.train(backend, options));
@@ -282,7 +282,7 @@ pub(crate) fn play_champions(
     let weights = champions(disk.at(&folder.join(POLICIES)), config)?;
     let played = flotilla::front::play(config, backend, config.learning.trials, &weights, starts)
         .map_err(|error| Error::Refused(error.to_string().into()))?;
-    Ok(played.observed.iter().map(|observed| observed / config.world.pois.len() as f64).collect())
+    Ok(played.observed.iter().map(|observed| observed / config.poi_count() as f64).collect())
 }
 
 /// Returns why a task is not admitted.

@@ -48,17 +48,22 @@ pub fn described(config: &ValidConfig) -> Value {
     let mut words = json!({ "toml": toml, "config": **config, "pois": pois, "parameters": parameters });
     // JavaScript numbers cannot represent every 64-bit seed.
     words["config"]["learning"]["seed"] = config.learning.seed.to_string().into();
+    // The page draws leaders and followers.
+    if !config.agents.is_empty() || !config.pois.is_empty() {
+        words["config"]["world"] = json!(config.drawn());
+        words["config"]["follow"] = json!({ "attraction_radius": config.influence_radius() });
+    }
     words["start"] = start_of(config);
     words
 }
 
 /// Returns each POI's coupling, each agent's heading, and the leader that each agent would follow first (-1 for none).
 fn start_of(config: &Config) -> Value {
-    let world = &config.world;
+    let (world, radius) = (config.drawn(), config.influence_radius());
     let first = |follower: &[f64; 2]| {
         let leader = start::nearest(follower, &world.leaders);
         let [dx, dy] = [0, 1].map(|axis| world.leaders[leader][axis] - follower[axis]);
-        if dx.hypot(dy) <= config.follow.attraction_radius { leader as i64 } else { -1 }
+        if dx.hypot(dy) <= radius { leader as i64 } else { -1 }
     };
     let owner: Vec<i64> = (0..world.leaders.len() as i64).chain(world.followers.iter().map(first)).collect();
     json!({ "owner": owner, "coupling": world.coupling.of_each(world.pois.len()), "headings": world.headings() })

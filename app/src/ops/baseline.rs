@@ -101,7 +101,7 @@ pub fn run(
     let outcomes = play(&config, request.seeds as usize, request.episodes, &mut **backend, context);
     context.pause();
     let outcomes = outcomes?;
-    let (learning, pois, actions) = (&config.learning, config.world.pois.len(), config.policy.actions);
+    let (learning, pois, actions) = (&config.learning, config.poi_count(), config.policy.actions);
     let moves = learning.start_jitter > 0.0 || learning.poi_jitter > 0.0;
     let observed = |g: &dyn Fn(&baseline::Outcome) -> f64| -> Vec<f64> {
         outcomes.iter().map(|outcome| g(outcome) * pois as f64).collect()

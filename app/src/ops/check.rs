@@ -49,6 +49,19 @@ pub fn run(request: &CheckRequest, context: Context<'_>) -> Result<CheckOutcome,
     Ok(CheckOutcome { cost: Cost::of(&config), config: config.into_config(), notes })
 }
 
+/// Reads a config, and returns it in full, see [`Config::expanded`].
+pub fn expand(config: &ConfigText, context: Context<'_>) -> Result<Config, Error> {
+    let config = config.read_noted(context)?.0.into_config();
+    let expanded = config.expanded();
+    for (list, is_short) in [("agents", expanded.agents.is_empty()), ("pois", expanded.pois.is_empty())] {
+        if is_short {
+            context
+                .message(format_args!("[[{list}]] is not written, because a stage sets a key that it would replace"));
+        }
+    }
+    Ok(expanded)
+}
+
 /// The cost of a whole run: all trials, all generations including the random start, all teams and the champions.
 #[derive(Clone, Debug, Serialize)]
 pub struct Cost {
@@ -97,7 +110,10 @@ impl Cost {
             team_steps += played * wide(world.steps());
             agent_steps += played * wide(world.steps()) * wide(world.agents());
             agents = agents.max(world.agents());
-            travel = reach::travel(&world, world.steps()).into_iter().fold(travel, f64::max);
+            let classes = config.classes();
+            let travelled =
+                classes.agents.iter().flat_map(|class| reach::travel(config, class, config.world.steps).pop());
+            travel = travelled.fold(travel, f64::max);
             record_bytes = record_bytes.max(backend::record_bytes(&world, learning.fitness));
         }
         let plan = Peaks::of([config], parallel::current_num_threads());

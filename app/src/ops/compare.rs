@@ -13,7 +13,7 @@ use crate::report::comparison::{self, At, Cohort, Comparison, ComparisonError, Q
 use crate::report::runs::{self, MAX_RUNS, ReadError};
 use crate::shell;
 use crate::sweep::{Sweep, results};
-use flotilla::config::{Config, WorldConfig};
+use flotilla::config::Config;
 use flotilla::escape::PathExt;
 use flotilla::file;
 use flotilla::statistics;
@@ -161,14 +161,14 @@ fn of_runs(folders: &[PathBuf], args: &CompareRequest, notes: &mut Vec<String>) 
         return Err(Error::Usage(with_remedy(format!("{} is named twice", twice.escaped()), "name other runs")));
     }
     let configs = folders.iter().map(|folder| runs::config(folder, verification)).collect::<Result<Vec<_>, _>>()?;
-    let first = &configs[0].world;
-    let differs =
-        |differs: fn(&WorldConfig, &WorldConfig) -> bool| configs.iter().any(|config| differs(&config.world, first));
+    let differs = |differs: fn(&Config, &Config) -> bool| configs.iter().any(|config| differs(config, &configs[0]));
     let layouts = [
-        ("world.map", differs(|a, b| a.map != b.map)),
-        ("world.leaders", differs(|a, b| a.leaders != b.leaders)),
-        ("world.followers", differs(|a, b| a.followers != b.followers)),
-        ("world.pois", differs(|a, b| a.pois != b.pois)),
+        ("world.map", differs(|a, b| a.world.map != b.world.map)),
+        ("world.leaders", differs(|a, b| a.world.leaders != b.world.leaders)),
+        ("world.followers", differs(|a, b| a.world.followers != b.world.followers)),
+        ("world.pois", differs(|a, b| a.world.pois != b.world.pois)),
+        ("agents", differs(|a, b| a.agents != b.agents)),
+        ("pois", differs(|a, b| a.pois != b.pois)),
     ];
     let layouts: Vec<&str> = layouts.into_iter().filter(|(_, differ)| *differ).map(|(key, _)| key).collect();
     if !layouts.is_empty() {

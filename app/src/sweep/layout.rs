@@ -11,7 +11,7 @@
 use toml::{Table, Value};
 
 use super::{Grid, problem};
-use flotilla::config::{Override, Problem};
+use flotilla::config::{Override, POIS, Problem};
 
 /// The key for followers per leader (0 to 64; 2 if only the other axis is given).
 pub(crate) const FOLLOWERS: &str = "followers_per_leader";
@@ -123,7 +123,7 @@ impl Arrangement {
         Arrangement {
             axes: used.then_some(axes),
             places: if used { places() } else { vec![] },
-            pois: !sets(grid, base, "world.pois"),
+            pois: !sets(grid, base, "world.pois") && !base.contains_key(POIS),
             map: !sets(grid, base, "world.map"),
         }
     }

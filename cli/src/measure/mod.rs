@@ -139,8 +139,11 @@ impl Timing {
 /// followers stays as close as integers allow. The number of POIs stays; they are ahead of the first groups.
 ///
 /// # Errors
-/// There are more leaders than groups, or more followers per leader than positions.
+/// The config has tables of classes or groups, there are more leaders than groups, or more followers per leader than positions.
 pub fn with_agents(config: &Config, agents: usize) -> Result<Config, String> {
+    if !config.agents.is_empty() || !config.pois.is_empty() {
+        return Err("only a config in short, without [[agents]] and [[pois]], can have other numbers of agents".into());
+    }
     let (leaders, followers) = (config.world.leaders.len(), config.world.followers.len());
     let groups = ((agents * leaders) as f64 / (leaders + followers) as f64).round().max(1.0) as usize;
     let followers = agents - groups;

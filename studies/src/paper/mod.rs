@@ -139,7 +139,7 @@ impl Experiment {
 
     /// Returns the number of POIs of the layout.
     pub fn pois(&self) -> usize {
-        self.config.world.pois.len()
+        self.config.poi_count()
     }
 }
 

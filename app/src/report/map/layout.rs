@@ -29,7 +29,7 @@ fn team(config: &StageConfig, world: &World) -> Team {
     Team {
         leaders,
         agents: world.starts.iter().enumerate().map(agent).collect(),
-        pois: config.world.pois.iter().zip(&world.coupling).enumerate().map(poi).collect(),
+        pois: config.classes().places().iter().zip(&world.coupling).enumerate().map(poi).collect(),
     }
 }
 
@@ -43,7 +43,8 @@ pub fn layout(name: &str, config: &StageConfig) -> Scene {
     let map = DVec2::from(config.world.map);
     let view = Viewport::new(config, [DVec2::ZERO, map], 80.0).moved_to([LEFT, HEAD]);
     let [width, height] = view.size();
-    let radius = config.world.observation_radius;
+    let drawn = config.drawn();
+    let radius = drawn.observation_radius;
     let mut legend = Legend::new(&view, std::slice::from_ref(&team), "");
     let alike = world.coupling.windows(2).all(|pair| pair[0] == pair[1]);
     let needs = match (world.coupling.first(), view.poi_labels(&team)) {
@@ -90,7 +91,7 @@ pub fn layout(name: &str, config: &StageConfig) -> Scene {
         let more = if places.len() > 12 { ", …" } else { "" };
         format!("{what} at {}{more}. ", list.join(", "))
     };
-    let who = match config.world.observers {
+    let who = match drawn.observers {
         Observers::All => String::new(),
         observers => format!(" Only {observers} observe."),
     };

@@ -120,7 +120,7 @@ impl Viewport {
     /// Fits a part of a config's map, given by its corners, into a square of `side` millimetres.
     pub fn new(config: &Config, [from, to]: [DVec2; 2], side: f64) -> Viewport {
         let scale = side / (to - from).max_element();
-        let (map, radius) = (config.world.map.into(), config.world.observation_radius);
+        let (map, radius) = (config.world.map.into(), config.drawn().observation_radius);
         Viewport { left: 0.0, above: 0.0, scale, from, to, map, radius }
     }
 

@@ -95,7 +95,7 @@ impl<'a> Screen<'a> {
         let view = Viewport::new(config, busy(config, played), Self::SIDE);
         let width = view.size()[0].max(60.0);
         let teams: Vec<Team> = played.iter().map(|played| played.team(played.world.steps() as f64)).collect();
-        let who = if config.world.observers == Observers::All { "agents" } else { "observers" };
+        let who = if config.drawn().observers == Observers::All { "agents" } else { "observers" };
         let timed = played.iter().any(|played| played.world.rule.is_timed());
         let needed = played.first().and_then(|played| played.world.coupling.first()).map_or(1, |&needed| needed);
         let near = needed.saturating_sub(1).max(1);
@@ -148,13 +148,13 @@ pub fn still(config: &Config, played: &[Replayed], step: usize) -> Scene {
 ///
 /// The shorter side is at least half the longer one, as far as the map allows.
 fn busy(config: &Config, played: &[Replayed]) -> [DVec2; 2] {
-    let map = DVec2::from(config.world.map);
+    let (map, drawn) = (DVec2::from(config.world.map), config.drawn());
     let around = |at: DVec2, margin: f64| [at - margin, at + margin];
     let pois: Vec<DVec2> = match config.learning.poi_jitter > 0.0 {
         true => played.iter().flat_map(|played| &played.world.pois).map(|poi| poi.as_dvec2()).collect(),
-        false => config.world.pois.iter().map(|&poi| poi.into()).collect(),
+        false => drawn.pois.iter().map(|&poi| poi.into()).collect(),
     };
-    let pois = pois.into_iter().map(|poi| around(poi, config.world.observation_radius + 1.0));
+    let pois = pois.into_iter().map(|poi| around(poi, drawn.observation_radius + 1.0));
     let agents = played.iter().flat_map(|played| &played.trace.moments);
     let agents = agents.map(|moment| around(Vec2::from(moment.position).as_dvec2(), 2.0));
     let [mut from, mut to] = pois

@@ -88,7 +88,7 @@ pub fn data(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Val
             episode(played, &played.shown(room), exact)
         })
         .collect();
-    let world = &config.world;
+    let world = &config.drawn();
     // Moving POIs are listed where the first episode had them.
     let pois = match played.first().filter(|_| config.learning.poi_jitter > 0.0) {
         Some(first) => first.world.pois.iter().map(|poi| poi.as_dvec2().to_array()).collect(),
@@ -106,7 +106,7 @@ pub fn data(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Val
         "observers": world.observers,
         "windows": world.windows,
         "after": world.after,
-        "attraction_radius": config.follow.attraction_radius,
+        "attraction_radius": config.influence_radius(),
         "dt": world.dt,
         "steps": world.steps,
         "exact": exact,

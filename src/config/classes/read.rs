@@ -1,0 +1,419 @@
+//! Reads classes of agents and groups of POIs, `[[agents]]` and `[[pois]]`.
+
+use std::collections::{HashMap, HashSet};
+use std::f64::consts::FRAC_PI_2;
+
+use serde::Serialize;
+
+use super::{
+    AGENTS, AgentClass, Channel, Control, MAX_CHANNELS, MAX_CLASSES, MAX_INPUTS, MAX_SECTORS, MAX_TERMS, Mobility,
+    POIS, PoiGroup, Term,
+};
+use crate::config::{Choice, Combine, Frame, MAX_AGENTS, MAX_POIS, Measure, Motion};
+use crate::model::rule::cycle;
+use crate::model::{LEAST, LONGEST};
+use crate::reader::{Allowed, Reader, Value, between, sized};
+
+/// Maximum length of a name.
+const LONGEST_NAME: usize = 64;
+
+/// What tables can refer to, before any of them is checked.
+#[derive(Default)]
+pub(in crate::config) struct Summary {
+    /// The classes of agents.
+    pub classes: Vec<ClassSummary>,
+    /// The groups of POIs.
+    pub groups: Vec<GroupSummary>,
+    /// Groups of which each comes after the next, and the last after the first. Empty if there are none.
+    cycle: Vec<usize>,
+}
+
+/// A class of agents before it is checked.
+pub(in crate::config) struct ClassSummary {
+    pub name: String,
+    /// `None` if it is wrong.
+    pub control: Option<Control>,
+    /// The number of its agents.
+    pub agents: usize,
+    pub observes: bool,
+    /// Whether it has a rule, whose radius is the default of influence radii.
+    pub has_rule: bool,
+}
+
+impl ClassSummary {
+    fn learns(&self) -> bool {
+        self.control == Some(Control::Policy)
+    }
+}
+
+/// A group of POIs before it is checked.
+pub(in crate::config) struct GroupSummary {
+    pub name: String,
+    /// The number of its POIs.
+    pub pois: usize,
+}
+
+impl Summary {
+    /// Looks at the lists of a config.
+    pub fn peek(r: &Reader<'_>) -> Summary {
+        fn get<'v, 'a>(table: &'v [(String, Value<'a>)], key: &str) -> Option<&'v Value<'a>> {
+            table.iter().find(|(name, _)| name == key).map(|(_, value)| value)
+        }
+        let word = |value: Option<&Value<'_>>| value.and_then(Value::word).unwrap_or_default().to_string();
+        let count = |value: Option<&Value<'_>>| value.and_then(Value::list).map_or(0, <[_]>::len);
+        let class = |table: &[(String, Value<'_>)]| {
+            let control = get(table, "control").map_or(Some("policy"), Value::word);
+            let control = Control::ALL.iter().find(|(word, _)| Some(*word) == control).map(|found| found.1);
+            ClassSummary {
+                name: word(get(table, "name")),
+                control,
+                has_rule: control == Some(Control::Follow) || count(get(table, "rule")) > 0,
+                agents: count(get(table, "at")),
+                observes: get(table, "observes").and_then(|value| value.flag()).unwrap_or(true),
+            }
+        };
+        let group = |table: &[(String, Value<'_>)]| GroupSummary {
+            name: word(get(table, "name")),
+            pois: count(get(table, "at")),
+        };
+        let tables = r.peek(POIS);
+        let groups: Vec<GroupSummary> = tables.iter().map(|table| group(table)).collect();
+        let index: HashMap<&str, usize> =
+            groups.iter().enumerate().map(|(index, group)| (&*group.name, index)).collect();
+        let after = |table: &&[(String, Value<'_>)]| {
+            let after = get(table, "after").map(|after| after.list().unwrap_or(std::slice::from_ref(after)));
+            let names = after.unwrap_or_default().iter().filter_map(Value::word);
+            names.filter_map(|name| index.get(name).copied()).collect()
+        };
+        let after: Vec<Vec<usize>> = tables.iter().take(MAX_POIS).map(after).collect();
+        let is_short = |groups: &Vec<usize>| groups.iter().all(|&group| group < after.len());
+        let cycle = if after.iter().all(is_short) { cycle(&after).unwrap_or_default() } else { vec![] };
+        Summary { classes: r.peek(AGENTS).into_iter().map(class).collect(), groups, cycle }
+    }
+
+    /// Returns the number of agents that observe POIs whose group does not name its observers.
+    pub fn observers(&self) -> usize {
+        self.classes.iter().filter(|class| class.observes).map(|class| class.agents).sum()
+    }
+
+    /// Returns the number of agents that learn.
+    pub fn learners(&self) -> usize {
+        self.classes.iter().filter(|class| class.learns()).map(|class| class.agents).sum()
+    }
+
+    /// Returns the names of classes, and some further ones. Returns `None` if a name is wrong, which is reported.
+    fn class_names<'n>(&'n self, others: &[&'n str]) -> Option<Vec<&'n str>> {
+        let names = valid_names(self.classes.iter().map(|class| &*class.name))?;
+        Some(others.iter().copied().chain(names).collect())
+    }
+
+    /// Returns the names of groups, or `None` if one is wrong.
+    fn group_names(&self) -> Option<Vec<&str>> {
+        valid_names(self.groups.iter().map(|group| &*group.name))
+    }
+}
+
+/// Reads the classes of agents on a map with these sides.
+pub(in crate::config) fn read_agents(
+    r: &mut Reader<'_>,
+    sides: [Allowed<f64>; 2],
+    summary: &Summary,
+) -> Vec<AgentClass> {
+    let classes = r.tables(AGENTS, 1..=MAX_CLASSES, |r, index| AgentClass::read(r, index, sides, summary));
+    let does_not_learn = |class: &ClassSummary| class.control.is_some() && !class.learns();
+    if !classes.is_empty() && summary.classes.iter().all(does_not_learn) {
+        r.report_key(AGENTS, "found no class that learns, allowed one or more with control = \"policy\"".into());
+    }
+    classes
+}
+
+/// Reads the groups of POIs on a map with these sides, for episodes of so many steps.
+pub(in crate::config) fn read_pois(
+    r: &mut Reader<'_>,
+    sides: [Allowed<f64>; 2],
+    steps: usize,
+    summary: &Summary,
+) -> Vec<PoiGroup> {
+    r.tables(POIS, 1..=MAX_POIS, |r, index| PoiGroup::read(r, index, sides, steps, summary))
+}
+
+/// What a name can be.
+const NAME: &str = "a name of letters, digits, _ and -";
+
+/// Returns what is wrong with the name of a table, if anything. `before` are the names of the tables before it.
+fn name_problem(name: &str, mut before: impl Iterator<Item = impl AsRef<str>>) -> Option<String> {
+    let is_plain = |byte: u8| byte.is_ascii_alphanumeric() || byte == b'_' || byte == b'-';
+    match name {
+        _ if name.is_empty() || !name.bytes().all(is_plain) => Some(format!("found {name:?}, allowed {NAME}")),
+        _ if name.len() > LONGEST_NAME => Some(format!("found {} characters, allowed 1 to {LONGEST_NAME}", name.len())),
+        AGENTS | POIS => Some(format!("found {name:?}, which names all of them, allowed another name")),
+        _ if before.any(|other| other.as_ref() == name) => Some(format!("found {name:?} again, allowed another name")),
+        _ => None,
+    }
+}
+
+/// Returns these names, or `None` if one is wrong.
+fn valid_names<'n>(names: impl Iterator<Item = &'n str>) -> Option<Vec<&'n str>> {
+    let mut seen = HashSet::new();
+    let mut is_valid = |name: &'n str| name_problem(name, std::iter::empty::<&str>()).is_none() && seen.insert(name);
+    names.map(|name| is_valid(name).then_some(name)).collect()
+}
+
+/// Reports positions that exceed the limit together with those of the tables before.
+fn limit(r: &mut Reader<'_>, key: &'static str, what: &str, [before, own, most]: [usize; 3]) {
+    if own <= most && before <= most && before + own > most {
+        let all = before + own;
+        r.report_key(key, format!("found {own}, which makes {all} {what} with those before, allowed 1 to {most}"));
+    }
+}
+
+impl AgentClass {
+    fn read(r: &mut Reader<'_>, index: usize, sides: [Allowed<f64>; 2], summary: &Summary) -> AgentClass {
+        let before = summary.classes.get(..index).unwrap_or_default();
+        let name = AgentClass::name(r).name(NAME, |name| name_problem(name, before.iter().map(|class| &class.name)));
+        let at = AgentClass::at(r).positions(1..=MAX_AGENTS, sides, None).unwrap_or_default();
+        let agents_before = before.iter().map(|class| class.agents).sum();
+        limit(r, "agents.at", "agents", [agents_before, at.len(), MAX_AGENTS]);
+        let counts = if at.is_empty() { 0..=usize::MAX } else { at.len()..=at.len() };
+        let heading = AgentClass::heading(r).one_or_each(between(-1e3, 1e3), counts, FRAC_PI_2);
+        let control = AgentClass::control(r).choice(Control::Policy);
+        let learns = control == Control::Policy;
+        // If the control is wrong, what it needs is unknown.
+        let is_known = summary.classes.get(index).is_none_or(|class| class.control.is_some());
+        let other = before.iter().find(|class| class.control.is_some() && !class.learns());
+        if let (true, Some(other)) = (learns && is_known, other) {
+            let message = format!(
+                "found a class that learns after {:?}, which does not; allowed before all classes that do not learn",
+                other.name
+            );
+            r.report_key("agents.control", message);
+        }
+        let (motion, speeds) = AgentClass::motion(r)
+            .table("motion", "the keys below", "kind = \"steered\", with its defaults", Mobility::read)
+            .unwrap_or_else(|| (Mobility::Free { max_speed: 1e3 }, between(0.0, 1e3)));
+        let speed = AgentClass::speed(r).number(speeds, 0.0);
+        let is_free = matches!(motion, Mobility::Free { .. });
+        let channel = |r: &mut Reader<'_>, _| Channel::read(r, is_free, summary);
+        let errors = r.error_count();
+        let senses = AgentClass::senses(r).tables(0..=MAX_CHANNELS, "channels", channel);
+        let inputs: usize = senses.iter().map(|channel| channel.sectors).sum();
+        if !is_known || r.error_count() > errors {
+            // A channel that is wrong is there.
+        } else if learns && senses.is_empty() {
+            r.report_key("agents.senses", format!("missing, allowed a list of 1 to {MAX_CHANNELS} channels"));
+        } else if !learns && !senses.is_empty() {
+            r.report_key("agents.senses", format!("found with control = \"{control}\", allowed with \"policy\""));
+        } else if inputs > MAX_INPUTS {
+            r.report_key(
+                "agents.senses",
+                format!("found {inputs} sectors, allowed up to {MAX_INPUTS} in all channels"),
+            );
+        }
+        let errors = r.error_count();
+        let rule = AgentClass::rule(r).tables(0..=MAX_TERMS, "terms", |r, _| Term::read(r, summary));
+        if !is_known || r.error_count() > errors {
+            // A term that is wrong is there.
+        } else if control == Control::Follow && rule.is_empty() {
+            r.report_key("agents.rule", format!("missing, allowed a list of 1 to {MAX_TERMS} terms"));
+        } else if control != Control::Follow && !rule.is_empty() {
+            r.report_key("agents.rule", format!("found with control = \"{control}\", allowed with \"follow\""));
+        }
+        let learners = |name: &str| {
+            let found = summary.classes.iter().any(|class| class.name == name && class.learns());
+            found.then(|| format!("found {name:?}, which learns: classes that learn cannot be led yet"))
+        };
+        let errors = r.error_count();
+        let names = summary.class_names(&[]);
+        let leads = AgentClass::leads(r).names("names of classes that do not learn", false, names.as_deref(), learners);
+        if !leads.is_empty() && is_known && !learns {
+            let message =
+                format!("found with control = \"{control}\", allowed with \"policy\": others cannot lead yet");
+            r.report_key("agents.leads", message);
+        }
+        let influence_radius = AgentClass::influence_radius(r)
+            .optional_number(between(0.01, LONGEST), "the largest radius of the led class's rule");
+        let ruleless =
+            |class: &&ClassSummary| leads.contains(&class.name) && class.control.is_some() && !class.has_rule;
+        if r.error_count() > errors {
+            // Leads or radius are wrong.
+        } else if influence_radius.is_some() && leads.is_empty() {
+            r.report_key("agents.influence_radius", "found without `leads`, which it is the radius of".into());
+        } else if let (None, Some(led)) = (influence_radius, summary.classes.iter().find(ruleless)) {
+            let message = format!("missing, and {:?} has no rule to take it from; allowed 0.01 to {LONGEST}", led.name);
+            r.report_key("agents.influence_radius", message);
+        }
+        AgentClass {
+            name,
+            at,
+            heading,
+            speed,
+            control,
+            motion,
+            senses,
+            rule,
+            wall_radius: AgentClass::wall_radius(r).number(between(0.01, LONGEST).or_zero(), 1.0),
+            wall_gain: AgentClass::wall_gain(r).number(between(1e-3, 1e3).or_zero(), 1.0),
+            leads,
+            influence_radius,
+            observes: AgentClass::observes(r).flag(true),
+        }
+    }
+}
+
+/// The value of `motion.kind`.
+#[derive(Clone, Copy, Serialize)]
+#[serde(rename_all = "lowercase")]
+enum Kind {
+    Steered,
+    Free,
+}
+
+impl Choice for Kind {
+    const ALL: &'static [(&'static str, Kind)] = &[("steered", Kind::Steered), ("free", Kind::Free)];
+}
+
+impl Mobility {
+    /// Reads the table, and returns the range of start speeds too.
+    fn read(r: &mut Reader<'_>) -> (Mobility, Allowed<f64>) {
+        let meaning = "steered: it has a heading and a speed, and turns and accelerates within the limits below; free: its \
+                       actions are its velocity along x and y as a share of max_speed, each limited by itself, and it has \
+                       no heading and no other limit";
+        match r.key("motion.kind", "", meaning, "").choice(Kind::Steered) {
+            Kind::Steered => {
+                let (motion, speeds) = Motion::read(r);
+                (Mobility::Steered(motion), speeds)
+            }
+            Kind::Free => {
+                let max_speed = Motion::read_max_speed(r);
+                (Mobility::Free { max_speed }, between(LEAST, max_speed).or_zero().because("motion.max_speed"))
+            }
+        }
+    }
+}
+
+impl Channel {
+    fn read(r: &mut Reader<'_>, is_free: bool, summary: &Summary) -> Channel {
+        let names = summary.class_names(&[AGENTS, POIS]);
+        let of = Channel::of(r).names("names of classes, or \"agents\", or \"pois\"", true, names.as_deref(), |_| None);
+        let alone = [AGENTS, POIS].into_iter().find(|name| of.len() > 1 && of.iter().any(|of| of == name));
+        if let Some(name) = alone {
+            r.report_key("agents.senses.of", format!("found {name:?} with other names, allowed alone"));
+        }
+        let groups = summary.group_names();
+        let pois = Channel::pois(r).names("names of groups", false, groups.as_deref(), |_| None);
+        if !pois.is_empty() && !of.is_empty() && of != [POIS] {
+            r.report_key("agents.senses.pois", "found without of = \"pois\", allowed with it".into());
+        }
+        let sectors = Channel::sectors(r).number(between(1, MAX_SECTORS), 4);
+        let frame = Channel::frame(r).choice(if is_free { Frame::Map } else { Frame::Heading });
+        if is_free && frame == Frame::Heading {
+            let message = "found \"heading\" with free motion, which has no heading; allowed \"map\"";
+            r.report_key("agents.senses.frame", message.into());
+        }
+        let range = Channel::range(r).number(between(0.01, LONGEST).or_zero().or_unlimited(), f64::INFINITY);
+        let measure = Channel::measure(r).choice(Measure::Linear);
+        if matches!(measure, Measure::Distance | Measure::Closeness) && range.is_infinite() {
+            let found = if r.has("agents.senses.range") { "found inf" } else { "missing" };
+            let message = format!("{found}, allowed 0 to {LONGEST} with measure = \"{measure}\"");
+            r.report_key("agents.senses.range", message);
+        }
+        Channel {
+            of,
+            pois,
+            sectors,
+            frame,
+            range,
+            measure,
+            nearest: Channel::nearest(r).number(between(0.01, LONGEST), 1.0),
+            combine: Channel::combine(r).choice(Combine::Share),
+            empty: Channel::empty(r).number(sized(LEAST, 1e3), 0.0),
+            gain: Channel::gain(r).number(between(1e-3, 1e3), 1.0),
+        }
+    }
+}
+
+impl Term {
+    fn read(r: &mut Reader<'_>, summary: &Summary) -> Term {
+        let names = summary.class_names(&[AGENTS]);
+        let of = Term::of(r).names("names of classes, or \"agents\"", true, names.as_deref(), |_| None);
+        if of.len() > 1 && of.iter().any(|of| of == AGENTS) {
+            r.report_key("agents.rule.of", format!("found {AGENTS:?} with other names, allowed alone"));
+        }
+        let to = Term::to(r).required_number(between(0.01, LONGEST)).unwrap_or(LONGEST);
+        let from = Term::from(r).number(between(0.01, to).or_zero().because("`to`"), 0.0);
+        let size = sized(1e-3, 1e3);
+        let gain = Term::gain(r).optional_number(size, "none: a term has either gain or align");
+        let align = Term::align(r).optional_number(size, "none: a term has either gain or align");
+        match (gain, align) {
+            (None, None) => r.report_key("agents.rule.gain", "missing, allowed either this or `align`".into()),
+            (Some(_), Some(_)) => r.report_key("agents.rule.align", "found with `gain`, allowed either of them".into()),
+            _ => {}
+        }
+        Term { of, from, to, gain, align }
+    }
+}
+
+impl PoiGroup {
+    fn read(r: &mut Reader<'_>, index: usize, sides: [Allowed<f64>; 2], steps: usize, summary: &Summary) -> PoiGroup {
+        let before = summary.groups.get(..index).unwrap_or_default();
+        let name = PoiGroup::name(r).name(NAME, |name| name_problem(name, before.iter().map(|group| &group.name)));
+        let at = PoiGroup::at(r).positions(1..=MAX_POIS, sides, None).unwrap_or_default();
+        limit(r, "pois.at", "POIs", [before.iter().map(|group| group.pois).sum(), at.len(), MAX_POIS]);
+        let counts = if at.is_empty() { 0..=usize::MAX } else { at.len()..=at.len() };
+        let errors = r.error_count();
+        let names = summary.class_names(&[]);
+        let observers = PoiGroup::observers(r).names("names of classes", false, names.as_deref(), |_| None);
+        let named = summary.classes.iter().filter(|class| observers.contains(&class.name)).map(|class| class.agents);
+        let counted = if observers.is_empty() { summary.observers() } else { named.sum() };
+        let is_known = r.error_count() == errors && names.is_some() && !summary.classes.is_empty();
+        if counted == 0 && is_known && summary.classes.iter().all(|class| class.agents > 0) {
+            r.report_key("pois.observers", "missing, and no class observes; allowed names of classes".into());
+        }
+        // If the number is unknown, the reason is reported already.
+        let most = if counted == 0 || !is_known { MAX_AGENTS } else { counted };
+        let coupling =
+            PoiGroup::coupling(r).one_or_each(between(1, most).because("the number of its observers"), counts, 3);
+        let groups = summary.group_names();
+        let after = PoiGroup::after(r).names("names of groups", false, groups.as_deref(), |_| None);
+        if groups.is_some() && summary.cycle.first() == Some(&index) {
+            let all = summary.cycle.iter().chain(&summary.cycle[..1]);
+            let names: Vec<_> = all.map(|&group| format!("{:?}", summary.groups[group].name)).collect();
+            r.report_key("pois.after", format!("found {}, which can never begin", names.join(" after ")));
+        }
+        PoiGroup {
+            name,
+            value: PoiGroup::value(r).number(between(1e-3, 1e3), 1.0),
+            coupling,
+            radius: PoiGroup::radius(r).number(between(0.01, LONGEST), 5.0),
+            observers,
+            windows: windows(r, steps, at.len()),
+            after,
+            at,
+        }
+    }
+}
+
+/// Reads the windows of a group of POIs, one per POI.
+fn windows(r: &mut Reader<'_>, steps: usize, pois: usize) -> Vec<[usize; 2]> {
+    const WHAT: &str = "pairs [first, last]";
+    let step = between(1, steps).because("world.steps");
+    let windows = PoiGroup::windows(r).lists(WHAT, ("pois.at, or one for all", None), 2..=2, step, |windows| {
+        let wrong = windows.iter().enumerate().filter(|(_, window)| window[0] > window[1]);
+        let problem = |(index, window): (usize, &Vec<usize>)| {
+            let [first, last] = [window[0], window[1]];
+            (index, format!("found the steps from {first} to {last}, allowed the earlier one first"))
+        };
+        wrong.map(problem).collect()
+    });
+    let windows: Vec<[usize; 2]> = windows.into_iter().map(|window| [window[0], window[1]]).collect();
+    match windows.len() {
+        1 => vec![windows[0]; pois],
+        count if count == 0 || count == pois || pois == 0 => windows,
+        count => {
+            let message =
+                format!("found a list of {count}, allowed a list of {pois} {WHAT}, or of one for all, or none");
+            r.report_key("pois.windows", message);
+            vec![]
+        }
+    }
+}

@@ -1,0 +1,658 @@
+//! Tests that classes of agents and groups of POIs are read, written and refused with precise messages.
+
+use std::collections::HashSet;
+
+use flotilla::config::{
+    Actions, AgentClass, Choice, Combine, Config, Control, Coupling, Frame, Heading, Measure, Mobility, Observers,
+    Override, Paradigm, Sharing,
+};
+use flotilla::reader::Document;
+use flotilla::sample;
+use proptest::collection::vec;
+use proptest::prelude::*;
+
+const TEXT: &str = r#"[world]
+steps = 20
+[[agents]]
+name = "uav"
+at = [[25, 25], [26, 25]]
+motion = { kind = "free", max_speed = 1.0 }
+senses = [
+  { of = "pois", range = 25 },
+  { of = ["uav", "dog"], range = 5, measure = "closeness" },
+]
+leads = "dog"
+[[agents]]
+name = "dog"
+at = [[20, 25]]
+control = "follow"
+rule = [{ of = "agents", to = 5, gain = -1 }]
+[[pois]]
+name = "a"
+at = [[1, 2], [3, 4]]
+coupling = 1
+[[pois]]
+name = "b"
+at = [[5, 6]]
+coupling = 2
+after = "a"
+"#;
+
+fn parse(text: &str) -> Config {
+    Config::parse(text, "x.toml").unwrap_or_else(|error| panic!("{text}\n{error}"))
+}
+
+/// Returns the text with one part replaced.
+fn with(from: &str, to: &str) -> String {
+    assert_eq!(TEXT.matches(from).count(), 1, "{from}");
+    TEXT.replace(from, to)
+}
+
+fn many(count: usize) -> String {
+    format!("at = [{}]", "[1, 1], ".repeat(count))
+}
+
+/// Each part of the text is replaced by another, with the problems that this causes.
+#[test]
+fn every_problem_names_key_line_found_and_allowed() {
+    let leads = "leads = \"dog\"";
+    let rule = "to = 5, gain = -1";
+    let control = "control = \"follow\"";
+    let pois = "{ of = \"pois\", range = 25 },";
+    let of = "of = \"pois\"";
+    let range = "range = 25";
+    let motion = "\"free\", max_speed = 1.0";
+    let coupling = "coupling = 1";
+    let steps = "steps = 20";
+    let replaced = |list: &str| {
+        format!(
+            "found in a config with [[{list}]], which replaces this key; to write a config in full, use `flotilla check \
+             --expand`"
+        )
+    };
+    let [agents, groups] = ["agents", "pois"].map(replaced);
+    for (from, to, expected) in [
+        (
+            "range = 5,",
+            "rnge = 5,",
+            "9: agents[0].senses[1].range: missing, allowed 0 to 10000 with measure = \"closeness\"\n9: agents[0].senses[1].rnge: unknown key, did you mean `range`?",
+        ),
+        (
+            "range = 5,",
+            "range = 5, colour = 1,",
+            "9: agents[0].senses[1].colour: unknown key, allowed combine, empty, frame, gain, measure, nearest, of, pois, range, sectors",
+        ),
+        ("range = 5,", "range = -1,", "9: agents[0].senses[1].range: found -1, allowed 0 to 10000 or inf (unlimited)"),
+        (
+            "range = 5,",
+            "range = \"far\",",
+            "9: agents[0].senses[1].range: found \"far\", allowed a number, 0 to 10000 or inf (unlimited)",
+        ),
+        (
+            "range = 5,",
+            "range = inf,",
+            "9: agents[0].senses[1].range: found inf, allowed 0 to 10000 with measure = \"closeness\"",
+        ),
+        (
+            "range = 5, measure",
+            "measure",
+            "9: agents[0].senses[1].range: missing, allowed 0 to 10000 with measure = \"closeness\"",
+        ),
+        (range, "range = 25, sectors = 17", "8: agents[0].senses[0].sectors: found 17, allowed 1 to 16"),
+        (
+            range,
+            "range = 25, sectors = 2.5",
+            "8: agents[0].senses[0].sectors: found 2.5, allowed a whole number, 1 to 16",
+        ),
+        (
+            range,
+            "range = 25, measure = \"near\"",
+            "8: agents[0].senses[0].measure: found \"near\", allowed \"linear\" or \"inverse\" or \"inverse-squared\" or \"exponential\" or \"distance\" or \"closeness\"",
+        ),
+        (
+            range,
+            "range = 25, combine = \"average\"",
+            "8: agents[0].senses[0].combine: found \"average\", allowed \"share\" or \"sum\" or \"mean\" or \"closest\"",
+        ),
+        (
+            range,
+            "range = 25, frame = \"heading\"",
+            "8: agents[0].senses[0].frame: found \"heading\" with free motion, which has no heading; allowed \"map\"",
+        ),
+        (
+            range,
+            "range = 25, empty = 1e-9",
+            "8: agents[0].senses[0].empty: found 1e-9, allowed -1000 to -0.000001 or 0 or 0.000001 to 1000",
+        ),
+        (range, "range = 25, gain = 0", "8: agents[0].senses[0].gain: found 0, allowed 0.001 to 1000"),
+        (range, "range = 25, nearest = 0", "8: agents[0].senses[0].nearest: found 0, allowed 0.01 to 10000"),
+        (
+            "{ of = \"pois\", range = 25 }",
+            "{ range = 25 }",
+            "8: agents[0].senses[0].of: missing, allowed \"agents\" or \"pois\" or \"uav\" or \"dog\" or a list of names",
+        ),
+        ("{ of = \"pois\", range = 25 }", "3", "8: agents[0].senses[0]: found 3, allowed a table"),
+        (
+            of,
+            "of = \"poi\"",
+            "8: agents[0].senses[0].of: found \"poi\", allowed \"agents\" or \"pois\" or \"uav\" or \"dog\"; did you mean \"pois\"?",
+        ),
+        (of, "of = 3", "8: agents[0].senses[0].of: found 3, allowed \"agents\" or \"pois\" or \"uav\" or \"dog\""),
+        (of, "of = []", "8: agents[0].senses[0].of: found a list of 0, allowed a list of 1 to 4 names"),
+        (of, "of = [\"pois\", \"uav\"]", "8: agents[0].senses[0].of: found \"pois\" with other names, allowed alone"),
+        (
+            of,
+            "of = \"agents\", pois = \"a\"",
+            "8: agents[0].senses[0].pois: found without of = \"pois\", allowed with it",
+        ),
+        (
+            of,
+            "of = \"pois\", pois = [\"a\", \"c\"]",
+            "8: agents[0].senses[0].pois[1]: found \"c\", allowed \"a\" or \"b\"",
+        ),
+        (of, "of = [\"uav\", \"uav\"]", "8: agents[0].senses[0].of[1]: found \"uav\" again"),
+        (
+            pois,
+            "{ of = \"pois\", sectors = 16 },{ of = \"pois\", sectors = 16 },{ of = \"pois\", sectors = 16 },{ of = \"pois\", sectors = 16 },",
+            "7: agents[0].senses: found 68 sectors, allowed up to 64 in all channels",
+        ),
+        (
+            pois,
+            "{ of = \"pois\", sectors = 1 },{ of = \"pois\", sectors = 1 },{ of = \"pois\", sectors = 1 },{ of = \"pois\", sectors = 1 },{ of = \"pois\", sectors = 1 },{ of = \"pois\", sectors = 1 },{ of = \"pois\", sectors = 1 },{ of = \"pois\", sectors = 1 },",
+            "7: agents[0].senses: found a list of 9, allowed a list of 0 to 8 channels",
+        ),
+        (motion, "\"flying\"", "6: agents[0].motion.kind: found \"flying\", allowed \"steered\" or \"free\""),
+        (motion, "\"free\", min_speed = 1.0", "6: agents[0].motion.min_speed: unknown key, did you mean `max_speed`?"),
+        (motion, "\"free\", max_speed = 1001", "6: agents[0].motion.max_speed: found 1001, allowed 0 to 1000"),
+        (
+            motion,
+            "\"steered\", min_speed = 4",
+            "6: agents[0].motion.min_speed: found 4, allowed 0 to 3 (motion.max_speed)",
+        ),
+        ("{ kind = \"free\", max_speed = 1.0 }", "\"free\"", "6: agents[0].motion: found \"free\", allowed a table"),
+        (
+            leads,
+            "leads = \"uav\"",
+            "11: agents[0].leads: found \"uav\", which learns: classes that learn cannot be led yet",
+        ),
+        (leads, "leads = \"cat\"", "11: agents[0].leads: found \"cat\", allowed \"uav\" or \"dog\""),
+        (
+            leads,
+            "leads = []\ninfluence_radius = 3",
+            "12: agents[0].influence_radius: found without `leads`, which it is the radius of",
+        ),
+        (
+            leads,
+            "leads = \"dog\"\ninfluence_radius = 0",
+            "12: agents[0].influence_radius: found 0, allowed 0.01 to 10000",
+        ),
+        (leads, "observes = 1", "11: agents[0].observes: found 1, allowed true or false"),
+        (leads, "speed = 2", "11: agents[0].speed: found 2, allowed 0 to 1 (motion.max_speed)"),
+        (
+            leads,
+            "heading = [1, 2, 3]",
+            "11: agents[0].heading: found a list of 3, allowed a list of 2 numbers, each -1000 to 1000",
+        ),
+        (leads, "wall_radius = 0.001", "11: agents[0].wall_radius: found 0.001, allowed 0 or 0.01 to 10000"),
+        (leads, "wall_gain = 2000", "11: agents[0].wall_gain: found 2000, allowed 0 to 1000"),
+        (
+            leads,
+            "count = 3",
+            "11: agents[0].count: unknown key, allowed at, control, heading, influence_radius, leads, motion, name, observes, rule, senses, speed, wall_gain, wall_radius",
+        ),
+        (
+            leads,
+            "rule = [{ of = \"agents\", to = 1, gain = 1 }]",
+            "11: agents[0].rule: found with control = \"policy\", allowed with \"follow\"",
+        ),
+        (
+            "control = \"follow\"\nrule = [{ of = \"agents\", to = 5, gain = -1 }]",
+            "control = \"still\"",
+            "3: agents[0].influence_radius: missing, and \"dog\" has no rule to take it from; allowed 0.01 to 10000",
+        ),
+        (control, "control = \"still\"", "16: agents[1].rule: found with control = \"still\", allowed with \"follow\""),
+        (
+            control,
+            "control = \"policy\"",
+            "11: agents[0].leads: found \"dog\", which learns: classes that learn cannot be led yet\n12: agents[1].senses: missing, allowed a list of 1 to 8 channels\n16: agents[1].rule: found with control = \"policy\", allowed with \"follow\"",
+        ),
+        (
+            control,
+            "control = \"fly\"",
+            "15: agents[1].control: found \"fly\", allowed \"policy\" or \"follow\" or \"still\"",
+        ),
+        (
+            control,
+            "control = \"follow\"\nsenses = [{ of = \"pois\" }]",
+            "16: agents[1].senses: found with control = \"follow\", allowed with \"policy\"",
+        ),
+        (
+            control,
+            "control = \"follow\"\nleads = \"dog\"",
+            "16: agents[1].leads: found with control = \"follow\", allowed with \"policy\": others cannot lead yet",
+        ),
+        (
+            "rule = [{ of = \"agents\", to = 5, gain = -1 }]",
+            "",
+            "12: agents[1].rule: missing, allowed a list of 1 to 8 terms",
+        ),
+        (
+            "rule = [{ of = \"agents\", to = 5, gain = -1 }]",
+            "rule = []",
+            "16: agents[1].rule: missing, allowed a list of 1 to 8 terms",
+        ),
+        (rule, "gain = -1", "16: agents[1].rule[0].to: missing, allowed 0.01 to 10000"),
+        (rule, "to = 5", "16: agents[1].rule[0].gain: missing, allowed either this or `align`"),
+        (rule, "to = 5, gain = 1, align = 1", "16: agents[1].rule[0].align: found with `gain`, allowed either of them"),
+        (rule, "to = 5, align = -2000", "16: agents[1].rule[0].align: found -2000, allowed -1000 to 1000"),
+        (
+            rule,
+            "to = 5, gain = 1e-5",
+            "16: agents[1].rule[0].gain: found 1e-5, allowed -1000 to -0.001 or 0 or 0.001 to 1000",
+        ),
+        (rule, "from = 6, to = 5, gain = 1", "16: agents[1].rule[0].from: found 6, allowed 0 to 5 (`to`)"),
+        (rule, "to = 0, gain = 1", "16: agents[1].rule[0].to: found 0, allowed 0.01 to 10000"),
+        (
+            "of = \"agents\", to = 5",
+            "of = \"pois\", to = 5",
+            "16: agents[1].rule[0].of: found \"pois\", allowed \"agents\" or \"uav\" or \"dog\"",
+        ),
+        (
+            "of = \"agents\", to = 5",
+            "of = [\"agents\", \"dog\"], to = 5",
+            "16: agents[1].rule[0].of: found \"agents\" with other names, allowed alone",
+        ),
+        ("name = \"dog\"", "name = \"uav\"", "13: agents[1].name: found \"uav\" again, allowed another name"),
+        (
+            "name = \"dog\"",
+            "name = \"agents\"",
+            "13: agents[1].name: found \"agents\", which names all of them, allowed another name",
+        ),
+        (
+            "name = \"dog\"",
+            "name = \"a dog\"",
+            "13: agents[1].name: found \"a dog\", allowed a name of letters, digits, _ and -",
+        ),
+        ("name = \"dog\"", "name = 3", "13: agents[1].name: found 3, allowed a name of letters, digits, _ and -"),
+        ("name = \"uav\"\n", "", "3: agents[0].name: missing, allowed a name of letters, digits, _ and -"),
+        ("at = [[20, 25]]\n", "", "12: agents[1].at: missing, allowed a list of 1 to 1024 positions [x, y]"),
+        (
+            "at = [[20, 25]]",
+            "at = []",
+            "14: agents[1].at: found a list of 0, allowed a list of 1 to 1024 positions [x, y]",
+        ),
+        ("at = [[20, 25]]", "at = [[20, 51]]", "14: agents[1].at[0][1]: found 51, allowed 0 to 50 (the map)"),
+        ("coupling = 2", "coupling = 4", "24: pois[1].coupling: found 4, allowed 1 to 3 (the number of its observers)"),
+        ("coupling = 2", "coupling = 0", "24: pois[1].coupling: found 0, allowed 1 to 3 (the number of its observers)"),
+        (
+            coupling,
+            "coupling = [1, 2, 3]",
+            "20: pois[0].coupling: found a list of 3, allowed a list of 2 numbers, each 1 to 3 (the number of its observers)",
+        ),
+        (
+            coupling,
+            "coupling = 2\nobservers = \"dog\"",
+            "20: pois[0].coupling: found 2, allowed 1 (the number of its observers)",
+        ),
+        (
+            coupling,
+            "coupling = 1\nobservers = \"cat\"",
+            "21: pois[0].observers: found \"cat\", allowed \"uav\" or \"dog\"",
+        ),
+        (coupling, "coupling = 1\nvalue = 0", "21: pois[0].value: found 0, allowed 0.001 to 1000"),
+        (coupling, "coupling = 1\nradius = 0", "21: pois[0].radius: found 0, allowed 0.01 to 10000"),
+        (
+            coupling,
+            "coupling = 1\nwindows = [[1, 2], [1, 3], [1, 4]]",
+            "21: pois[0].windows: found a list of 3, allowed a list of 2 pairs [first, last], or of one for all, or none",
+        ),
+        (
+            coupling,
+            "coupling = 1\nwindows = [[3, 2]]",
+            "21: pois[0].windows[0]: found the steps from 3 to 2, allowed the earlier one first",
+        ),
+        (
+            coupling,
+            "coupling = 1\nwindows = [[1, 21]]",
+            "21: pois[0].windows[0][1]: found 21, allowed 1 to 20 (world.steps)",
+        ),
+        (
+            coupling,
+            "coupling = 1\nafter = \"b\"",
+            "21: pois[0].after: found \"a\" after \"b\" after \"a\", which can never begin",
+        ),
+        (coupling, "coupling = 1\nafter = \"c\"", "21: pois[0].after: found \"c\", allowed \"a\" or \"b\""),
+        ("after = \"a\"", "after = \"b\"", "25: pois[1].after: found \"b\" after \"b\", which can never begin"),
+        (
+            "after = \"a\"",
+            "count = 3",
+            "25: pois[1].count: unknown key, allowed after, at, coupling, name, observers, radius, value, windows",
+        ),
+        ("name = \"b\"", "name = \"a\"", "22: pois[1].name: found \"a\" again, allowed another name"),
+        (
+            "name = \"b\"",
+            "name = \"pois\"",
+            "22: pois[1].name: found \"pois\", which names all of them, allowed another name",
+        ),
+        (steps, "leaders = [[1, 1]]", &*format!("2: world.leaders: {agents}")),
+        (steps, "speed = 1", &*format!("2: world.speed: {agents}")),
+        (steps, "pois = [[1, 1]]", &*format!("2: world.pois: {groups}")),
+        (steps, "observers = \"leaders\"", &*format!("2: world.observers: {agents}")),
+        (steps, "windows = [[1, 2]]", &*format!("2: world.windows: {groups}")),
+        (steps, "[sense]\ngain = 2", &*format!("3: sense.gain: {agents}")),
+        (steps, "[motion]\nmax_speed = 2", &*format!("3: motion.max_speed: {agents}")),
+        (steps, "[follow]\nwall_gain = 2", &*format!("3: follow.wall_gain: {agents}")),
+        (steps, "[learning]\nparadigm = \"all-leaders\"", &*format!("3: learning.paradigm: {agents}")),
+        (
+            steps,
+            "[learning]\nsharing = \"group\"",
+            "3: learning.sharing: found \"group\" with [[agents]], which needs learning.groups",
+        ),
+        (
+            steps,
+            "[learning]\nsharing = \"group\"\ngroups = [[0], [2]]",
+            "4: learning.groups[1][0]: found 2, allowed 0 to 1 (the last learner)",
+        ),
+        (
+            steps,
+            "[policy]\nactions = \"behaviours\"",
+            "3: policy.actions: found \"behaviours\", but the senses of \"uav\" do not begin with POIs and agents in 4 sectors around the heading",
+        ),
+        (
+            steps,
+            "[[stages]]\nfrom = 1\nset = { \"agents\" = 3 }",
+            "4: stages[0].set.agents: this key cannot change between stages",
+        ),
+        (
+            steps,
+            "[[stages]]\nfrom = 1\nset = { \"pois.radius\" = 3 }",
+            "4: stages[0].set.pois.radius: this key cannot change between stages",
+        ),
+        (
+            steps,
+            "[[stages]]\nfrom = 1\nset = { \"world.coupling\" = 3 }",
+            &*format!("4: stages[0].set.world.coupling: {groups}"),
+        ),
+        (
+            steps,
+            "[[stages]]\nfrom = 1\nset = { \"world.map\" = [20, 20] }",
+            "2: stages[0]: agents[0].at[0][0]: found 25.0, allowed 0 to 20 (the map)\n2: stages[0]: agents[0].at[0][1]: found 25.0, allowed 0 to 20 (the map)\n2: stages[0]: agents[0].at[1][0]: found 26.0, allowed 0 to 20 (the map)\n2: stages[0]: agents[0].at[1][1]: found 25.0, allowed 0 to 20 (the map)\n2: stages[0]: agents[1].at[0][1]: found 25.0, allowed 0 to 20 (the map)",
+        ),
+        (
+            "[[pois]]\nname = \"a\"",
+            "[[poi]]\nname = \"a\"",
+            "17: poi: unknown key, did you mean `pois`?\n25: pois[0].after: found \"a\", allowed \"b\"",
+        ),
+    ] {
+        let text = with(from, to);
+        let error = Config::parse(&text, "x.toml").expect_err(&text).to_string();
+        let found: Vec<&str> = error.lines().filter(|line| !line.ends_with("problems in x.toml")).collect();
+        let expected: Vec<String> = expected.lines().map(|problem| format!("x.toml:{problem}")).collect();
+        assert_eq!(found, expected, "{to}");
+    }
+}
+
+#[test]
+fn classes_and_groups_have_their_limits() {
+    let uav = "at = [[25, 25], [26, 25]]";
+    assert_eq!(parse(&with(uav, &many(1023))).agent_count(), 1024);
+    assert_eq!(parse(&with("at = [[5, 6]]", &many(254))).poi_count(), 256);
+    for (from, to, expected) in [
+        (
+            "at = [[20, 25]]",
+            many(1023),
+            "x.toml:14: agents[1].at: found 1023, which makes 1025 agents with those before, allowed 1 to 1024",
+        ),
+        (
+            "at = [[5, 6]]",
+            many(255),
+            "x.toml:23: pois[1].at: found 255, which makes 257 POIs with those before, allowed 1 to 256",
+        ),
+        (
+            "[[pois]]\nname = \"a\"",
+            format!("{}[[pois]]\nname = \"a\"", "[[agents]]\n".repeat(7)),
+            "x.toml:3: agents: found a list of 9, allowed a list of 1 to 8 tables [[agents]]",
+        ),
+    ] {
+        assert_eq!(Config::parse(&with(from, &to), "x.toml").unwrap_err().to_string(), expected);
+    }
+    let none = with("name = \"a\"", "name = \"a\"").split("[[pois]]").next().unwrap().to_string();
+    let error = |text: String| Config::parse(&text, "x.toml").unwrap_err().to_string();
+    assert_eq!(
+        error(format!("pois = []\n{none}")),
+        "x.toml:1: pois: found a list of 0, allowed a list of 1 to 256 tables [[pois]]"
+    );
+    assert_eq!(
+        error(
+            TEXT.replace("[[agents]]\nname = \"uav\"", "[agents]\nname = \"uav\"")
+                .replace("[[agents]]\nname = \"dog\"", "[x]")
+        ),
+        "2 problems in x.toml\nx.toml:3: agents: found a section, allowed tables [[agents]]\nx.toml:12: x: unknown section"
+    );
+    // Without groups, POIs are needed in short, and the other way around.
+    assert_eq!(error(none), "x.toml:1: world.pois: missing, allowed a list of 1 to 256 positions [x, y]");
+}
+
+#[test]
+fn flags_and_stages_cannot_set_tables() {
+    for (key, value, expected) in [
+        ("agents", "3", "--set: [[agents]] can only be set in a config file"),
+        ("agents[0].speed", "3", "--set: [[agents]] can only be set in a config file"),
+        ("pois.radius", "3", "--set: [[pois]] can only be set in a config file"),
+        (
+            "learning.paradigm",
+            "'all-leaders'",
+            "--set: found in a config with [[agents]], which replaces this key; to write a config in full, use `flotilla \
+             check --expand`",
+        ),
+    ] {
+        let set = Override::of_text(key, value, "--set");
+        let error = Config::read(TEXT, "x.toml", &[], &[set]).unwrap_err();
+        assert_eq!((error.to_string().as_str(), error.is_usage()), (expected, true));
+    }
+    let set = Override::new("learning.population", 7, "--population");
+    let config = parse(TEXT);
+    assert_eq!(config.with(&[set]).unwrap().learning.population, 7);
+    let staged = parse(&format!("{TEXT}[[stages]]\nfrom = 3\nset = {{ \"world.steps\" = 30 }}\n"));
+    assert_eq!((staged.stages.len(), &staged.agents), (1, &config.agents));
+    assert_eq!(parse(&staged.to_toml()), staged);
+}
+
+#[test]
+fn keys_of_tables_have_their_defaults() {
+    let config = parse(TEXT);
+    let [uav, dog] = &config.agents[..] else { panic!("{:?}", config.agents) };
+    assert_eq!(
+        (uav.control, uav.speed, uav.observes, uav.wall_radius, uav.wall_gain),
+        (Control::Policy, 0.0, true, 1.0, 1.0)
+    );
+    assert_eq!(
+        (&uav.motion, &uav.heading),
+        (&Mobility::Free { max_speed: 1.0 }, &Heading::Same(std::f64::consts::FRAC_PI_2))
+    );
+    assert_eq!((uav.leads.clone(), uav.influence_radius), (vec!["dog".to_string()], None));
+    let [pois, agents] = &uav.senses[..] else { panic!("{:?}", uav.senses) };
+    assert_eq!(
+        (pois.sectors, pois.frame, pois.measure, pois.combine),
+        (4, Frame::Map, Measure::Linear, Combine::Share)
+    );
+    assert_eq!((pois.nearest, pois.empty, pois.gain, pois.range), (1.0, 0.0, 1.0, 25.0));
+    assert_eq!(agents.of, ["uav", "dog"]);
+    let short = parse("[world]\nleaders = [[1, 1]]\npois = [[2, 2]]\n");
+    assert_eq!(dog.motion, Mobility::Steered(short.motion.clone()));
+    assert_eq!((dog.rule[0].from, dog.rule[0].to, dog.rule[0].gain, dog.rule[0].align), (0.0, 5.0, Some(-1.0), None));
+    let group = &config.pois[0];
+    assert_eq!((group.value, group.radius, &group.coupling), (1.0, 5.0, &Coupling::Same(1)));
+    let timed = parse(&with("coupling = 1", "coupling = 1\nwindows = [[1, 9]]"));
+    assert_eq!(timed.pois[0].windows, [[1, 9]; 2]);
+    assert_eq!(timed.classes().windows(20), [[1, 9], [1, 9], [1, 20]]);
+    assert_eq!(config.classes().after(), [vec![], vec![], vec![0, 1]]);
+    // The other keys are as in an empty config.
+    assert_eq!((&config.motion, &config.sense, &config.follow), (&short.motion, &short.sense, &short.follow));
+    assert_eq!((config.learners(), config.agent_count(), config.poi_count(), config.inputs()), (2, 3, 3, 8));
+    assert_eq!(config.classes().influence_radius(0, 1), Some(5.0));
+    let wide = parse(&with("range = 25", "range = 25, sectors = 12"));
+    assert_eq!((wide.inputs(), wide.policy.widths(wide.inputs())), (16, vec![16, 10, 2]));
+    assert_eq!(wide.parameters(), 17 * 10 + 11 * 2);
+}
+
+/// Classes and groups may refer to those of the short form.
+#[test]
+fn one_list_may_be_in_full_and_the_other_in_short() {
+    let (agents, pois) = TEXT.split_once("[[pois]]").unwrap();
+    let agents = agents.replace("steps = 20", "pois = [[5, 6], [7, 8]]\ncoupling = 1\nafter = [[], [0]]");
+    let agents = parse(&agents.replace("of = \"pois\"", "of = \"pois\", pois = \"poi1\""));
+    assert_eq!((agents.agents.len(), agents.pois.len(), agents.classes().pois.len()), (2, 0, 2));
+    let text = format!("[world]\nleaders = [[1, 1]]\nfollowers = [[2, 2]]\n[[pois]]{pois}");
+    let groups = parse(&text.replace("coupling = 1", "coupling = 1\nobservers = \"follower\""));
+    assert_eq!((groups.agents.len(), groups.pois.len(), groups.classes().agents.len()), (0, 2, 2));
+    let error = |text: String| Config::parse(&text, "x.toml").unwrap_err().to_string();
+    assert_eq!(
+        error(text.replace("coupling = 1", "coupling = 2\nobservers = \"follower\"")),
+        "x.toml:7: pois[0].coupling: found 2, allowed 1 (the number of its observers)"
+    );
+    let alone = text.replace("coupling = 1", "observers = \"follower\"") + "[learning]\nparadigm = \"all-leaders\"\n";
+    assert_eq!(error(alone), "x.toml:7: pois[0].observers: found \"follower\", allowed \"leader\"");
+    for config in [agents, groups] {
+        assert_eq!(parse(&config.to_toml()), config);
+        assert_eq!(parse(&config.expanded().to_toml()).classes(), config.classes());
+    }
+}
+
+/// Stages cannot set keys of tables, so what they set stays in short.
+#[test]
+fn keys_that_stages_set_stay_in_short() {
+    let text =
+        "[world]\nleaders = [[1, 1]]\nfollowers = [[2, 2]]\npois = [[3, 3]]\ncoupling = 1\nobservers = \"leaders\"\n";
+    for (set, in_full) in [
+        ("\"world.steps\" = 7", [true, true]),
+        ("\"world.coupling\" = 1", [true, false]),
+        ("\"sense.gain\" = 2", [false, false]),
+        ("\"world.observers\" = \"all\"", [false, false]),
+    ] {
+        let config = parse(&format!("{text}[[stages]]\nfrom = 3\nset = {{ {set} }}\n"));
+        let expanded = config.expanded();
+        assert_eq!([!expanded.agents.is_empty(), !expanded.pois.is_empty()], in_full, "{set}");
+        assert_eq!((parse(&expanded.to_toml()), expanded.classes()), (expanded, config.classes()));
+    }
+}
+
+#[test]
+fn blind_channels_and_headings_in_degrees_cause_notes() {
+    let notes = |text: &str| Config::read_noted(&Document::parse(text), "x.toml", &[], &[]).unwrap().1;
+    assert_eq!(notes(TEXT), Vec::<String>::new());
+    let blind = "agents[0].senses[0] never senses anything in this world";
+    assert_eq!(notes(&with("range = 25", "range = 0")), [blind]);
+    let alone = with("at = [[25, 25], [26, 25]]", "at = [[25, 25]]").replace("of = \"pois\"", "of = \"uav\"");
+    assert_eq!(notes(&alone), [blind]);
+    let turned = notes(&with("leads", "heading = 90\nleads"));
+    assert!(turned.len() == 1 && turned[0].starts_with("agents[0].heading has 90"), "{turned:?}");
+    let default = notes(&with("coupling = 1", "observers = \"dog\""));
+    assert!(default.len() == 1 && default[0].starts_with("pois[0].coupling is not set: 1 is used"), "{default:?}");
+    let short = notes(&with("control = \"follow\"", "control = \"follow\"\nmotion = { max_speed = 1e-6 }"));
+    assert!(short.len() == 1 && short[0].starts_with("agents[1].motion.max_speed times world.dt"), "{short:?}");
+}
+
+/// Random configs are valid, and are the same after they were written and read, and in full.
+#[test]
+fn random_classes_survive_a_round_trip() {
+    let mut seen = HashSet::new();
+    let mut note = |what: &str, of: String| {
+        seen.insert(format!("{what} {of}"));
+    };
+    for seed in 0..500 {
+        let config = sample::classes_world(seed);
+        let valid = config.validate().unwrap_or_else(|error| panic!("{seed}: {error}"));
+        assert_eq!(*valid, config, "{seed}");
+        let text = config.to_toml();
+        assert_eq!(Config::parse(&text, "x.toml"), Ok(config.clone()), "{seed}: {text}");
+        assert_eq!(config.expanded(), config, "{seed}");
+        assert_eq!(sample::classes_world(seed), config, "{seed}");
+        let learning = config.agents.iter().take_while(|class| class.learns()).map(AgentClass::inputs);
+        assert_eq!(config.inputs(), learning.max().unwrap(), "{seed}");
+        if seed >= 100 {
+            continue;
+        }
+        for class in &config.agents {
+            note("control", class.control.to_string());
+            note("motion", matches!(class.motion, Mobility::Free { .. }).to_string());
+            for channel in &class.senses {
+                note("measure", channel.measure.to_string());
+                note("combine", channel.combine.to_string());
+                note("frame", channel.frame.to_string());
+            }
+            class.rule.iter().for_each(|term| note("gain", term.gain.is_some().to_string()));
+        }
+        for group in &config.pois {
+            note("windows", group.windows.is_empty().to_string());
+            note("after", group.after.is_empty().to_string());
+            note("observers", group.observers.is_empty().to_string());
+            note("coupling", matches!(group.coupling, Coupling::Same(_)).to_string());
+        }
+        note("actions", config.policy.actions.to_string());
+        note("sharing", config.learning.sharing.to_string());
+    }
+    let words = Measure::ALL.len() + Combine::ALL.len() + Frame::ALL.len() + Control::ALL.len();
+    assert_eq!(seen.len(), words + 6 * 2 + Actions::Direct.outputs() + Sharing::ALL.len(), "{seen:?}");
+}
+
+/// A config in short is the same in full: same classes, learners, populations and policies.
+#[test]
+fn a_config_in_short_has_the_same_classes_in_full() {
+    for seed in 0..300 {
+        let short = sample::world(seed);
+        let full = parse(&short.expanded().to_toml());
+        assert_eq!(full, short.expanded(), "{seed}");
+        assert_eq!(full.classes(), short.classes(), "{seed}");
+        assert_eq!(full.population_of_each(), short.population_of_each(), "{seed}");
+        assert_eq!(
+            [full.learners(), full.inputs(), full.parameters()],
+            [short.learners(), 8, short.parameters()],
+            "{seed}"
+        );
+        assert_eq!([full.agent_count(), full.poi_count()], [short.agent_count(), short.poi_count()], "{seed}");
+        let (drawn, mut world) = (full.drawn(), short.world.clone());
+        if short.learning.paradigm == Paradigm::AllLeaders {
+            world.leaders.append(&mut world.followers);
+        }
+        let whole = |world: &flotilla::config::WorldConfig| {
+            let observers = match world.followers.is_empty() {
+                true => Observers::All,
+                false => world.observers,
+            };
+            let after = if world.after.iter().all(Vec::is_empty) { vec![] } else { world.after.clone() };
+            let coupling = world.coupling.of_each(world.pois.len());
+            (world.leaders.clone(), world.followers.clone(), world.pois.clone(), coupling, observers, after)
+        };
+        assert_eq!(whole(&drawn), whole(&world), "{seed}");
+        assert_eq!((&drawn.windows, drawn.observation_radius), (&world.windows, world.observation_radius), "{seed}");
+        assert_eq!(drawn.headings(), world.headings(), "{seed}");
+    }
+}
+
+/// Generates a piece of text: mostly one that has a meaning in TOML or in a table.
+fn token() -> impl Strategy<Value = String> {
+    let known = "[ ] [[ ]] = , . # \" { } inf -inf nan -1 0 3 1e-40 true [[agents]] [[pois]] [agents] agents pois uav dog \
+                 \"uav\" \"dog\" \"pois\" \"a\" \"b\" name at of to senses rule motion kind control after windows [[1,2],[3]]";
+    let known: Vec<String> = known.split_whitespace().map(str::to_string).chain(["\n".into()]).collect();
+    prop_oneof![4 => (0..known.len()).prop_map(move |index| known[index].clone()), 1 => "\\PC{0,6}"]
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn mangled_tables_never_panic(edits in vec((any::<prop::sample::Index>(), 0..12usize, token()), 1..6)) {
+        let mut text = TEXT.as_bytes().to_vec();
+        for (at, cut, token) in edits {
+            let at = at.index(text.len() + 1);
+            let end = (at + cut).min(text.len());
+            text.splice(at..end, token.into_bytes());
+        }
+        let text = String::from_utf8_lossy(&text);
+        match Config::parse(&text, "x.toml") {
+            Ok(config) => prop_assert_eq!(Config::parse(&config.to_toml(), "again.toml"), Ok(config)),
+            Err(error) => prop_assert!(error.to_string().contains("x.toml")),
+        }
+    }
+}
