@@ -416,6 +416,14 @@ fn classes_and_groups_have_their_limits() {
     ] {
         assert_eq!(Config::parse(&with(from, &to), "x.toml").unwrap_err().to_string(), expected);
     }
+    // All of them learn.
+    let dogs = "at = [[1, 1]]\nsenses = [{ of = \"pois\" }]";
+    let all = TEXT.replace("at = [[25, 25], [26, 25]]", &many(1024)).replace("at = [[20, 25]]", dogs);
+    let all = all.replace("control = \"follow\"\nrule = [{ of = \"agents\", to = 5, gain = -1 }]\n", "");
+    assert_eq!(
+        Config::parse(&all.replace("leads = \"dog\"\n", ""), "x.toml").unwrap_err().to_string(),
+        "x.toml:13: agents[1].at: found 1, which makes 1025 agents with those before, allowed 1 to 1024"
+    );
     let none = with("name = \"a\"", "name = \"a\"").split("[[pois]]").next().unwrap().to_string();
     let error = |text: String| Config::parse(&text, "x.toml").unwrap_err().to_string();
     assert_eq!(
@@ -428,6 +436,30 @@ fn classes_and_groups_have_their_limits() {
                 .replace("[[agents]]\nname = \"dog\"", "[x]")
         ),
         "2 problems in x.toml\nx.toml:3: agents: found a section, allowed tables [[agents]]\nx.toml:12: x: unknown section"
+    );
+    let (head, rest) = TEXT.split_once("[[agents]]").unwrap();
+    let (uav, rest) = rest.split_once("[[agents]]").unwrap();
+    let (dog, groups) = rest.split_once("[[pois]]").unwrap();
+    assert_eq!(
+        error(format!("{head}[[agents]]{dog}[[agents]]{uav}[[pois]]{groups}")),
+        "x.toml:8: agents[1].control: found a class that learns after \"dog\", which does not; allowed before all classes \
+         that do not learn"
+    );
+    assert_eq!(
+        error(format!("{head}[[agents]]{dog}[[pois]]{}", groups.replace("coupling = 2", "coupling = 1"))),
+        "x.toml:3: agents: found no class that learns, allowed one or more with control = \"policy\""
+    );
+    let blind = TEXT.replace("name = \"uav\"", "name = \"uav\"\nobserves = false");
+    let blind = blind.replace("name = \"dog\"", "name = \"dog\"\nobserves = false");
+    let nobody = "missing, and no class observes; allowed names of classes";
+    assert_eq!(
+        error(blind.clone()),
+        format!("2 problems in x.toml\nx.toml:19: pois[0].observers: {nobody}\nx.toml:23: pois[1].observers: {nobody}")
+    );
+    let blind = blind.split("[[pois]]").next().unwrap().replace("steps", "pois = [[1, 1]]\nsteps");
+    assert_eq!(
+        error(blind),
+        "x.toml:4: agents: found no class that observes, allowed one or more with observes = true"
     );
     // Without groups, POIs are needed in short, and the other way around.
     assert_eq!(error(none), "x.toml:1: world.pois: missing, allowed a list of 1 to 256 positions [x, y]");

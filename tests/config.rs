@@ -498,6 +498,12 @@ fn counts_at_their_limits_are_valid() {
     let config = Config::parse(&text, "test.toml").unwrap();
     assert_eq!(config.learning.seed, i64::MAX as u64);
     assert_eq!(Config::parse(&config.to_toml(), "again.toml"), Ok(config));
+    let (leaders, followers) = (many(1000), many(25));
+    let text = format!(
+        "[world]\nleaders = {leaders}\nfollowers = {followers}\npois = [[1, 1]]\n[learning]\nparadigm = 'all-leaders'"
+    );
+    let [Problem { key, message, .. }] = &problems(&text)[..] else { panic!("{text}") };
+    assert_eq!((&**key, &**message), ("world.followers", "found 1025 agents with the leaders, allowed 1 to 1024"));
     for (key, most) in [("population", MAX_POPULATION), ("trials", MAX_TRIALS), ("generations", MAX_GENERATIONS)] {
         let text = |value: usize| format!("{SMALLEST}[learning]\n{key} = {value}");
         assert!(Config::parse(&text(most), "test.toml").is_ok());

@@ -51,7 +51,8 @@ class Config(Mapping[str, Any]):
 
     Args:
         sections: a mapping for every section of a config file: `world={"leaders": [[5, 5]], "pois": [[5, 15]]}`, and a
-            list for `stages`. Positions may be lists or NumPy arrays `[n, 2]`, in map units.
+            list for `stages`. Positions may be lists or NumPy arrays `[n, 2]`, in map units. Classes of agents and groups of
+            POIs are read from text only, see `parse`.
 
     Raises:
         ConfigError: everything that is wrong, at once.

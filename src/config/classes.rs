@@ -266,9 +266,7 @@ impl Classes {
         let (class, group) = (&self.agents[class], &self.pois[group]);
         if group.observers.is_empty() { class.observes } else { group.observers.contains(&class.name) }
     }
-}
 
-impl Classes {
     /// Returns the distance up to which agents of a class influence those of a class that it leads.
     pub fn influence_radius(&self, leader: usize, led: usize) -> Option<f64> {
         let (leader, led) = (&self.agents[leader], &self.agents[led]);
@@ -302,12 +300,7 @@ impl Channel {
     pub(super) fn is_blind(&self, class: &AgentClass, classes: &Classes) -> bool {
         let sensed = |other: &&AgentClass| self.of.contains(&other.name) || self.of == [AGENTS];
         let others = || classes.agents.iter().filter(sensed).map(|other| other.at.len() - usize::from(other == class));
-        let is_listed = |group: &PoiGroup| self.pois.is_empty() || self.pois.contains(&group.name);
-        self.range == 0.0
-            || match self.of == [POIS] {
-                true => !classes.pois.iter().any(is_listed),
-                false => others().sum::<usize>() == 0,
-            }
+        self.range == 0.0 || self.of != [POIS] && others().sum::<usize>() == 0
     }
 }
 

@@ -388,8 +388,10 @@ impl Config {
                 r.report_key("learning.hall_of_fame", text);
             }
         }
-        let bytes = config.policy_bytes() / population as u64 * (population + hall_of_fame) as u64;
-        if r.error_count() == 0 && bytes > MAX_POLICY_BYTES {
+        // With too many agents there are no populations to count.
+        let bytes = |config: &Config| config.policy_bytes() / population as u64 * (population + hall_of_fame) as u64;
+        if r.error_count() == 0 && bytes(&config) > MAX_POLICY_BYTES {
+            let bytes = bytes(&config);
             let gib = |bytes: u64| bytes.div_ceil(1 << 30);
             let (bytes, most) = (gib(bytes), gib(MAX_POLICY_BYTES));
             let text = format!("found {population}, whose policies of all trials take {bytes} GiB, allowed {most} GiB");

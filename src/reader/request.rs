@@ -5,8 +5,13 @@ use std::ops::RangeInclusive;
 use serde::{Serialize, Serializer};
 
 use super::value::Kind;
-use super::{Allowed, Definition, Entry, Number, Reader, Value, between};
+use super::{Allowed, Definition, Entry, MAX_HINTS, Number, Reader, Value, between};
 use crate::config_enum::Choice;
+
+/// Maximum number of names that an error lists.
+const MAX_NAMED: usize = 16;
+/// Maximum number of names in a list if those that there are are unknown.
+const MAX_NAMES: usize = 1024;
 
 /// A requested key, before its allowed values and its default are given.
 pub(crate) struct KeyRequest<'r, 'a> {
@@ -89,7 +94,11 @@ impl<'a> KeyRequest<'_, 'a> {
     ) -> Vec<String> {
         let words = || match allowed {
             Some([]) => "none, because there are no others".into(),
-            Some(allowed) => allowed.iter().map(|name| format!("{name:?}")).collect::<Vec<_>>().join(" or "),
+            Some(allowed) => {
+                let listed = allowed.iter().take(MAX_NAMED).map(|name| format!("{name:?}"));
+                let more = (allowed.len() > MAX_NAMED).then(|| format!("{} more", allowed.len() - MAX_NAMED));
+                listed.chain(more).collect::<Vec<_>>().join(" or ")
+            }
             None => range.into(),
         };
         let default = (!is_required).then(|| "[]".into());
@@ -103,7 +112,7 @@ impl<'a> KeyRequest<'_, 'a> {
             Some(_) => {
                 let least = usize::from(is_required);
                 self.reader
-                    .items(entry, least..=allowed.map_or(usize::MAX, <[_]>::len).max(1), "names")
+                    .items(entry, least..=allowed.map_or(MAX_NAMES, <[_]>::len).max(1), "names")
                     .unwrap_or_default()
             }
             None => vec![entry],
@@ -115,7 +124,11 @@ impl<'a> KeyRequest<'_, 'a> {
                 Some(word) if names.iter().any(|name| name == word) => Some(format!("found {found} again")),
                 Some(word) if allowed.is_none_or(|allowed| allowed.contains(&word)) => check(word),
                 word => {
-                    let hint = similar(word, allowed.unwrap_or_default().iter().copied());
+                    self.reader.hints += 1;
+                    let hint = match allowed {
+                        Some(allowed) if self.reader.hints <= MAX_HINTS => similar(word, allowed.iter().copied()),
+                        _ => String::new(),
+                    };
                     Some(format!("found {found}, allowed {}{hint}", words()))
                 }
             };

@@ -101,15 +101,16 @@ impl Summary {
         self.classes.iter().filter(|class| class.learns()).map(|class| class.agents).sum()
     }
 
-    /// Returns the names of classes, and some further ones. Returns `None` if a name is wrong, which is reported.
+    /// Returns the names of classes, and some further ones. Returns `None` if the list or a name is wrong, which is
+    /// reported.
     fn class_names<'n>(&'n self, others: &[&'n str]) -> Option<Vec<&'n str>> {
-        let names = valid_names(self.classes.iter().map(|class| &*class.name))?;
+        let names = valid_names(self.classes.iter().map(|class| &*class.name), MAX_CLASSES)?;
         Some(others.iter().copied().chain(names).collect())
     }
 
     /// Returns the names of groups, or `None` if one is wrong.
     fn group_names(&self) -> Option<Vec<&str>> {
-        valid_names(self.groups.iter().map(|group| &*group.name))
+        valid_names(self.groups.iter().map(|group| &*group.name), MAX_POIS)
     }
 }
 
@@ -152,11 +153,11 @@ fn name_problem(name: &str, mut before: impl Iterator<Item = impl AsRef<str>>) -
     }
 }
 
-/// Returns these names, or `None` if one is wrong.
-fn valid_names<'n>(names: impl Iterator<Item = &'n str>) -> Option<Vec<&'n str>> {
+/// Returns these names, or `None` if there are more than `most` or one is wrong.
+fn valid_names<'n>(names: impl ExactSizeIterator<Item = &'n str>, most: usize) -> Option<Vec<&'n str>> {
     let mut seen = HashSet::new();
     let mut is_valid = |name: &'n str| name_problem(name, std::iter::empty::<&str>()).is_none() && seen.insert(name);
-    names.map(|name| is_valid(name).then_some(name)).collect()
+    if names.len() > most { None } else { names.map(|name| is_valid(name).then_some(name)).collect() }
 }
 
 /// Reports positions that exceed the limit together with those of the tables before.
