@@ -84,7 +84,8 @@ impl World {
         let described = config.as_ref().classes();
         let map = Vec2::new(world.map[0] as f32, world.map[1] as f32);
         let on_grid = |at: [f64; 2]| on_grid(DVec2::from(at).as_vec2(), map);
-        let of_each: Vec<&PoiGroup> = described.group_of_each().into_iter().map(|group| &described.pois[group]).collect();
+        let of_each: Vec<&PoiGroup> =
+            described.group_of_each().into_iter().map(|group| &described.pois[group]).collect();
         let (worth, total_worth) = worth(of_each.iter().map(|group| group.value));
         let values: Vec<f32> = of_each.iter().map(|group| group.value as f32).collect();
         let classes = Class::all(&described, &values, world.map, world.dt);
@@ -145,6 +146,15 @@ impl World {
     /// Returns the inputs of a policy: the most that any class has.
     pub fn inputs(&self) -> usize {
         self.constants.policy.inputs()
+    }
+
+    /// Returns the squared distance up to which each leader leads the agents of a class, `[classes][leaders]`.
+    pub(crate) fn influences2(&self) -> Vec<f32> {
+        let leading = self.classes.iter().flat_map(|class| class.agents().map(move |agent| (agent, class)));
+        let leading: Vec<&Class> =
+            leading.filter(|(agent, _)| *agent < self.leaders()).map(|(_, class)| class).collect();
+        let of = |led: usize| leading.iter().map(move |class| class.constants.influence2[led]);
+        (0..self.classes.len()).flat_map(of).collect()
     }
 
     /// Reports whether any rule aligns headings.

@@ -112,7 +112,7 @@ fn sensors_measure_what_the_authors_program_measures() {
                     let expected = expected[kind * sectors + sector].as_f64().unwrap();
                     let found = f64::from(found[place * sectors + sector]);
                     assert!(
-                        (found - expected).abs() <= 1e-5 * expected.abs().max(1.0),
+                        (found - expected).abs() <= 1e-5 * (1.0 + expected.abs()),
                         "scene {line}, agent {agent}, kind {kind}, sector {sector}: {found}, not {expected}\n{text}"
                     );
                     compared += 1;

@@ -86,7 +86,8 @@ fn ln(x: f32) -> f32 {
 
 // exp(-x) for x from 0.
 fn exp_negative(x: f32) -> f32 {
-    let limited = select(60.0, x, x < 60.0);
+    let most = 60.0;
+    let limited = select(most, x, x < most);
     let whole = 12582912.0;
     let raised = limited * 1.442695 + whole;
     let k = raised - whole;

@@ -45,6 +45,8 @@ pub(crate) struct Block<S: Simd> {
     pub(super) bounds: Vec<Bounds<S>>,
     /// See [`neighbours::find_near`].
     reach2: Vec<f32>,
+    /// The squared distance up to which each leader leads the agents of a class, `[classes][leaders]`.
+    influences2: Vec<f32>,
     /// The squared observation radius and the value of each POI, `[pois]`.
     pub(super) radii2: Vec<f32>,
     pub(super) values: Vec<f32>,
@@ -60,6 +62,7 @@ pub(crate) struct BlockState<S: Simd> {
 
 #[derive(Clone, Copy)]
 pub(super) struct Follower<S: Simd> {
+    sums: [Sum<S>; 2],
     force: follow::SteeringForce<S>,
     /// The squared size of the force, and the inverse of its size.
     sizes: (S::f32s, S::f32s),
@@ -79,11 +82,12 @@ impl<S: Simd> Block<S> {
             wanted: vec![zero; agents],
             velocities: vec![[zero; 2]; agents],
             headings: vec![[zero; 2]; if world.aligns() { agents } else { 0 }],
-            followers: vec![Follower { force, sizes: (zero, zero) }; followers],
+            followers: vec![Follower { sums: [Sum::new(simd); 2], force, sizes: (zero, zero) }; followers],
             counts: vec![S::u32s::splat(simd, 0); followers * leaders],
             near: vec![0; agents.div_ceil(64) * agents],
             bounds: vec![Bounds::nowhere(simd); agents.div_ceil(S::f32s::LEN)],
             reach2: reach2(world),
+            influences2: world.influences2(),
             radii2: world.radii2.clone(),
             values: world.values.clone(),
         }
@@ -192,26 +196,46 @@ impl<S: Simd> Block<S> {
         }
     }
 
-    /// Followers count the leaders they see, and obey their class's rule.
+    /// Followers count the leaders they see, and obey their class's rule. Several short loops: out-of-order execution
+    /// overlaps iterations only if they are short.
     #[inline(always)]
     fn follow(&mut self) {
-        self.count_leaders();
-        let Block { simd, world, agents, wanted, velocities, headings, near, followers, .. } = self;
+        let Block { simd, world, agents, wanted, velocities, headings, near, followers, counts, influences2, .. } =
+            self;
         let leaders = world.constants.leaders as usize;
-        for class in world.classes.iter().filter(|class| class.control() == Control::Follow) {
+        let influences2 = influences2.chunks_exact(leaders);
+        for (class, influences2) in
+            world.classes.iter().zip(influences2).filter(|(class, _)| class.agents().start >= leaders)
+        {
             let (shape, motion) = (&class.constants.shape, &class.constants.motion);
             let (own, terms) = (shape.agents(), &class.terms[..shape.term_count as usize]);
+            let counts = &mut counts[(own.start - leaders) * leaders..(own.end - leaders) * leaders];
             let followers = &mut followers[own.start - leaders..own.end - leaders];
+            let mut pairs = terms.chunk_by(|a, b| a.shape == b.shape).flat_map(|terms| terms.chunks(2)).peekable();
+            // The first terms count the leaders, too, if they visit all of them.
+            let visits = |terms: &&[follow::TermLanes<S>]| {
+                model::each(&terms[0].shape.ranges).any(|range| range.start == 0 && range.end >= leaders)
+            };
+            let mut counted = pairs.peek().is_some_and(visits);
+            if !counted {
+                count_leaders(agents, near, own.clone(), influences2, counts);
+            }
+            if shape.control() != Control::Follow {
+                continue;
+            }
             for follower in &mut *followers {
                 follower.force = follow::SteeringForce::none(*simd);
             }
-            for terms in terms.chunk_by(|a, b| a.shape == b.shape).flat_map(|terms| terms.chunks(4)) {
-                let part = Attraction { class, terms, agents, headings, near };
-                match terms.len() {
-                    1 => part.add::<1>(own.clone(), followers),
-                    2 => part.add::<2>(own.clone(), followers),
-                    3 => part.add::<3>(own.clone(), followers),
-                    _ => part.add::<4>(own.clone(), followers),
+            for terms in pairs {
+                let part = Attraction { class, terms, agents, headings, near, influences2 };
+                match (terms.len(), std::mem::take(&mut counted)) {
+                    (1, true) => part.add::<1, true>(own.clone(), followers, counts),
+                    (1, false) => part.add::<1, false>(own.clone(), followers, counts),
+                    (_, true) => part.add::<2, true>(own.clone(), followers, counts),
+                    (_, false) => part.add::<2, false>(own.clone(), followers, counts),
+                }
+                for follower in &mut *followers {
+                    follower.force.add(terms, &follower.sums);
                 }
             }
             for (agent, follower) in agents[own.clone()].iter().zip(&mut *followers) {
@@ -229,34 +253,6 @@ impl<S: Simd> Block<S> {
                 steer::<S, true>(motion, agents, followers, wanted);
             } else {
                 steer::<S, false>(motion, agents, followers, wanted);
-            }
-        }
-    }
-
-    /// Counts the leaders that each follower sees.
-    #[inline(always)]
-    fn count_leaders(&mut self) {
-        let Block { simd, world, agents, near, counts, .. } = self;
-        let leaders = world.constants.leaders as usize;
-        let leading = |class: &&ClassLanes<S>| class.agents().start < leaders;
-        for (class, led) in world.classes.iter().enumerate().filter(|(_, class)| class.agents().start >= leaders) {
-            for leading in world.classes.iter().take_while(leading) {
-                let influence2 = splat(*simd, leading.constants.influence2[class]);
-                for agent in led.agents() {
-                    let (x, y) = (agents[agent].x, agents[agent].y);
-                    let counts = &mut counts[(agent - leaders) * leaders..][..leaders];
-                    neighbours::each_near(
-                        near,
-                        agents,
-                        agent,
-                        leading.agents(),
-                        #[inline(always)]
-                        |leader, other| {
-                            let sees = within::<S>(other.x - x, other.y - y, influence2);
-                            counts[leader] -= sees.to_vector().bitcast::<S::u32s>();
-                        },
-                    );
-                }
             }
         }
     }
@@ -483,40 +479,76 @@ impl<S: Simd, P: PoiPosition<S>> ConstDispatch for Quartering<'_, '_, S, P> {
     }
 }
 
-/// Terms of a rule that count the same agents and add the same quantity.
+/// Counts which leaders the agents of `own` see, `[own][leaders]`. `influences2` are the leaders' squared distances.
+#[inline(always)]
+fn count_leaders<S: Simd>(
+    agents: &[Agent<S>],
+    near: &[u64],
+    own: Range<usize>,
+    influences2: &[f32],
+    counts: &mut [S::u32s],
+) {
+    for (index, counts) in own.zip(counts.chunks_exact_mut(influences2.len())) {
+        let &Agent { x, y, .. } = &agents[index];
+        neighbours::each_near(
+            near,
+            agents,
+            index,
+            0..influences2.len(),
+            #[inline(always)]
+            |leader, other| {
+                let sees = within::<S>(other.x - x, other.y - y, splat(x.token(), influences2[leader]));
+                counts[leader] -= sees.to_vector().bitcast::<S::u32s>();
+            },
+        );
+    }
+}
+
+/// One or two terms of a rule that count the same agents and add the same quantity.
 struct Attraction<'a, S: Simd> {
     class: &'a ClassLanes<S>,
     terms: &'a [follow::TermLanes<S>],
     agents: &'a [Agent<S>],
     headings: &'a [[S::f32s; 2]],
     near: &'a [u64],
+    influences2: &'a [f32],
 }
 
 impl<S: Simd> Attraction<'_, S> {
-    /// Adds so many terms to the forces on the agents of `own`.
+    /// Computes the sums of so many terms for the agents of `own`, and counts the leaders they see if wanted.
     #[inline(always)]
-    fn add<const TERMS: usize>(&self, own: Range<usize>, followers: &mut [Follower<S>]) {
+    fn add<const TERMS: usize, const COUNTS: bool>(
+        &self,
+        own: Range<usize>,
+        followers: &mut [Follower<S>],
+        counts: &mut [S::u32s],
+    ) {
         match self.terms[0].shape.aligns != 0 {
-            true => self.add_quantity::<TERMS, true>(own, followers),
-            false => self.add_quantity::<TERMS, false>(own, followers),
+            true => self.add_quantity::<TERMS, COUNTS, true>(own, followers, counts),
+            false => self.add_quantity::<TERMS, COUNTS, false>(own, followers, counts),
         }
     }
 
     #[inline(always)]
-    fn add_quantity<const TERMS: usize, const ALIGNS: bool>(&self, own: Range<usize>, followers: &mut [Follower<S>]) {
-        let &Attraction { class, terms, agents, headings, near } = self;
+    fn add_quantity<const TERMS: usize, const COUNTS: bool, const ALIGNS: bool>(
+        &self,
+        own: Range<usize>,
+        followers: &mut [Follower<S>],
+        counts: &mut [S::u32s],
+    ) {
+        let &Attraction { class, terms, agents, headings, near, influences2 } = self;
         let rule = &class.constants.rule;
         let terms: &[follow::TermLanes<S>; TERMS] = terms.as_array().expect("the caller counts the terms");
         let (runs, used) = model::runs(&terms[0].shape.ranges);
-        for (index, follower) in own.zip(followers) {
+        for ((index, follower), counts) in own.zip(followers).zip(counts.chunks_exact_mut(influences2.len())) {
             let &Agent { x, y, .. } = &agents[index];
             let mut sums = [Sum::new(x.token()); TERMS];
-            for range in runs[..used].iter().cloned() {
+            for range in &runs[..used] {
                 neighbours::each_near(
                     near,
                     agents,
                     index,
-                    range,
+                    range.clone(),
                     #[inline(always)]
                     |index, other| {
                         let (dx, dy) = (other.x - x, other.y - y);
@@ -528,10 +560,14 @@ impl<S: Simd> Attraction<'_, S> {
                         for (sum, term) in sums.iter_mut().zip(terms) {
                             sum.add(term, d2, quantity);
                         }
+                        if COUNTS && let Some(count) = counts.get_mut(index) {
+                            let sees = d2.simd_le(splat(x.token(), influences2[index]));
+                            *count -= sees.to_vector().bitcast::<S::u32s>();
+                        }
                     },
                 );
             }
-            follower.force.add(terms, &sums);
+            follower.sums[..TERMS].copy_from_slice(&sums);
         }
     }
 }
