@@ -288,6 +288,11 @@ fn plain_world(seed: u64) -> Config {
     }
 }
 
+/// Returns a world in the short form for even seeds, else one with classes of agents.
+pub fn any_world(seed: u64) -> Config {
+    if seed.is_multiple_of(2) { world(seed) } else { classes_world(seed) }
+}
+
 /// Returns a valid config with 1 to 5 classes of agents and 1 to 4 groups of POIs, a pure function of the seed.
 ///
 /// Places, map and learning are those of [`world`] for the same seed, so layouts are as degenerate. A hundred consecutive

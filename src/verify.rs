@@ -37,7 +37,7 @@ impl Plan {
     /// Returns a plan with random worlds of every kind, including degenerate ones.
     pub fn random(seeds: Range<u64>, teams: usize) -> Plan {
         let seed = seeds.start;
-        let worlds = seeds.map(|seed| (format!("random world {seed}"), sample::world(seed))).collect();
+        let worlds = seeds.map(|seed| (format!("random world {seed}"), sample::any_world(seed))).collect();
         Plan { worlds, teams, seed, generations: 3 }
     }
 }

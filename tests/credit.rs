@@ -556,7 +556,7 @@ fn played_teams_get_the_scores_of_their_records() {
     let (mut cpu, mut credit) = (Cpu::default(), Credit::default());
     let mut observed_by_rule = [0, 0];
     for seed in 0..100 {
-        let world = World::new(&sample::world(seed).validate().unwrap());
+        let world = World::new(&sample::any_world(seed).validate().unwrap());
         let (leaders, policies) = (world.leaders(), 5);
         let populations: Vec<u32> = (0..leaders as u32).collect();
         let weights = sample::weights(&world, policies, seed);

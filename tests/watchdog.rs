@@ -308,14 +308,30 @@ impl Faults for Edited {
     }
 }
 
-/// The self-test at opening also covers every density, and the kernels that only training uses.
+/// The self-test at opening also covers every measure, and the kernels that only training uses.
 #[test]
 fn opening_detects_an_edit_of_any_kernel() {
     type Edit = fn(String) -> String;
-    let edits: [(&str, Edit); 8] = [
-        ("linear density", |text| text.replace("exact_sqrt(d2) * world.inverse_diagonal", "exact_sqrt(d2)")),
-        ("inverse density", |text| text.replace("select(1.0, d2, d2 > 1.0)", "1.001 * d2")),
-        ("mean density", |text| text.replace("counts.z, counts.z > 1.0", "counts.z, counts.z > 2.0")),
+    let edits: [(&str, Edit); 13] = [
+        ("linear density", |text| {
+            text.replace("base - exact_sqrt(d2) * (gauge.slope * value)", "base - exact_sqrt(d2)")
+        }),
+        ("distance", |text| {
+            text.replace(
+                "on_lattice(exact_sqrt(d2) * (gauge.slope * value), base)",
+                "on_lattice(exact_sqrt(d2) * gauge.slope, base) + 1",
+            )
+        }),
+        ("exponential measure", |text| text.replace("k * 2.12194440e-4", "k * 2.13e-4")),
+        ("inverse density", |text| text.replace("select(gauge.nearest2, d2, d2 > gauge.nearest2)", "1.001 * d2")),
+        ("inverse-squared measure", |text| {
+            text.replace("inverse * inverse * value", "inverse * 1.001 * inverse * value")
+        }),
+        ("mean density", |text| text.replace("recip(nearest_f32(max(count, 1)))", "recip(nearest_f32(max(count, 2)))")),
+        ("closest entity", |text| text.replace("max(most, measured.measure)", "min(most, measured.measure)")),
+        ("aligned headings", |text| {
+            text.replace("on_lattice((*state).hx, own.heading_base)", "on_lattice((*state).hy, own.heading_base)")
+        }),
         ("pack", |text| text.replace("size >= enough", "size > enough")),
         ("pack", |text| text.replace("if steps > most", "if steps >= most")),
         ("gather", |text| text.replace("vec4(tile[start], tile[start + 1u]", "vec4(tile[start + 1u], tile[start]")),

@@ -326,13 +326,17 @@ impl<S: Simd> Quadrants<S> {
 
     /// Writes the channel's inputs.
     #[inline(always)]
-    pub(crate) fn write(self, channel: &ChannelLanes<S>, inputs: &mut [S::f32s]) {
+    pub(crate) fn write<const PLAIN: bool>(self, channel: &ChannelLanes<S>, inputs: &mut [S::f32s]) {
         let [sums, counts] = [self.sums.quadrants(), self.counts.quadrants()];
-        // Sectors of the map begin at the x axis, which is straight ahead.
-        let first = if channel.shape.frame == Frame::Map as u32 { 2 } else { 0 };
-        for (quadrant, (&sum, &count)) in sums.iter().zip(&counts).enumerate() {
-            inputs[(quadrant + first) % 4] = input::<S>(channel, sum, count);
+        let mut values = [channel.scale; 4];
+        for ((value, &sum), &count) in values.iter_mut().zip(&sums).zip(&counts) {
+            *value = if PLAIN { nearest_f32::<S>(sum) * channel.scale } else { input::<S>(channel, sum, count) };
         }
+        // Sectors of the map begin at the x axis, which is straight ahead.
+        if channel.shape.frame == Frame::Map as u32 {
+            values.rotate_left(2);
+        }
+        inputs.copy_from_slice(&values);
     }
 }
 

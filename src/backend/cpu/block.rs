@@ -6,14 +6,14 @@ use fearless_simd::{Simd, prelude::*};
 use glam::Vec2;
 
 use super::agent::Agent;
-use super::neighbours::{self, Bounds};
+use super::neighbours::{self, Bounds, Masks, masks};
 use super::pois::PoiPosition;
 use crate::backend::Moment;
 use crate::config::{Control, Measure};
 use crate::config_enum::ConstDispatch;
 use crate::kernels::math::{on_lattice, within};
 use crate::kernels::{clamp_to, splat};
-use crate::model::class::ClassLanes;
+use crate::model::class::{Class, ClassLanes};
 use crate::model::follow::{self, Sum};
 use crate::model::sense::{self, ChannelLanes, Combine, Frame};
 use crate::model::{self, Lanes, motion, policy};
@@ -45,8 +45,8 @@ pub(crate) struct Block<S: Simd> {
     pub(super) bounds: Vec<Bounds<S>>,
     /// See [`neighbours::find_near`].
     reach2: Vec<f32>,
-    /// The squared distance up to which each leader leads the agents of a class, `[classes][leaders]`.
-    influences2: Vec<f32>,
+    /// `[classes]`.
+    plans: Vec<Plan>,
     /// The squared observation radius and the value of each POI, `[pois]`.
     pub(super) radii2: Vec<f32>,
     pub(super) values: Vec<f32>,
@@ -87,7 +87,7 @@ impl<S: Simd> Block<S> {
             near: vec![0; agents.div_ceil(64) * agents],
             bounds: vec![Bounds::nowhere(simd); agents.div_ceil(S::f32s::LEN)],
             reach2: reach2(world),
-            influences2: world.influences2(),
+            plans: Plan::all(world),
             radii2: world.radii2.clone(),
             values: world.values.clone(),
         }
@@ -144,13 +144,13 @@ impl<S: Simd> Block<S> {
     /// Computes the inputs of the leaders' policies, channel by channel.
     #[inline(always)]
     pub fn sense(&mut self, pois: &[impl PoiPosition<S>]) {
-        let Block { simd, world, agents, near, bounds, reach2, values, inputs, .. } = self;
+        let Block { simd, world, agents, near, bounds, reach2, plans, values, inputs, .. } = self;
         neighbours::find_near(reach2, agents, near, bounds);
         let width = world.constants.policy.inputs();
-        for class in &world.classes {
+        for (class, plan) in world.classes.iter().zip(plans) {
             let shape = &class.constants.shape;
-            for channel in &class.channels[..shape.channel_count as usize] {
-                let scene = Scene { simd: *simd, channel, pois, values, agents, near };
+            for (channel, others) in class.channels.iter().zip(&plan.channels) {
+                let scene = Scene { simd: *simd, channel, pois, values, agents, near, others };
                 let (observers, inputs) = (shape.agents(), Inputs { all: &mut *inputs, width });
                 if channel.shape.sectors == 4 && channel.shape.combine != Combine::Closest as u32 {
                     Measure::of(channel.shape.measure).dispatch(Quartering { scene, observers, inputs });
@@ -200,25 +200,15 @@ impl<S: Simd> Block<S> {
     /// overlaps iterations only if they are short.
     #[inline(always)]
     fn follow(&mut self) {
-        let Block { simd, world, agents, wanted, velocities, headings, near, followers, counts, influences2, .. } =
-            self;
+        let Block { simd, world, agents, wanted, velocities, headings, near, followers, counts, plans, .. } = self;
         let leaders = world.constants.leaders as usize;
-        let influences2 = influences2.chunks_exact(leaders);
-        for (class, influences2) in
-            world.classes.iter().zip(influences2).filter(|(class, _)| class.agents().start >= leaders)
-        {
-            let (shape, motion) = (&class.constants.shape, &class.constants.motion);
-            let (own, terms) = (shape.agents(), &class.terms[..shape.term_count as usize]);
+        let follow = world.classes.iter().zip(plans).filter(|(class, _)| class.agents().start >= leaders);
+        for (class, plan) in follow {
+            let (shape, motion, own) = (&class.constants.shape, &class.constants.motion, class.agents());
             let counts = &mut counts[(own.start - leaders) * leaders..(own.end - leaders) * leaders];
             let followers = &mut followers[own.start - leaders..own.end - leaders];
-            let mut pairs = terms.chunk_by(|a, b| a.shape == b.shape).flat_map(|terms| terms.chunks(2)).peekable();
-            // The first terms count the leaders, too, if they visit all of them.
-            let visits = |terms: &&[follow::TermLanes<S>]| {
-                model::each(&terms[0].shape.ranges).any(|range| range.start == 0 && range.end >= leaders)
-            };
-            let mut counted = pairs.peek().is_some_and(visits);
-            if !counted {
-                count_leaders(agents, near, own.clone(), influences2, counts);
+            if let Some(leaders) = &plan.leaders {
+                count_leaders(agents, near, own.clone(), leaders, &plan.influences2, counts);
             }
             if shape.control() != Control::Follow {
                 continue;
@@ -226,13 +216,15 @@ impl<S: Simd> Block<S> {
             for follower in &mut *followers {
                 follower.force = follow::SteeringForce::none(*simd);
             }
-            for terms in pairs {
-                let part = Attraction { class, terms, agents, headings, near, influences2 };
-                match (terms.len(), std::mem::take(&mut counted)) {
-                    (1, true) => part.add::<1, true>(own.clone(), followers, counts),
-                    (1, false) => part.add::<1, false>(own.clone(), followers, counts),
-                    (_, true) => part.add::<2, true>(own.clone(), followers, counts),
-                    (_, false) => part.add::<2, false>(own.clone(), followers, counts),
+            for (index, (terms, others)) in plan.terms.iter().enumerate() {
+                let counting = index == 0 && plan.leaders.is_none();
+                let (terms, influences2) = (&class.terms[terms.clone()], &plan.influences2);
+                let attraction = Attraction { class, terms, agents, headings, near, others, influences2 };
+                match (terms.len(), counting) {
+                    (1, true) => attraction.add::<1, true>(own.clone(), followers, counts),
+                    (1, false) => attraction.add::<1, false>(own.clone(), followers, counts),
+                    (_, true) => attraction.add::<2, true>(own.clone(), followers, counts),
+                    (_, false) => attraction.add::<2, false>(own.clone(), followers, counts),
                 }
                 for follower in &mut *followers {
                     follower.force.add(terms, &follower.sums);
@@ -309,6 +301,48 @@ impl<S: Simd> Block<S> {
     }
 }
 
+/// How the agents of a class visit others.
+struct Plan {
+    /// The agents of each channel, `[channels]`.
+    channels: Vec<Masks>,
+    /// Terms that are added together, one or two, and their agents.
+    terms: Vec<(Range<usize>, Masks)>,
+    /// The leaders, unless the first terms count them because they visit all of them.
+    leaders: Option<Masks>,
+    /// The squared distance up to which each leader leads agents of this class, `[leaders]`.
+    influences2: Vec<f32>,
+}
+
+impl Plan {
+    /// Plans every class of a world.
+    fn all(world: &World) -> Vec<Plan> {
+        let leaders = 0..world.leaders();
+        let leading: Vec<&Class> = leaders.clone().map(|leader| world.class_of(leader)).collect();
+        let plan = |(index, class): (usize, &Class)| {
+            let mut terms: Vec<(Range<usize>, Masks)> = vec![];
+            for (term, constants) in class.terms().iter().enumerate() {
+                match terms.last_mut().map(|(range, _)| range) {
+                    Some(range) if range.len() == 1 && class.terms()[range.start].shape == constants.shape => {
+                        range.end += 1;
+                    }
+                    _ => terms.push((term..term + 1, masks(model::each(&constants.shape.ranges)))),
+                }
+            }
+            let visits = |constants: &follow::TermConstants| {
+                model::each(&constants.shape.ranges).any(|range| range.start == 0 && range.end >= leaders.end)
+            };
+            let counted = class.terms().first().is_some_and(visits);
+            Plan {
+                channels: class.channels().iter().map(|of| masks(model::each(&of.shape.ranges))).collect(),
+                terms,
+                leaders: (!counted).then(|| masks([leaders.clone()])),
+                influences2: leading.iter().map(|class| class.constants.influence2[index]).collect(),
+            }
+        };
+        world.classes.iter().enumerate().map(plan).collect()
+    }
+}
+
 /// Returns the largest squared distance at which each agent and any after it matter to each other, `[agents]`.
 fn reach2(world: &World) -> Vec<f32> {
     let mut reach2: Vec<f32> =
@@ -341,6 +375,7 @@ struct Scene<'a, S: Simd, P> {
     values: &'a [f32],
     agents: &'a [Agent<S>],
     near: &'a [u64],
+    others: &'a Masks,
 }
 
 impl<S: Simd, P: PoiPosition<S>> Scene<'_, S, P> {
@@ -378,30 +413,31 @@ impl<S: Simd, P: PoiPosition<S>> Scene<'_, S, P> {
         observers: Range<usize>,
         mut inputs: Inputs<'_, S>,
     ) {
-        let &Scene { simd, channel, pois, values, agents, near } = self;
+        let &Scene { simd, channel, pois, values, agents, near, others } = self;
         let (runs, used) = model::runs(&channel.shape.ranges);
         for observer in observers {
             let &Agent { x, y, .. } = &agents[observer];
             let heading = self.heading(&agents[observer]);
             let mut quadrants = sense::Quadrants::new(simd);
-            for range in runs[..used].iter().cloned() {
-                if channel.shape.of_pois == 0 {
-                    neighbours::each_near(
-                        near,
-                        agents,
-                        observer,
-                        range,
-                        #[inline(always)]
-                        |_, other| {
-                            let offset = [other.x - x, other.y - y];
-                            let measured = self.measured::<MEASURE, true>(1.0, offset);
-                            quadrants.add::<PLAIN>(measured, offset, heading);
-                        },
-                    );
-                    continue;
-                }
+            if channel.shape.of_pois == 0 {
+                neighbours::each_near(
+                    near,
+                    agents,
+                    observer,
+                    others,
+                    #[inline(always)]
+                    |_, other| {
+                        let offset = [other.x - x, other.y - y];
+                        let measured = self.measured::<MEASURE, true>(1.0, offset);
+                        quadrants.add::<PLAIN>(measured, offset, heading);
+                    },
+                );
+                quadrants.write::<PLAIN>(channel, inputs.of(observer, channel));
+                continue;
+            }
+            for range in &runs[..used] {
                 let (fours, rest) = pois[range.clone()].as_chunks::<4>();
-                let (values, last) = values[range].as_chunks::<4>();
+                let (values, last) = values[range.clone()].as_chunks::<4>();
                 for (pois, values) in fours.iter().zip(values) {
                     let mut four = [(S::i32s::splat(simd, 0), S::mask32s::splat(simd, false)); 4];
                     for ((to, poi), &value) in four.iter_mut().zip(pois).zip(values) {
@@ -416,40 +452,36 @@ impl<S: Simd, P: PoiPosition<S>> Scene<'_, S, P> {
                     quadrants.add::<PLAIN>(self.measured::<MEASURE, PLAIN>(value, offset), offset, heading);
                 }
             }
-            quadrants.write(channel, inputs.of(observer, channel));
+            quadrants.write::<PLAIN>(channel, inputs.of(observer, channel));
         }
     }
 
     /// Senses by any number of sectors.
     #[inline(always)]
     fn sense_sectors(&self, observers: Range<usize>, mut inputs: Inputs<'_, S>) {
-        let &Scene { simd, channel, pois, values, agents, near } = self;
+        let &Scene { simd, channel, pois, values, agents, near, others } = self;
         let measure = Measure::of(channel.shape.measure);
-        let (runs, used) = model::runs(&channel.shape.ranges);
         for observer in observers {
             let &Agent { x, y, .. } = &agents[observer];
             let heading = self.heading(&agents[observer]);
             let mut sectors = sense::Sectors::new(simd, Combine::of(channel.shape.combine));
-            for range in runs[..used].iter().cloned() {
-                if channel.shape.of_pois == 0 {
-                    neighbours::each_near(
-                        near,
-                        agents,
-                        observer,
-                        range,
-                        #[inline(always)]
-                        |_, other| {
-                            let offset = [other.x - x, other.y - y];
-                            let one = splat(simd, 1.0);
-                            let measured = sense::measured::<S>(channel, measure, one, offset[0], offset[1]);
-                            sectors.add(channel, measured, offset, heading);
-                        },
-                    );
-                    continue;
-                }
-                for (poi, &value) in pois[range.clone()].iter().zip(&values[range]) {
-                    let offset = self.offset(poi, x, y);
-                    let measured = sense::measured::<S>(channel, measure, splat(simd, value), offset[0], offset[1]);
+            if channel.shape.of_pois == 0 {
+                neighbours::each_near(
+                    near,
+                    agents,
+                    observer,
+                    others,
+                    #[inline(always)]
+                    |_, other| {
+                        let (offset, one) = ([other.x - x, other.y - y], splat(simd, 1.0));
+                        let measured = sense::measured::<S>(channel, measure, one, offset[0], offset[1]);
+                        sectors.add(channel, measured, offset, heading);
+                    },
+                );
+            } else {
+                for poi in model::each(&channel.shape.ranges).flatten() {
+                    let (offset, value) = (self.offset(&pois[poi], x, y), splat(simd, values[poi]));
+                    let measured = sense::measured::<S>(channel, measure, value, offset[0], offset[1]);
                     sectors.add(channel, measured, offset, heading);
                 }
             }
@@ -485,6 +517,7 @@ fn count_leaders<S: Simd>(
     agents: &[Agent<S>],
     near: &[u64],
     own: Range<usize>,
+    leaders: &Masks,
     influences2: &[f32],
     counts: &mut [S::u32s],
 ) {
@@ -494,7 +527,7 @@ fn count_leaders<S: Simd>(
             near,
             agents,
             index,
-            0..influences2.len(),
+            leaders,
             #[inline(always)]
             |leader, other| {
                 let sees = within::<S>(other.x - x, other.y - y, splat(x.token(), influences2[leader]));
@@ -511,6 +544,7 @@ struct Attraction<'a, S: Simd> {
     agents: &'a [Agent<S>],
     headings: &'a [[S::f32s; 2]],
     near: &'a [u64],
+    others: &'a Masks,
     influences2: &'a [f32],
 }
 
@@ -536,37 +570,34 @@ impl<S: Simd> Attraction<'_, S> {
         followers: &mut [Follower<S>],
         counts: &mut [S::u32s],
     ) {
-        let &Attraction { class, terms, agents, headings, near, influences2 } = self;
+        let &Attraction { class, terms, agents, headings, near, others, influences2 } = self;
         let rule = &class.constants.rule;
         let terms: &[follow::TermLanes<S>; TERMS] = terms.as_array().expect("the caller counts the terms");
-        let (runs, used) = model::runs(&terms[0].shape.ranges);
         for ((index, follower), counts) in own.zip(followers).zip(counts.chunks_exact_mut(influences2.len())) {
             let &Agent { x, y, .. } = &agents[index];
             let mut sums = [Sum::new(x.token()); TERMS];
-            for range in &runs[..used] {
-                neighbours::each_near(
-                    near,
-                    agents,
-                    index,
-                    range.clone(),
-                    #[inline(always)]
-                    |index, other| {
-                        let (dx, dy) = (other.x - x, other.y - y);
-                        let d2 = dx * dx + dy * dy;
-                        let quantity = match ALIGNS {
-                            true => headings[index].map(|part| on_lattice::<S>(part, rule.heading_base)),
-                            false => [dx, dy].map(|part| on_lattice::<S>(part, rule.offset_base)),
-                        };
-                        for (sum, term) in sums.iter_mut().zip(terms) {
-                            sum.add(term, d2, quantity);
-                        }
-                        if COUNTS && let Some(count) = counts.get_mut(index) {
-                            let sees = d2.simd_le(splat(x.token(), influences2[index]));
-                            *count -= sees.to_vector().bitcast::<S::u32s>();
-                        }
-                    },
-                );
-            }
+            neighbours::each_near(
+                near,
+                agents,
+                index,
+                others,
+                #[inline(always)]
+                |index, other| {
+                    let (dx, dy) = (other.x - x, other.y - y);
+                    let d2 = dx * dx + dy * dy;
+                    let quantity = match ALIGNS {
+                        true => headings[index].map(|part| on_lattice::<S>(part, rule.heading_base)),
+                        false => [dx, dy].map(|part| on_lattice::<S>(part, rule.offset_base)),
+                    };
+                    for (sum, term) in sums.iter_mut().zip(terms) {
+                        sum.add(term, d2, quantity);
+                    }
+                    if COUNTS && let Some(count) = counts.get_mut(index) {
+                        let sees = d2.simd_le(splat(x.token(), influences2[index]));
+                        *count -= sees.to_vector().bitcast::<S::u32s>();
+                    }
+                },
+            );
             follower.sums[..TERMS].copy_from_slice(&sums);
         }
     }

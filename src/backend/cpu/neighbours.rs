@@ -116,29 +116,37 @@ impl<S: Simd> Bounds<S> {
 /// With more agents than this, pairs are first tested by their bounding boxes.
 const MAX_UNBOUNDED_AGENTS: usize = 32;
 
-/// Calls `f` with the index and the state of each agent of `range` that may be in reach of this one, ascending.
+/// Some agents, as masks of the words of a set that have any: the index of the word, and its mask.
+pub(super) type Masks = Vec<(usize, u64)>;
+
+/// Returns the agents of some runs as masks.
+pub(super) fn masks(runs: impl IntoIterator<Item = Range<usize>>) -> Masks {
+    let mut masks: Masks = vec![];
+    for agent in runs.into_iter().flatten() {
+        let bit = 1 << (agent % 64);
+        match masks.last_mut().filter(|(word, _)| *word == agent / 64) {
+            Some((_, mask)) => *mask |= bit,
+            None => masks.push((agent / 64, bit)),
+        }
+    }
+    masks
+}
+
+/// Calls `f` with the index and the state of each of some agents that may be in reach of this one, ascending.
 #[inline(always)]
 pub(super) fn each_near<T>(
     near: &[u64],
     agents: &[T],
     agent: usize,
-    range: Range<usize>,
+    of: &[(usize, u64)],
     mut f: impl FnMut(usize, &T),
 ) {
-    let mut first = range.start / 64 * 64;
-    while first < range.end {
-        let mut bits = near[first / 64 * agents.len() + agent];
-        if first < range.start {
-            bits &= u64::MAX << (range.start - first);
-        }
-        if range.end < first + 64 {
-            bits &= !(u64::MAX << (range.end - first));
-        }
+    for &(word, mask) in of {
+        let mut bits = near[word * agents.len() + agent] & mask;
         while bits != 0 {
-            let index = first + bits.trailing_zeros() as usize;
+            let index = word * 64 + bits.trailing_zeros() as usize;
             f(index, &agents[index]);
             bits &= bits - 1;
         }
-        first += 64;
     }
 }

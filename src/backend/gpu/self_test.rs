@@ -114,6 +114,56 @@ fn arithmetic(executor: &Executor) -> Result<Option<String>, BackendError> {
     }))
 }
 
+/// A world with what the paper's layouts lack: every measure and combination, sectors of the map, both kinds of motion,
+/// POIs with values, and agents that align.
+const CLASSES: &str = r#"
+world = { map = [50, 50], steps = 20 }
+learning = { population = 2 }
+
+[[agents]]
+name = "rover"
+at = [[20, 20], [25, 22], [28, 24], [30, 26]]
+motion = { kind = "free" }
+senses = [
+    { of = "pois", sectors = 6, frame = "map", range = 20, measure = "closeness", combine = "closest", empty = -1 },
+    { of = ["rover", "uav"], sectors = 3, frame = "map", measure = "exponential", combine = "sum" },
+    { of = "agents", frame = "map", range = 9, measure = "distance", combine = "mean" },
+]
+leads = "sheep"
+
+[[agents]]
+name = "uav"
+at = [[22, 30], [26, 30]]
+senses = [
+    { of = "pois", pois = "far", sectors = 5, measure = "inverse", combine = "mean", empty = 0.5 },
+    { of = "sheep", measure = "inverse-squared", nearest = 0.5, combine = "share" },
+    { of = "agents", sectors = 2, range = 12 },
+]
+
+[[agents]]
+name = "sheep"
+at = [[20, 24], [22, 24], [24, 25], [26, 25], [27, 27], [21, 27]]
+control = "follow"
+rule = [
+    { of = "sheep", to = 1, gain = -1 },
+    { of = "sheep", from = 1, to = 6, gain = 2 },
+    { of = "rover", to = 5, gain = -3 },
+    { of = "agents", to = 8, align = 1 },
+]
+
+[[pois]]
+name = "near"
+at = [[20, 26], [24, 21], [27, 24]]
+value = 2
+radius = 3
+observers = ["rover", "sheep"]
+
+[[pois]]
+name = "far"
+at = [[30, 30], [18, 18]]
+coupling = 1
+"#;
+
 /// Returns the world of the paper's first layout, with a density, and its config.
 fn world(density: Density) -> (World, Config) {
     let mut config = Config::parse(include_str!("../../../configs/generally_forward.toml"), "generally_forward.toml")
@@ -128,20 +178,22 @@ fn group<'a>(world: &'a World, weights: &'a [f32], policies: usize, teams: &'a [
     Group { world, starts, weights, policies, teams, populations, fitnesses: &[] }
 }
 
-/// Tests an episode with each density, stage by stage.
+/// Tests an episode with each density, and one with classes of agents, stage by stage.
 fn episode(executor: &Executor) -> Result<Option<String>, BackendError> {
     const TEAMS: usize = 8;
     let mut backend = GpuBackend::with_executor(executor.clone());
     if executor.gpu.adapter.kind != Kind::Software {
         backend = backend.with_kernel(Kernel::Specialised);
     }
-    for (_, density) in Density::ALL {
-        let (world, _) = world(*density);
+    let classes = Config::parse(CLASSES, "classes").and_then(|config| config.validate());
+    let classes = World::new(&classes.expect("the project's own config"));
+    let worlds = Density::ALL.iter().map(|&(name, density)| (format!("{name} density"), world(density).0));
+    for (name, world) in worlds.chain([("classes of agents".into(), classes)]) {
         let weights = sample::weights(&world, TEAMS, 0);
         let teams: Vec<u32> = (0..TEAMS as u32).flat_map(|team| vec![team; world.leaders()]).collect();
         let group = group(&world, &weights, TEAMS, &teams);
         if let Some(mismatch) = compare_traces(&group, &mut Cpu::default(), &mut backend)? {
-            return Ok(Some(format!("an episode with {density} density differs: {mismatch}")));
+            return Ok(Some(format!("an episode with {name} differs: {mismatch}")));
         }
     }
     Ok(None)
