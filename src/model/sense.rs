@@ -326,17 +326,19 @@ impl<S: Simd> Quadrants<S> {
 
     /// Writes the channel's inputs.
     #[inline(always)]
-    pub(crate) fn write<const PLAIN: bool>(self, channel: &ChannelLanes<S>, inputs: &mut [S::f32s]) {
-        let [sums, counts] = [self.sums.quadrants(), self.counts.quadrants()];
-        let mut values = [channel.scale; 4];
-        for ((value, &sum), &count) in values.iter_mut().zip(&sums).zip(&counts) {
-            *value = if PLAIN { nearest_f32::<S>(sum) * channel.scale } else { input::<S>(channel, sum, count) };
-        }
+    pub(crate) fn write<const PLAIN: bool>(self, channel: &ChannelLanes<S>, inputs: &mut [S::f32s; 4]) {
+        let ([a, b, c, d], counts) = (self.sums.quadrants(), self.counts.quadrants());
+        let [a, b, c, d] = match PLAIN {
+            true => [a, b, c, d].map(|sum| nearest_f32::<S>(sum) * channel.scale),
+            false => [
+                input::<S>(channel, a, counts[0]),
+                input::<S>(channel, b, counts[1]),
+                input::<S>(channel, c, counts[2]),
+                input::<S>(channel, d, counts[3]),
+            ],
+        };
         // Sectors of the map begin at the x axis, which is straight ahead.
-        if channel.shape.frame == Frame::Map as u32 {
-            values.rotate_left(2);
-        }
-        inputs.copy_from_slice(&values);
+        *inputs = if channel.shape.frame == Frame::Map as u32 { [c, d, a, b] } else { [a, b, c, d] };
     }
 }
 

@@ -408,16 +408,14 @@ impl<S: Simd, P: PoiPosition<S>> Scene<'_, S, P> {
 
     /// Senses by quadrants. `PLAIN` channels count no entities, and sense POIs of value 1 only.
     #[inline(always)]
-    fn sense_quadrants<const MEASURE: u32, const PLAIN: bool>(
-        &self,
-        observers: Range<usize>,
-        mut inputs: Inputs<'_, S>,
-    ) {
+    fn sense_quadrants<const MEASURE: u32, const PLAIN: bool>(&self, observers: Range<usize>, inputs: Inputs<'_, S>) {
         let &Scene { simd, channel, pois, values, agents, near, others } = self;
         let (runs, used) = model::runs(&channel.shape.ranges);
-        for observer in observers {
-            let &Agent { x, y, .. } = &agents[observer];
-            let heading = self.heading(&agents[observer]);
+        let first = channel.shape.input as usize;
+        let inputs = inputs.all.chunks_exact_mut(inputs.width).skip(observers.start);
+        for ((observer, agent), inputs) in observers.clone().zip(&agents[observers]).zip(inputs) {
+            let &Agent { x, y, .. } = agent;
+            let heading = self.heading(agent);
             let mut quadrants = sense::Quadrants::new(simd);
             if channel.shape.of_pois == 0 {
                 neighbours::each_near(
@@ -432,19 +430,23 @@ impl<S: Simd, P: PoiPosition<S>> Scene<'_, S, P> {
                         quadrants.add::<PLAIN>(measured, offset, heading);
                     },
                 );
-                quadrants.write::<PLAIN>(channel, inputs.of(observer, channel));
-                continue;
             }
-            for range in &runs[..used] {
+            for range in &runs[..if channel.shape.of_pois == 0 { 0 } else { used }] {
                 let (fours, rest) = pois[range.clone()].as_chunks::<4>();
                 let (values, last) = values[range.clone()].as_chunks::<4>();
                 for (pois, values) in fours.iter().zip(values) {
-                    let mut four = [(S::i32s::splat(simd, 0), S::mask32s::splat(simd, false)); 4];
-                    for ((to, poi), &value) in four.iter_mut().zip(pois).zip(values) {
-                        *to = self.measured::<MEASURE, PLAIN>(value, self.offset(poi, x, y));
+                    let (mut measures, mut within) =
+                        ([S::i32s::splat(simd, 0); 4], [S::mask32s::splat(simd, false); 4]);
+                    for index in 0..4 {
+                        let measured = self.measured::<MEASURE, PLAIN>(values[index], self.offset(&pois[index], x, y));
+                        measures[index] = measured.0;
+                        if !PLAIN {
+                            within[index] = measured.1;
+                        }
                     }
-                    for (&measured, poi) in four.iter().zip(pois) {
-                        quadrants.add::<PLAIN>(measured, self.offset(poi, x, y), heading);
+                    for index in 0..4 {
+                        let measured = (measures[index], within[index]);
+                        quadrants.add::<PLAIN>(measured, self.offset(&pois[index], x, y), heading);
                     }
                 }
                 for (poi, &value) in rest.iter().zip(last) {
@@ -452,7 +454,8 @@ impl<S: Simd, P: PoiPosition<S>> Scene<'_, S, P> {
                     quadrants.add::<PLAIN>(self.measured::<MEASURE, PLAIN>(value, offset), offset, heading);
                 }
             }
-            quadrants.write::<PLAIN>(channel, inputs.of(observer, channel));
+            let inputs = inputs[first..].first_chunk_mut().expect("a policy has the inputs of its channels");
+            quadrants.write::<PLAIN>(channel, inputs);
         }
     }
 
