@@ -6,9 +6,9 @@ use serde_json::json;
 
 use super::{Counterfactual, Replayed, near};
 use crate::record::folder::OWN_FITNESS;
-use crate::report::map::{GROUPS, GROUPS_DARK};
+use crate::report::map::{self, GROUPS, GROUPS_DARK};
 use crate::report::scene::hex;
-use flotilla::config::Config;
+use flotilla::config::{Config, Mobility};
 use flotilla::credit::{self, Strided};
 use flotilla::world::OUTPUTS;
 
@@ -45,9 +45,17 @@ pub(crate) const STAGE: &str = include_str!("../stage.js");
 ///
 /// Per episode that adds `dpp`, `[leaders]`; `senses`, base64 of f32 `[shown][leaders][inputs, 2 outputs]`; and
 /// `without`, `[leaders]`. Its entries `alone` and `group` (with the followers that the leader led) have `observed` and
-/// `near` like the episode. Very long episodes have neither of the last two.
+/// `near` like the episode. Very long episodes have neither of the last two. A config with `[[agents]]` adds `classes`: those
+/// that learn, with their `name`, the `count` of their agents, whether they move `free`, and the channels of their `senses`.
 pub fn detailed(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Value {
     let mut data = data(name, config, played);
+    if !config.agents.is_empty() {
+        let learning = config.agents.iter().filter(|class| class.learns()).map(|class| {
+            let free = matches!(class.motion, Mobility::Free { .. });
+            json!({ "name": class.name, "count": class.at.len(), "free": free, "senses": class.senses })
+        });
+        data["classes"] = learning.collect();
+    }
     for (played, episode) in played.iter().zip(data["episodes"].as_array_mut().into_iter().flatten()) {
         let shown: Vec<usize> =
             episode["shown"].as_array().into_iter().flatten().flat_map(|step| Some(step.as_u64()? as usize)).collect();
@@ -113,6 +121,16 @@ pub fn data(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Val
         "colors": colors(),
         "episodes": episodes,
     });
+    // Only configs with several kinds of POIs have these.
+    if let Some(Replayed { world, .. }) = played.first() {
+        let radii: Vec<f64> = (0..world.pois.len()).map(|poi| map::radius_of(world, poi)).collect();
+        if radii.windows(2).any(|pair| pair[0] != pair[1]) {
+            data["radii"] = json!(radii);
+        }
+        if map::values_differ(world) {
+            data["values"] = json!(world.values);
+        }
+    }
     if played.iter().any(|played| played.given) {
         data["given"] = true.into();
     }
