@@ -8,7 +8,7 @@ use super::{Counterfactual, Replayed, near};
 use crate::record::folder::OWN_FITNESS;
 use crate::report::map::{self, GROUPS, GROUPS_DARK};
 use crate::report::scene::hex;
-use flotilla::config::{Config, Mobility};
+use flotilla::config::{AgentClass, Config, Mobility};
 use flotilla::credit::{self, Strided};
 use flotilla::world::OUTPUTS;
 
@@ -45,17 +45,9 @@ pub(crate) const STAGE: &str = include_str!("../stage.js");
 ///
 /// Per episode that adds `dpp`, `[leaders]`; `senses`, base64 of f32 `[shown][leaders][inputs, 2 outputs]`; and
 /// `without`, `[leaders]`. Its entries `alone` and `group` (with the followers that the leader led) have `observed` and
-/// `near` like the episode. Very long episodes have neither of the last two. A config with `[[agents]]` adds `classes`: those
-/// that learn, with their `name`, the `count` of their agents, whether they move `free`, and the channels of their `senses`.
+/// `near` like the episode. Very long episodes have neither of the last two.
 pub fn detailed(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Value {
     let mut data = data(name, config, played);
-    if !config.agents.is_empty() {
-        let learning = config.agents.iter().filter(|class| class.learns()).map(|class| {
-            let free = matches!(class.motion, Mobility::Free { .. });
-            json!({ "name": class.name, "count": class.at.len(), "free": free, "senses": class.senses })
-        });
-        data["classes"] = learning.collect();
-    }
     for (played, episode) in played.iter().zip(data["episodes"].as_array_mut().into_iter().flatten()) {
         let shown: Vec<usize> =
             episode["shown"].as_array().into_iter().flatten().flat_map(|step| Some(step.as_u64()? as usize)).collect();
@@ -82,6 +74,9 @@ pub fn detailed(name: &str, config: &Config, played: &[Replayed]) -> serde_json:
 }
 
 /// Returns the data that a page needs to play episodes of one run.
+///
+/// Only configs with `[[agents]]` have `classes`, those that learn first: with their `name`, the `count` of their agents,
+/// whether they move `free`, and the channels of their `senses`. Only those whose POIs differ have their `radii` or `values`.
 pub fn data(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Value {
     let count = played.len().max(1);
     let size = |per_agent: usize, played: &Replayed| {
@@ -121,7 +116,13 @@ pub fn data(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Val
         "colors": colors(),
         "episodes": episodes,
     });
-    // Only configs with several kinds of POIs have these.
+    if !config.agents.is_empty() {
+        let class = |class: &AgentClass| {
+            let free = matches!(class.motion, Mobility::Free { .. });
+            json!({ "name": class.name, "count": class.at.len(), "free": free, "senses": class.senses })
+        };
+        data["classes"] = config.agents.iter().map(class).collect();
+    }
     if let Some(Replayed { world, .. }) = played.first() {
         let radii: Vec<f64> = (0..world.pois.len()).map(|poi| map::radius_of(world, poi)).collect();
         if radii.windows(2).any(|pair| pair[0] != pair[1]) {
