@@ -17,7 +17,7 @@ OPENING = """\
 For Python users: every function and class of `import flotilla`.
 
 [The same in Python](../tutorial/python.md) is a gentler start. Arrays are NumPy's; shapes are written \
-`[teams, leaders, 8]`. Every
+`[teams, leaders, inputs]`. Every
 example is run by the package's tests, with `np` for NumPy.
 
 This page is made from the docstrings by `python python/api.py > docs/reference/python.md`.

@@ -118,8 +118,8 @@ impl Tally {
     }
 
     /// Returns the spread of the values divided by `unit`. The interval is clamped to `0..=most`.
-    pub fn spread(&self, unit: usize, most: usize) -> Spread {
-        let (count, unit) = (self.count as f64, unit as f64);
+    pub fn spread(&self, unit: f64, most: usize) -> Spread {
+        let count = self.count as f64;
         let mean = self.mean() / unit;
         let deviation = (self.count > 1).then(|| {
             let sum = u128::from(self.sum);
@@ -144,25 +144,37 @@ pub struct Evaluation {
     pub leaders: usize,
     /// Number of POIs.
     pub pois: usize,
-    /// POIs observed, `[teams]`.
+    /// What the observed POIs are worth, `[teams]`.
     pub observed: Vec<Tally>,
-    /// Sum of the POIs observed by all teams, per episode.
+    /// Sum of that over all teams, per episode.
     pub together: Tally,
     /// Sums over episodes of D, Df, D++ and Dt, `[teams][leaders]`. Dt is 0 unless it was requested.
     credits: Vec<[f64; 4]>,
     /// Whether Dt was requested.
     timed: bool,
+    /// What all POIs are worth.
+    worth: f64,
 }
 
 impl Evaluation {
-    /// Returns the spread of the POIs observed by a team.
-    pub fn team(&self, team: usize) -> Spread {
-        self.observed[team].spread(1, self.pois)
+    /// Returns what a POI is worth on average: 1 if all have the same value.
+    fn unit(&self) -> f64 {
+        self.worth / self.pois as f64
     }
 
-    /// Returns the spread over episodes of the POIs observed by the mean team.
+    /// Returns the mean number of POIs that a team observes, weighted by their values: G times the number of POIs.
+    pub fn mean_observed(&self, team: usize) -> f64 {
+        self.observed[team].mean() / self.unit()
+    }
+
+    /// Returns the spread of the same number.
+    pub fn team(&self, team: usize) -> Spread {
+        self.observed[team].spread(self.unit(), self.pois)
+    }
+
+    /// Returns the spread of the same number over episodes, for the mean team.
     pub fn mean(&self) -> Spread {
-        self.together.spread(self.observed.len(), self.pois)
+        self.together.spread(self.observed.len() as f64 * self.unit(), self.pois)
     }
 
     /// Returns the index of the team that observes most. Ties go to the lower index.
@@ -173,7 +185,7 @@ impl Evaluation {
 
     /// Returns a leader's mean G, D, Df and D++ over episodes.
     pub fn scores(&self, team: usize, leader: usize) -> [f32; 4] {
-        let g = self.observed[team].mean() / self.pois as f64;
+        let g = self.observed[team].mean() / self.worth;
         let [d, df, dpp, _] = self.credits[team * self.leaders + leader].map(|sum| sum / self.episodes as f64);
         [g, d, df, dpp].map(|score| score as f32)
     }
@@ -189,8 +201,8 @@ impl Evaluation {
 pub struct Batch<'a> {
     /// The share of all episodes that were played so far, in 0..1.
     pub share: f64,
-    /// The first episode, and POIs observed in it and the following ones, `[episodes][teams]`. Empty while episodes are
-    /// incomplete.
+    /// The first episode, and what the observed POIs are worth in it and the following ones, `[episodes][teams]`. Empty
+    /// while episodes are incomplete.
     pub first: usize,
     /// See `first`.
     pub observed: &'a [u32],
@@ -226,6 +238,7 @@ pub fn evaluate(
         together: Tally::default(),
         credits: vec![[0.0; 4]; teams * leaders],
         timed,
+        worth: world.total_worth.into(),
     };
     let (mut done, all) = (0, (teams * episodes) as f64);
     // Episodes of teams that are played at once, so that this takes a fraction of a second.
@@ -298,7 +311,7 @@ mod tests {
     fn the_mean_of_nothing_is_0() {
         let mut tally = Tally::default();
         assert_eq!(tally.mean(), 0.0);
-        assert_eq!(tally.spread(2, 4), Spread { mean: 0.0, deviation: None, interval: None });
+        assert_eq!(tally.spread(2.0, 4), Spread { mean: 0.0, deviation: None, interval: None });
         tally.add(3);
         assert_eq!(tally.mean(), 3.0);
     }

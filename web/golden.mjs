@@ -65,8 +65,9 @@ const [positions, headings, senses] = [episode.positions, episode.headings, epis
 await player.ask({ ask: "drive", text: resolved.toml, leader: 0, policies: 1 }, weights);
 let driven = null;
 for (let step = 1; step <= whole.steps; step++) {
-  // Per step and leader, there are 8 inputs and 2 outputs.
-  const [turn, speed] = senses.slice(step * leaders * 10 + 8, step * leaders * 10 + 10);
+  // Per step and leader, there are inputs and 2 outputs.
+  const size = senses.length / (episode.shown.length * leaders), end = (step * leaders + 1) * size;
+  const [turn, speed] = senses.slice(end - 2, end);
   driven = (await player.ask({ ask: "step", turn, speed })).words;
   for (const [found, expected] of [[driven.positions, positions], [driven.headings, headings]]) {
     const frame = expected.slice(step * agents * 2, (step + 1) * agents * 2);

@@ -52,11 +52,20 @@ test("curves are written as CSV, with labels quoted if necessary", () => {
 
 test("the inputs shown are those of the chosen leader and frame, and quadrants are relative to the heading", () => {
   const numbers = Float32Array.from({ length: 2 * 3 * 10 }, (_, index) => index);
-  assert.deepEqual(moment(numbers, 3, 1, 2), { pois: [50, 51, 52, 53], agents: [54, 55, 56, 57], turn: 58, speed: 59 });
+  const found = moment({}, { senses: numbers, leaders: 3, shown: [0, 1] }, 1, 2);
+  assert.deepEqual(found.channels.map(({ of, values }) => [of, values]), [["pois", [50, 51, 52, 53]], ["agents", [54, 55, 56, 57]]]);
+  assert.deepEqual(found.answer, [58, 59]);
   // Front left is between the heading and 90 degrees counterclockwise.
-  assert.deepEqual(angles(2), [0, Math.PI / 2]);
-  const inputs = { pois: [0, 0, 1, 0], agents: [0, 0, 0, 0], turn: 0.5, speed: 1 };
-  assert.match(words(inputs), /front left 1\.00.* 90° to the left, at 100 %/);
+  assert.deepEqual(angles(2, { sectors: 4, frame: "heading" }), [0, Math.PI / 2]);
+  const inputs = moment({}, { senses: Float32Array.of(0, 0, 1, 0, 0, 0, 0, 0, 0.5, 1), leaders: 1, shown: [0] }, 0, 0);
+  assert.match(words(inputs), /senses POIs: .*front left 1\.00.*; agents: .* 90° to the left, at 100 %/);
+  // The second class has fewer inputs than the first, and moves freely.
+  const channel = (of, sectors) => ({ of, sectors, frame: "map" });
+  const classes = [{ count: 2, free: false, senses: [channel("pois", 3)] }, { count: 1, free: true, senses: [channel(["a", "b"], 2)] }];
+  const free = moment({ classes }, { senses: Float32Array.from({ length: 15 }, (_, index) => index / 16), leaders: 3, shown: [0] }, 0, 2);
+  assert.deepEqual(free.channels[0].values, [10 / 16, 11 / 16]);
+  assert.match(words(free), /senses a and b: 0\.63, 0\.69\. It moves by 81 % .* 88 % along y/);
+  assert.deepEqual(angles(1, free.channels[0]), [Math.PI, 2 * Math.PI]);
 });
 
 test("requests open another worker after one has failed or could not be opened", async () => {

@@ -76,3 +76,92 @@ fn check_prints_a_config_in_full_and_nothing_else() {
     assert!(full.contains("[[agents]]") && !full.contains("[[pois]]"), "{full}");
     assert!(noted.contains("[[pois]] is not written, because a stage sets a key that it would replace"), "{noted}");
 }
+
+/// Two classes that learn, one with a rule, and POIs that differ in radius and value.
+const HERD: &str = r#"
+world = { map = [40, 40], steps = 20 }
+learning = { population = 6, generations = 2, trials = 2, seed = 3 }
+
+[[agents]]
+name = "rover"
+at = [[10, 10], [14, 10]]
+senses = [{ of = "pois" }, { of = "sheep" }]
+leads = "sheep"
+
+[[agents]]
+name = "drone"
+at = [[30, 12]]
+motion = { kind = "free" }
+senses = [{ of = "pois", sectors = 3 }]
+
+[[agents]]
+name = "sheep"
+at = [[12, 13], [15, 13]]
+control = "follow"
+rule = [{ of = "rover", to = 6, gain = 2 }]
+observes = false
+
+[[pois]]
+name = "near"
+at = [[12, 18], [30, 20]]
+value = 2
+coupling = [2, 1]
+radius = 5
+
+[[pois]]
+name = "far"
+at = [[22, 19]]
+value = 0.5
+coupling = 1
+radius = 3
+"#;
+
+#[test]
+fn g_weighs_pois_by_value_in_metrics_replays_and_rollouts() {
+    let place = Place::new(&[("herd.toml", HERD)]);
+    place.good("train herd.toml --out run");
+    let metrics = place.read("run/metrics.csv");
+    let g = |row: &str| row.split(',').nth(2).unwrap().parse::<f64>().unwrap();
+    let best: Vec<f64> = metrics.lines().skip(1).map(g).collect();
+    // POIs are worth 4, 4 and 1 of 9.
+    assert!(
+        best.iter().all(|g| [0, 1, 4, 5, 8, 9].iter().any(|worth| (g * 9.0 - f64::from(*worth)).abs() < 1e-9)),
+        "{metrics}"
+    );
+    assert!(best.iter().any(|g| *g > 4.0 / 9.0), "{metrics}");
+    // A replay is compared with the metrics.
+    for generation in 0..=2 {
+        place.good(&*format!("replay run --team best --generation {generation} --out best.svg"));
+    }
+    let (text, _) = place.good("rollout run --scores scores.csv");
+    let most = place.read("scores.csv").lines().skip(1).map(g).fold(0.0, f64::max);
+    assert!(most > 0.0 && text.contains(&format!("best {:.2} ", most * 3.0)), "{most}: {text}");
+}
+
+#[test]
+fn pictures_and_pages_show_classes_radii_and_values() {
+    let place = Place::new(&[("herd.toml", HERD)]);
+    place.good("check herd.toml --out layout.svg");
+    let layout = place.read("layout.svg");
+    let labels = [
+        "2 rover, 1 drone, 2 sheep, 3 POIs",
+        "rover 0 to 1, drone 2",
+        "sheep",
+        "2, value 2",
+        "1, value 2",
+        "1, value 0.5",
+    ];
+    for text in labels.into_iter().chain(["at a POI: agents it needs within its circle, and its value"]) {
+        assert!(layout.contains(&format!("aria-label=\"{text}\"")), "{text}");
+    }
+    assert!(layout.contains(" Observers: rover, drone."), "sheep do not observe");
+    // 80 mm show 40 units, and an SVG has 10 units per millimetre.
+    for radius in [5, 3] {
+        assert!(layout.contains(&format!("r=\"{}\" fill=\"#", radius * 20)), "a circle of {radius} units");
+    }
+    place.good("train herd.toml --out run");
+    place.good("replay run --out page.html");
+    let page = place.read("page.html");
+    assert!(page.contains("\"classes\":[{\"count\":2,\"free\":false,\"name\":\"rover\",\"senses\":[{"));
+    assert!(page.contains("\"radii\":[5.0,5.0,3.0]") && page.contains("\"values\":[2.0,2.0,0.5]"));
+}

@@ -26,16 +26,16 @@ class Leaders(torch.nn.Module):
 
     def __init__(self, config: flotilla.Config) -> None:
         super().__init__()
-        self.widths = [8, *config["policy.hidden"], 2]
+        self.widths = [config.num_inputs, *config["policy.hidden"], 2]
         # Half the standard deviation of evolution's initial weights.
         self.weights = torch.nn.Parameter(0.5 * torch.randn(config.num_learners, config.parameters))
         self.log_std = torch.nn.Parameter(torch.full((config.num_learners, 2), -0.7))
-        inputs = config.num_learners * 8 + 1
+        inputs = config.num_learners * config.num_inputs + 1
         layers = [torch.nn.Linear(inputs, 64), torch.nn.Tanh(), torch.nn.Linear(64, 64), torch.nn.Tanh()]
         self.critic = torch.nn.Sequential(*layers, torch.nn.Linear(64, 1))
 
     def distribution(self, observations: torch.Tensor) -> torch.distributions.Normal:
-        """Returns the distribution of actions, [teams, leaders, 2], for observations, [teams, leaders, 8]."""
+        """Returns the distribution of actions, [teams, leaders, 2], for observations, [teams, leaders, inputs]."""
         at, values = 0, observations.transpose(0, 1)
         for before, after in zip(self.widths, self.widths[1:]):
             layer = self.weights[:, at : at + (before + 1) * after].view(-1, before + 1, after)

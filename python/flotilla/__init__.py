@@ -77,8 +77,8 @@ def parallel_env(
 ) -> TeamEnv:
     """One team as a PettingZoo `ParallelEnv`: agents `leader_0`, `leader_1`, …
 
-    Needs PettingZoo (`pip install flotilla-teams[pettingzoo]`). Observations are float32 `[8]`, actions float32 `[2]`
-    in -1..1, `state()` is float32 `[agents * 5 + pois]`: everyone's x, y, heading and speed, and which POIs have been
+    Needs PettingZoo (`pip install flotilla-teams[pettingzoo]`). Observations are float32 `[inputs]`, actions float32
+    `[2]` in -1..1, see `VectorEnv`. `state()` is float32 `[agents * 5 + pois]`: everyone's x, y, heading and speed, and which POIs have been
     observed. An episode takes `world.steps` steps, and is *truncated* then.
 
     Args:
@@ -106,8 +106,8 @@ def parallel_env(
 def team_env(config: Config, render_mode: str | None = None, reward: str = "G", **options: Any) -> SingleEnv:
     """One team as a `gymnasium.Env`, whose learner controls all leaders at once.
 
-    Needs gymnasium (`pip install flotilla-teams[gymnasium]`). Observations are float32 `[leaders, 8]`, actions float32
-    `[leaders, 2]` in -1..1. The reward is the mean over the leaders. The last step's info has `g`.
+    Needs gymnasium (`pip install flotilla-teams[gymnasium]`). Observations are float32 `[leaders, inputs]`, actions
+    float32 `[leaders, 2]` in -1..1, see `VectorEnv`. The reward is the mean over the leaders. The last step's info has `g`.
 
     Args:
         config: the world.

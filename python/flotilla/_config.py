@@ -175,6 +175,11 @@ class Config(Mapping[str, Any]):
         return len(self.to_dict())
 
     @property
+    def num_inputs(self) -> int:
+        """Number of a policy's inputs: 8, or with `[[agents]]` the most that any class that learns has."""
+        return self._native.inputs
+
+    @property
     def num_learners(self) -> int:
         """Number of agents that learn: the leaders and, in the all-leaders paradigm, everyone."""
         return self._native.learners

@@ -6,7 +6,6 @@ from numpy.typing import NDArray
 __version__: str
 COMMIT: str | None
 FITNESSES: list[str]
-INPUTS: int
 OUTPUTS: int
 
 _F32 = NDArray[np.float32]
@@ -36,6 +35,12 @@ class Config:
     def populations(self) -> int: ...
     @property
     def sizes(self) -> tuple[int, int, int]: ...
+    @property
+    def inputs(self) -> int: ...
+    @property
+    def least_input(self) -> float: ...
+    @property
+    def worth(self) -> list[int]: ...
     @property
     def widths(self) -> list[int]: ...
     @property

@@ -39,7 +39,7 @@ class TeamEnv(ParallelEnv[str, Array, Array]):  # type: ignore[misc, unused-igno
         }
         self.possible_agents = [f"leader_{leader}" for leader in range(self._teams.leaders)]
         self.agents: list[str] = []
-        sensed = spaces.Box(0, np.inf, (_native.INPUTS,), np.float32)
+        sensed = spaces.Box(config._native.least_input, np.inf, (config.num_inputs,), np.float32)
         wanted = spaces.Box(-1, 1, (_native.OUTPUTS,), np.float32)
         self.observation_spaces = {agent: sensed for agent in self.possible_agents}
         self.action_spaces = {agent: spaces.Box(-1, 1, wanted.shape, np.float32) for agent in self.possible_agents}

@@ -18,6 +18,8 @@ from flotilla._errors import no_key, warn
 from flotilla._show import Replay
 
 MAX_EPISODES = 1_000_000
+# Inputs of a policy without a config.
+INPUTS = 8
 
 
 @dataclass(frozen=True)
@@ -28,8 +30,7 @@ class Trace:
         positions: positions from the start on, `[teams, steps + 1, agents, 2]`, leaders first, in map units.
         headings: unit vectors, of the same shape.
         speeds: `[teams, steps + 1, agents]`, in units per second.
-        inputs: what leaders sense, `[teams, steps, leaders, 8]`: the density of POIs, then of agents, in four quadrants
-            around their heading: back right, front right, front left, back left.
+        inputs: what leaders sense, `[teams, steps, leaders, inputs]`, see `VectorEnv`.
         outputs: the answers of their policies, `[teams, steps, leaders, 2]` in -1..1, which lead to the next step's
             states.
         agents_at_poi: which agents are within the observation radius of each POI after each step,
@@ -62,8 +63,8 @@ class Rollout:
     """The scores of teams; means over episodes. `rollout["Df"]` is a score by the name of the fitness.
 
     Attributes:
-        observed: POIs observed, `[teams]`.
-        g: the share of POIs observed, float64 `[teams]`, as in a run's metrics.
+        observed: POIs observed, weighted by their values if these differ, `[teams]`: G times the number of POIs.
+        g: G, the value of the POIs observed as a share of all, float64 `[teams]`, as in a run's metrics.
         d: what the team would have lost without each leader, `[teams, leaders]`, as the next three.
         df: without the leader and the followers that it led.
         dpp: D, or the gain per added copy of the leader if that is larger.
@@ -127,7 +128,7 @@ def _shapes(config: Config, teams: int) -> dict[str, tuple[int, ...]]:
         "positions": (teams, steps + 1, agents, 2),
         "headings": (teams, steps + 1, agents, 2),
         "speeds": (teams, steps + 1, agents),
-        "inputs": (teams, steps, leaders, _native.INPUTS),
+        "inputs": (teams, steps, leaders, config.num_inputs),
         "outputs": (teams, steps, leaders, _native.OUTPUTS),
         "actions": (teams, steps, leaders, _native.OUTPUTS),
         "agents_at_poi": (teams, steps, pois, agents),
@@ -245,20 +246,23 @@ def rollout(
     starts = _starts(config, episodes, seed, jitter, poi_jitter)
     if starts is not None and starts[0] > 1 and max(starts[2:]) == 0:
         warn(f"{episodes} episodes without jitter are all the same; pass jitter= or poi_jitter=", UserWarning)
-    _, pois, _ = config._native.sizes
+    total = sum(config._native.worth)
+    # What a POI is worth on average. It is 1 if all have the same value.
+    unit = total / config._native.sizes[1]
     traced = None
     if fields:
         first = None if starts is None else (1, *starts[1:])
         arrays = _allocate(_shapes(config, array.shape[1]), fields, out)
-        observed, d, df, dpp, dt = _record(config, array, first, None, arrays)
+        worth, d, df, dpp, dt = _record(config, array, first, None, arrays)
         traced = Trace(**arrays)
         if starts is None and not spread:
-            return Rollout(observed, observed / pois, d, df, dpp, dt, traced)
-    (observed, d, df, dpp, dt), spreads = _native.rollout(config._native, array, starts, name, bool(spread))
-    scores = Rollout(observed, observed / pois, d, df, dpp, dt, traced)
+            return Rollout(worth / unit, worth / total, d, df, dpp, dt, traced)
+    (worth, d, df, dpp, dt), spreads = _native.rollout(config._native, array, starts, name, bool(spread))
+    scores = Rollout(worth / unit, worth / total, d, df, dpp, dt, traced)
     if spreads is not None:
         rows, each = spreads
-        scores = replace(scores, deviation=rows[:, 0] / pois, interval=rows[:, 1:] / pois, episodes=each / pois)
+        pois = config._native.sizes[1]
+        scores = replace(scores, deviation=rows[:, 0] / pois, interval=rows[:, 1:] / pois, episodes=each / total)
     return scores
 
 
@@ -296,7 +300,7 @@ class Collected:
     """Episodes with noise on the actions, for trainers such as PPO. Episodes of a team follow each other by teams.
 
     Attributes:
-        observations: what leaders sense, `[episodes * teams, steps, leaders, 8]`.
+        observations: what leaders sense, `[episodes * teams, steps, leaders, inputs]`.
         actions: what they did before it was clamped to -1..1: their policy's answer plus noise,
             `[episodes * teams, steps, leaders, 2]`.
         means: the answers of their policies, of the same shape.
@@ -362,20 +366,21 @@ def collect(
     shapes = _shapes(config, total)
     arrays: dict[str, NDArray[Any]] = {name: np.empty(shapes[name], np.float32) for name in ("inputs", "outputs", "actions")}
     _, pois, steps = config._native.sizes
+    values = np.array(config._native.worth)
     at = np.empty((total, pois), np.uint32)
     if reward == "G":
         arrays["observed_at"] = at
-    observed, d, df, dpp, dt = _record(scored, array, starts, (starts[1], deviations), arrays)
+    worth, d, df, dpp, dt = _record(scored, array, starts, (starts[1], deviations), arrays)
     rewards = np.zeros((total, steps, config.num_learners), np.float32)
     if reward == "G":
         team, poi = np.nonzero(at)
-        counts = np.bincount(team * steps + at[team, poi] - 1, minlength=total * steps)
-        rewards[...] = counts.reshape(total, steps, 1).astype(np.float32) / np.float32(pois)
+        gains = np.bincount(team * steps + at[team, poi] - 1, values[poi], total * steps)
+        rewards[...] = gains.reshape(total, steps, 1).astype(np.float32) / np.float32(values.sum())
     else:
         rewards[:, -1] = {"D": d, "Df": df, "D++": dpp, "Dt": dt}[reward]
     masks = np.ones((total, steps), np.bool_)
     masks[:, -1] = False
-    return Collected(arrays["inputs"], arrays["actions"], arrays["outputs"], rewards, masks, observed / pois)
+    return Collected(arrays["inputs"], arrays["actions"], arrays["outputs"], rewards, masks, worth / values.sum())
 
 
 def replay(
@@ -423,7 +428,7 @@ def _layers(config: Config | None, parameters: int) -> list[int]:
     Without a config, the policy has at most one hidden layer, whose width follows from the number of parameters.
     """
     if config is None:
-        ins, outs = _native.INPUTS, _native.OUTPUTS
+        ins, outs = INPUTS, _native.OUTPUTS
         units = (parameters - outs) // (ins + 1 + outs)
         found = [ins, outs] if parameters == (ins + 1) * outs else [ins, max(units, 1), outs]
     else:
@@ -445,8 +450,8 @@ def forward(policies: ArrayLike, inputs: ArrayLike, config: Config | None = None
 
     Args:
         policies: `[..., parameters]`, see `rollout`.
-        inputs: `[..., 8]`; the axes before the last are broadcast against those of the policies.
-        config: the config of the policies; None if they have at most one hidden layer, and answer directly.
+        inputs: `[..., inputs]`; the axes before the last are broadcast against those of the policies.
+        config: the config of the policies; None if they have 8 inputs and at most one hidden layer, and answer directly.
 
     Returns:
         float32 `[..., 2]` in -1..1: the turn, as a fraction of a half turn to the left, and the speed, from standing still
@@ -464,11 +469,11 @@ def forward(policies: ArrayLike, inputs: ArrayLike, config: Config | None = None
     for what, array in (("policies", weights), ("inputs", given)):
         if array.dtype.kind not in "fiu" or array.ndim == 0:
             raise ValueError(f"{what} are {array.dtype} of shape {array.shape}, allowed are arrays of numbers")
-    if given.shape[-1] != _native.INPUTS:
-        raise ValueError(f"inputs have the shape {given.shape}, allowed is [..., {_native.INPUTS}]")
     layers = _layers(config, weights.shape[-1])
+    if given.shape[-1] != layers[0]:
+        raise ValueError(f"inputs have the shape {given.shape}, allowed is [..., {layers[0]}]")
     shape = np.broadcast_shapes(weights.shape[:-1], given.shape[:-1])
-    rows = np.ascontiguousarray(np.broadcast_to(given, (*shape, _native.INPUTS)), np.float32).reshape(-1, _native.INPUTS)
+    rows = np.ascontiguousarray(np.broadcast_to(given, (*shape, layers[0])), np.float32).reshape(-1, layers[0])
     if not np.isfinite(rows).all():
         raise ValueError("inputs hold a NaN or an infinity")
     table = np.ascontiguousarray(weights, np.float32).reshape(-1, weights.shape[-1])
@@ -479,7 +484,7 @@ def forward(policies: ArrayLike, inputs: ArrayLike, config: Config | None = None
 
 
 def to_onnx(policy: ArrayLike, path: str | os.PathLike[str], config: Config | None = None) -> None:
-    """Writes one policy's network as an ONNX model with an input `inputs [n, 8]` and an output `outputs [n, 2]`.
+    """Writes one policy's network as an ONNX model with an input `inputs [n, inputs]` and an output `outputs [n, 2]`.
 
     Needs the package `onnx` (`pip install flotilla-teams[onnx]`). If a config says that policies choose among
     behaviours, the output is `[n, 5]`, one value per behaviour.

@@ -30,7 +30,7 @@ class SingleEnv(gymnasium.Env[NDArray[Any], NDArray[Any]]):  # type: ignore[misc
 
     def step(self, action: ArrayLike) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         seen, rewards, terminated, truncated, _ = self._team.step(np.asarray(action)[None])
-        infos = {"g": float(self._team.observed.mean())} if terminated[0] or truncated[0] else {}
+        infos = {"g": float(self._team._teams.g[0])} if terminated[0] or truncated[0] else {}
         return seen[0], float(rewards[0]), bool(terminated[0]), bool(truncated[0]), infos
 
     def render(self) -> NDArray[np.uint8] | None:

@@ -63,7 +63,8 @@ class TeamBatch:
         self.drawn = 0
         self.started = False
         self.rewards = np.zeros((self.count, self.leaders), np.float32)
-        self.new_inputs = ArraySupply((self.count, self.leaders, _native.INPUTS))
+        self.worth = np.array(config._native.worth)
+        self.new_inputs = ArraySupply((self.count, self.leaders, config.num_inputs))
 
     def _make_stepper(self) -> _native.Stepper:
         # The fitness decides what the stepper records.
@@ -88,8 +89,14 @@ class TeamBatch:
         """POIs that each team has observed in its episode, `[teams, pois]`."""
         return self.stepper.observed
 
+    @property
+    def g(self) -> NDArray[np.float64]:
+        """G of each team's episode so far, `[teams]`."""
+        g: NDArray[np.float64] = self.observed @ self.worth / self.worth.sum()
+        return g
+
     def inputs(self, out: Floats | None = None) -> Floats:
-        """Returns what every leader senses, `[teams, leaders, 8]`, in a new array or in `out`."""
+        """Returns what every leader senses, `[teams, leaders, inputs]`, in a new array or in `out`."""
         if out is None:
             out = self.new_inputs()
         self.stepper.read_inputs(out)
@@ -144,10 +151,14 @@ class VectorEnv(Base):
     front right, front left, back left. Its action is a turn, from -1 (half a turn to the right) to 1 (half a turn to the
     left), and a speed, from -1 (standing still) to 1 (the largest speed).
 
+    A config with `[[agents]]` says what each class senses, channel by channel. Observations have `config.num_inputs` numbers,
+    and those of classes with fewer inputs end with zeros. The action of an agent with free motion is its velocity along x
+    and y.
+
     Args:
         config: the world. Of its learning section, only the paradigm and the jitter of starts matter here.
         num_envs: number of teams.
-        reward: `"G"` gives the newly observed share of POIs at each step, the same to all leaders, which adds up to G;
+        reward: `"G"` gives what the newly observed POIs add to G at each step, the same to all leaders;
             `"D"`, `"Df"`, `"D++"` and `"Dt"` give each leader that fitness at the last step, and 0 before.
         layout: shape of rewards and environments. `"leaders"`: one environment per team and one reward per leader,
             `[num_envs, leaders]`. `"team"`: one environment per team and one reward, `[num_envs]`, the mean over its
@@ -160,7 +171,7 @@ class VectorEnv(Base):
         copy: return new arrays at every step. If False, observations and rewards are the same arrays at every step,
             with new values: faster, but wrong in a replay buffer that keeps references.
         horizon: how the end of an episode is reported, `"truncated"` or `"terminated"`.
-        time_input: append the played share of the episode to each leader's observation, which then has 9 numbers.
+        time_input: append the played share of the episode to each leader's observation, which then has one more number.
         render_mode: None or `"rgb_array"`.
         jitter: largest offset of a start on each axis, in map units; None takes the config's `learning.start_jitter`.
         poi_jitter: the same for POIs; None takes the config's `learning.poi_jitter`.
@@ -215,7 +226,7 @@ class VectorEnv(Base):
         self.closed = False
         self._finished = np.zeros(self._teams.count, np.bool_)
         self._any_finished = False
-        inputs = _native.INPUTS + self.time_input
+        inputs = config.num_inputs + self.time_input
         self._single = (inputs,) if layout == "flat" else (self.num_learners, inputs)
         self._make_arrays()
         self._make_spaces()
@@ -223,7 +234,7 @@ class VectorEnv(Base):
     def _make_arrays(self) -> None:
         """Makes the arrays that are reused at every step, if `copy` is False."""
         teams, leaders = self._teams.count, self.num_learners
-        self._inputs = aligned((teams, leaders, _native.INPUTS))
+        self._inputs = aligned((teams, leaders, self.config.num_inputs))
         self._observations = aligned((teams, leaders, self._single[-1])) if self.time_input else self._inputs
         self._rewards = aligned((self.num_envs,) + ((leaders,) if self.layout == "leaders" else ()))
         self._new_observations, self._new_rewards = (ArraySupply(own.shape) for own in (self._observations, self._rewards))
@@ -243,9 +254,10 @@ class VectorEnv(Base):
         except ImportError:
             return
         action = (*self._single[:-1], _native.OUTPUTS)
-        self.single_observation_space = spaces.Box(0, np.inf, self._single, np.float32)
+        least = self.config._native.least_input
+        self.single_observation_space = spaces.Box(least, np.inf, self._single, np.float32)
         self.single_action_space = spaces.Box(-1, 1, action, np.float32)
-        self.observation_space = spaces.Box(0, np.inf, (self.num_envs, *self._single), np.float32)
+        self.observation_space = spaces.Box(least, np.inf, (self.num_envs, *self._single), np.float32)
         self.action_space = spaces.Box(-1, 1, (self.num_envs, *action), np.float32)
 
     def __getattr__(self, name: str) -> Any:
@@ -293,8 +305,8 @@ class VectorEnv(Base):
                 `"flat"` the mask is `[num_envs]`, and a team is reset if all its leaders are marked.
 
         Returns:
-            observations, float32 `[num_envs, leaders, 8]` (`[num_envs, 8]` in the layout `"flat"`), and an empty
-            dictionary.
+            observations, float32 `[num_envs, leaders, inputs]` (`[num_envs, inputs]` in the layout `"flat"`), and an
+            empty dictionary.
 
         Raises:
             ValueError: the seed or the mask is not allowed, or another thread is stepping this environment.
@@ -371,8 +383,8 @@ class VectorEnv(Base):
         """Returns G, observed POIs and state of finished teams, before they are reset. Masks mark these teams."""
         copies = self.num_learners if self.layout == "flat" else 1
         found: dict[str, Any] = {}
-        observed = self._teams.observed
-        for name, values in (("g", observed.mean(axis=1)), ("observed", observed), ("state", self._teams.state())):
+        teams = self._teams
+        for name, values in (("g", teams.g), ("observed", teams.observed), ("state", teams.state())):
             found[name], found[f"_{name}"] = np.repeat(values, copies, axis=0), ended.copy()
         return found
 

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use flotilla::config::{self, Definition, Override};
+use flotilla::world::World;
 use flotilla_app::sweep::Sweep;
 use flotilla_studies::paper::{Experiment, arms};
 use pyo3::exceptions::{PyTypeError, PyValueError};
@@ -79,6 +80,26 @@ impl Config {
     #[getter]
     fn sizes(&self) -> (usize, usize, usize) {
         (self.0.agent_count(), self.0.poi_count(), self.0.world.steps)
+    }
+
+    /// Number of a policy's inputs: the most that any learning class has.
+    #[getter]
+    fn inputs(&self) -> usize {
+        self.0.inputs()
+    }
+
+    /// Lower bound of a policy's inputs. Only a channel that senses nothing can give less than 0.
+    #[getter]
+    fn least_input(&self) -> f64 {
+        let classes = self.0.classes();
+        let negative = classes.agents.iter().flat_map(|class| &class.senses).any(|channel| channel.empty < 0.0);
+        if negative { f64::NEG_INFINITY } else { 0.0 }
+    }
+
+    /// What each POI is worth, as a multiple of a common unit.
+    #[getter]
+    fn worth(&self) -> PyResult<Vec<u32>> {
+        Ok(World::new(&self.0.validate().raise()?).worth.clone())
     }
 
     /// Widths of a policy's layers, inputs and outputs included.

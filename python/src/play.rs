@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use flotilla::backend::cpu::{self, StepArrays};
 use flotilla::config::{Fitness, MAX_HIDDEN_UNITS};
-use flotilla::evaluate::{self, Batch, Spread, Starts};
+use flotilla::evaluate::{self, Batch, Spread, Starts, Tally};
 use flotilla::evolve::{self, MAX_WEIGHT};
 use flotilla::front::{self, ActionNoise, Failure, Played};
 use flotilla::model::policy::{MAX_HIDDEN_LAYERS, PolicyConstants};
@@ -54,17 +54,17 @@ type Scores<'py> = (
     Bound<'py, PyArray2<f32>>,
     Option<Bound<'py, PyArray2<f32>>>,
 );
-/// The standard deviation and the interval of POIs observed, of each team, and these of each episode.
+/// See `rollout`.
 type Spreads<'py> = (Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<u32>>);
 
 /// Minimum time between checks for Ctrl-C.
 const PATIENCE: Duration = Duration::from_millis(50);
 
-/// Plays teams. Returns POIs observed, `[teams]`, and D, Df, D++ and Dt, `[teams, leaders]`. Dt is `None` unless it is
-/// the config's fitness.
+/// Plays teams. Returns what the observed POIs are worth, `[teams]`, and D, Df, D++ and Dt, `[teams, leaders]`. Dt is
+/// `None` unless it is the config's fitness.
 ///
-/// With `spread`, also returns deviation, low and high of POIs observed, `[teams, 3]`, NaN for one episode, and POIs
-/// observed in each episode, `[episodes, teams]`.
+/// With `spread`, also returns deviation, low and high of G times the number of POIs, `[teams, 3]`, NaN for one episode, and
+/// what the POIs are worth that are observed in each episode, `[episodes, teams]`.
 #[pyfunction]
 pub fn rollout<'py>(
     py: Python<'py>,
@@ -110,19 +110,20 @@ pub fn rollout<'py>(
         let each = PyArray1::from_vec(py, each).reshape([episodes, teams])?;
         PyResult::Ok((PyArray1::from_vec(py, rows).reshape([teams, 3])?, each))
     });
-    let Played { observed, d, df, dpp, dt, .. } = Played::from(&evaluation);
+    let Played { d, df, dpp, dt, .. } = Played::from(&evaluation);
+    let worth: Vec<f64> = evaluation.observed.iter().map(Tally::mean).collect();
     let timed = !dt.is_empty();
     let shape = [teams, config.0.learners()];
     let rows = |scores: Vec<f32>| PyArray1::from_vec(py, scores).reshape(shape);
     let dt = timed.then(|| rows(dt)).transpose()?;
-    Ok(((PyArray1::from_vec(py, observed), rows(d)?, rows(df)?, rows(dpp)?, dt), spreads.transpose()?))
+    Ok(((PyArray1::from_vec(py, worth), rows(d)?, rows(df)?, rows(dpp)?, dt), spreads.transpose()?))
 }
 
 /// Plays some episodes on the CPU, and writes every step of all teams to the arrays that are given. Returns the scores
-/// of each episode's teams.
+/// of each episode's teams, as `rollout`.
 ///
 /// The arrays are positions and headings `[teams, steps + 1, agents, 2]`, speeds `[teams, steps + 1, agents]`, inputs
-/// `[teams, steps, leaders, 8]`, outputs and actions `[teams, steps, leaders, 2]`, all float32, and near
+/// `[teams, steps, leaders, inputs]`, outputs and actions `[teams, steps, leaders, 2]`, all float32, and near
 /// `[teams, steps, pois, agents]`, bool, whether each agent is within the observation radius of each POI. `observed_at`,
 /// `[teams, pois]`, uint32, is the step at which each POI was observed, from 1, or 0. `distances` are those from every POI
 /// to every agent, `[teams, steps, pois, agents]`, and from every agent to the nearest other one, `[teams, steps, agents]`,
@@ -262,7 +263,7 @@ fn contiguous<'a, T: Element>(array: &'a mut Option<PyReadwriteArrayDyn<'_, T>>)
     array.as_slice_mut().map_err(|_| PyValueError::new_err("arrays of steps must be C-contiguous"))
 }
 
-/// Writes what policies answer to inputs, as in an episode: `inputs` are `[rows, 8]`, `outputs` `[rows, 2]`.
+/// Writes what policies answer to inputs, as in an episode: `inputs` are `[rows, widths[0]]`, `outputs` `[rows, 2]`.
 ///
 /// `policies` are `[policies, parameters]`, with layers of the given widths. Row i is answered by policy `chosen[i]`.
 #[pyfunction]

@@ -103,8 +103,8 @@ impl Stepper {
 
     /// Plays a step with actions `[teams, leaders, 2]`.
     ///
-    /// Writes to `rewards`, `[teams, leaders]`, the share of POIs that each leader's team has just observed for the
-    /// first time.
+    /// Writes to `rewards`, `[teams, leaders]`, what the POIs are worth that each leader's team has just observed for the
+    /// first time, as a share of all.
     fn step(
         &self,
         py: Python<'_>,
@@ -127,7 +127,9 @@ impl Stepper {
                 .into_iter()
                 .flat_map(|rewards| rewards.chunks_exact_mut(leaders).zip(stepper.newly_observed().chunks_exact(pois)))
             {
-                team.fill(newly.iter().filter(|&&newly| newly).count() as f32 / pois as f32);
+                let newly = newly.iter().zip(&stepper.world().worth).filter(|(newly, _)| **newly);
+                let worth: u32 = newly.map(|(_, worth)| worth).sum();
+                team.fill(worth as f32 / stepper.world().total_worth as f32);
             }
             Ok(())
         })
@@ -246,7 +248,8 @@ fn team_of(stepper: &mut stepping::Stepper, team: usize) -> Team {
         let (near, needed) = (near(poi), world.coupling[poi]);
         Poi {
             place: place.as_dvec2(),
-            label: map::poi_label(&world.rule, poi, format!("{near}/{needed}")),
+            radius: map::radius_of(world, poi),
+            label: map::poi_label(world, poi, format!("{near}/{needed}")),
             share: Some(f64::from(near) / f64::from(needed)),
             observed: observed[poi],
             open: world.rule.is_open(poi, step, observed),

@@ -14,7 +14,7 @@ const ZEROED_TOGETHER: usize = 1 << 16;
 /// The scores of one group's teams.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct GroupScores {
-    /// POIs observed, `[teams]`.
+    /// What the observed POIs are [worth](crate::world::WorldParts::worth), `[teams]`: with equal values, their number.
     pub observed: Vec<u32>,
     /// The leaders' scores, `[teams][fitnesses][leaders]`.
     pub scores: Vec<f32>,
@@ -23,7 +23,7 @@ pub struct GroupScores {
 /// The scores of the groups of a batch. Several threads may write at a time; each team is scored once.
 pub(crate) struct ScoreTable<'a> {
     groups: &'a [Group<'a>],
-    /// POIs observed, `[teams]` per group.
+    /// What the observed POIs are worth, `[teams]` per group.
     observed: Vec<Vec<AtomicU32>>,
     /// Scores, f32 as bits, `[teams][fitnesses][leaders]` per group.
     scores: Vec<Vec<AtomicU32>>,
@@ -61,7 +61,8 @@ impl<'a> ScoreTable<'a> {
         });
     }
 
-    /// Puts how many POIs a team observed, and the scores of its leaders by one of the group's fitnesses, if it has any.
+    /// Puts what the POIs that a team observed are worth, and the scores of its leaders by one of the group's fitnesses, if
+    /// it has any.
     #[inline(always)]
     pub(crate) fn put(
         &self,

@@ -186,8 +186,9 @@ pub(super) fn play_segments(world: &World, teams: &[(&[f32], &[Vec<Vec2>])]) -> 
             stepper.step(&actions).map_err(failed)?;
         }
         let all = stepper.observed().chunks_exact(world.pois.len());
-        for (count, pois) in observed.iter_mut().zip(all) {
-            *count += pois.iter().filter(|&&observed| observed).count() as u32;
+        for (total, pois) in observed.iter_mut().zip(all) {
+            let observed = pois.iter().zip(&world.worth).filter(|(observed, _)| **observed);
+            *total += observed.map(|(_, worth)| worth).sum::<u32>();
         }
     }
     Ok(observed)

@@ -487,7 +487,7 @@ impl Setting {
     /// Adds the results of a generation.
     fn collect_results(&mut self, generation: usize) {
         let episodes_per_team = self.config.learning.episodes_per_team;
-        let whole = (self.world.pois.len() * episodes_per_team) as f64;
+        let whole = (self.world.total_worth as usize * episodes_per_team) as f64;
         let played = self.played_constants(generation);
         for (place, trial) in self.trials.iter_mut().enumerate() {
             let (constants, random) = trial.observed.split_at(played);
@@ -523,7 +523,7 @@ impl Setting {
         let Learning { generations, episodes_per_team, start_jitter, poi_jitter, .. } = self.config.learning;
         let all: Vec<Team> = (0..self.constants.len()).map(Team::Constant).collect();
         if !self.moves() {
-            let whole = (self.world.pois.len() * episodes_per_team) as f64;
+            let whole = (self.world.total_worth as usize * episodes_per_team) as f64;
             let [action, network, shared] = [0, 1, 2].map(|kind| f64::from(trial.finalists[kind][0].0) / whole);
             let climbed = |of: fn(&Climbers) -> &Climber| {
                 trial.climbers.as_ref().map_or(0.0, |climbers| f64::from(of(climbers).observed()) / whole)
@@ -564,7 +564,7 @@ impl Setting {
 
         let held_out = Starts::Drawn { episodes, seed: 0, jitter: start_jitter, poi_jitter };
         let starts: Vec<Vec<Vec2>> = (0..episodes as usize).map(|episode| held_out.of(episode, &self.world)).collect();
-        let whole = (self.world.pois.len() * starts.len()) as f64;
+        let whole = (self.world.total_worth as usize * starts.len()) as f64;
         let mut g: Vec<f64> = played(&chosen, &starts)?.into_iter().map(|count| f64::from(count) / whole).collect();
         let open_loop = match &trial.climbers {
             Some(climbers) => f64::from(play_segments(world, &[(climbers.segments.best(), &starts)])?[0]) / whole,

@@ -16,9 +16,9 @@ use crate::world::{OUTPUTS, World};
 #[derive(Clone, Debug, PartialEq)]
 #[non_exhaustive]
 pub struct Played {
-    /// Number of POIs observed, `[teams]`.
+    /// Number of POIs observed, weighted by their values: G times the number of POIs, `[teams]`.
     pub observed: Vec<f64>,
-    /// G, the share of POIs observed, in 0..1, `[teams]`.
+    /// G, what the observed POIs are worth as a share of all, in 0..1, `[teams]`.
     pub g: Vec<f32>,
     /// D, `[teams][leaders]`.
     pub d: Vec<f32>,
@@ -79,7 +79,7 @@ impl From<&Evaluation> for Played {
         let places = || (0..teams * leaders).map(|place| (place / leaders, place % leaders));
         let scores: Vec<[f32; 4]> = places().map(|(team, leader)| evaluation.scores(team, leader)).collect();
         Played {
-            observed: evaluation.observed.iter().map(evaluate::Tally::mean).collect(),
+            observed: (0..teams).map(|team| evaluation.mean_observed(team)).collect(),
             g: scores.iter().step_by(leaders).map(|&[g, ..]| g).collect(),
             d: scores.iter().map(|&[_, d, ..]| d).collect(),
             df: scores.iter().map(|&[_, _, df, _]| df).collect(),

@@ -79,12 +79,12 @@ impl ExperimentState {
         let ExperimentState { stages, trials, schedules, .. } = self;
         let Stage { config, world, .. } = stages.of(generation);
         let (teams, hall) = (config.learning.teams(), config.hall_teams(generation) > 0);
-        let pois_before = stages.ending_before(generation).map_or(world.pois.len(), |stage| stage.world.pois.len());
+        let total_before = stages.ending_before(generation).map_or(world.total_worth, |stage| stage.world.total_worth);
         let mut rows = Vec::with_capacity(trials.len());
         for (number, (trial, schedule)) in trials.iter_mut().zip(schedules).enumerate() {
             // Teams with past champions are not among the k·m teams whose best and mean count.
-            let [best_g, mean_g] = team_g(&trial.scores, world.pois.len(), teams);
-            rows.extend(trial.pending.map(|row| Row { champion_g: trial.champion_g(pois_before), ..row }));
+            let [best_g, mean_g] = team_g(&trial.scores, world.total_worth, teams);
+            rows.extend(trial.pending.map(|row| Row { champion_g: trial.champion_g(total_before), ..row }));
             trial.pending =
                 Some(Row { experiment: index, trial: trial.index, generation, best_g, mean_g, champion_g: 0.0 });
             let score = |place: usize| match given_scores {
@@ -99,9 +99,9 @@ impl ExperimentState {
 
     /// Returns the last generation's rows, which its champions have just completed. The experiment is done then.
     pub fn collect_last_rows(&mut self) -> Vec<Row> {
-        let pois = self.stage().world.pois.len();
+        let total = self.stage().world.total_worth;
         let row = |trial: &mut TrialState| {
-            let row = trial.pending.map(|row| Row { champion_g: trial.champion_g(pois), ..row });
+            let row = trial.pending.map(|row| Row { champion_g: trial.champion_g(total), ..row });
             trial.forget_scores();
             row
         };
@@ -113,11 +113,11 @@ impl ExperimentState {
 }
 
 impl TrialState {
-    /// Returns G of the champion's team, the last of those that played.
-    fn champion_g(&self, pois: usize) -> f64 {
+    /// Returns G of the champion's team, the last of those that played. `total` is what all POIs are worth.
+    fn champion_g(&self, total: u32) -> f64 {
         let of_stage = if self.previous_stage_scores.is_empty() { &self.scores } else { &self.previous_stage_scores };
         let observed = |episode: &GroupScores| u64::from(episode.observed.last().copied().unwrap_or(0));
-        of_stage.iter().map(observed).sum::<u64>() as f64 / (pois * of_stage.len()) as f64
+        of_stage.iter().map(observed).sum::<u64>() as f64 / (total as usize * of_stage.len()) as f64
     }
 
     /// Frees the memory of scores that were used.
@@ -126,8 +126,9 @@ impl TrialState {
     }
 }
 
-/// Returns G of the best team, and the mean over teams. `episodes` are the scores of each episode.
-fn team_g(episodes: &[GroupScores], pois: usize, teams: usize) -> [f64; 2] {
+/// Returns G of the best team, and the mean over teams. `episodes` are the scores of each episode, and `worth` is what all
+/// POIs are worth.
+fn team_g(episodes: &[GroupScores], worth: u32, teams: usize) -> [f64; 2] {
     let observed = |team: usize| episodes.iter().map(|episode| u64::from(episode.observed[team])).sum();
     let fold = |all: (u64, u64), (best, total)| (all.0.max(best), all.1 + total);
     let chunk = |first: usize| {
@@ -137,7 +138,7 @@ fn team_g(episodes: &[GroupScores], pois: usize, teams: usize) -> [f64; 2] {
     let chunks: Vec<_> =
         (0..teams.div_ceil(TEAMS_TOGETHER)).into_par_iter().map(|index| chunk(index * TEAMS_TOGETHER)).collect();
     let (best, total) = chunks.into_iter().fold((0, 0), fold);
-    let whole = (pois * episodes.len()) as f64;
+    let whole = (worth as usize * episodes.len()) as f64;
     [best as f64 / whole, total as f64 / (whole * teams as f64)]
 }
 

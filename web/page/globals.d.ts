@@ -40,9 +40,12 @@ interface Episode extends Seen {
   led: Uint32Array, positions: Float32Array, headings: Float32Array, best_g?: number, d?: number[], df?: number[], dpp?: number[], dt?: number[],
   senses?: Float32Array, without?: { alone: Seen, group: Seen }[],
 }
+/** A channel of a class's senses, and a class of agents. Those that learn come first. */
+interface Channel { of: string | string[], sectors: number, frame: "heading" | "map" }
+interface AgentClass { count: number, free: boolean, senses: Channel[] }
 interface Scene extends Rule {
   map: Place, pois: Place[], observation_radius: number, attraction_radius: number, dt: number, steps: number, exact: boolean,
-  colors: Palettes, fitness?: string, episodes: Episode[],
+  colors: Palettes, fitness?: string, episodes: Episode[], radii?: number[], values?: number[], classes?: AgentClass[],
 }
 /** A scene as it is sent: arrays are base64 until `stage.unpack`. */
 interface Packed { colors: Palettes, episodes: { generation: number, best_g: number }[] }

@@ -1,27 +1,45 @@
-// What a leader senses: the densities of POIs and agents in four quadrants, and its answer.
+// What a leader senses, channel by channel, and its answer.
 
 /** Names of the quadrants, in the order of a policy's inputs. */
 const QUADRANTS = ["back right", "front right", "front left", "back left"];
-
-/** Returns the angles at which a quadrant starts and ends, from the heading and counterclockwise. @param {number} quadrant */
-export const angles = quadrant => [(quadrant - 2) * Math.PI / 2, (quadrant - 1) * Math.PI / 2];
+/** What leaders sense if the config has no `[[agents]]`. @type {AgentClass} */
+const QUADRANTS_ONLY = { count: 1, free: false, senses: ["pois", "agents"].map(of => ({ of, sectors: 4, frame: "heading" })) };
 
 /**
- * Returns what a leader senses and answers at a frame, from `[frames][leaders][8 inputs, 2 outputs]`. At the start it has not yet
- * sensed anything.
- * @param {Float32Array} numbers
- * @param {number} leaders
+ * Returns the angles at which a sector starts and ends, counterclockwise: from the heading, or from the x axis of the map.
+ * @param {number} sector
+ * @param {Pick<Channel, "sectors" | "frame">} channel
+ */
+export const angles = (sector, { sectors, frame }) =>
+  [sector, sector + 1].map(edge => edge * 2 * Math.PI / sectors - (frame === "heading" ? Math.PI : 0));
+
+/** Returns the class of a leader. @param {Pick<Scene, "classes">} data @param {number} leader */
+export function class_of({ classes = [] }, leader) {
+  let left = leader;
+  return classes.find(({ count }) => (left -= count) < 0) ?? QUADRANTS_ONLY;
+}
+
+/**
+ * Returns what a leader senses and answers at a frame, from `[frames][leaders][inputs, 2 outputs]`. At the start it has not yet sensed
+ * anything. Each channel has its values, one per sector.
+ * @param {Pick<Scene, "classes">} data
+ * @param {Pick<Episode, "senses" | "leaders" | "shown">} episode
  * @param {number} frame
  * @param {number} leader
  */
-export function moment(numbers, leaders, frame, leader) {
-  const at = (frame * leaders + leader) * 10, own = [...numbers.subarray(at, at + 10)];
-  return { pois: own.slice(0, 4), agents: own.slice(4, 8), turn: own[8], speed: own[9] };
+export function moment(data, { senses = new Float32Array(), leaders, shown }, frame, leader) {
+  const size = senses.length / (shown.length * leaders), at = (frame * leaders + leader) * size, own = [...senses.subarray(at, at + size)];
+  const { free, senses: channels } = class_of(data, leader), answer = own.slice(-2);
+  return { channels: channels.map(channel => ({ ...channel, values: own.splice(0, channel.sectors) })), free, answer };
 }
 
 /** Describes a moment in words. @param {ReturnType<typeof moment>} now */
-export function words({ pois, agents, turn, speed }) {
-  const list = (/** @type {number[]} */ values) => values.map((value, quadrant) => `${QUADRANTS[quadrant]} ${value.toFixed(2)}`).join(", ");
+export function words({ channels, free, answer: [turn, speed] }) {
+  const list = channels.map(({ of, sectors, frame, values }) => {
+    const name = [of].flat().map(name => name === "pois" ? "POIs" : name).join(" and "), quadrants = sectors === 4 && frame === "heading";
+    return `${name}: ${values.map((value, sector) => (quadrants ? `${QUADRANTS[sector]} ` : "") + value.toFixed(2)).join(", ")}`;
+  });
+  if (free) return `senses ${list.join("; ")}. It moves by ${(turn * 100).toFixed(0)} % of the largest speed along x, ${(speed * 100).toFixed(0)} % along y.`;
   const way = Math.abs(turn) < 0.02 ? "straight ahead" : `${(Math.abs(turn) * 180).toFixed(0)}° to the ${turn > 0 ? "left" : "right"}`;
-  return `senses POIs: ${list(pois)}; agents: ${list(agents)}. It answers ${way}, at ${((speed + 1) * 50).toFixed(0)} % of the largest speed.`;
+  return `senses ${list.join("; ")}. It answers ${way}, at ${((speed + 1) * 50).toFixed(0)} % of the largest speed.`;
 }

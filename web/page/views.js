@@ -124,21 +124,22 @@ function ring(view, [list, index]) {
   pen.beginPath(); pen.arc(X(place[0]), Y(place[1]), 17, 0, 2 * Math.PI); pen.stroke();
 }
 
-/** Draws what the selected leader senses: a sector per quadrant, outside for POIs and inside for agents. @param {View} view @param {Scene} data */
+/** Draws what the selected leader senses: the sectors of each channel, the first channel outside. @param {View} view @param {Scene} data */
 function senses(view, data) {
   const [episode] = data.episodes, leader = view.selected;
   view.sensed.hidden = leader === null || !episode.senses;
   if (leader === null || !episode.senses) return;
   const frame = Math.min(Math.floor(view.place), episode.shown.length - 1);
-  const now = moment(episode.senses, episode.leaders, frame, leader), { X, Y } = stage.place_on(view.canvas, view.crop);
+  const now = moment(data, episode, frame, leader), { X, Y } = stage.place_on(view.canvas, view.crop);
   view.sensed.textContent = frame === 0 ? `Leader ${leader} has not sensed anything yet.` : `Leader ${leader} ${words(now)}`;
   if (frame === 0) return;
   const [x, y, cos, sin] = stage.moment(data, episode, frame - 1, leader), ahead = Math.atan2(sin, cos);
   const pen = pen_of(view.canvas), style = getComputedStyle(document.documentElement);
-  for (const { values, tone, size } of [{ values: now.pois, tone: "--poi", size: 46 }, { values: now.agents, tone: "--accent", size: 26 }]) {
-    const most = Math.max(...values, 1e-9);
-    values.forEach((value, quadrant) => {
-      const [from, to] = angles(quadrant).map(angle => -(ahead + angle));
+  now.channels.forEach(({ values, ...channel }, index) => {
+    const most = Math.max(...values, 1e-9), size = 46 * (1 - index / now.channels.length);
+    const tone = channel.of === "pois" ? "--poi" : "--accent", zero = channel.frame === "heading" ? ahead : 0;
+    values.forEach((value, sector) => {
+      const [from, to] = angles(sector, channel).map(angle => -(zero + angle));
       pen.beginPath();
       pen.moveTo(X(x), Y(y));
       pen.arc(X(x), Y(y), size, from, to, true);
@@ -151,7 +152,7 @@ function senses(view, data) {
       pen.lineWidth = 1;
       pen.stroke();
     });
-  }
+  });
   pen.globalAlpha = 1;
 }
 

@@ -319,9 +319,12 @@ fn write_film(numbered: &Numbered, out: &Path, frames: &replay::Frames<'_>) -> R
 /// Returns what was played, for people.
 fn described(played: &Replayed) -> String {
     let Replayed { team_g, episodes, world, which, .. } = played;
-    let (pois, digits) = (world.pois.len(), if *episodes > 1 { 2 } else { 0 });
+    let pois = world.pois.len();
+    // With different values, G times the number of POIs is no count.
+    let by_value = if world.total_worth as usize == pois { "" } else { ", weighted by value" };
+    let digits = if *episodes > 1 || !by_value.is_empty() { 2 } else { 0 };
     format!(
-        "{} of {}: observed {:.digits$} of {pois} POIs{}{}",
+        "{} of {}: observed {:.digits$} of {pois} POIs{by_value}{}{}",
         played.name(),
         played.place(),
         team_g * pois as f64,

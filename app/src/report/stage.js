@@ -46,7 +46,7 @@ const stage = (() => {
       left = Math.min(left, x - margin); right = Math.max(right, x + margin);
       below = Math.min(below, y - margin); above = Math.max(above, y + margin);
     };
-    for (const [x, y] of data.pois) include(x, y, data.observation_radius + 1);
+    data.pois.forEach(([x, y], poi) => include(x, y, radius(data, poi) + 1));
     for (const episode of data.episodes)
       for (let frame = 0; frame < episode.shown.length; frame++)
         for (let agent = 0; agent < episode.agents; agent++) { const [x, y] = moment(data, episode, frame, agent); include(x, y, 2); }
@@ -73,7 +73,7 @@ const stage = (() => {
     return found;
   }
 
-  // is_open reports whether a POI can be observed at a step. when describes its window and order.
+  // is_open reports whether a POI can be observed at a step. when describes its value, window and order.
   function is_open(data, episode, poi, step) {
     const [first, end] = data.windows[poi] || [1, data.steps], others = data.after[poi] || [];
     const done = other => episode.observed[other] !== null && episode.observed[other] < step;
@@ -81,8 +81,9 @@ const stage = (() => {
   }
   function when(data, poi) {
     const window = data.windows[poi], others = data.after[poi] || [];
-    return (window ? `, steps ${window[0]} to ${window[1]}` : "") + (others.length ? `, after ${others.join(" and ")}` : "");
+    return (data.values ? `, value ${data.values[poi]}` : "") + (window ? `, steps ${window[0]} to ${window[1]}` : "") + (others.length ? `, after ${others.join(" and ")}` : "");
   }
+  const radius = (data, poi) => data.radii ? data.radii[poi] : data.observation_radius;
   const counts_at_pois = (data, episode, agent) =>
     data.observers === "all" || (data.observers === "leaders") === (agent < episode.leaders);
 
@@ -166,7 +167,7 @@ const stage = (() => {
       const done = episode.observed[poi] !== null && episode.observed[poi] <= step, needed = episode.coupling[poi];
       const closed = !done && !is_open(data, episode, poi, Math.max(1, step));
       const dark = (look.dark || []).includes(poi), tone = color(dark ? "--wrong" : done ? "--seen" : "--poi");
-      circle(x, y, data.observation_radius);
+      circle(x, y, radius(data, poi));
       draw.fillStyle = tone;
       draw.globalAlpha = dark ? 0.16 : done ? 0.22 : closed ? 0.02 : 0.07;
       draw.fill();
@@ -302,10 +303,10 @@ const stage = (() => {
   // Returns the POI nearest to a place on a canvas, if it is within the POI's radius.
   function poi_at(data, canvas, crop, x, y) {
     const { scale, X, Y } = place_on(canvas, crop);
-    let [best, least] = [null, Math.max(14, data.observation_radius * scale)];
+    let [best, least] = [null, Infinity];
     data.pois.forEach(([px, py], poi) => {
       const away = Math.hypot(X(px) - x, Y(py) - y);
-      if (away <= least) [best, least] = [poi, away];
+      if (away <= Math.min(least, Math.max(14, radius(data, poi) * scale))) [best, least] = [poi, away];
     });
     return best;
   }

@@ -2,10 +2,9 @@
 
 use glam::DVec2;
 
-use super::{Legend, Marker, Poi, Team, Viewport, counted, poi_label};
+use super::{Legend, Marker, Poi, Team, Viewport, counted, poi_label, radius_of, values_differ};
 use crate::report::scene::{Anchor, BLACK, Scene};
 use flotilla::config::{Observers, StageConfig};
-use flotilla::model::rule::Rule;
 use flotilla::world::World;
 
 /// Returns the team of a config before training.
@@ -21,7 +20,8 @@ fn team(config: &StageConfig, world: &World) -> Team {
     let none = vec![false; world.pois.len()];
     let poi = |(poi, (&place, needed)): (usize, (&[f64; 2], &u32))| Poi {
         place: place.into(),
-        label: poi_label(&world.rule, poi, needed.to_string()),
+        radius: radius_of(world, poi),
+        label: poi_label(world, poi, needed.to_string()),
         share: None,
         observed: false,
         open: world.rule.is_open(poi, 1, &none),
@@ -43,19 +43,24 @@ pub fn layout(name: &str, config: &StageConfig) -> Scene {
     let map = DVec2::from(config.world.map);
     let view = Viewport::new(config, [DVec2::ZERO, map], 80.0).moved_to([LEFT, HEAD]);
     let [width, height] = view.size();
-    let drawn = config.drawn();
-    let radius = drawn.observation_radius;
-    let mut legend = Legend::new(&view, std::slice::from_ref(&team), "");
+    let classes = config.classes();
+    let alike_radii = classes.pois.windows(2).all(|pair| pair[0].radius == pair[1].radius);
+    let within = match classes.pois.first() {
+        Some(group) if alike_radii => format!("within {} of it", group.radius),
+        _ => "within its circle".into(),
+    };
+    let mut legend = Legend::new(config, &view, std::slice::from_ref(&team), "");
     let alike = world.coupling.windows(2).all(|pair| pair[0] == pair[1]);
     let needs = match (world.coupling.first(), view.poi_labels(&team)) {
         (_, Some(_)) if world.rule.is_timed() => {
-            format!("at a POI: its number, agents it needs within {radius} of it, and when")
+            format!("at a POI: its number, agents it needs {within}, and when")
         }
-        (_, Some(_)) => format!("number at a POI: agents it needs, within {radius} of it"),
+        (_, Some(_)) if values_differ(&world) => format!("at a POI: agents it needs {within}, and its value"),
+        (_, Some(_)) => format!("number at a POI: agents it needs, {within}"),
         (Some(&needed), None) if alike => {
-            format!("each POI needs {} within {radius} of it", counted(needed as usize, "agent"))
+            format!("each POI needs {} {within}", counted(needed as usize, "agent"))
         }
-        _ => format!("what each POI needs has no room here; it counts within {radius} of it"),
+        _ => format!("what each POI needs has no room here; it counts {within}"),
     };
     legend.note(needs);
     if config.learning.start_jitter > 0.0 {
@@ -67,13 +72,13 @@ pub fn layout(name: &str, config: &StageConfig) -> Scene {
     let whole = LEFT + width.max(50.0) + EDGE;
     let room = whole - 2.0 * EDGE;
     let mut scene = Scene::new(whole, HEAD + height + 9.5 + legend.height(room) + 0.5);
-    let followers = world.followers();
-    let described = format!(
-        "{}, {}, {}",
-        counted(leaders, "leader"),
-        counted(followers, "follower"),
-        counted(team.pois.len(), "POI")
-    );
+    let agents = match &config.agents[..] {
+        [] => [counted(leaders, "leader"), counted(world.followers(), "follower")].join(", "),
+        classes => {
+            classes.iter().map(|class| format!("{} {}", class.at.len(), class.name)).collect::<Vec<_>>().join(", ")
+        }
+    };
+    let described = format!("{agents}, {}", counted(team.pois.len(), "POI"));
     scene.bold([EDGE, 4.2], described.clone(), 3.0, Anchor::Start, BLACK);
     view.draw(&mut scene, &team);
     view.rule(&mut scene);
@@ -91,15 +96,20 @@ pub fn layout(name: &str, config: &StageConfig) -> Scene {
         let more = if places.len() > 12 { ", …" } else { "" };
         format!("{what} at {}{more}. ", list.join(", "))
     };
-    let who = match drawn.observers {
+    let who = match config.drawn().observers {
+        _ if !config.agents.is_empty() => {
+            let observes = |&class: &usize| (0..classes.pois.len()).any(|group| classes.observes(class, group));
+            let names = (0..classes.agents.len()).filter(observes).map(|class| classes.agents[class].name.as_str());
+            format!(" Observers: {}.", names.collect::<Vec<_>>().join(", "))
+        }
         Observers::All => String::new(),
         observers => format!(" Only {observers} observe."),
     };
-    let timed = if world.rule.is_timed() { pois_in_words(&world.rule, world.pois.len()) } else { String::new() };
+    let timed = if world.rule.is_timed() { pois_in_words(&world) } else { String::new() };
     let starts: Vec<DVec2> = team.agents[..leaders].iter().map(|agent| agent.place).collect();
     let pois: Vec<DVec2> = team.pois.iter().map(|poi| poi.place).collect();
     scene.description = format!(
-        "A map of {} by {} units before any training. {}{}{couplings}, within {radius} of it.{who}{timed}",
+        "A map of {} by {} units before any training. {}{}{couplings}, {within}.{who}{timed}",
         map.x,
         map.y,
         places("Leaders", &starts),
@@ -109,8 +119,9 @@ pub fn layout(name: &str, config: &StageConfig) -> Scene {
 }
 
 /// Describes when POIs can be observed, for at most 12 of them.
-fn pois_in_words(rule: &Rule, pois: usize) -> String {
-    let list: Vec<_> = (0..pois.min(12)).map(|poi| poi_label(rule, poi, "any time".into())).collect();
+fn pois_in_words(world: &World) -> String {
+    let pois = world.pois.len();
+    let list: Vec<_> = (0..pois.min(12)).map(|poi| poi_label(world, poi, "any time".into())).collect();
     format!(" POIs can be observed: {}{}.", list.join("; "), if pois > 12 { "; …" } else { "" })
 }
 

@@ -5,6 +5,7 @@ use glam::DVec2;
 use super::{CLOSED, FAINT, LABEL, Team, Viewport, arrow, strike};
 use crate::report::curves::round_step;
 use crate::report::scene::{Anchor, BLACK, COLORS, Fill, GREY, Pen, Scene, text_width};
+use flotilla::config::Config;
 
 /// The symbol of an entry, drawn from a place on the baseline.
 enum Symbol {
@@ -52,6 +53,26 @@ impl Symbol {
     }
 }
 
+/// Returns the names of leaders, of followers in the colour of their leader, and of other followers. With `[[agents]]` these
+/// are names of classes.
+fn roles(config: &Config, leaders: usize) -> [String; 3] {
+    if config.agents.is_empty() {
+        let leader = if leaders > 1 { "leader, by number" } else { "leader" };
+        return [leader, "its follower", "follower"].map(String::from);
+    }
+    let (learning, others): (Vec<_>, Vec<_>) = config.agents.iter().partition(|class| class.learns());
+    let mut first = 0;
+    let numbered = learning.iter().map(|class| {
+        let last = first + class.at.len() - 1;
+        let numbers = if first == last { first.to_string() } else { format!("{first} to {last}") };
+        first = last + 1;
+        if leaders > 1 { format!("{} {numbers}", class.name) } else { class.name.clone() }
+    });
+    let leader = numbered.collect::<Vec<_>>().join(", ");
+    let follower = others.iter().map(|class| class.name.as_str()).collect::<Vec<_>>().join(" or ");
+    [leader, format!("{follower}, in its leader's colour"), follower]
+}
+
 /// The legend below a map: symbols with their texts.
 #[derive(Default)]
 pub(crate) struct Legend {
@@ -64,19 +85,19 @@ type Placed<'a> = (&'a Symbol, String, [f64; 2]);
 impl Legend {
     const ROW: f64 = 4.2;
 
-    /// Returns the legend of the symbols that occur on the maps of these teams.
-    pub fn new(view: &Viewport, teams: &[Team], counts: &str) -> Legend {
+    /// Returns the legend of the symbols that occur on the maps of these teams of a config.
+    pub fn new(config: &Config, view: &Viewport, teams: &[Team], counts: &str) -> Legend {
         let mut entries = Vec::new();
         let mut add = |symbol: Symbol, text: &str| entries.push((symbol, text.to_string()));
         let Some(team) = teams.first() else { return Legend::default() };
         let mut pois = teams.iter().flat_map(|team| &team.pois);
-        let leader = if team.leaders > 1 { "leader, by number" } else { "leader" };
-        add(Symbol::Agent(1.6, Some(0), true, true), leader);
+        let [leader, its_follower, follower] = roles(config, team.leaders);
+        add(Symbol::Agent(1.6, Some(0), true, true), &leader);
         let followers = &team.agents[team.leaders..];
         if followers.iter().any(|agent| agent.group.is_some()) {
-            add(Symbol::Agent(1.4, Some(0), false, true), "its follower");
+            add(Symbol::Agent(1.4, Some(0), false, true), &its_follower);
         } else if !followers.is_empty() {
-            add(Symbol::Agent(1.4, None, false, true), "follower");
+            add(Symbol::Agent(1.4, None, false, true), &follower);
         }
         if pois.clone().any(|poi| poi.observed) {
             let fill = Fill { color: COLORS[2], opacity: 0.22 };

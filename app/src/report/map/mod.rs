@@ -7,7 +7,7 @@ use glam::DVec2;
 use super::curves::round_step;
 use super::scene::{Anchor, BLACK, COLORS, Color, Fill, GREY, LIGHT, Pen, Scene, WHITE, colors, text_width};
 use flotilla::config::Config;
-use flotilla::model::rule::Rule;
+use flotilla::world::World;
 
 mod layout;
 mod legend;
@@ -61,6 +61,8 @@ pub struct Marker {
 pub struct Poi {
     /// Position in map units.
     pub place: DVec2,
+    /// Observation radius in map units.
+    pub radius: f64,
     /// Text next to the POI.
     pub label: String,
     /// Observers present divided by the coupling. None before an episode.
@@ -72,8 +74,25 @@ pub struct Poi {
     pub open: bool,
 }
 
-/// Returns a POI's label: `needs`, and for a timed rule also the POI's number and when it can be observed.
-pub fn poi_label(rule: &Rule, poi: usize, needs: String) -> String {
+/// Reports whether POIs have different values.
+pub(crate) fn values_differ(world: &World) -> bool {
+    world.values.windows(2).any(|pair| pair[0] != pair[1])
+}
+
+/// Returns the part of a POI's label that has its value, empty if all have the same value.
+fn value_label(world: &World, poi: usize) -> String {
+    if values_differ(world) { format!(", value {}", world.values[poi]) } else { String::new() }
+}
+
+/// Returns the observation radius of a POI in map units.
+pub fn radius_of(world: &World, poi: usize) -> f64 {
+    f64::from(world.radii2[poi]).sqrt()
+}
+
+/// Returns a POI's label: `needs`, its value if values differ, and for a timed rule also the POI's number and when it can be
+/// observed.
+pub fn poi_label(world: &World, poi: usize, needs: String) -> String {
+    let (rule, needs) = (&world.rule, needs + &value_label(world, poi));
     if !rule.is_timed() {
         return needs;
     }
@@ -86,9 +105,10 @@ pub fn poi_label(rule: &Rule, poi: usize, needs: String) -> String {
     format!("{poi}: {needs}{}{after}", window.unwrap_or_default())
 }
 
-/// Returns an observed POI's label: the step at which it was observed.
-pub(crate) fn observed_label(rule: &Rule, poi: usize, step: usize) -> String {
-    if rule.is_timed() { format!("{poi}: at step {step}") } else { format!("at step {step}") }
+/// Returns an observed POI's label: the step at which it was observed, and its value if values differ.
+pub(crate) fn observed_label(world: &World, poi: usize, step: usize) -> String {
+    let number = if world.rule.is_timed() { format!("{poi}: ") } else { String::new() };
+    format!("{number}at step {step}{}", value_label(world, poi))
 }
 
 /// A team at one moment, to draw.
@@ -112,16 +132,13 @@ pub struct Viewport {
     from: DVec2,
     to: DVec2,
     map: DVec2,
-    /// Observation radius in map units.
-    radius: f64,
 }
 
 impl Viewport {
     /// Fits a part of a config's map, given by its corners, into a square of `side` millimetres.
     pub fn new(config: &Config, [from, to]: [DVec2; 2], side: f64) -> Viewport {
         let scale = side / (to - from).max_element();
-        let (map, radius) = (config.world.map.into(), config.drawn().observation_radius);
-        Viewport { left: 0.0, above: 0.0, scale, from, to, map, radius }
+        Viewport { left: 0.0, above: 0.0, scale, from, to, map: config.world.map.into() }
     }
 
     /// Returns the same view with another upper left corner, in millimetres.
@@ -191,14 +208,15 @@ impl Viewport {
         let [x, y] = self.at(poi.place);
         let color = if poi.observed { COLORS[2] } else { GREY };
         let opacity = if poi.observed { 0.22 } else { 0.06 };
-        let dash: &[f64] = match self.radius * self.scale {
+        let radius = poi.radius * self.scale;
+        let dash: &[f64] = match radius {
             _ if poi.observed => &[],
             _ if !poi.open => CLOSED,
             small if small < 2.5 => &[0.5, 0.4],
             _ => &[1.0, 0.8],
         };
         let fill = Fill { color, opacity };
-        scene.circle([x, y], self.radius * self.scale, Some(fill), Some(Pen { dash, ..Pen::new(color, 0.25) }));
+        scene.circle([x, y], radius, Some(fill), Some(Pen { dash, ..Pen::new(color, 0.25) }));
         let (Some(ring), Some(share)) = (ring, poi.share) else {
             let arm = ring.unwrap_or(0.8).min(0.8);
             for sign in [1.0, -1.0] {
@@ -237,8 +255,8 @@ impl Viewport {
                 let [x, y] = self.at(poi.place);
                 let half = text_width(&poi.label, size) / 2.0;
                 // Labels of large circles are at the top, because agents gather in the middle.
-                let top = y - self.radius * self.scale + size + 0.8;
-                let bottom = y + self.radius * self.scale - 0.8;
+                let top = y - poi.radius * self.scale + size + 0.8;
+                let bottom = y + poi.radius * self.scale - 0.8;
                 let places = [
                     [x, if top < y - 2.5 { top } else { y - 1.6 }],
                     [x, y - 1.6],

@@ -6,7 +6,7 @@ use super::Replayed;
 use crate::record::digests::UNVERIFIED;
 use crate::report::map::{self, FAINT, Legend, Marker, Poi, Team, Viewport};
 use crate::report::scene::{Anchor, BLACK, Scene};
-use flotilla::config::{Config, Observers};
+use flotilla::config::Config;
 
 impl Replayed {
     /// Returns the team at `place` steps from the start, with its trails.
@@ -34,10 +34,11 @@ impl Replayed {
             let observed = self.observed[poi].filter(|&observed| observed <= step);
             Poi {
                 place: place.as_dvec2(),
+                radius: map::radius_of(world, poi),
                 // An observed POI needs no agents any more.
                 label: match observed {
-                    Some(observed) => map::observed_label(&world.rule, poi, observed),
-                    None => map::poi_label(&world.rule, poi, format!("{near}/{needed}")),
+                    Some(observed) => map::observed_label(world, poi, observed),
+                    None => map::poi_label(world, poi, format!("{near}/{needed}")),
                 },
                 share: Some(if observed.is_some() { 1.0 } else { f64::from(near) / f64::from(needed) }),
                 observed: observed.is_some(),
@@ -95,13 +96,16 @@ impl<'a> Screen<'a> {
         let view = Viewport::new(config, busy(config, played), Self::SIDE);
         let width = view.size()[0].max(60.0);
         let teams: Vec<Team> = played.iter().map(|played| played.team(played.world.steps() as f64)).collect();
-        let who = if config.drawn().observers == Observers::All { "agents" } else { "observers" };
+        let all_count = |Replayed { world, .. }: &Replayed| {
+            (0..world.pois.len()).all(|poi| (0..world.agents()).all(|agent| world.rule.counts_at(poi, agent)))
+        };
+        let who = if played.iter().all(all_count) { "agents" } else { "observers" };
         let timed = played.iter().any(|played| played.world.rule.is_timed());
         let needed = played.first().and_then(|played| played.world.coupling.first()).map_or(1, |&needed| needed);
         let near = needed.saturating_sub(1).max(1);
         let who = if near == 1 { &who[..who.len() - 1] } else { who };
         let label = if timed { format!("0: {near}/{needed}: POI 0,") } else { format!("{near}/{needed}:") };
-        let mut legend = Legend::new(&view, &teams, &format!("{label} {near} {who} near of {needed} needed"));
+        let mut legend = Legend::new(config, &view, &teams, &format!("{label} {near} {who} near of {needed} needed"));
         let unverified = played.iter().any(|played| played.unverified).then(|| UNVERIFIED.to_string());
         note.into_iter().chain(unverified).for_each(|note| legend.note(note));
         Screen { played, view, width, legend }

@@ -428,7 +428,7 @@ impl<'a> Episodes<'a> {
         for scores in backend.play(&groups)? {
             observed.iter_mut().zip(scores.observed).for_each(|(sum, observed)| *sum += observed);
         }
-        let whole = (self.world.pois.len() * groups.len()) as f64;
+        let whole = (self.world.total_worth as usize * groups.len()) as f64;
         Ok(observed.into_iter().map(|observed| f64::from(observed) / whole).collect())
     }
 
@@ -450,7 +450,7 @@ pub fn one(group: &Group<'_>, backend: &mut dyn Backend) -> Result<Replayed, Bac
     let mut led = Vec::new();
     credit::find_leading(&episode.sights, world, &mut led);
     let observed = credit::observed_at(episode.sets, world);
-    let team_g = f64::from(scores.observed) / world.pois.len() as f64;
+    let team_g = f64::from(scores.observed) / f64::from(world.total_worth);
     // POIs are drawn where this episode had them.
     let world = world.clone().with_pois(group.moved_pois().unwrap_or(&world.pois));
     Ok(Replayed {

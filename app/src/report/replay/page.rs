@@ -6,9 +6,9 @@ use serde_json::json;
 
 use super::{Counterfactual, Replayed, near};
 use crate::record::folder::OWN_FITNESS;
-use crate::report::map::{GROUPS, GROUPS_DARK};
+use crate::report::map::{self, GROUPS, GROUPS_DARK};
 use crate::report::scene::hex;
-use flotilla::config::Config;
+use flotilla::config::{AgentClass, Config, Mobility};
 use flotilla::credit::{self, Strided};
 use flotilla::world::OUTPUTS;
 
@@ -74,6 +74,9 @@ pub fn detailed(name: &str, config: &Config, played: &[Replayed]) -> serde_json:
 }
 
 /// Returns the data that a page needs to play episodes of one run.
+///
+/// Only configs with `[[agents]]` have `classes`, those that learn first: with their `name`, the `count` of their agents,
+/// whether they move `free`, and the channels of their `senses`. Only those whose POIs differ have their `radii` or `values`.
 pub fn data(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Value {
     let count = played.len().max(1);
     let size = |per_agent: usize, played: &Replayed| {
@@ -113,6 +116,22 @@ pub fn data(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Val
         "colors": colors(),
         "episodes": episodes,
     });
+    if !config.agents.is_empty() {
+        let class = |class: &AgentClass| {
+            let free = matches!(class.motion, Mobility::Free { .. });
+            json!({ "name": class.name, "count": class.at.len(), "free": free, "senses": class.senses })
+        };
+        data["classes"] = config.agents.iter().map(class).collect();
+    }
+    if let Some(Replayed { world, .. }) = played.first() {
+        let radii: Vec<f64> = (0..world.pois.len()).map(|poi| map::radius_of(world, poi)).collect();
+        if radii.windows(2).any(|pair| pair[0] != pair[1]) {
+            data["radii"] = json!(radii);
+        }
+        if map::values_differ(world) {
+            data["values"] = json!(world.values);
+        }
+    }
     if played.iter().any(|played| played.given) {
         data["given"] = true.into();
     }

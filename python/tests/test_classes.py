@@ -1,0 +1,201 @@
+"""Tests configs with classes of agents and groups of POIs: two classes that learn, one with a rule, and POIs with values."""
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+from conftest import random_policies
+
+import flotilla
+from flotilla import Config, VectorEnv, forward, rollout
+
+# Rovers have 8 inputs and drones 3, of which those without a POI are below 0.
+TEXT = """
+[world]
+map = [40, 40]
+steps = 30
+
+[[agents]]
+name = "rover"
+at = [[10, 10], [14, 10], [18, 10]]
+senses = [{ of = "pois", sectors = 4 }, { of = ["drone", "sheep"], sectors = 4, range = 15, measure = "inverse" }]
+leads = "sheep"
+influence_radius = 6
+
+[[agents]]
+name = "drone"
+at = [[30, 12], [30, 16]]
+motion = { kind = "free", max_speed = 2 }
+senses = [{ of = "pois", sectors = 3, frame = "map", range = 12, measure = "closeness", combine = "closest", empty = -1 }]
+
+[[agents]]
+name = "sheep"
+at = [[12, 13], [15, 13], [17, 13], [19, 12]]
+control = "follow"
+rule = [{ of = "sheep", to = 1, gain = -1 }, { of = "rover", to = 6, gain = 2 }]
+
+[[pois]]
+name = "pen"
+at = [[13, 19], [20, 19]]
+value = 2
+coupling = 2
+radius = 5
+observers = ["rover", "sheep"]
+
+[[pois]]
+name = "tower"
+at = [[31, 20], [25, 12], [5, 25]]
+value = 0.5
+coupling = 1
+radius = 4
+
+[policy]
+hidden = [6]
+
+[learning]
+population = 8
+generations = 2
+trials = 2
+fitness = "D"
+"""
+CONFIG = Config.parse(TEXT)
+VALUES = np.array([2, 2, 0.5, 0.5, 0.5])
+
+
+def test_a_config_with_classes_is_read_written_and_copied():
+    with open("herd.toml", "w") as file:
+        file.write(TEXT)
+    assert Config.load("herd.toml") == CONFIG == Config.parse(CONFIG.to_toml())
+    assert pickle.loads(pickle.dumps(CONFIG)) == copy.deepcopy(CONFIG) == CONFIG
+    assert (CONFIG.num_inputs, CONFIG.num_learners, CONFIG.parameters) == (8, 5, 9 * 6 + 7 * 2)
+    assert CONFIG.replace(world={"steps": 3})["world.steps"] == 3
+    assert repr(CONFIG).startswith("<flotilla.Config: 3 rover, 2 drone, 4 sheep, 5 POIs; 5 learners by D, 8 teams")
+    assert [group["value"] for group in CONFIG["pois"]] == [2, 0.5]
+    # The widest class decides.
+    wide = Config.parse(TEXT.replace("sectors = 3", "sectors = 11"))
+    assert wide.num_inputs == 11 and VectorEnv(wide, 2).reset()[0].shape == (2, 5, 11)
+
+
+def test_observations_are_those_of_each_class_and_then_zeros():
+    env = VectorEnv(CONFIG, 4, jitter=2.0)
+    observations, _ = env.reset(seed=1)
+    assert observations.shape == (4, 5, 8) and env.agents_at_poi.shape == (4, 5, 9)
+    rng, below = np.random.default_rng(2), False
+    for _ in range(29):
+        rovers, drones = observations[:, :3], observations[:, 3:]
+        assert rovers.min() >= 0 and (rovers != 0).any()
+        assert not drones[..., 3:].any() and drones[..., :3].min() >= -1 and drones[..., :3].max() <= 1
+        below |= bool((drones == -1).any()) and bool((drones > 0).any())
+        observations = env.step(rng.uniform(-1, 1, (4, 5, 2)))[0]
+    assert below, "a drone has never had a sector with a POI and one without"
+
+
+def test_a_drone_senses_its_closest_poi_by_sectors_of_the_map():
+    observations, _ = VectorEnv(CONFIG, 1).reset()
+    places, drone = np.array([place for group in CONFIG["pois"] for place in group["at"]]), np.array([30, 12])
+    away = places - drone
+    distances, sectors = np.hypot(*away.T), np.arctan2(away[:, 1], away[:, 0]) % (2 * np.pi) // (2 * np.pi / 3)
+    expected = [-1.0] * 3
+    for distance, sector, value in zip(distances, sectors, VALUES):
+        if distance <= 12:
+            expected[int(sector)] = max(expected[int(sector)], value * (1 - distance / 12))
+    assert max(expected) > 0 > min(expected) and np.allclose(observations[0, 3, :3], expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("text, least", [(TEXT, -np.inf), (TEXT.replace("empty = -1", "empty = 1"), 0)])
+def test_spaces_hold_every_observation(text, least):
+    pytest.importorskip("gymnasium", reason="gymnasium is not installed")
+    config = Config.parse(text)
+    for layout, shape in (("leaders", (3, 5, 9)), ("flat", (15, 9))):
+        env = VectorEnv(config, 3, layout=layout, time_input=True)
+        assert env.observation_space.shape == shape and env.single_observation_space.shape == shape[1:]
+        assert (env.observation_space.low == least).all() and (env.observation_space.high == np.inf).all()
+        assert (env.single_observation_space.low == least).all()
+        assert env.reset()[0] in env.observation_space
+    single = flotilla.team_env(config)
+    assert single.reset()[0] in single.observation_space
+    assert (Config.paper()._native.least_input, Config.paper().num_inputs) == (0, 8)
+
+
+def test_the_parallel_environment_has_the_same_observations():
+    pytest.importorskip("pettingzoo", reason="pettingzoo is not installed")
+    from pettingzoo.test import parallel_api_test
+
+    env, many = flotilla.parallel_env(CONFIG), VectorEnv(CONFIG, 1)
+    observations, _ = env.reset()
+    assert np.array_equal(np.stack([observations[agent] for agent in env.agents]), many.reset()[0][0])
+    for agent in env.agents:
+        space = env.observation_space(agent)
+        assert space.shape == (8,) and (space.low == -np.inf).all() and observations[agent] in space
+    parallel_api_test(env, num_cycles=100)
+
+
+@pytest.mark.parametrize("reward", flotilla._native.FITNESSES)
+def test_steps_give_the_bits_of_a_rollout(reward):
+    config = CONFIG.replace(learning={"fitness": reward})
+    policies = random_policies(config, 40, 3)
+    scores = rollout(config, policies, trace=True)
+    trace = scores.trace
+    env = VectorEnv(config, 40, reward, autoreset="same_step")
+    observations, _ = env.reset()
+    total = np.zeros((40, 5))
+    for step in range(30):
+        assert np.array_equal(observations.view(np.uint32), trace.inputs[:, step].view(np.uint32)), step
+        answers = forward(policies.transpose(1, 0, 2), observations, config)
+        assert np.array_equal(answers.view(np.uint32), trace.outputs[:, step].view(np.uint32)), step
+        observations, rewards, _, truncated, infos = env.step(answers)
+        total += rewards
+        if step < 29:
+            assert np.array_equal(env.agents_at_poi, trace.agents_at_poi[:, step])
+            assert np.array_equal(env.states[0].view(np.uint32), trace.positions[:, step + 1].view(np.uint32))
+    assert truncated.all()
+    observed = infos["final_info"]["observed"]
+    # G is the share of the value of all POIs, and some teams observe POIs of each value.
+    g = observed @ VALUES / VALUES.sum()
+    assert observed[:, :2].any() and observed[:, 2:].any() and len(set(g)) > 3
+    assert np.allclose(scores.g, g, atol=1e-12) and np.array_equal(infos["final_info"]["g"], scores.g)
+    assert np.allclose(scores.observed, g * 5, atol=1e-12)
+    if reward == "G":
+        assert np.allclose(total, g[:, None], atol=1e-6)
+    else:
+        assert np.array_equal(rewards.view(np.uint32), scores[reward].view(np.uint32))
+
+
+def test_held_out_starts_and_collected_episodes_weigh_pois_by_value():
+    policies = random_policies(CONFIG, 6, 4)
+    scores = rollout(CONFIG, policies, episodes=20, seed=3, jitter=2.0, spread=True)
+    assert scores.episodes.max() <= 1 and len(np.unique(scores.episodes)) > 3
+    assert np.allclose(scores.episodes.mean(0), scores.g, atol=1e-12)
+    assert np.allclose(scores.episodes.std(0, ddof=1), scores.deviation, atol=1e-12)
+    batch = flotilla.collect(CONFIG, policies, noise=0.0, seed=3, episodes=20, jitter=2.0)
+    assert batch.observations.shape == (120, 30, 5, 8) and not batch.observations[:, :, 3:, 3:].any()
+    assert np.array_equal(batch.g.reshape(20, 6), scores.episodes)
+    assert np.allclose(batch.rewards[..., 0].sum(1), batch.g, atol=1e-6)
+
+
+def test_two_generations_are_trained_and_their_champion_replayed():
+    run = flotilla.train(CONFIG, seed=5)
+    assert run.metrics["best_g"].shape == (2, 3) and 0 < run.metrics["best_g"].max() <= 1
+    assert flotilla.train(CONFIG, seed=5).digest == run.digest
+    coevolution = flotilla.Coevolution(CONFIG, seed=5)
+    while not coevolution.done:
+        coevolution.tell(coevolution.play().fitness)
+    assert coevolution.run.digest == run.digest
+    for trial in range(2):
+        scores = rollout(run.config, run.policies[trial])
+        assert scores.g[0] == run.metrics["champion_g"][trial, -1]
+    [episode] = run.replay(trial=1).episodes
+    assert episode.best_g == run.metrics["champion_g"][1, -1]
+    flotilla.replay(CONFIG, random_policies(CONFIG, 2), 1).save("herd.gif", width=200)
+    assert VectorEnv(CONFIG, 2, render_mode="rgb_array").render()[0].shape == (480, 480, 3)
+
+
+def test_inputs_of_another_width_are_refused():
+    wide = Config.parse(TEXT.replace("sectors = 3", "sectors = 11"))
+    policy = random_policies(wide, 1)[0, 0]
+    assert forward(policy, np.zeros((7, 11)), wide).shape == (7, 2)
+    with pytest.raises(ValueError, match=r"inputs have the shape \(7, 8\), allowed is \[..., 11\]"):
+        forward(policy, np.zeros((7, 8)), wide)
+    with pytest.raises(ValueError, match="out is .*allowed is"):
+        VectorEnv(wide, 2)._teams.inputs(np.zeros((2, 5, 8), np.float32))
