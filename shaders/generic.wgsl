@@ -1,6 +1,6 @@
 // The sizes and the classes of a task's world, which are constants in specialised kernels.
 //
-// Uses: lib/layout.wgsl (weights, classes), policy.wgsl, episode.wgsl (world, own, Shape, Agent).
+// Uses: lib/layout.wgsl (weights, classes), policy.wgsl, follow.wgsl, episode.wgsl (world, own, Shape, Agent).
 //
 // The host prepends:
 //   CHOOSES        whether outputs choose a behaviour
@@ -72,7 +72,9 @@ fn decide(start: u32, stride: u32, sensed: array<f32, INPUTS>) -> vec2<f32> {
         first += (rows + 1u) * columns;
     }
     if CHOOSES {
-        return choose(sensed, array(inputs[0], inputs[1], inputs[2], inputs[3], inputs[4]));
+        let pois = vec4(sensed[0], sensed[1], sensed[2], sensed[3]);
+        let agents = vec4(sensed[4], sensed[5], sensed[6], sensed[7]);
+        return choose(pois, agents, array(inputs[0], inputs[1], inputs[2], inputs[3], inputs[4]));
     }
     return vec2(inputs[0], inputs[1]);
 }

@@ -1,6 +1,6 @@
 // A leader's policy: a fully connected network with biases and tanh in every layer (paper, Sections 2.4 and 3.1).
 //
-// Uses: lib/math.wgsl, episode.wgsl (own), source.rs (INPUTS), and from src/model: TINY, BEHAVIOURS.
+// Uses: lib/math.wgsl, episode.wgsl (own), and from src/model: TINY, BEHAVIOURS.
 
 // Returns the tanh of a unit's sum. Small sums are flushed to 0, so that the next layer has no denormals.
 fn activate(sum: f32) -> f32 {
@@ -28,8 +28,9 @@ fn quadrant(densities: vec4<f32>, away: bool) -> f32 {
     return select(0.0, select(turn, back, away), most > 0.0);
 }
 
-// Returns the actions of the most wanted behaviour: the first of the largest `wanted`, each in -1..1.
-fn choose(inputs: array<f32, INPUTS>, wanted: array<f32, BEHAVIOURS>) -> vec2<f32> {
+// Returns the actions of the most wanted behaviour: the first of the largest `wanted`, each in -1..1. `pois` and `agents`
+// are the inputs of quadrants.
+fn choose(pois: vec4<f32>, agents: vec4<f32>, wanted: array<f32, BEHAVIOURS>) -> vec2<f32> {
     var most = wanted[0];
     var behaviour = 0u;
     if wanted[1] > most {
@@ -50,8 +51,6 @@ fn choose(inputs: array<f32, INPUTS>, wanted: array<f32, BEHAVIOURS>) -> vec2<f3
     if behaviour == 0u {
         return vec2(0.0, -1.0);
     }
-    let pois = vec4(inputs[0], inputs[1], inputs[2], inputs[3]);
-    let agents = vec4(inputs[4], inputs[5], inputs[6], inputs[7]);
     return vec2(quadrant(select(agents, pois, behaviour < 3u), behaviour == 2u || behaviour == 4u), 1.0);
 }
 

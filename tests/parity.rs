@@ -79,18 +79,18 @@ fn checked_shaders_and_default_limits_agree() {
 fn a_changed_shader_is_reported_with_its_stage() {
     type Edit = fn(String) -> String;
     let edits: [(&str, Edit); 13] = [
-        ("sense", |text| replaced(text, "less_base(1.0 + base - exact", "less_base(1.000001 + base - exact")),
-        ("sense", |text| replaced(text, "place.y - y, world.agent_range2", "place.y - y, 0.99 * world.agent_range2")),
-        ("sense", |text| replaced(text, "leader / 32u == word", "leader / 32u > word")),
+        ("sense", |text| replaced(text, "less_base(value + base - exact", "less_base(1.000001 * value + base - exact")),
+        ("sense", |text| replaced(text, "place.y - y, range2", "place.y - y, 0.99 * range2")),
+        ("sense", |text| replaced(text, "before % 32u), before < 32u", "before % 32u), before > 32u")),
         ("policy", |text| replaced(text, "14.7163315", "14.716334")),
-        ("follow", |text| replaced(text, "vec2(push * world.wall_gain", "vec2(push * 1.01 * world.wall_gain")),
+        ("follow", |text| replaced(text, "vec2(push * own.wall_gain", "vec2(push * 1.01 * own.wall_gain")),
         ("move", |text| replaced(text, "let scale = 1.5", "let scale = 1.5000001")),
-        ("couple", |text| replaced(text, "dy, world.observ", "dy, 0.99 * world.observ")),
+        ("couple", |text| replaced(text, "return within(dx, dy, radius2)", "return within(dx, dy, 0.99 * radius2)")),
         ("influence", |text| replaced(text, "seen = u32(", "seen = 2u * u32(")),
         ("policy", |text| replaced(text, "if wanted[3] > most", "if wanted[3] >= most")),
         ("policy", |text| replaced(text, "if densities.y > most", "if densities.y >= most")),
         ("breed", |text| replaced(text, "* breed_job.sigma", "* 1.0000001 * breed_job.sigma")),
-        ("sight", |text| replaced(text, "return within(dx, dy, world.attr", "return within(dx, dy, 0.99 * world.attr")),
+        ("sight", |text| replaced(text, "place.y - at.y, influence2)", "place.y - at.y, 0.99 * influence2)")),
         ("sight", |text| replaced(text, "sights + (step * rows + row)", "sights + (step * rows + rows - 1u - row)")),
     ];
     for (stage, edit) in edits {

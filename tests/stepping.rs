@@ -113,7 +113,8 @@ fn stepping_with_traced_actions_gives_the_bits_of_the_trace() {
                 (0..teams).for_each(|team| played.check(&mut stepper, step, team, &case));
                 let newly = stepper.newly_observed().chunks(played.world.pois.len());
                 observed.iter_mut().zip(newly).for_each(|(sum, newly)| {
-                    *sum += newly.iter().filter(|&&newly| newly).count() as u32;
+                    let worth = newly.iter().zip(&played.world.worth).filter(|(newly, _)| **newly);
+                    *sum += worth.map(|(_, worth)| worth).sum::<u32>();
                 });
                 if step < played.world.steps() {
                     let actions: Vec<f32> = (0..teams).flat_map(|team| played.actions(step, team)).collect();

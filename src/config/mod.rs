@@ -18,17 +18,18 @@ use crate::reader::{self, Document, Keys, Reader, Section};
 use classes::Summary;
 
 pub use crate::config_enum::Choice;
+pub use crate::model::classes::{
+    AGENTS, AgentClass, Channel, Classes, Combine, Control, Frame, MAX_CHANNELS, MAX_CLASSES, MAX_INPUTS, MAX_SECTORS,
+    MAX_TERMS, Measure, POIS, PoiGroup, Term,
+};
 pub use crate::model::follow::Follow;
-pub use crate::model::motion::Motion;
+pub use crate::model::motion::{Mobility, Motion};
 pub use crate::model::policy::{Actions, MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, Policy};
 pub use crate::model::rule::{Coupling, Observers};
-pub use crate::model::sense::{Combine, Density, Frame, Measure, Sense};
+pub use crate::model::sense::{Density, Sense};
 pub use crate::model::start::Heading;
 pub use crate::reader::{Definition, Override, Problem};
-pub use classes::{
-    AGENTS, AgentClass, Channel, Classes, Control, MAX_CHANNELS, MAX_CLASSES, MAX_INPUTS, MAX_SECTORS, MAX_TERMS,
-    Mobility, POIS, PoiGroup, Term,
-};
+
 pub use learning::{
     CheckpointConfig, Elites, Fitness, Learning, LedBy, Leniency, MAX_EPISODES, MAX_GENERATIONS, MAX_HALL_OF_FAME,
     MAX_PARTNERS, MAX_POPULATION, MAX_TRIALS, Method, Mutation, Paradigm, Parents, Sharing,

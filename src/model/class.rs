@@ -5,10 +5,10 @@ use std::ops::Range;
 use bytemuck::Zeroable;
 use fearless_simd::Simd;
 
+use super::classes::{AgentClass, Classes, Control, MAX_CHANNELS, MAX_CLASSES, MAX_TERMS};
 use super::follow::{RuleConstants, TermConstants};
-use super::motion::MotionConstants;
+use super::motion::{Mobility, MotionConstants};
 use super::sense::{ChannelConstants, NOTHING};
-use crate::config::{AgentClass, Classes, Control, MAX_CHANNELS, MAX_CLASSES, MAX_TERMS, Mobility};
 use crate::gpu_struct::gpu_struct;
 
 gpu_struct! {

@@ -5,10 +5,10 @@ use std::ops::Range;
 
 use fearless_simd::{Simd, prelude::*};
 
+use super::classes::{AGENTS, AgentClass, Term};
 use super::motion::{GRID, MapLanes, MotionLanes, rotate};
 use super::sense::NOTHING;
 use super::{LONGEST, Ranges, TINY, ranges};
-use crate::config::{AGENTS, AgentClass, Term};
 use crate::gpu_struct::gpu_struct;
 use crate::kernels::{
     larger,

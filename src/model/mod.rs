@@ -7,10 +7,10 @@ use std::ops::Range;
 
 use fearless_simd::Simd;
 
-use crate::config::Control;
 use crate::gpu_struct::{GpuStruct, gpu_constants, gpu_struct};
 
 pub mod class;
+pub mod classes;
 pub(crate) mod couple;
 pub(crate) mod follow;
 pub(crate) mod motion;
@@ -20,10 +20,11 @@ pub mod sense;
 pub mod start;
 
 use class::{Class, ClassConstants, ClassLanes, ClassShape};
+use classes::{Combine, Control, Frame, Measure};
 use follow::{TermConstants, TermShape};
 use motion::{GRID, INVERSE_GRID, MapConstants, MapLanes};
 use policy::{BEHAVIOURS, PolicyConstants};
-use sense::{ChannelConstants, ChannelShape, Combine, Frame, Measure};
+use sense::{ChannelConstants, ChannelShape};
 
 /// The maximum length of a map side, radius or range. Its square is far from f32's overflow.
 pub(crate) const LONGEST: f64 = 1e4;

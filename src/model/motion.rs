@@ -5,7 +5,6 @@ use std::f64::consts::{FRAC_PI_2, PI};
 use fearless_simd::{Simd, prelude::*};
 
 use super::{LEAST, TINY};
-use crate::config::Mobility;
 use crate::gpu_struct::gpu_struct;
 use crate::kernels::{
     clamp_to,
@@ -29,6 +28,19 @@ section! {
         /// an agent's heading turns by at most this times dt
         max_turn_rate: f64 = "rad/s", "3.1",
     }
+}
+
+/// How an agent can move.
+#[derive(Clone, Debug, PartialEq, serde::Serialize)]
+#[serde(tag = "kind", rename_all = "lowercase")]
+pub enum Mobility {
+    /// It has a heading and a speed, and turns and accelerates within limits.
+    Steered(Motion),
+    /// It has any velocity whose components do not exceed a maximum, and no heading.
+    Free {
+        /// The largest speed along each axis of the map, in units per second.
+        max_speed: f64,
+    },
 }
 
 impl Motion {

@@ -5,8 +5,8 @@ use std::ops::Range;
 
 use fearless_simd::{Simd, prelude::*};
 
+use super::classes::{AGENTS, Channel, Combine, Frame, MAX_SECTORS, Measure, POIS};
 use super::{LONGEST, Ranges, ranges};
-use crate::config::{AGENTS, Channel, MAX_SECTORS, POIS};
 use crate::config_enum::{Choice, config_enum};
 use crate::gpu_struct::gpu_struct;
 use crate::kernels::{
@@ -66,48 +66,6 @@ config_enum! {
         Inverse = "inverse",
         /// The mean of `1 / max(d, 1)` over the quadrant.
         Mean = "mean",
-    }
-}
-
-config_enum! {
-    /// What an entity at distance d counts in its sector.
-    Measure {
-        /// `1 - d/D` with D = √2·max(map).
-        Linear = "linear",
-        /// `1 / max(d, nearest)`.
-        Inverse = "inverse",
-        /// `1 / max(d, nearest)²`.
-        InverseSquared = "inverse-squared",
-        /// `exp(-d)`.
-        Exponential = "exponential",
-        /// `d / range`.
-        Distance = "distance",
-        /// `1 - d / range`.
-        Closeness = "closeness",
-    }
-}
-
-config_enum! {
-    /// How the measures of a sector become one input.
-    Combine {
-        /// Their sum divided by the number of such entities in the world.
-        Share = "share",
-        /// Their sum.
-        Sum = "sum",
-        /// Their mean.
-        Mean = "mean",
-        /// The largest of them.
-        Closest = "closest",
-    }
-}
-
-config_enum! {
-    /// What the sectors of a channel turn with.
-    Frame {
-        /// The agent's heading: the first sector begins straight behind.
-        Heading = "heading",
-        /// The map: the first sector begins at the x axis.
-        Map = "map",
     }
 }
 

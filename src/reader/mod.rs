@@ -290,7 +290,7 @@ macro_rules! section {
     };
     (@key $section:tt, $field:ident { $($words:tt)+ }) => {};
     (@key $section:tt, $field:ident { $($words:tt)+ } $unit:tt, $paper:tt) => {
-        fn $field<'r, 'a>(r: &'r mut $crate::reader::Reader<'a>) -> $crate::reader::KeyRequest<'r, 'a> {
+        pub(crate) fn $field<'r, 'a>(r: &'r mut $crate::reader::Reader<'a>) -> $crate::reader::KeyRequest<'r, 'a> {
             let meaning = const { concat!($($words)+).trim_ascii() };
             r.key(concat!($section, ".", stringify!($field)), $unit, meaning, $paper)
         }
@@ -336,7 +336,7 @@ macro_rules! table {
 
         impl $name {
             /// The keys, in order.
-            const KEYS: &[&str] = &[$(stringify!($field)),+];
+            pub(crate) const KEYS: &[&str] = &[$(stringify!($field)),+];
             $($crate::reader::section! { @key $table, $field { $($words),+ } $($unit, "")? })+
         }
     };

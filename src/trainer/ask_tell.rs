@@ -48,7 +48,7 @@ impl Trainer {
         let (world, teams) = self.world_and_teams();
         let (mut g, mut scores) = (Vec::new(), Vec::new());
         for trial in &self.experiments[0].trials {
-            let all = (world.pois.len() * trial.scores.len()) as f64;
+            let all = f64::from(world.total_worth) * trial.scores.len() as f64;
             let observed =
                 |team: usize| trial.scores.iter().map(|episode| u64::from(episode.observed[team])).sum::<u64>();
             g.extend((0..teams).map(|team| observed(team) as f64 / all));

@@ -13,6 +13,7 @@ use flotilla::backend::{Backend, OpenBackend};
 use flotilla::baseline::NAMES;
 use flotilla::config::{Config, Fitness, Learning, Override};
 use flotilla::evaluate::Starts;
+use flotilla::world::World;
 use flotilla_app::choice::Work;
 use flotilla_app::ops::{BackendSource, ConfigText, Context, Error, Event, baseline, check_memory, with_remedy};
 use flotilla_app::record::RecordError;
@@ -208,12 +209,13 @@ fn play_script(script: &Script, name: &str, config: &Config) -> Result<f64, Erro
         true => Starts::Drawn { episodes: EPISODES, seed: 0, jitter, poi_jitter },
         false => Starts::Own,
     };
-    let mut observed = 0;
+    let (world, mut observed) = (World::new(&valid), 0);
     for episode in 0..starts.episodes() {
         let played = script.play_from(valid.as_ref(), &starts, episode).map_err(|error| invalid(error.to_string()))?;
-        observed += played.iter().flatten().count();
+        observed +=
+            played.iter().zip(&world.worth).filter(|(step, _)| step.is_some()).map(|(_, worth)| worth).sum::<u32>();
     }
-    Ok(observed as f64 / (config.poi_count() * starts.episodes()) as f64)
+    Ok(f64::from(observed) / (f64::from(world.total_worth) * starts.episodes() as f64))
 }
 
 /// Reports whether starts or POIs move.

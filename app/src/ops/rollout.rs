@@ -19,7 +19,8 @@ use flotilla::escape::PathExt;
 use flotilla::evaluate::{self, Batch, Evaluation, Spread, Starts};
 use flotilla::file;
 use flotilla::model::class::Class;
-use flotilla::model::sense::{ChannelConstants, ChannelShape, Frame};
+use flotilla::model::classes::Frame;
+use flotilla::model::sense::{ChannelConstants, ChannelShape};
 use flotilla::world::{OUTPUTS, World};
 
 /// Columns of a trace. Only agents that learn fill the others: the inputs and outputs of their policies.

@@ -7,11 +7,11 @@
 //! | entities in reach of an agent of their team | tests of pairs that are out of reach |
 
 use flotilla::backend::Trace;
-use flotilla::config::Control;
+use flotilla::config::{Combine, Control, Measure};
 use flotilla::model;
 use flotilla::model::class::Class;
 use flotilla::model::policy::{Actions, PolicyConstants};
-use flotilla::model::sense::{ChannelConstants, Combine, Measure};
+use flotilla::model::sense::ChannelConstants;
 use flotilla::world::World;
 
 /// Numbers of entities in reach of agents, as means over a trace's teams and steps.

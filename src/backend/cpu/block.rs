@@ -9,13 +9,13 @@ use super::agent::Agent;
 use super::neighbours::{self, Bounds, Masks, masks};
 use super::pois::PoiPosition;
 use crate::backend::Moment;
-use crate::config::{Control, Measure};
+use crate::config::{Combine, Control, Frame, Measure};
 use crate::config_enum::ConstDispatch;
 use crate::kernels::math::{on_lattice, within};
 use crate::kernels::{clamp_to, splat};
 use crate::model::class::{Class, ClassLanes};
 use crate::model::follow::{self, Sum};
-use crate::model::sense::{self, ChannelLanes, Combine, Frame};
+use crate::model::sense::{self, ChannelLanes};
 use crate::model::{self, Lanes, motion, policy};
 use crate::world::{OUTPUTS, World};
 

@@ -28,6 +28,8 @@ pub(super) const TEAMS: [usize; 3] = [32, 16, 8];
 /// Maximum threads per workgroup of a specialised kernel: two or more workgroups then fit into a compute unit and hide
 /// each other's latency.
 pub(super) const MAX_THREADS: usize = 512;
+/// Minimum width that the generic kernel has room for: the inputs that behaviours use.
+const LEAST_WIDTH: usize = 8;
 /// Maximum weights of a policy that are written out as straight-line code.
 const MAX_STRAIGHT_WEIGHTS: usize = 512;
 /// Maximum number of specialised kernels per rollout under [`Kernel::Best`]: each takes a fraction of a second to compile.
@@ -132,7 +134,11 @@ impl Shape {
     pub(super) fn generic(world: &World, capacity: Capacity, records: Recorded) -> (Shape, Workgroup) {
         let (workgroup, policy) = (Workgroup::generic(world, capacity.workgroup), &world.constants.policy);
         let chooses = policy.actions() == Some(Actions::Behaviours);
-        let sizes = Sizes::Any { widest: policy.widest().next_power_of_two(), chooses, aligns: world.aligns() };
+        let sizes = Sizes::Any {
+            widest: policy.widest().next_power_of_two().max(LEAST_WIDTH),
+            chooses,
+            aligns: world.aligns(),
+        };
         (Shape { workgroup: workgroup.threads, slots: workgroup.slots, records, sizes }, workgroup)
     }
 

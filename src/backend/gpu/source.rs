@@ -361,7 +361,11 @@ fn straight_policy(widths: &[u32; WIDTHS]) -> String {
     }
     match inputs.len() {
         OUTPUTS => line(format_args!("return vec2({});", inputs.join(", "))),
-        _ => line(format_args!("return choose(inputs, array({}));", inputs.join(", "))),
+        _ => line(format_args!(
+            "return choose(vec4(inputs[0], inputs[1], inputs[2], inputs[3]), vec4(inputs[4], inputs[5], inputs[6], \
+             inputs[7]), array({}));",
+            inputs.join(", ")
+        )),
     }
     text + "}\n"
 }

@@ -5,11 +5,10 @@ use std::f64::consts::FRAC_PI_2;
 
 use serde::Serialize;
 
-use super::{
-    AGENTS, AgentClass, Channel, Control, MAX_CHANNELS, MAX_CLASSES, MAX_INPUTS, MAX_SECTORS, MAX_TERMS, Mobility,
-    POIS, PoiGroup, Term,
+use crate::config::{
+    AGENTS, AgentClass, Channel, Choice, Combine, Control, Frame, MAX_AGENTS, MAX_CHANNELS, MAX_CLASSES, MAX_INPUTS,
+    MAX_POIS, MAX_SECTORS, MAX_TERMS, Measure, Mobility, Motion, POIS, PoiGroup, Term,
 };
-use crate::config::{Choice, Combine, Frame, MAX_AGENTS, MAX_POIS, Measure, Motion};
 use crate::model::rule::cycle;
 use crate::model::{LEAST, LONGEST};
 use crate::reader::{Allowed, Reader, Value, between, sized};

@@ -1,0 +1,307 @@
+//! Classes of agents and groups of POIs as configs describe them, `[[agents]]` and `[[pois]]`.
+
+use serde::{Serialize, Serializer};
+
+use super::motion::Mobility;
+use super::rule::Coupling;
+use crate::config_enum::config_enum;
+use crate::reader::{OneOrEach, table};
+
+/// Maximum number of classes of agents.
+pub const MAX_CLASSES: usize = 8;
+/// Maximum number of channels of a class's senses.
+pub const MAX_CHANNELS: usize = 8;
+/// Maximum number of terms of a class's rule.
+pub const MAX_TERMS: usize = 8;
+/// Maximum number of sectors of a channel.
+pub const MAX_SECTORS: usize = 16;
+
+/// Maximum number of inputs of a class's policies.
+pub const MAX_INPUTS: usize = 64;
+
+/// The name that stands for all other agents in channels and terms.
+pub const AGENTS: &str = "agents";
+/// The name that stands for POIs in channels.
+pub const POIS: &str = "pois";
+
+/// The classes of agents and the groups of POIs of a config.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Classes {
+    /// The classes of agents. Those that learn come first. Agents are numbered class by class.
+    pub agents: Vec<AgentClass>,
+    /// The groups of POIs. POIs are numbered group by group.
+    pub pois: Vec<PoiGroup>,
+}
+
+table! {
+    /// A class of agents, `[[agents]]`.
+    AgentClass = "agents" {
+        /// the class's name: letters, digits, `_` and `-`
+        name: String = "",
+        /// start positions of its agents, which are numbered class by class
+        at: Vec<[f64; 2]> = "units",
+        /// headings at the start, from the x axis towards the y axis: one number for all its agents, or one per agent
+        heading: OneOrEach<f64> = "rad",
+        /// speed at the start
+        speed: f64 = "units/s",
+        /// what decides how its agents move: a policy, which learns, its `rule`, or nothing, so that they stay where they
+        /// are; classes that learn come first
+        control: Control = "",
+        /// how its agents can move, see below
+        motion: Mobility = "",
+        /// with control = "policy": what its policies sense, channel by channel, see below
+        #[serde(skip_serializing_if = "Vec::is_empty")]
+        senses: Vec<Channel> = "",
+        /// with control = "follow": the terms of the force on its agents, see below
+        #[serde(skip_serializing_if = "Vec::is_empty")]
+        rule: Vec<Term> = "",
+        /// distance within which walls push agents that obey a rule
+        wall_radius: f64 = "units",
+        /// push of a wall for each unit nearer than the wall radius
+        wall_gain: f64 = "1/s",
+        /// classes whose agents it influences, for Df and Dt
+        #[serde(skip_serializing_if = "Vec::is_empty", serialize_with = "one_or_list")]
+        leads: Vec<String> = "",
+        /// distance up to which it influences them
+        #[serde(skip_serializing_if = "Option::is_none")]
+        influence_radius: Option<f64> = "units",
+        /// whether it counts at POIs that do not name their observers
+        observes: bool = "",
+    }
+}
+
+config_enum! {
+    /// What decides how an agent moves.
+    Control {
+        /// A policy, which learns.
+        Policy = "policy",
+        /// The class's rule.
+        Follow = "follow",
+        /// It stays where it is.
+        Still = "still",
+    }
+}
+
+table! {
+    /// One channel of senses: what agents or POIs add to the inputs of a policy, sector by sector.
+    Channel = "agents.senses" {
+        /// what it senses: agents of these classes, "agents" for all other agents, or "pois"
+        #[serde(serialize_with = "one_or_list")]
+        of: Vec<String> = "",
+        /// with of = "pois": the groups of POIs that it senses, by default all
+        #[serde(skip_serializing_if = "Vec::is_empty", serialize_with = "one_or_list")]
+        pois: Vec<String> = "",
+        /// number of sectors of equal angle, counterclockwise; each is an input
+        sectors: usize = "",
+        /// what the sectors turn with: the agent's heading, so that the first begins straight behind, or the map, so that
+        /// it begins at the x axis; always "map" with free motion
+        frame: Frame = "",
+        /// distance up to which it senses; with 0 it senses nothing; finite for "distance" and "closeness"
+        range: f64 = "units",
+        /// what something at distance d counts: 1 − d/(√2·max(map)) if linear, 1/max(d, nearest) if inverse, the square
+        /// of that, e^(−d) if exponential, d/range if distance, 1 − d/range if closeness
+        measure: Measure = "",
+        /// distance below which the inverse measures do not grow
+        nearest: f64 = "units",
+        /// how the measures of a sector become its input: their sum divided by the number of such agents or POIs in the
+        /// world, their sum, their mean, or the largest
+        combine: Combine = "",
+        /// input of a sector with nothing in it
+        empty: f64 = "",
+        /// multiplies the inputs of sectors with something in them
+        gain: f64 = "",
+    }
+}
+
+config_enum! {
+    /// What an entity at distance d counts in its sector.
+    Measure {
+        /// `1 - d/D` with D = √2·max(map).
+        Linear = "linear",
+        /// `1 / max(d, nearest)`.
+        Inverse = "inverse",
+        /// `1 / max(d, nearest)²`.
+        InverseSquared = "inverse-squared",
+        /// `exp(-d)`.
+        Exponential = "exponential",
+        /// `d / range`.
+        Distance = "distance",
+        /// `1 - d / range`.
+        Closeness = "closeness",
+    }
+}
+
+config_enum! {
+    /// How the measures of a sector become one input.
+    Combine {
+        /// Their sum divided by the number of such entities in the world.
+        Share = "share",
+        /// Their sum.
+        Sum = "sum",
+        /// Their mean.
+        Mean = "mean",
+        /// The largest of them.
+        Closest = "closest",
+    }
+}
+
+config_enum! {
+    /// What the sectors of a channel turn with.
+    Frame {
+        /// The agent's heading: the first sector begins straight behind.
+        Heading = "heading",
+        /// The map: the first sector begins at the x axis.
+        Map = "map",
+    }
+}
+
+table! {
+    /// One term of a rule. It has either a gain or an alignment.
+    Term = "agents.rule" {
+        /// agents that count: those of these classes, or "agents" for all others
+        #[serde(serialize_with = "one_or_list")]
+        of: Vec<String> = "",
+        /// distance above which they count; 0 includes those at the same place
+        from: f64 = "units",
+        /// distance up to which they count
+        to: f64 = "units",
+        /// pull towards them at the distance `to`, less in proportion when nearer; a push if negative
+        #[serde(skip_serializing_if = "Option::is_none")]
+        gain: Option<f64> = "units/s",
+        /// pull towards their mean heading
+        #[serde(skip_serializing_if = "Option::is_none")]
+        align: Option<f64> = "units/s",
+    }
+}
+
+table! {
+    /// A group of POIs, `[[pois]]`.
+    PoiGroup = "pois" {
+        /// the group's name: letters, digits, `_` and `-`
+        name: String = "",
+        /// positions of its POIs, which are numbered group by group
+        at: Vec<[f64; 2]> = "units",
+        /// weight of each POI in G
+        value: f64 = "",
+        /// agents that each POI needs at the same step; one number for all its POIs, or one per POI
+        coupling: Coupling = "agents",
+        /// distance up to which an agent observes one of its POIs
+        radius: f64 = "units",
+        /// classes whose agents count here, by default those that observe
+        #[serde(skip_serializing_if = "Vec::is_empty", serialize_with = "one_or_list")]
+        observers: Vec<String> = "",
+        /// the first and the last step, from 1, at which each POI can be observed; one pair for all, or one per POI
+        #[serde(skip_serializing_if = "Vec::is_empty")]
+        windows: Vec<[usize; 2]> = "steps",
+        /// groups whose POIs must all have been observed at earlier steps
+        #[serde(skip_serializing_if = "Vec::is_empty", serialize_with = "one_or_list")]
+        after: Vec<String> = "",
+    }
+}
+
+/// Writes a list of one name as that name.
+fn one_or_list<S: Serializer>(names: &[String], serializer: S) -> Result<S::Ok, S::Error> {
+    if let [name] = names { name.serialize(serializer) } else { names.serialize(serializer) }
+}
+
+impl Classes {
+    /// Returns the start position of each agent in units, `[agents]`.
+    pub fn starts(&self) -> Vec<[f64; 2]> {
+        self.agents.iter().flat_map(|class| class.at.iter().copied()).collect()
+    }
+
+    /// Returns each agent's heading at the start in radians, `[agents]`.
+    pub fn headings(&self) -> Vec<f64> {
+        self.agents.iter().flat_map(|class| class.heading.of_each(class.at.len())).collect()
+    }
+
+    /// Returns the index of each agent's class, `[agents]`.
+    pub fn class_of_each(&self) -> Vec<usize> {
+        let of_class = |(index, class): (usize, &AgentClass)| vec![index; class.at.len()];
+        self.agents.iter().enumerate().flat_map(of_class).collect()
+    }
+
+    /// Returns the position of each POI in units, `[pois]`.
+    pub fn places(&self) -> Vec<[f64; 2]> {
+        self.pois.iter().flat_map(|group| group.at.iter().copied()).collect()
+    }
+
+    /// Returns the index of each POI's group, `[pois]`.
+    pub fn group_of_each(&self) -> Vec<usize> {
+        let of_group = |(index, group): (usize, &PoiGroup)| vec![index; group.at.len()];
+        self.pois.iter().enumerate().flat_map(of_group).collect()
+    }
+
+    /// Returns the number of agents that each POI needs, `[pois]`.
+    pub fn couplings(&self) -> Vec<u32> {
+        self.pois.iter().flat_map(|group| group.coupling.of_each(group.at.len())).map(|count| count as u32).collect()
+    }
+
+    /// Returns the first and the last step of each POI, `[pois]`, in episodes of so many steps. Empty without windows.
+    pub fn windows(&self, steps: usize) -> Vec<[usize; 2]> {
+        if self.pois.iter().all(|group| group.windows.is_empty()) {
+            return vec![];
+        }
+        let of_group = |group: &PoiGroup| match group.windows.is_empty() {
+            true => vec![[1, steps]; group.at.len()],
+            false => group.windows.clone(),
+        };
+        self.pois.iter().flat_map(of_group).collect()
+    }
+
+    /// Returns the POIs that each POI comes after, `[pois]`. Empty if their order is free.
+    pub fn after(&self) -> Vec<Vec<usize>> {
+        if self.pois.iter().all(|group| group.after.is_empty()) {
+            return vec![];
+        }
+        let groups = self.group_of_each();
+        let of_name = |name: &String| {
+            let is_before = |(_, group): &(usize, &usize)| self.pois[**group].name == *name;
+            groups.iter().enumerate().filter(is_before).map(|(poi, _)| poi).collect::<Vec<_>>()
+        };
+        let before = |group: &PoiGroup| group.after.iter().flat_map(of_name).collect::<Vec<_>>();
+        self.pois.iter().flat_map(|group| vec![before(group); group.at.len()]).collect()
+    }
+
+    /// Reports whether the agents of a class count at a group's POIs.
+    pub fn observes(&self, class: usize, group: usize) -> bool {
+        let (class, group) = (&self.agents[class], &self.pois[group]);
+        if group.observers.is_empty() { class.observes } else { group.observers.contains(&class.name) }
+    }
+
+    /// Returns the distance up to which agents of a class influence those of a class that it leads.
+    pub fn influence_radius(&self, leader: usize, led: usize) -> Option<f64> {
+        let (leader, led) = (&self.agents[leader], &self.agents[led]);
+        let largest = || led.rule.iter().map(|term| term.to).fold(0.0, f64::max);
+        leader.leads.contains(&led.name).then(|| leader.influence_radius.unwrap_or_else(largest))
+    }
+}
+
+impl AgentClass {
+    /// Reports whether its agents learn.
+    pub fn learns(&self) -> bool {
+        self.control == Control::Policy
+    }
+
+    /// Returns the number of inputs that its policies use.
+    pub fn inputs(&self) -> usize {
+        self.senses.iter().map(|channel| channel.sectors).sum()
+    }
+
+    /// Reports whether behaviours can use its inputs, which begin with POIs and agents in the quadrants around its heading.
+    pub(crate) fn senses_quadrants(&self) -> bool {
+        let is_quadrants = |(channel, of): (&Channel, &str)| {
+            channel.of == [of] && channel.sectors == 4 && channel.frame == Frame::Heading
+        };
+        self.senses.len() >= 2 && self.senses.iter().zip([POIS, AGENTS]).all(is_quadrants)
+    }
+}
+
+impl Channel {
+    /// Reports whether an agent of a class can never sense anything with this channel.
+    pub(crate) fn is_blind(&self, class: &AgentClass, classes: &Classes) -> bool {
+        let sensed = |other: &&AgentClass| self.of.contains(&other.name) || self.of == [AGENTS];
+        let others = || classes.agents.iter().filter(sensed).map(|other| other.at.len() - usize::from(other == class));
+        self.range == 0.0 || self.of != [POIS] && others().sum::<usize>() == 0
+    }
+}
