@@ -259,11 +259,16 @@ fn rollout(
     };
     let mut observed = 0;
     let play = || {
-        observed = backend.play(&[group])?.iter().flat_map(|scores| &scores.observed).sum::<u32>();
+        observed = backend
+            .play(&[group])?
+            .iter()
+            .flat_map(|scores| &scores.observed)
+            .map(|&worth| u64::from(worth))
+            .sum::<u64>();
         Ok(())
     };
     let times = time(play, ceiling)?;
-    let mean_g = f64::from(observed) / (count * world.pois.len()) as f64;
+    let mean_g = observed as f64 / (count * world.total_worth as usize) as f64;
     let pairs = world.steps() * world.agents() * world.agents();
     let traced = (TRACED_PAIRS / pairs).clamp(1, TRACED_TEAMS).min(count);
     // The CPU traces, because every backend's trace is the same.
