@@ -61,7 +61,8 @@ fn config(scene: &Value) -> (String, Vec<Vec<usize>>) {
         // Rovers never sense hidden POIs, and others only those of their subtypes.
         let is_sensed = |poi: &Value| {
             let listed = || agent["senses_subtypes"].as_array().unwrap().contains(&poi["subtype"]);
-            text(poi, "type") != "hidden" || text(agent, "type") != "rover" && (text(poi, "subtype") == "" || listed())
+            text(poi, "type") != "hidden"
+                || text(agent, "type") != "rover" && (text(poi, "subtype").is_empty() || listed())
         };
         let sensed: Vec<String> =
             pois.iter().enumerate().filter(|(_, poi)| is_sensed(poi)).map(|(poi, _)| format!("\"poi{poi}\"")).collect();

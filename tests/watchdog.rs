@@ -322,7 +322,7 @@ fn opening_detects_an_edit_of_any_kernel() {
                 "on_lattice(exact_sqrt(d2) * gauge.slope, base) + 1",
             )
         }),
-        ("exponential measure", |text| text.replace("k * 2.12194440e-4", "k * 2.13e-4")),
+        ("exponential measure", |text| text.replace("k * 2.1219444e-4", "k * 2.13e-4")),
         ("inverse density", |text| text.replace("select(gauge.nearest2, d2, d2 > gauge.nearest2)", "1.001 * d2")),
         ("inverse-squared measure", |text| {
             text.replace("inverse * inverse * value", "inverse * 1.001 * inverse * value")

@@ -91,8 +91,8 @@ fn exp_negative(x: f32) -> f32 {
     let whole = 12582912.0;
     let raised = limited * 1.442695 + whole;
     let k = raised - whole;
-    let r = (limited - k * 0.693359375) + k * 2.12194440e-4;
-    let p = (((((r * 1.3888889e-3 - 8.3333333e-3) * r + 4.1666668e-2) * r - 0.16666667) * r + 0.5) * r - 1.0) * r + 1.0;
+    let r = (limited - k * 0.6933594) + k * 2.1219444e-4;
+    let p = (((((r * 1.3888889e-3 - 8.333333e-3) * r + 4.1666668e-2) * r - 0.16666667) * r + 0.5) * r - 1.0) * r + 1.0;
     return bitcast<f32>(bitcast<i32>(p) - (less_base(raised, whole) << 23u));
 }
 

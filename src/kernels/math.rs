@@ -134,8 +134,8 @@ pub fn exp_negative<S: Simd>(x: S::f32s) -> S::f32s {
     let whole = S::f32s::splat(simd, 12582912.0);
     let raised = x * 1.442695 + whole;
     let k = raised - whole;
-    let r = (x - k * 0.693359375) + k * 2.12194440e-4;
-    let p = (((((r * 1.3888889e-3 - 8.3333333e-3) * r + 4.1666668e-2) * r - 0.16666667) * r + 0.5) * r - 1.0) * r + 1.0;
+    let r = (x - k * 0.6933594) + k * 2.1219444e-4;
+    let p = (((((r * 1.3888889e-3 - 8.333333e-3) * r + 4.1666668e-2) * r - 0.16666667) * r + 0.5) * r - 1.0) * r + 1.0;
     let (p, exponent): (S::i32s, S::i32s) = (p.bitcast(), less_base::<S>(raised, whole));
     (p - (exponent << 23)).bitcast()
 }

@@ -73,7 +73,7 @@ impl Class {
             let mut channels = [ChannelConstants::zeroed(); MAX_CHANNELS];
             let mut input = 0;
             for (to, channel) in channels.iter_mut().zip(&class.senses) {
-                *to = ChannelConstants::new(channel, input, (&of_class, &of_group), values, end, map);
+                *to = ChannelConstants::new(channel, input, &of_class, &of_group, values, end, map);
                 input += channel.sectors;
             }
             let mut terms = [TermConstants::zeroed(); MAX_TERMS];

@@ -8,7 +8,7 @@ use fearless_simd::{Simd, prelude::*};
 use super::classes::{AGENTS, AgentClass, Term};
 use super::motion::{GRID, MapLanes, MotionLanes, rotate};
 use super::sense::NOTHING;
-use super::{LONGEST, Ranges, TINY, ranges};
+use super::{LONGEST, Ranges, TINY, one_range, ranges};
 use crate::gpu_struct::gpu_struct;
 use crate::kernels::{
     larger,
@@ -120,7 +120,7 @@ impl TermConstants {
         let [[_, offset], [_, heading]] = lattices(&class.rule, agents);
         let term = |term: &Term| {
             let ranges =
-                if term.of == [AGENTS] { ranges([0..agents]) } else { ranges(term.of.iter().map(|name| of(name))) };
+                if term.of == [AGENTS] { one_range(0..agents) } else { ranges(term.of.iter().map(|name| of(name))) };
             let scale = match term.align {
                 Some(gain) => gain * f64::from(heading),
                 None => term.gain.unwrap_or(0.0) / term.to * f64::from(offset),

@@ -61,6 +61,11 @@ pub(crate) fn ranges(runs: impl IntoIterator<Item = Range<usize>>) -> Ranges {
     joined
 }
 
+/// Returns one run.
+pub(crate) fn one_range(run: Range<usize>) -> Ranges {
+    ranges(std::iter::once(run))
+}
+
 /// Returns the runs, unused ones as empty ranges, and the number of used ones.
 #[inline(always)]
 pub(crate) fn runs(ranges: &Ranges) -> ([Range<usize>; MAX_RANGES], usize) {

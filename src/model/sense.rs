@@ -6,7 +6,7 @@ use std::ops::Range;
 use fearless_simd::{Simd, prelude::*};
 
 use super::classes::{AGENTS, Channel, Combine, Frame, MAX_SECTORS, Measure, POIS};
-use super::{LONGEST, Ranges, ranges};
+use super::{LONGEST, Ranges, one_range, ranges};
 use crate::config_enum::{Choice, config_enum};
 use crate::gpu_struct::gpu_struct;
 use crate::kernels::{
@@ -118,7 +118,8 @@ impl ChannelConstants {
     pub(crate) fn new(
         channel: &Channel,
         input: usize,
-        (class, group): (&dyn Fn(&str) -> Range<usize>, &dyn Fn(&str) -> Range<usize>),
+        class: &dyn Fn(&str) -> Range<usize>,
+        group: &dyn Fn(&str) -> Range<usize>,
         values: &[f32],
         agents: usize,
         map: [f64; 2],
@@ -126,9 +127,9 @@ impl ChannelConstants {
         let Channel { of, pois, sectors, frame, range, measure, nearest, combine, empty, gain } = channel;
         let of_pois = of == &[POIS];
         let ranges = match of_pois {
-            true if pois.is_empty() => ranges([0..values.len()]),
+            true if pois.is_empty() => one_range(0..values.len()),
             true => ranges(pois.iter().map(|name| group(name))),
-            false if of == &[AGENTS] => ranges([0..agents]),
+            false if of == &[AGENTS] => one_range(0..agents),
             false => ranges(of.iter().map(|name| class(name))),
         };
         let value = if of_pois { values.iter().copied().fold(0.0, f32::max) } else { 1.0 };

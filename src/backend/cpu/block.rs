@@ -335,7 +335,7 @@ impl Plan {
             Plan {
                 channels: class.channels().iter().map(|of| masks(model::each(&of.shape.ranges))).collect(),
                 terms,
-                leaders: (!counted).then(|| masks([leaders.clone()])),
+                leaders: (!counted).then(|| masks(std::iter::once(leaders.clone()))),
                 influences2: leading.iter().map(|class| class.constants.influence2[index]).collect(),
             }
         };
@@ -575,7 +575,7 @@ impl<S: Simd> Attraction<'_, S> {
     ) {
         let &Attraction { class, terms, agents, headings, near, others, influences2 } = self;
         let rule = &class.constants.rule;
-        let terms: &[follow::TermLanes<S>; TERMS] = terms.as_array().expect("the caller counts the terms");
+        let terms: &[follow::TermLanes<S>; TERMS] = terms.try_into().expect("the caller counts the terms");
         for ((index, follower), counts) in own.zip(followers).zip(counts.chunks_exact_mut(influences2.len())) {
             let &Agent { x, y, .. } = &agents[index];
             let mut sums = [Sum::new(x.token()); TERMS];
