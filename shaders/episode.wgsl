@@ -1,7 +1,7 @@
 // Whole episodes: a workgroup plays some teams from start to end, with state in registers and workgroup memory. Long
 // episodes take several dispatches, with the state stored in between.
 //
-// Uses: lib/layout.wgsl, lib/math.wgsl, generic.wgsl (shape, set_shape, class_shape, sense_all, obey_all, decide),
+// Uses: lib/layout.wgsl, lib/math.wgsl, generic.wgsl (shape, set_shape, class_shape, act, sense_all, obey_all, decide),
 // sense.wgsl, policy.wgsl, follow.wgsl, motion.wgsl, couple.wgsl.
 //
 // One text makes two kernels. In the specialised one all sizes and the shapes of all classes are constants. In the generic
@@ -20,6 +20,7 @@
 //   shape         the sizes
 //   set_shape     sets them for a task
 //   class_shape   the shape of a class
+//   act           the step of an agent
 //   sense_all     what an agent senses
 //   obey_all      the force of a rule's terms
 //   decide        a leader's policy
@@ -44,6 +45,7 @@ struct Shape {
 // The task's world, and the class of the agent that the thread plays.
 var<private> world: Constants;
 var<private> own: ClassConstants;
+var<private> own_class: u32;
 
 // Positions of all agents, `[agents][teams]`, after the last step and after this step. The two halves alternate, so
 // that one barrier per step is enough.
@@ -154,7 +156,7 @@ fn add_sensed(
     var f = turned(dx, dy, hx, hy);
     // What is at the same place is straight ahead.
     f.x = select(f.x, 1.0, f.x == 0.0 && f.y == 0.0);
-    let class_number = world.first_class + (*me).class_index;
+    let class_number = world.first_class + own_class;
     let first = is_after(boundary_of(class_number, index, 0u), f);
     var begun = first;
     for (var sector = 0u; sector < channel.sectors; sector++) {
@@ -235,6 +237,13 @@ fn sense_agents(
     }
 }
 
+// Returns one of some runs of agents or POIs.
+fn range_of(ranges: array<u32, 2u * MAX_RANGES>, run: u32) -> vec2<u32> {
+    let low = select(vec2(ranges[0], ranges[1]), vec2(ranges[2], ranges[3]), run == 1u);
+    let high = select(vec2(ranges[4], ranges[5]), vec2(ranges[6], ranges[7]), run == 3u);
+    return select(low, high, run > 1u);
+}
+
 // Senses one channel of the agent's class, and writes its inputs. Its team's positions start at `first`.
 fn sense_channel(
     task: Task,
@@ -244,23 +253,23 @@ fn sense_channel(
     me: ptr<function, Agent>,
     inputs: ptr<function, array<f32, INPUTS>>,
 ) {
-    let gauge = gauge_of((*me).class_index, index);
+    let gauge = gauge_of(own_class, index);
     var sensed = Sensed();
     if channel.combine == COMBINE_CLOSEST {
         for (var sector = 0u; sector < channel.sectors; sector++) {
             sensed.sums[sector] = NO_MEASURE;
         }
     }
-    if channel.of_pois != 0u {
-        sense_pois(task, channel, gauge, index, channel.ranges[0], channel.ranges[1], me, &sensed);
-        sense_pois(task, channel, gauge, index, channel.ranges[2], channel.ranges[3], me, &sensed);
-        sense_pois(task, channel, gauge, index, channel.ranges[4], channel.ranges[5], me, &sensed);
-        sense_pois(task, channel, gauge, index, channel.ranges[6], channel.ranges[7], me, &sensed);
-    } else {
-        sense_agents(first, channel, gauge, index, channel.ranges[0], channel.ranges[1], me, &sensed);
-        sense_agents(first, channel, gauge, index, channel.ranges[2], channel.ranges[3], me, &sensed);
-        sense_agents(first, channel, gauge, index, channel.ranges[4], channel.ranges[5], me, &sensed);
-        sense_agents(first, channel, gauge, index, channel.ranges[6], channel.ranges[7], me, &sensed);
+    for (var run = 0u; run < MAX_RANGES; run++) {
+        let range = range_of(channel.ranges, run);
+        if range.x == range.y {
+            break;
+        }
+        if channel.of_pois != 0u {
+            sense_pois(task, channel, gauge, index, range.x, range.y, me, &sensed);
+        } else {
+            sense_agents(first, channel, gauge, index, range.x, range.y, me, &sensed);
+        }
     }
     let input = channel.input;
     if has_quadrants(channel) {
@@ -384,22 +393,22 @@ fn obey_terms(
     me: ptr<function, Agent>,
     force: ptr<function, SteeringForce>,
 ) {
-    let one = pull_of((*me).class_index, index);
+    let one = pull_of(own_class, index);
     var two = Pull(0.0, -1.0, 0.0);
     if pair {
-        two = pull_of((*me).class_index, index + 1u);
+        two = pull_of(own_class, index + 1u);
     }
     var sums: array<Sum, 2>;
-    if !ALIGNS || term.aligns == 0u {
-        obey_range(first, term.ranges[0], term.ranges[1], one, two, me, &sums);
-        obey_range(first, term.ranges[2], term.ranges[3], one, two, me, &sums);
-        obey_range(first, term.ranges[4], term.ranges[5], one, two, me, &sums);
-        obey_range(first, term.ranges[6], term.ranges[7], one, two, me, &sums);
-    } else {
-        align_range(task, first, term.ranges[0], term.ranges[1], one, two, me, &sums);
-        align_range(task, first, term.ranges[2], term.ranges[3], one, two, me, &sums);
-        align_range(task, first, term.ranges[4], term.ranges[5], one, two, me, &sums);
-        align_range(task, first, term.ranges[6], term.ranges[7], one, two, me, &sums);
+    for (var run = 0u; run < MAX_RANGES; run++) {
+        let range = range_of(term.ranges, run);
+        if range.x == range.y {
+            break;
+        }
+        if !ALIGNS || term.aligns == 0u {
+            obey_range(first, range.x, range.y, one, two, me, &sums);
+        } else {
+            align_range(task, first, range.x, range.y, one, two, me, &sums);
+        }
     }
     add_term(one, sums[0], force);
     if pair {
@@ -423,7 +432,7 @@ fn follow(task: Task, first: u32, me: ptr<function, Agent>) {
     let y = (*me).y;
     for (var leader = 0u; leader < shape.leaders; leader++) {
         let place = positions[first + leader * shape.teams];
-        let seen = u32(within(place.x - x, place.y - y, influence_of(leader, (*me).class_index)));
+        let seen = u32(within(place.x - x, place.y - y, influence_of(leader, own_class)));
         if COUNTS_IN_REGISTERS {
             (*me).counts[leader] += seen;
         } else if seen != 0u {
@@ -550,8 +559,8 @@ fn trace(task: Task, step: u32, me: ptr<function, Agent>) {
 
 // Loads the class of the agent that the thread plays next.
 fn load_class(index: u32) {
-    let class_number = world.first_class + index;
-    own = class_constants(class_number);
+    own_class = index;
+    own = class_constants(world.first_class + index);
 }
 
 // Starts an episode.
@@ -637,15 +646,7 @@ fn episode(
         for (var slot = 0u; slot < SLOTS; slot++) {
             var me = agents[slot];
             if me.plays {
-                if SLOTS > 1u {
-                    load_class(me.class_index);
-                }
-                if me.agent < shape.leaders {
-                    lead(task, now + me.team, &me);
-                } else {
-                    follow(task, now + me.team, &me);
-                }
-                move_agent(&me);
+                act(task, now + me.team, &me);
                 positions[next + me.index] = vec2(me.x, me.y);
                 share_heading(task, next > 0u, &me);
                 if TRACE {

@@ -20,9 +20,20 @@ fn class_shape(index: u32) -> ClassShape {
     return shape_of(world.first_class + index);
 }
 
+// The step of an agent. Its team's positions start at `first`.
+fn act(task: Task, first: u32, me: ptr<function, Agent>) {
+    load_class((*me).class_index);
+    if (*me).agent < shape.leaders {
+        lead(task, first, me);
+    } else {
+        follow(task, first, me);
+    }
+    move_agent(me);
+}
+
 // Senses all channels of the agent's class.
 fn sense_all(task: Task, first: u32, me: ptr<function, Agent>, inputs: ptr<function, array<f32, INPUTS>>) {
-    let class_number = world.first_class + (*me).class_index;
+    let class_number = world.first_class + own_class;
     for (var index = 0u; index < own.channel_count; index++) {
         sense_channel(task, first, channel_of(class_number, index), index, me, inputs);
     }
@@ -30,7 +41,7 @@ fn sense_all(task: Task, first: u32, me: ptr<function, Agent>, inputs: ptr<funct
 
 // Adds all terms of the rule of the agent's class to the force. Neighbours of one shape are added together.
 fn obey_all(task: Task, first: u32, me: ptr<function, Agent>, force: ptr<function, SteeringForce>) {
-    let class_number = world.first_class + (*me).class_index;
+    let class_number = world.first_class + own_class;
     for (var index = 0u; index < own.term_count; index++) {
         let term = term_of(class_number, index);
         var pair = index + 1u < own.term_count;

@@ -24,7 +24,7 @@
 //! let played = flotilla::play(&config, &mut *backend, config.learning.population, &trained.policies[0], &Starts::Own)?;
 //! println!("the champion observes {} POIs; its leaders' D: {:?}", played.observed[0], &played.d[..4]);
 //!
-//! // Step teams by given actions, [teams][leaders][2] in -1..1, and see what leaders sense: [teams][leaders][8].
+//! // Step teams by given actions, [teams][leaders][2] in -1..1, and see what leaders sense: [teams][leaders][inputs].
 //! let mut stepper = flotilla::stepper(&config, 16, false)?;
 //! let actions = vec![0.5; 16 * 4 * 2];
 //! stepper.step(&actions)?;
@@ -44,7 +44,8 @@
 //!
 //! 1. [`config`] reads a TOML file and reports every problem in it. [`model`] has the config sections, constants and
 //!    formulas of the parts of a step.
-//! 2. [`world`] computes one experiment's constants and start state from its config.
+//! 2. [`world`] computes one experiment's constants and start state from its config. The engine knows classes of agents
+//!    only: leaders and followers of the short form are two of them.
 //! 3. [`trainer`] draws team schedules with [`evolve`] and passes the teams of all trials to a [`backend`] as one
 //!    batch.
 //! 4. The backend plays each team's whole episode: with [`model`] on the CPU, with the equivalent shaders under
@@ -60,8 +61,8 @@
 //!
 //! | to | change |
 //! |---|---|
-//! | add a density | `model/sense.rs` and its shader `shaders/sense.wgsl`, `cli/src/measure/operations.rs`; an edit of it in `tests/watchdog.rs`; `docs/explain/model.md` |
-//! | add an input | `model/sense.rs`, `shaders/sense.wgsl`, and the trace in `app/src/ops/rollout.rs` |
+//! | add a measure of senses | `model/classes.rs`, `model/sense.rs` and its shader `shaders/sense.wgsl`, `cli/src/measure/operations.rs`; an edit of it in `tests/watchdog.rs`; `docs/explain/model.md` |
+//! | add a key of classes or POIs | `model/classes.rs`, `config/classes/read.rs`; what kernels read of it in `model/class.rs` or `world.rs` |
 //! | add a fitness | `config/learning.rs`, `credit/` (`mod.rs`, `replay.rs`; `record.rs` for what it needs, `fast.rs` and `lanes.rs` for speed); then show it, because Python offers every fitness |
 //! | test a new word of a key | `cli/tests/model.rs` or `tests/credit.rs`, a line in `cli/tests/cli.rs`, a case in `tests/golden/cases.rs`; for a fitness `KINDS` in `verify.rs` and `tests/evolve.rs` |
 //! | show a fitness beside the others | `evaluate.rs`, `front/play.rs`, `app/src/ops/rollout.rs`, `app/src/report/replay/page.rs`, `python/src/play.rs`, `python/flotilla/_play.py`, `web/page/`, `docs/explain/credits.md` |

@@ -121,6 +121,9 @@ pub enum Action {
     ShiftWide,
     Swap,
     FirstLane,
+    /// A scalar register from one lane of a vector register, and the other way.
+    ReadLane,
+    WriteLane,
     /// A result and two inputs. The flag says whether they have 64 bits. The last field is the new condition code.
     Scalar(fn(u64, u64) -> u64, bool, Change),
     ScalarCompare(fn(u32, u32) -> bool),
@@ -264,13 +267,13 @@ fn instruction(text: &str, family: &str) -> (Instruction, Option<String>) {
                 .push(Operand::parse(word).unwrap_or_else(|| panic!("unknown operand {word} in `{text}`"))),
         }
     }
-    // The constants of s_movk and s_mulk have 16 bits and a sign.
+    // The constants of s_movk, s_mulk and s_addk have 16 bits and a sign.
     if let ["s", kind, ..] = name.split('_').collect::<Vec<_>>()[..]
-        && ["movk", "mulk"].contains(&kind)
+        && ["movk", "mulk", "addk"].contains(&kind)
         && let Some(Operand { place: Place::Constant(bits, wide), .. }) = parsed.operands.last_mut()
     {
         (*bits, *wide) = (*bits as i16 as u32, *bits as i16 as u64);
-        if kind == "mulk" {
+        if kind != "movk" {
             parsed.operands.insert(1, parsed.operands[0]);
         }
     }
@@ -347,7 +350,7 @@ fn action(name: &str, rest: &str) -> Option<Action> {
     match name {
         "endpgm" => Some(Action::End),
         "barrier" => Some(Action::Barrier),
-        "clause" => Some(Action::Nothing),
+        "clause" | "sendmsg" => Some(Action::Nothing),
         "branch" => Some(Action::Branch(When::Always)),
         "cbranch_scc0" => Some(Action::Branch(When::Condition(false))),
         "cbranch_scc1" => Some(Action::Branch(When::Condition(true))),
@@ -363,6 +366,7 @@ fn words(name: &str) -> Option<usize> {
     match name.rsplit('_').next()? {
         "dword" | "b32" => Some(1),
         "dwordx2" | "b64" => Some(2),
+        "dwordx3" | "b96" => Some(3),
         "dwordx4" | "b128" => Some(4),
         _ => None,
     }
@@ -373,6 +377,8 @@ fn integer_comparison(kind: &str, relation: &str) -> Option<fn(u32, u32) -> bool
     Some(match (kind, relation) {
         ("i32", "lt") => |a, b| (a as i32) < b as i32,
         ("i32", "ge") => |a, b| a as i32 >= b as i32,
+        ("i32", "gt") => |a, b| a as i32 > b as i32,
+        ("i32", "le") => |a, b| a as i32 <= b as i32,
         ("u32", "lt") => |a, b| a < b,
         ("u32", "le") => |a, b| a <= b,
         ("u32", "gt") => |a, b| a > b,
@@ -391,6 +397,11 @@ fn vector_action(name: &str) -> Option<Action> {
         let (narrows, comparison) = comparison.strip_prefix('x').map_or((false, comparison), |rest| (true, rest));
         let (relation, kind) = comparison.strip_prefix('_')?.split_once('_')?;
         let holds: fn(u32, u32) -> bool = match (kind, relation) {
+            ("f32", "nlt") => |a, b| !(f(a) < f(b)),
+            ("f32", "ngt") => |a, b| !(f(a) > f(b)),
+            ("f32", "nle") => |a, b| !(f(a) <= f(b)),
+            ("f32", "nge") => |a, b| !(f(a) >= f(b)),
+            ("f32", "eq") => |a, b| f(a) == f(b),
             ("f32", "lt") => |a, b| f(a) < f(b),
             ("f32", "le") => |a, b| f(a) <= f(b),
             ("f32", "gt") => |a, b| f(a) > f(b),
@@ -404,10 +415,12 @@ fn vector_action(name: &str) -> Option<Action> {
         "add_f32" => float(|[a, b, _]| (f(a) + f(b)).to_bits()),
         "sub_f32" => float(|[a, b, _]| (f(a) - f(b)).to_bits()),
         // These round the product and the sum.
-        "mad_f32" | "madak_f32" => float(|[a, b, c]| (f(a) * f(b) + f(c)).to_bits()),
+        "mad_f32" | "madak_f32" | "madmk_f32" => float(|[a, b, c]| (f(a) * f(b) + f(c)).to_bits()),
         "mac_f32" => Some(Accumulates(|[a, b, c]| (f(a) * f(b) + f(c)).to_bits())),
-        "fma_f32" | "fmaak_f32" => float(|[a, b, c]| f(a).mul_add(f(b), f(c)).to_bits()),
+        "fma_f32" | "fmaak_f32" | "fmamk_f32" => float(|[a, b, c]| f(a).mul_add(f(b), f(c)).to_bits()),
         "fmac_f32" => Some(Accumulates(|[a, b, c]| f(a).mul_add(f(b), f(c)).to_bits())),
+        "max_f32" => float(|[a, b, _]| f(a).max(f(b)).to_bits()),
+        "min_f32" => float(|[a, b, _]| f(a).min(f(b)).to_bits()),
         "floor_f32" => float(|[a, ..]| f(a).floor().to_bits()),
         // Chips may err by a unit in the last place. The compiler uses this for integer division, and corrects the
         // result.
@@ -428,6 +441,11 @@ fn vector_action(name: &str) -> Option<Action> {
         "lshl_add_u32" => integer(|[a, b, c]| (a << (b & 31)).wrapping_add(c)),
         "lshlrev_b32" => integer(|[a, b, _]| b << (a & 31)),
         "lshrrev_b32" => integer(|[a, b, _]| b >> (a & 31)),
+        "ashrrev_i32" => integer(|[a, b, _]| (b as i32 >> (a & 31)) as u32),
+        "bfrev_b32" => integer(|[a, ..]| a.reverse_bits()),
+        "max_i32" => integer(|[a, b, _]| (a as i32).max(b as i32) as u32),
+        "min_i32" => integer(|[a, b, _]| (a as i32).min(b as i32) as u32),
+        "cvt_f32_i32" => float(|[a, ..]| (a as i32 as f32).to_bits()),
         "bfe_u32" => integer(|[a, b, c]| a >> (b & 31) & ((1u32 << (c & 31)) - 1)),
         "max_u32" => integer(|[a, b, _]| a.max(b)),
         "min_u32" => integer(|[a, b, _]| a.min(b)),
@@ -441,6 +459,8 @@ fn vector_action(name: &str) -> Option<Action> {
         "lshrrev_b64" => Some(Action::ShiftWide),
         "swap_b32" => Some(Action::Swap),
         "readfirstlane_b32" => Some(Action::FirstLane),
+        "readlane_b32" => Some(Action::ReadLane),
+        "writelane_b32" => Some(Action::WriteLane),
         _ => None,
     }
 }
@@ -461,14 +481,17 @@ fn scalar_action(name: &str) -> Option<Action> {
         ("or", "b32" | "b64") => scalar(|a, b| a | b, NotZero),
         ("andn2" | "and_not1", "b32" | "b64") => scalar(|a, b| a & !b, NotZero),
         ("add", "u32") => scalar(|a, b| a + b, Carry),
-        ("add", "i32") => scalar(|a, b| a.wrapping_add(b), Overflow),
+        ("add" | "addk", "i32") => scalar(|a, b| a.wrapping_add(b), Overflow),
         ("sub", "i32") => scalar(|a, b| a.wrapping_sub(b), OverflowDown),
         ("mul" | "mulk", "i32") => scalar(|a, b| a.wrapping_mul(b), Kept),
         ("mul_hi", "u32") => scalar(|a, b| (a * b) >> 32, Kept),
         ("lshl", "b32") => scalar(|a, b| a << (b & 31), NotZero),
         ("lshr", "b32") => scalar(|a, b| a >> (b & 31), NotZero),
+        ("ashr", "i32") => scalar(|a, b| (a as i32 >> (b & 31)) as u32 as u64, NotZero),
         ("lshl3_add", "u32") => scalar(|a, b| (a << 3) + b, Carry),
         ("min", "u32") => scalar(|a, b| a.min(b), Kept),
+        ("min", "i32") => scalar(|a, b| (a as i32).min(b as i32) as u32 as u64, Kept),
+        ("max", "i32") => scalar(|a, b| (a as i32).max(b as i32) as u32 as u64, Kept),
         ("max", "u32") => scalar(|a, b| a.max(b), Kept),
         ("cselect", "b32" | "b64") => Some(Action::ScalarSelect(wide)),
         ("and_saveexec", _) => Some(Action::SaveLanes),

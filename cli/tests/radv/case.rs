@@ -110,6 +110,9 @@ impl Case {
         let cost = chip.run(assembly, self.workgroup.threads, &mut buffers);
         let compare = |binding: usize, expected: &[u32]| {
             assert_eq!(buffers[binding].len(), expected.len());
+            let d: Vec<_> =
+                buffers[binding].iter().zip(expected).enumerate().filter(|(_, (a, b))| a != b).take(6).collect();
+            eprintln!("YY {} binding {binding} of {}: {d:x?}", self.name, expected.len());
             buffers[binding].iter().zip(expected).filter(|(a, b)| a != b).count()
         };
         let differences = compare(RECORD, &self.record) + compare(STATES, &self.states);
@@ -134,10 +137,10 @@ impl Case {
         match (pass, self.kernel) {
             (_, Kernel::Generic) => 0.0,
             _ if self.is_limited => 0.0,
-            (Pass::Guarded, _) => 0.4,
+            (Pass::Guarded, _) => 0.33,
             // On RDNA 3, kernels use fewer registers and wait longer for memory.
-            _ if self.name.starts_with("chaotic") || chip.family == "GFX1100" => 0.6,
-            _ => 0.7,
+            _ if self.name.starts_with("chaotic") || chip.family == "GFX1100" => 0.52,
+            _ => 0.61,
         }
     }
 }

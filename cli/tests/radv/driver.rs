@@ -7,7 +7,7 @@ use std::ffi::{CStr, c_char};
 use ash::{Device, Entry, Instance, khr, vk};
 
 /// Number of bindings in group 0 of every shader: a uniform buffer, and then storage buffers.
-const BINDINGS: u32 = 8;
+const BINDINGS: u32 = 9;
 
 /// A compiled shader.
 #[derive(Debug)]

@@ -365,6 +365,15 @@ impl Wave {
                 let value = self.read(&operands[1], lane);
                 self.write_scalar(&operands[0], value.into(), false);
             }
+            Action::ReadLane => {
+                let lane = self.read_scalar(&operands[2], false) as usize;
+                let value = self.vector_registers[operands[1].vector()][lane];
+                self.write_scalar(&operands[0], value.into(), false);
+            }
+            Action::WriteLane => {
+                let lane = self.read_scalar(&operands[2], false) as usize;
+                self.vector_registers[operands[0].vector()][lane] = self.read_scalar(&operands[1], false) as u32;
+            }
             Action::Scalar(work, wide, condition) => {
                 let a = self.read_scalar(&operands[1], wide);
                 let b = operands.get(2).map_or(0, |operand| self.read_scalar(operand, wide));

@@ -6,7 +6,7 @@ use std::fmt::Write;
 use super::exact;
 use super::shape::{Capacity, ClassKind, MAX_THREADS, ROLE, Recorded, Shape, Sizes, TEAMS, WIDTHS, WORKGROUPS};
 use crate::backend::{MOMENT_WORDS, VECTOR};
-use crate::config::{Config, MAX_AGENTS, MAX_SECTORS, Policy};
+use crate::config::{Config, Control, MAX_AGENTS, MAX_SECTORS, Policy};
 use crate::evolve::{MAX_WEIGHT, MIN_WEIGHT, UNCHANGED};
 use crate::gpu_struct::{GpuStruct, gpu_constants, gpu_struct};
 use crate::model;
@@ -305,9 +305,17 @@ fn straight_classes(kinds: &[ClassKind]) -> String {
     }
     text += &format!("    return {};\n}}\n", last.shape.literal());
     let parameters = "task: Task, first: u32, me: ptr<function, Agent>";
+    // With the class as a constant, all threads load the same numbers of it, once per wave.
+    text += &format!("fn act({parameters}) {{\n");
+    for (class, kind) in kinds.iter().enumerate() {
+        let role = if kind.shape.control() == Control::Policy { "lead" } else { "follow" };
+        text += &format!("    if (*me).class_index == {class}u {{\n        load_class({class}u);\n");
+        text += &format!("        {role}(task, first, me);\n        move_agent(me);\n        return;\n    }}\n");
+    }
+    text += "}\n";
     text += &format!("fn sense_all({parameters}, inputs: ptr<function, array<f32, INPUTS>>) {{\n");
     for (class, kind) in kinds.iter().enumerate().filter(|(_, kind)| !kind.channels.is_empty()) {
-        text += &format!("    if (*me).class_index == {class}u {{\n");
+        text += &format!("    if own_class == {class}u {{\n");
         for (index, channel) in kind.channels.iter().enumerate() {
             text += &format!("        sense_channel(task, first, {}, {index}u, me, inputs);\n", channel.literal());
         }
@@ -315,7 +323,7 @@ fn straight_classes(kinds: &[ClassKind]) -> String {
     }
     text += &format!("}}\nfn obey_all({parameters}, force: ptr<function, SteeringForce>) {{\n");
     for (class, kind) in kinds.iter().enumerate().filter(|(_, kind)| !kind.terms.is_empty()) {
-        text += &format!("    if (*me).class_index == {class}u {{\n");
+        text += &format!("    if own_class == {class}u {{\n");
         let mut index = 0;
         for terms in kind.terms.chunk_by(|a, b| a == b).flat_map(|terms| terms.chunks(2)) {
             let (term, pair) = (terms[0].literal(), terms.len() == 2);
