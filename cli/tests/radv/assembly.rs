@@ -1,6 +1,7 @@
 //! Parses RADV's assembly. Only those of AMD's instructions are known that the kernels use. Any other instruction is a
 //! panic that names it.
 
+use std::cmp::Ordering;
 use std::collections::HashMap;
 use std::ops::Range;
 
@@ -397,10 +398,8 @@ fn vector_action(name: &str) -> Option<Action> {
         let (narrows, comparison) = comparison.strip_prefix('x').map_or((false, comparison), |rest| (true, rest));
         let (relation, kind) = comparison.strip_prefix('_')?.split_once('_')?;
         let holds: fn(u32, u32) -> bool = match (kind, relation) {
-            ("f32", "nlt") => |a, b| !(f(a) < f(b)),
-            ("f32", "ngt") => |a, b| !(f(a) > f(b)),
-            ("f32", "nle") => |a, b| !(f(a) <= f(b)),
-            ("f32", "nge") => |a, b| !(f(a) >= f(b)),
+            ("f32", "nlt") => |a, b| f(a).partial_cmp(&f(b)) != Some(Ordering::Less),
+            ("f32", "ngt") => |a, b| f(a).partial_cmp(&f(b)) != Some(Ordering::Greater),
             ("f32", "eq") => |a, b| f(a) == f(b),
             ("f32", "lt") => |a, b| f(a) < f(b),
             ("f32", "le") => |a, b| f(a) <= f(b),

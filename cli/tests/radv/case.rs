@@ -110,9 +110,6 @@ impl Case {
         let cost = chip.run(assembly, self.workgroup.threads, &mut buffers);
         let compare = |binding: usize, expected: &[u32]| {
             assert_eq!(buffers[binding].len(), expected.len());
-            let d: Vec<_> =
-                buffers[binding].iter().zip(expected).enumerate().filter(|(_, (a, b))| a != b).take(6).collect();
-            eprintln!("YY {} binding {binding} of {}: {d:x?}", self.name, expected.len());
             buffers[binding].iter().zip(expected).filter(|(a, b)| a != b).count()
         };
         let differences = compare(RECORD, &self.record) + compare(STATES, &self.states);
