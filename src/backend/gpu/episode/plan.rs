@@ -802,12 +802,12 @@ mod tests {
             check(&both, 1 << 24, [1 << 26, 65_535], Records::Whole, false),
             // Agents that wait between two dispatches count towards a batch, too.
             check(&[(27_000, &long)], 1 << 20, FREE, Records::Whole, false),
-            // With one team per group, worlds and positions take more than records and weights.
+            // With one team per group, classes of agents take more than records and weights.
             check(&[(1, &short); 1000], 1 << 20, FREE, Records::Whole, false),
         ];
         let one_batch = [[1, 1, 1], [1, 1, 1], [1, 1, 2], [1, 1, 38 + 19], [1, 75 + 38 + 1, 75 + 38], [1, 94, 94]];
         assert_eq!(found[..6], one_batch);
-        assert_eq!(found[6..], [[133, 133, 266], [4, 4, 4]]);
+        assert_eq!(found[6..], [[133, 133, 266], [5, 5, 5]]);
         assert_eq!(state_bytes(&long, RecordRequest(&[Fitness::Df])), 256 * 20);
     }
 }
