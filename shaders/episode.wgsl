@@ -312,34 +312,6 @@ fn pull_of(class_number: u32, index: u32) -> Pull {
     return Pull((*term).inner2, (*term).outer2, (*term).scale);
 }
 
-// Adds the agents from `begin` to before `end` to two terms.
-fn obey_range(
-    first: u32,
-    begin: u32,
-    end: u32,
-    one: Pull,
-    two: Pull,
-    me: ptr<function, Agent>,
-    sums: ptr<function, array<Sum, 2>>,
-) {
-    for (var other = begin; other < end; other++) {
-        let place = positions[first + other * shape.teams];
-        let dx = place.x - (*me).x;
-        let dy = place.y - (*me).y;
-        let d2 = dx * dx + dy * dy;
-        if other != (*me).agent && bitcast<i32>(d2) <= max(bitcast<i32>(one.outer2), bitcast<i32>(two.outer2)) {
-            let x = on_lattice(dx, own.offset_base);
-            let y = on_lattice(dy, own.offset_base);
-            var sum = (*sums)[0];
-            add_to_term(one, d2, x, y, &sum);
-            (*sums)[0] = sum;
-            sum = (*sums)[1];
-            add_to_term(two, d2, x, y, &sum);
-            (*sums)[1] = sum;
-        }
-    }
-}
-
 // Returns the index of an agent's state before a step. If ALIGNS, there are two of each, which alternate as positions do.
 fn state_of(task: Task, second: bool, team: u32, agent: u32) -> u32 {
     return task.states + (select(0u, task.teams, second) + team) * shape.agents + agent;
@@ -353,10 +325,11 @@ fn share_heading(task: Task, second: bool, me: ptr<function, Agent>) {
     }
 }
 
-// Adds the headings of the agents from `begin` to before `end` to two terms.
-fn align_range(
+// Adds the offsets or the headings of the agents from `begin` to before `end` to two terms.
+fn obey_range(
     task: Task,
     first: u32,
+    aligns: bool,
     begin: u32,
     end: u32,
     one: Pull,
@@ -370,9 +343,13 @@ fn align_range(
         let dy = place.y - (*me).y;
         let d2 = dx * dx + dy * dy;
         if other != (*me).agent && bitcast<i32>(d2) <= max(bitcast<i32>(one.outer2), bitcast<i32>(two.outer2)) {
-            let state = &states[state_of(task, first >= SHARED, (*me).team, other)];
-            let x = on_lattice((*state).hx, own.heading_base);
-            let y = on_lattice((*state).hy, own.heading_base);
+            var x = on_lattice(dx, own.offset_base);
+            var y = on_lattice(dy, own.offset_base);
+            if aligns {
+                let state = &states[state_of(task, first >= SHARED, (*me).team, other)];
+                x = on_lattice((*state).hx, own.heading_base);
+                y = on_lattice((*state).hy, own.heading_base);
+            }
             var sum = (*sums)[0];
             add_to_term(one, d2, x, y, &sum);
             (*sums)[0] = sum;
@@ -404,11 +381,7 @@ fn obey_terms(
         if range.x == range.y {
             break;
         }
-        if !ALIGNS || term.aligns == 0u {
-            obey_range(first, range.x, range.y, one, two, me, &sums);
-        } else {
-            align_range(task, first, range.x, range.y, one, two, me, &sums);
-        }
+        obey_range(task, first, ALIGNS && term.aligns != 0u, range.x, range.y, one, two, me, &sums);
     }
     add_term(one, sums[0], force);
     if pair {

@@ -144,7 +144,7 @@ pub struct Evaluation {
     pub leaders: usize,
     /// Number of POIs.
     pub pois: usize,
-    /// What the observed POIs are worth, `[teams]`.
+    /// The summed worth of the observed POIs, `[teams]`.
     pub observed: Vec<Tally>,
     /// Sum of that over all teams, per episode.
     pub together: Tally,
@@ -152,7 +152,7 @@ pub struct Evaluation {
     credits: Vec<[f64; 4]>,
     /// Whether Dt was requested.
     timed: bool,
-    /// What all POIs are worth.
+    /// The summed worth of all POIs.
     worth: f64,
 }
 

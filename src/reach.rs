@@ -108,7 +108,7 @@ pub fn travel(config: &Config, class: &AgentClass, steps: usize) -> Vec<f64> {
     std::iter::once(0.0).chain((0..steps).map(step)).collect()
 }
 
-/// How far agents travel, and how far from each POI its observers start.
+/// The distances that agents travel, and those from each POI at which its observers start.
 struct Distances {
     /// The maximum distance that an agent of each class travels, `[classes][steps + 1]`.
     travel: Vec<Vec<f64>>,

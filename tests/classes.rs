@@ -8,6 +8,7 @@ use flotilla::config::{
 };
 use flotilla::reader::Document;
 use flotilla::sample;
+use flotilla::world::World;
 use proptest::collection::vec;
 use proptest::prelude::*;
 
@@ -687,4 +688,23 @@ proptest! {
             Err(error) => prop_assert!(error.to_string().contains("x.toml")),
         }
     }
+}
+
+/// Kernels have room for four runs of neighbouring groups per channel.
+#[test]
+fn a_channel_names_at_most_four_runs_of_groups() {
+    let read = |named: &str| {
+        let mut text = format!(
+            "[[agents]]\nname = \"rover\"\nat = [[5, 5]]\nsenses = [\n{{ of = \"pois\", pois = [{named}] }},\n]\n"
+        );
+        for group in ["a", "b", "c", "d", "e", "f", "g", "h", "i"] {
+            text += &format!("[[pois]]\nname = \"{group}\"\nat = [[9, 9]]\ncoupling = 1\n");
+        }
+        Config::parse(&text, "runs.toml").map(|config| World::new(&config.validate().unwrap()).pois.len())
+    };
+    assert_eq!(read(r#""a", "c", "d", "f", "h""#), Ok(9));
+    let error = read(r#""a", "c", "e", "g", "i""#).unwrap_err().to_string();
+    let expected =
+        "runs.toml:5: agents[0].senses[0].pois: found 5 runs of neighbouring groups, allowed up to 4: reorder [[pois]]";
+    assert_eq!(error, expected);
 }

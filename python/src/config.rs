@@ -96,7 +96,7 @@ impl Config {
         if negative { f64::NEG_INFINITY } else { 0.0 }
     }
 
-    /// What each POI is worth, as a multiple of a common unit.
+    /// The worth of each POI, as a multiple of a common unit.
     #[getter]
     fn worth(&self) -> PyResult<Vec<u32>> {
         Ok(World::new(&self.0.validate().raise()?).worth.clone())

@@ -14,7 +14,7 @@ const ZEROED_TOGETHER: usize = 1 << 16;
 /// The scores of one group's teams.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct GroupScores {
-    /// What the observed POIs are [worth](crate::world::WorldParts::worth), `[teams]`: with equal values, their number.
+    /// The summed [worth](crate::world::WorldParts::worth) of the observed POIs, `[teams]`: with equal values, their number.
     pub observed: Vec<u32>,
     /// The leaders' scores, `[teams][fitnesses][leaders]`.
     pub scores: Vec<f32>,
@@ -23,7 +23,7 @@ pub struct GroupScores {
 /// The scores of the groups of a batch. Several threads may write at a time; each team is scored once.
 pub(crate) struct ScoreTable<'a> {
     groups: &'a [Group<'a>],
-    /// What the observed POIs are worth, `[teams]` per group.
+    /// The summed worth of the observed POIs, `[teams]` per group.
     observed: Vec<Vec<AtomicU32>>,
     /// Scores, f32 as bits, `[teams][fitnesses][leaders]` per group.
     scores: Vec<Vec<AtomicU32>>,

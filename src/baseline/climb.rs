@@ -64,8 +64,8 @@ pub(super) struct Climber {
     genome: Genome,
     /// The best team so far. Empty before the first round.
     parent: Vec<f32>,
-    /// POIs that it observes in the episodes of this generation.
-    observed: u32,
+    /// Summed worth of the POIs that it observes in the episodes of this generation.
+    observed: u64,
     /// The teams of this round, `[teams][numbers]`.
     teams: Vec<f32>,
 }
@@ -76,7 +76,7 @@ impl Climber {
     }
 
     /// Returns POIs that the best team observes in the episodes of its last generation.
-    pub(super) fn observed(&self) -> u32 {
+    pub(super) fn observed(&self) -> u64 {
         self.observed
     }
 
@@ -127,7 +127,7 @@ impl Climber {
     }
 
     /// Keeps the best of a round's teams, which observed these POIs. Ties go to the last, so that teams drift.
-    pub(super) fn select(&mut self, observed: &[u32]) {
+    pub(super) fn select(&mut self, observed: &[u64]) {
         let best = self.teams().zip(observed).max_by_key(|&(_, &observed)| observed);
         if let Some((team, &observed)) = best.filter(|&(_, &found)| self.parent.is_empty() || found >= self.observed) {
             (self.parent, self.observed) = (team.to_vec(), observed);
@@ -161,14 +161,15 @@ pub(super) fn by_population(climber: &Climber, parameters: usize, weights: &mut 
 ///
 /// # Errors
 /// There is too little memory.
-pub(super) fn play_segments(world: &World, teams: &[(&[f32], &[Vec<Vec2>])]) -> Result<Vec<u32>, BackendError> {
+pub(super) fn play_segments(world: &World, teams: &[(&[f32], &[Vec<Vec2>])]) -> Result<Vec<u64>, BackendError> {
     let failed = |error: crate::stepping::StepError| BackendError::InvalidInput(error.to_string());
     let mut observed = vec![0; teams.len()];
     let Some((_, starts)) = teams.first() else { return Ok(observed) };
     let mut stepper = Stepper::new(world.clone(), teams.len(), Recording::None).map_err(failed)?;
     let (steps, mut actions) = (world.steps(), Vec::new());
-    // The largest turn per step of a leader, as a fraction of a half turn.
+    // The largest turn per step of each leader, as a fraction of a half turn.
     let most = |leader: usize| world.class_of(leader).constants.motion.max_turn / std::f32::consts::PI;
+    let most: Vec<f32> = (0..world.leaders()).map(most).collect();
     for episode in 0..starts.len() {
         let starts: Vec<f32> =
             teams.iter().flat_map(|(_, starts)| &starts[episode]).flat_map(|place| place.to_array()).collect();
@@ -177,9 +178,9 @@ pub(super) fn play_segments(world: &World, teams: &[(&[f32], &[Vec<Vec2>])]) -> 
             let segment = step * SEGMENTS / steps;
             let turns = (step - (segment * steps).div_ceil(SEGMENTS)) as f32;
             actions.clear();
-            let leaders = teams.iter().flat_map(|(team, _)| team.chunks_exact(SEGMENTS * OUTPUTS).enumerate());
-            for (index, leader) in leaders {
-                let turned = most(index) * turns;
+            let leaders = teams.iter().flat_map(|(team, _)| team.chunks_exact(SEGMENTS * OUTPUTS).zip(&most));
+            for (leader, most) in leaders {
+                let turned = most * turns;
                 let [turn, speed] = [0, 1].map(|output| leader[segment * OUTPUTS + output]);
                 actions.extend([turn.signum() * (turn.abs() - turned).max(0.0), speed]);
             }
@@ -188,7 +189,7 @@ pub(super) fn play_segments(world: &World, teams: &[(&[f32], &[Vec<Vec2>])]) -> 
         let all = stepper.observed().chunks_exact(world.pois.len());
         for (total, pois) in observed.iter_mut().zip(all) {
             let observed = pois.iter().zip(&world.worth).filter(|(observed, _)| **observed);
-            *total += observed.map(|(_, worth)| worth).sum::<u32>();
+            *total += observed.map(|(_, &worth)| u64::from(worth)).sum::<u64>();
         }
     }
     Ok(observed)

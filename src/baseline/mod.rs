@@ -153,15 +153,15 @@ struct Trial {
     weights: Vec<f32>,
     /// `[episodes][agents]`, with POIs if they move.
     starts: Vec<Vec<Vec2>>,
-    /// POIs observed in all episodes of the current generation: by the constants that play, then by each kind of
+    /// Summed worth of the POIs observed in all episodes of the current generation: by the constants that play, then by each kind of
     /// [`RANDOM`] teams.
-    observed: Vec<u32>,
-    /// POIs that each constant observed when it last played.
-    last_constants: Vec<u32>,
-    /// POIs that each constant observed in all generations.
+    observed: Vec<u64>,
+    /// The same of each constant when it last played.
+    last_constants: Vec<u64>,
+    /// The same of each constant in all generations.
     constants: Vec<u64>,
     /// The random teams of each kind that observed most, best first.
-    finalists: [Vec<(u32, Team)>; RANDOM.len()],
+    finalists: [Vec<(u64, Team)>; RANDOM.len()],
     /// `None` if only random teams are wanted.
     climbers: Option<Climbers>,
 }
@@ -297,7 +297,7 @@ fn climb(
             .iter()
             .flat_map(|(trial, climbers)| climbers.segments.teams().map(|team| (team, &trial.starts[..])));
         observed.extend(
-            play_segments(&setting.world, &open_loop.collect::<Vec<_>>())?.chunks(teams.max(1)).map(<[u32]>::to_vec),
+            play_segments(&setting.world, &open_loop.collect::<Vec<_>>())?.chunks(teams.max(1)).map(<[u64]>::to_vec),
         );
     }
     let networks = play(backend, &rounds)?;
@@ -319,9 +319,9 @@ struct Round<'a> {
     starts: &'a [Vec<Vec2>],
 }
 
-/// Plays all teams from all their starts as one batch. Returns the POIs that each team of each round observes over all
-/// starts, `[rounds][teams]`.
-fn play(backend: &mut dyn Backend, rounds: &[Round<'_>]) -> Result<Vec<Vec<u32>>, BackendError> {
+/// Plays all teams from all their starts as one batch. Returns the summed worth of the POIs that each team of each round
+/// observes over all starts, `[rounds][teams]`.
+fn play(backend: &mut dyn Backend, rounds: &[Round<'_>]) -> Result<Vec<Vec<u64>>, BackendError> {
     let teams = |round: &Round<'_>| evolve::aligned_teams(round.teams, round.world.leaders());
     let teams: Vec<Vec<u32>> = rounds.iter().map(teams).collect();
     let mut groups = Vec::new();
@@ -340,7 +340,7 @@ fn play(backend: &mut dyn Backend, rounds: &[Round<'_>]) -> Result<Vec<Vec<u32>>
     let of_round = |round: &Round<'_>| {
         let mut observed = vec![0; round.teams];
         for scores in scores.by_ref().take(round.starts.len()) {
-            observed.iter_mut().zip(scores.observed).for_each(|(sum, observed)| *sum += observed);
+            observed.iter_mut().zip(scores.observed).for_each(|(sum, observed)| *sum += u64::from(observed));
         }
         observed
     };
@@ -495,13 +495,13 @@ impl Setting {
                 trial.last_constants = constants.to_vec();
             }
             let constants = &trial.last_constants;
-            trial.constants.iter_mut().zip(constants).for_each(|(sum, &observed)| *sum += u64::from(observed));
+            trial.constants.iter_mut().zip(constants).for_each(|(sum, &observed)| *sum += observed);
             let most = constants.iter().copied().max().unwrap_or(0);
-            self.found.constant[place].push(f64::from(most) / whole);
+            self.found.constant[place].push(most as f64 / whole);
             let Baseline { actions, random: networks, shared, open_loop, hill_climbing, .. } = &mut self.found;
             if let Some(climbers) = &trial.climbers {
-                open_loop[place].push(f64::from(climbers.segments.observed()) / whole);
-                hill_climbing[place].push(f64::from(climbers.networks.observed()) / whole);
+                open_loop[place].push(climbers.segments.observed() as f64 / whole);
+                hill_climbing[place].push(climbers.networks.observed() as f64 / whole);
             }
             let kinds = random.chunks_exact(self.config.learning.teams()).zip([actions, networks, shared]).zip(RANDOM);
             for (((observed, best), team), finalists) in kinds.zip(&mut trial.finalists) {
@@ -514,7 +514,7 @@ impl Setting {
                         finalists.truncate(FINALISTS);
                     }
                 }
-                best.push(f64::from(finalists[0].0) / whole);
+                best.push(finalists[0].0 as f64 / whole);
             }
         }
     }
@@ -524,9 +524,9 @@ impl Setting {
         let all: Vec<Team> = (0..self.constants.len()).map(Team::Constant).collect();
         if !self.moves() {
             let whole = (self.world.total_worth as usize * episodes_per_team) as f64;
-            let [action, network, shared] = [0, 1, 2].map(|kind| f64::from(trial.finalists[kind][0].0) / whole);
+            let [action, network, shared] = [0, 1, 2].map(|kind| trial.finalists[kind][0].0 as f64 / whole);
             let climbed = |of: fn(&Climbers) -> &Climber| {
-                trial.climbers.as_ref().map_or(0.0, |climbers| f64::from(of(climbers).observed()) / whole)
+                trial.climbers.as_ref().map_or(0.0, |climbers| of(climbers).observed() as f64 / whole)
             };
             let open_loop = climbed(|climbers| &climbers.segments);
             let hill_climbing = climbed(|climbers| &climbers.networks);
@@ -565,9 +565,9 @@ impl Setting {
         let held_out = Starts::Drawn { episodes, seed: 0, jitter: start_jitter, poi_jitter };
         let starts: Vec<Vec<Vec2>> = (0..episodes as usize).map(|episode| held_out.of(episode, &self.world)).collect();
         let whole = (self.world.total_worth as usize * starts.len()) as f64;
-        let mut g: Vec<f64> = played(&chosen, &starts)?.into_iter().map(|count| f64::from(count) / whole).collect();
+        let mut g: Vec<f64> = played(&chosen, &starts)?.into_iter().map(|count| count as f64 / whole).collect();
         let open_loop = match &trial.climbers {
-            Some(climbers) => f64::from(play_segments(world, &[(climbers.segments.best(), &starts)])?[0]) / whole,
+            Some(climbers) => play_segments(world, &[(climbers.segments.best(), &starts)])?[0] as f64 / whole,
             None => 0.0,
         };
         let others = g.split_off(all.len());

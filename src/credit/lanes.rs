@@ -16,15 +16,15 @@ use crate::world::World;
 /// So one pass is enough, which skips the sets that the kept set before or the next set contains.
 pub(crate) struct LaneCredit<S: Simd> {
     simd: S,
-    /// What the observed POIs are worth.
+    /// The summed worth of the observed POIs.
     observed: S::u32s,
-    /// What the POIs are worth that are lost without each leader, or without its group, `[leaders]`.
+    /// The summed worth of the POIs that are lost without each leader, or without its group, `[leaders]`.
     lost: Vec<S::u32s>,
     /// The leaders without whom, or without whose groups, the POI is lost, `[words]`.
     critical: Vec<S::u32s>,
     /// The agents of each leader's group, `[leaders][words]`.
     groups: Vec<S::u32s>,
-    /// What all POIs are worth, and each worth as a share of it, `[total + 1]`; empty if that is large.
+    /// The summed worth of all POIs, and each sum up to it as a share, `[total + 1]`; empty if that is large.
     total: u32,
     shares: Vec<f32>,
 }

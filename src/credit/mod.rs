@@ -29,7 +29,7 @@ use crate::world::World;
 /// Every fitness of one team. Each difference is `[leaders]`.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Scores {
-    /// What the observed POIs are [worth](crate::world::WorldParts::worth); their number if they have equal values. Without
+    /// The summed [worth](crate::world::WorldParts::worth) of the observed POIs; their number with equal values. Without
     /// windows and orders: those with enough observers within their radius at some step.
     pub observed: u32,
     /// G: what the observed POIs are worth as a share of all, the same for every leader (paper, Equation 1).
@@ -54,7 +54,7 @@ pub struct Credit {
     observed: Vec<bool>,
     /// The leaders without whom (D), or without whose groups (Df), an observed POI is lost, `[pois][words]`.
     critical: Vec<u32>,
-    /// What the POIs are worth that are lost without the leader, `[leaders]`.
+    /// The summed worth of the POIs that are lost without the leader, `[leaders]`.
     lost: Vec<u32>,
     /// The leader that each agent belongs to, or [`UNASSIGNED`], `[agents]`.
     owner: Vec<u32>,
@@ -62,7 +62,7 @@ pub struct Credit {
     groups: Vec<u32>,
     /// The largest set at the POI that has the leader in it, `[pois][leaders]`.
     largest_set_with: Vec<u32>,
-    /// What the unobserved POIs are worth that this number of copies of one leader would complete, `[copies]`.
+    /// The summed worth of the unobserved POIs that this number of copies of one leader would complete, `[copies]`.
     completed: Vec<u32>,
     /// One set, and the set of the step before, `[2][words]`.
     sets: Vec<u32>,

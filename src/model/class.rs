@@ -33,7 +33,7 @@ gpu_struct! {
 
     /// Constants of a class, without its channels and terms.
     pub struct ClassConstants as ClassConstantsLanes {
-        /// What kernels are specialised for.
+        /// The parts that kernels are specialised for.
         pub shape: ClassShape,
         /// Constants of motion.
         pub motion: MotionConstants,
@@ -45,7 +45,7 @@ gpu_struct! {
 
     /// A class.
     pub struct Class as ClassLanes {
-        /// Its constants.
+        /// The constants without channels and terms.
         pub constants: ClassConstants,
         /// The channels of its senses.
         pub channels: [ChannelConstants; MAX_CHANNELS],

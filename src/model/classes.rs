@@ -71,7 +71,7 @@ table! {
 }
 
 config_enum! {
-    /// What decides how an agent moves.
+    /// The source of an agent's decisions.
     Control {
         /// A policy, which learns.
         Policy = "policy",
@@ -114,7 +114,7 @@ table! {
 }
 
 config_enum! {
-    /// What an entity at distance d counts in its sector.
+    /// The number that an entity at distance d adds to its sector.
     Measure {
         /// `1 - d/D` with D = √2·max(map).
         Linear = "linear",
@@ -132,7 +132,7 @@ config_enum! {
 }
 
 config_enum! {
-    /// How the measures of a sector become one input.
+    /// The function that makes one input of the measures of a sector.
     Combine {
         /// Their sum divided by the number of such entities in the world.
         Share = "share",
@@ -146,7 +146,7 @@ config_enum! {
 }
 
 config_enum! {
-    /// What the sectors of a channel turn with.
+    /// The direction from which the sectors of a channel are counted.
     Frame {
         /// The agent's heading: the first sector begins straight behind.
         Heading = "heading",

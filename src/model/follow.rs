@@ -70,7 +70,7 @@ gpu_struct! {
 
     /// Constants of a rule's term.
     pub struct TermConstants as TermLanes {
-        /// What kernels are specialised for.
+        /// The parts that kernels are specialised for.
         pub shape: TermShape,
         /// The squared distance above which agents count.
         pub inner2: f32,

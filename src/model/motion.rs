@@ -30,7 +30,7 @@ section! {
     }
 }
 
-/// How an agent can move.
+/// The kind of motion of an agent.
 #[derive(Clone, Debug, PartialEq, serde::Serialize)]
 #[serde(tag = "kind", rename_all = "lowercase")]
 pub enum Mobility {

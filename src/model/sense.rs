@@ -93,7 +93,7 @@ gpu_struct! {
 
     /// Constants of a channel.
     pub struct ChannelConstants as ChannelLanes {
-        /// What kernels are specialised for.
+        /// The parts that kernels are specialised for.
         pub shape: ChannelShape,
         /// The squared range.
         pub range2: f32,

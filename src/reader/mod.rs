@@ -306,7 +306,7 @@ pub(crate) use section;
 pub(crate) trait Section {
     /// The section's name.
     const NAME: &'static str;
-    /// Its keys without their section, in order.
+    /// Keys without their section, in order.
     const KEYS: &'static [&'static str];
 
     /// Writes the section without some of its keys.

@@ -301,7 +301,7 @@ impl<S: Simd> Block<S> {
     }
 }
 
-/// How the agents of a class visit others.
+/// The order in which the agents of a class visit others.
 struct Plan {
     /// The agents of each channel, `[channels]`.
     channels: Vec<Masks>,
@@ -367,7 +367,7 @@ impl<S: Simd> Inputs<'_, S> {
     }
 }
 
-/// What one channel senses.
+/// The entities that one channel senses.
 struct Scene<'a, S: Simd, P> {
     simd: S,
     channel: &'a ChannelLanes<S>,

@@ -10,13 +10,13 @@ use crate::config::{
     MAX_POIS, MAX_SECTORS, MAX_TERMS, Measure, Mobility, Motion, POIS, PoiGroup, Term,
 };
 use crate::model::rule::cycle;
-use crate::model::{LEAST, LONGEST};
+use crate::model::{LEAST, LONGEST, MAX_RANGES};
 use crate::reader::{Allowed, Reader, Value, between, sized};
 
 /// Maximum length of a name.
 const LONGEST_NAME: usize = 64;
 
-/// What tables can refer to, before any of them is checked.
+/// The names and numbers that tables can refer to, before any table is checked.
 #[derive(Default)]
 pub(in crate::config) struct Summary {
     /// The classes of agents.
@@ -137,7 +137,7 @@ pub(in crate::config) fn read_pois(
     r.tables(POIS, 1..=MAX_POIS, |r, index| PoiGroup::read(r, index, sides, steps, summary))
 }
 
-/// What a name can be.
+/// The form of a name, for errors.
 const NAME: &str = "a name of letters, digits, _ and -";
 
 /// Returns what is wrong with the name of a table, if anything. `before` are the names of the tables before it.
@@ -301,6 +301,12 @@ impl Channel {
         }
         let groups = summary.group_names();
         let pois = Channel::pois(r).names("names of groups", false, groups.as_deref(), |_| None);
+        let runs = runs(groups.as_deref().unwrap_or_default(), &pois);
+        if runs > MAX_RANGES {
+            let message =
+                format!("found {runs} runs of neighbouring groups, allowed up to {MAX_RANGES}: reorder [[pois]]");
+            r.report_key("agents.senses.pois", message);
+        }
         if !pois.is_empty() && !of.is_empty() && of != [POIS] {
             r.report_key("agents.senses.pois", "found without of = \"pois\", allowed with it".into());
         }
@@ -330,6 +336,12 @@ impl Channel {
             gain: Channel::gain(r).number(between(1e-3, 1e3), 1.0),
         }
     }
+}
+
+/// Returns the number of runs of neighbours among the named ones of all groups.
+fn runs(all: &[&str], named: &[String]) -> usize {
+    let is_named: Vec<bool> = all.iter().map(|group| named.iter().any(|name| name == group)).collect();
+    is_named.chunk_by(|a, b| a == b).filter(|run| run[0]).count()
 }
 
 impl Term {
