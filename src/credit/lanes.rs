@@ -8,6 +8,7 @@ use fearless_simd::{Simd, prelude::*};
 use super::share;
 use crate::config::Fitness;
 use crate::kernels::count_ones;
+use crate::model::rule::Rule;
 use crate::world::World;
 
 /// Scores of one vector of teams, with scratch memory for the next.
@@ -185,11 +186,10 @@ impl<S: Simd> LaneCredit<S> {
     ) -> S::u32s {
         let zero = S::u32s::splat(self.simd, 0);
         // A set that contains another also contains its observers, so only here others are left out.
-        let simd = self.simd;
-        let observers = |word: usize| S::u32s::splat(simd, world.rule.counted(poi, word, u32::MAX));
+        let (simd, rule) = (self.simd, &world.rule);
         let mut size = zero;
         for (word, &set) in set.iter().enumerate() {
-            size += count_ones::<S>(set & observers(word));
+            size += count_ones::<S>(set & observers::<S>(simd, rule, poi, word));
         }
         let enough = mask::<S>(size.simd_ge(S::u32s::splat(self.simd, coupling))) & lanes;
         let spare = size - S::u32s::splat(self.simd, coupling);
@@ -197,7 +197,7 @@ impl<S: Simd> LaneCredit<S> {
             // A set with agents to spare needs nobody.
             let needed = mask::<S>(spare.simd_eq(zero));
             for (word, (critical, &set)) in self.critical.iter_mut().zip(set).enumerate() {
-                *critical &= (set & observers(word) & needed) | !enough;
+                *critical &= (set & observers::<S>(simd, rule, poi, word) & needed) | !enough;
             }
         }
         if TAKEN == GROUP && !enough.simd_eq(zero).all_true() {
@@ -209,13 +209,19 @@ impl<S: Simd> LaneCredit<S> {
                 }
                 let mut members = zero;
                 for (word, (&group, &set)) in group.iter().zip(set).enumerate() {
-                    members += count_ones::<S>(group & set & observers(word));
+                    members += count_ones::<S>(group & set & observers::<S>(simd, rule, poi, word));
                 }
                 *critical &= !(bit & enough & mask::<S>(members.simd_le(spare)));
             }
         }
         enough
     }
+}
+
+/// Returns a word of the set of a POI's observers, in all lanes.
+#[inline(always)]
+fn observers<S: Simd>(simd: S, rule: &Rule, poi: usize, word: usize) -> S::u32s {
+    S::u32s::splat(simd, rule.counted(poi, word, u32::MAX))
 }
 
 /// Returns all bits of the lanes of a mask.

@@ -286,19 +286,24 @@ impl<S: Simd> Quadrants<S> {
     /// Writes the channel's inputs.
     #[inline(always)]
     pub(crate) fn write<const PLAIN: bool>(self, channel: &ChannelLanes<S>, inputs: &mut [S::f32s; 4]) {
-        let ([a, b, c, d], counts) = (self.sums.quadrants(), self.counts.quadrants());
-        let [a, b, c, d] = match PLAIN {
-            true => [a, b, c, d].map(|sum| nearest_f32::<S>(sum) * channel.scale),
-            false => [
-                input::<S>(channel, a, counts[0]),
-                input::<S>(channel, b, counts[1]),
-                input::<S>(channel, c, counts[2]),
-                input::<S>(channel, d, counts[3]),
-            ],
-        };
+        let (sums, counts) = (self.sums.quadrants(), self.counts.quadrants());
+        for ((input, &sum), &count) in inputs.iter_mut().zip(&sums).zip(&counts) {
+            *input = if PLAIN { nearest_f32::<S>(sum) * channel.scale } else { input_of::<S>(channel, sum, count) };
+        }
         // Sectors of the map begin at the x axis, which is straight ahead.
-        *inputs = if channel.shape.frame == Frame::Map as u32 { [c, d, a, b] } else { [a, b, c, d] };
+        if channel.shape.frame == Frame::Map as u32 {
+            inputs.rotate_left(2);
+        }
     }
+}
+
+/// Whether a direction is less than half a turn after the beginning of a sector.
+#[inline(always)]
+fn is_after<S: Simd>(channel: &ChannelLanes<S>, sector: usize, fx: S::f32s, fy: S::f32s) -> S::mask32s {
+    let (simd, zero) = (fx.token(), splat(fx.token(), 0.0));
+    let (bx, by) = (splat(simd, channel.boundaries[sector * 2]), splat(simd, channel.boundaries[sector * 2 + 1]));
+    let across = bx * fy - by * fx;
+    across.simd_gt(zero) | (across.simd_ge(zero) & (bx * fx + by * fy).simd_ge(zero))
 }
 
 /// A channel of any number of sectors.
@@ -333,13 +338,7 @@ impl<S: Simd> Sectors<S> {
         let (fx, fy) = turned::<S>(dx, dy, hx, hy);
         // What is at the same place is straight ahead.
         let fx = select::<S>(fx, splat(simd, 1.0), fx.simd_eq(zero) & fy.simd_eq(zero));
-        // Whether the direction is less than half a turn after the beginning of a sector.
-        let after = |sector: usize| {
-            let [bx, by] = [0, 1].map(|axis| splat(simd, channel.boundaries[sector * 2 + axis]));
-            let across = bx * fy - by * fx;
-            across.simd_gt(zero) | (across.simd_ge(zero) & (bx * fx + by * fy).simd_ge(zero))
-        };
-        let first = after(0);
+        let first = is_after::<S>(channel, 0, fx, fy);
         let mut begun = first;
         for sector in 0..sectors {
             let inside = match sectors {
@@ -347,7 +346,7 @@ impl<S: Simd> Sectors<S> {
                 2 if sector == 1 => within & !first,
                 2 => within & first,
                 _ => {
-                    let next = if sector + 1 < sectors { after(sector + 1) } else { first };
+                    let next = if sector + 1 < sectors { is_after::<S>(channel, sector + 1, fx, fy) } else { first };
                     let inside = within & begun & !next;
                     begun = next;
                     inside
@@ -367,14 +366,14 @@ impl<S: Simd> Sectors<S> {
     #[inline(always)]
     pub(crate) fn write(&self, channel: &ChannelLanes<S>, inputs: &mut [S::f32s]) {
         for ((to, &sum), &count) in inputs.iter_mut().zip(&self.sums).zip(&self.counts) {
-            *to = input::<S>(channel, sum, count);
+            *to = input_of::<S>(channel, sum, count);
         }
     }
 }
 
 /// Returns the input of a sector from the sum, or the largest, of its measures, and the number of its entities.
 #[inline(always)]
-fn input<S: Simd>(channel: &ChannelLanes<S>, sum: S::i32s, count: S::i32s) -> S::f32s {
+fn input_of<S: Simd>(channel: &ChannelLanes<S>, sum: S::i32s, count: S::i32s) -> S::f32s {
     let (sum, simd) = (nearest_f32::<S>(sum), channel.scale.token());
     let shape = &channel.shape;
     let value = if shape.combine == Combine::Mean as u32 {

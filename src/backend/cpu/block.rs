@@ -183,8 +183,8 @@ impl<S: Simd> Block<S> {
             let (shape, motion) = (&class.constants.shape, &class.constants.motion);
             let own = shape.agents();
             if shape.free != 0 {
-                for (velocity, outputs) in velocities[own.clone()].iter_mut().zip(&outputs[own]) {
-                    *velocity = outputs.map(|output| output * motion.max_speed);
+                for (velocity, &[x, y]) in velocities[own.clone()].iter_mut().zip(&outputs[own]) {
+                    *velocity = [x * motion.max_speed, y * motion.max_speed];
                 }
                 continue;
             }
@@ -235,8 +235,8 @@ impl<S: Simd> Block<S> {
             }
             if shape.free != 0 {
                 for (velocity, follower) in velocities[own].iter_mut().zip(followers) {
-                    let follow::SteeringForce { x, y, .. } = follower.force;
-                    *velocity = [x, y].map(|force| clamp_to::<S>(force, -motion.max_speed, motion.max_speed));
+                    let (follow::SteeringForce { x, y, .. }, most) = (follower.force, motion.max_speed);
+                    *velocity = [clamp_to::<S>(x, -most, most), clamp_to::<S>(y, -most, most)];
                 }
                 continue;
             }
@@ -588,15 +588,14 @@ impl<S: Simd> Attraction<'_, S> {
                 |index, other| {
                     let (dx, dy) = (other.x - x, other.y - y);
                     let d2 = dx * dx + dy * dy;
-                    let quantity = match ALIGNS {
-                        true => headings[index].map(|part| on_lattice::<S>(part, rule.heading_base)),
-                        false => [dx, dy].map(|part| on_lattice::<S>(part, rule.offset_base)),
-                    };
+                    let ([x, y], base) =
+                        if ALIGNS { (headings[index], rule.heading_base) } else { ([dx, dy], rule.offset_base) };
+                    let quantity = [on_lattice::<S>(x, base), on_lattice::<S>(y, base)];
                     for (sum, term) in sums.iter_mut().zip(terms) {
                         sum.add(term, d2, quantity);
                     }
                     if COUNTS && let Some(count) = counts.get_mut(index) {
-                        let sees = d2.simd_le(splat(x.token(), influences2[index]));
+                        let sees = d2.simd_le(splat(d2.token(), influences2[index]));
                         *count -= sees.to_vector().bitcast::<S::u32s>();
                     }
                 },
