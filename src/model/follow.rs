@@ -180,15 +180,13 @@ impl<S: Simd> SteeringForce<S> {
         SteeringForce { x: splat(simd, 0.0), y: splat(simd, 0.0), influenced: S::mask32s::splat(simd, false) }
     }
 
-    /// Adds terms, each the scaled mean of its sum.
+    /// Adds a term, the scaled mean of its sum.
     #[inline(always)]
-    pub(crate) fn add(&mut self, terms: &[TermLanes<S>], sums: &[Sum<S>]) {
-        for (term, sum) in terms.iter().zip(sums) {
-            let scale = recip::<S>(nearest_f32::<S>(sum.count.max(1))) * term.scale;
-            self.x += nearest_f32::<S>(sum.x) * scale;
-            self.y += nearest_f32::<S>(sum.y) * scale;
-            self.influenced |= sum.count.simd_gt(0);
-        }
+    pub(crate) fn add(&mut self, term: &TermLanes<S>, sum: &Sum<S>) {
+        let scale = recip::<S>(nearest_f32::<S>(sum.count.max(1))) * term.scale;
+        self.x += nearest_f32::<S>(sum.x) * scale;
+        self.y += nearest_f32::<S>(sum.y) * scale;
+        self.influenced |= sum.count.simd_gt(0);
     }
 
     /// Adds the walls' push at a position, after all terms.
@@ -287,7 +285,7 @@ mod tests {
         fn squared<S: Simd>(simd: S, world: &World) -> f32 {
             let (lanes, zero) = (Lanes::new(simd, world.constants, &world.classes), splat(simd, 0.0));
             let (class, mut force) = (&lanes.classes[1], SteeringForce::none(simd));
-            force.add(&class.terms, &[Sum::new(simd); 2]);
+            (0..2).for_each(|term| force.add(&class.terms[term], &Sum::new(simd)));
             force.add_walls(&class.constants.rule, &lanes.map, zero, zero);
             let force2 = sizes::<S>(&force).0;
             force2[0]

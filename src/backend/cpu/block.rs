@@ -226,9 +226,6 @@ impl<S: Simd> Block<S> {
                     (_, true) => attraction.add::<2, true>(own.clone(), followers, counts),
                     (_, false) => attraction.add::<2, false>(own.clone(), followers, counts),
                 }
-                for follower in &mut *followers {
-                    follower.force.add(terms, &follower.sums);
-                }
             }
             for (agent, follower) in agents[own.clone()].iter().zip(&mut *followers) {
                 follower.force.add_walls(&class.constants.rule, &world.map, agent.x, agent.y);
@@ -552,7 +549,7 @@ struct Attraction<'a, S: Simd> {
 }
 
 impl<S: Simd> Attraction<'_, S> {
-    /// Computes the sums of so many terms for the agents of `own`, and counts the leaders they see if wanted.
+    /// Adds so many terms to the forces on the agents of `own`, and counts the leaders they see if wanted.
     #[inline(always)]
     fn add<const TERMS: usize, const COUNTS: bool>(
         &self,
@@ -576,7 +573,7 @@ impl<S: Simd> Attraction<'_, S> {
         let &Attraction { class, terms, agents, headings, near, others, influences2 } = self;
         let rule = &class.constants.rule;
         let terms: &[follow::TermLanes<S>; TERMS] = terms.try_into().expect("the caller counts the terms");
-        for ((index, follower), counts) in own.zip(followers).zip(counts.chunks_exact_mut(influences2.len())) {
+        for ((index, follower), counts) in own.zip(&mut *followers).zip(counts.chunks_exact_mut(influences2.len())) {
             let &Agent { x, y, .. } = &agents[index];
             let mut sums = [Sum::new(x.token()); TERMS];
             neighbours::each_near(
@@ -601,6 +598,11 @@ impl<S: Simd> Attraction<'_, S> {
                 },
             );
             follower.sums[..TERMS].copy_from_slice(&sums);
+        }
+        for follower in followers {
+            for term in 0..TERMS {
+                follower.force.add(&terms[term], &follower.sums[term]);
+            }
         }
     }
 }
