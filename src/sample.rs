@@ -52,8 +52,8 @@ pub fn world(seed: u64) -> Config {
     if rng.random_bool(0.5) {
         observe_otherwise(rng, &mut config);
     }
-    config.learning.led_within = [0, 1, rng.random_range(2..=10)][rng.random_range(0..3)];
-    config.learning.led_by = word(rng);
+    config.credit.led_within = [0, 1, rng.random_range(2..=10)][rng.random_range(0..3)];
+    config.credit.led_by = word(rng);
     config
 }
 
@@ -215,6 +215,7 @@ fn plain_world(seed: u64) -> Config {
             windows: vec![],
             after: vec![],
             steps: rng.random_range(20..=60),
+            start_counts: false,
             dt: [0.05, 0.2, 0.2, 0.5, 1.0][rng.random_range(0..5)],
             heading: Heading::Same(if exact || rng.random_bool(0.3) {
                 quarter * f64::from(rng.random_range(-2..=2))
@@ -274,13 +275,12 @@ fn plain_world(seed: u64) -> Config {
             mutation: if rng.random_bool(0.5) { Mutation::Scaled } else { Mutation::Additive },
             mutation_probability: 0.15,
             mutation_sigma: 0.1,
-            led_within: 0,
-            led_by: LedBy::MostSeen,
             episodes_per_team: 1,
             start_jitter: 0.0,
             poi_jitter: if later.random_bool(0.3) { later.random_range(0.5..5.0) } else { 0.0 },
             seed,
         },
+        credit: CreditConfig { led_by: LedBy::MostSeen, led_within: 0, removes: vec![], add_g: false },
         checkpoint: CheckpointConfig::default(),
         agents: vec![],
         pois: vec![],
@@ -405,6 +405,7 @@ pub fn classes_world(seed: u64) -> Config {
             leads,
             influence_radius,
             observes: rng.random_bool(0.8),
+            fitness: None,
         }
     };
     let agents: Vec<AgentClass> = parts.into_iter().enumerate().map(class).collect();
@@ -452,6 +453,8 @@ pub fn classes_world(seed: u64) -> Config {
             radius: lengths.draw(rng),
             observers,
             windows,
+            score: Score::Observed,
+            when: When::Ever,
             after,
             at,
         }
@@ -463,7 +466,41 @@ pub fn classes_world(seed: u64) -> Config {
         config.learning.groups = (0..learners.min(2)).map(of_group).collect();
     }
     (config.agents, config.pois) = (agents, pois);
+    score_otherwise(&mut ChaCha8Rng::seed_from_u64(seed ^ 0x7061_7468), &mut config, &lengths);
     config.without_replaced()
+}
+
+/// Sets the fitness of classes, and mostly scores that need paths.
+fn score_otherwise(rng: &mut ChaCha8Rng, config: &mut Config, lengths: &Lengths) {
+    let learns: Vec<(String, bool)> = config.agents.iter().map(|class| (class.name.clone(), class.learns())).collect();
+    for class in config.agents.iter_mut().filter(|class| class.learns()) {
+        class.fitness = rng.random_bool(0.3).then(|| word(rng));
+    }
+    config.credit.add_g = rng.random_bool(0.2);
+    if rng.random_bool(0.4) {
+        return;
+    }
+    for group in &mut config.pois {
+        group.score = word(rng);
+        group.when = if rng.random_bool(0.5) { When::Ever } else { word(rng) };
+    }
+    for class in config.agents.iter_mut().filter(|class| class.learns()) {
+        let others = learns.iter().filter(|(_, learns)| *learns && rng.random_bool(0.5));
+        class.leads.extend(others.map(|(name, _)| name.clone()));
+        if !class.leads.is_empty() && class.influence_radius.is_none() {
+            class.influence_radius = Some(lengths.draw(rng));
+        }
+    }
+    config.world.start_counts = rng.random_bool(0.3);
+    let (learners, agents) = (config.learners(), config.agent_count());
+    if rng.random_bool(0.2) {
+        let lists = if rng.random_bool(0.5) { 1 } else { learners };
+        let list = |_| (0..agents).filter(|_| rng.random_bool(0.3)).collect();
+        config.credit.removes = (0..lists).map(list).collect();
+    }
+    if config.needs_paths().is_some() {
+        config.pois.iter_mut().for_each(|group| group.after.clear());
+    }
 }
 
 /// Lengths for radii and ranges.

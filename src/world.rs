@@ -4,7 +4,7 @@ use std::ops::{Deref, Range};
 
 use glam::{DVec2, Vec2};
 
-use crate::config::{Config, Control, LedBy, PoiGroup, StageConfig};
+use crate::config::{Config, Control, LedBy, PoiGroup, Score, StageConfig, When};
 use crate::model::class::Class;
 use crate::model::motion::MapConstants;
 use crate::model::policy::PolicyConstants;
@@ -50,8 +50,21 @@ pub struct WorldParts {
     pub rule: Rule,
     /// The rule by which leaders lead followers, for Dt.
     pub led: Led,
+    /// What scores need if they are computed from paths.
+    pub paths: Option<PathRule>,
     /// The population that each leader chooses its policy from, `[leaders]`.
     pub populations: Vec<u32>,
+}
+
+/// The rule by which scores are computed from [paths](crate::credit::Paths).
+#[derive(Clone, Debug, PartialEq)]
+pub struct PathRule {
+    /// What each POI counts for, and when, `[pois]`.
+    pub scores: Vec<(Score, When)>,
+    /// Whether the start counts as a step.
+    pub start_counts: bool,
+    /// The agents that D takes out for each learner, one bit per agent, `[leaders][words]`. Empty if that is the learner.
+    pub removes: Vec<u32>,
 }
 
 /// The rule by which leaders lead a follower at a step, for [`Dt`](crate::config::Fitness::Dt).
@@ -61,6 +74,22 @@ pub struct Led {
     pub within: usize,
     /// The leaders that lead, of those seen at these steps.
     pub by: LedBy,
+}
+
+impl PathRule {
+    fn new(config: &Config, groups: &[&PoiGroup], leaders: usize, agents: usize) -> PathRule {
+        let (words, removes) = (agents.div_ceil(32), &config.credit.removes);
+        let mut bits = vec![0; if removes.is_empty() { 0 } else { leaders * words }];
+        for (leader, bits) in bits.chunks_exact_mut(words).enumerate() {
+            let removed = removes.get(leader).unwrap_or(&removes[0]);
+            removed.iter().for_each(|agent| bits[agent / 32] |= 1 << (agent % 32));
+        }
+        PathRule {
+            scores: groups.iter().map(|group| (group.score, group.when)).collect(),
+            start_counts: config.world.start_counts,
+            removes: bits,
+        }
+    }
 }
 
 impl Default for Led {
@@ -80,13 +109,29 @@ impl Deref for World {
 impl World {
     /// Builds the world of a valid config.
     pub fn new(config: &impl AsRef<StageConfig>) -> World {
-        let Config { world, policy, learning, .. } = &**config.as_ref();
-        let described = config.as_ref().classes();
+        World::build(config.as_ref(), config.as_ref().needs_paths().is_some())
+    }
+
+    /// Builds the world of a valid config, whose scores are computed from paths even if they do not need that. POIs have no
+    /// order.
+    pub fn scored_by_paths(config: &impl AsRef<StageConfig>) -> World {
+        World::build(config.as_ref(), true)
+    }
+
+    fn build(config: &StageConfig, by_paths: bool) -> World {
+        let Config { world, policy, credit, .. } = &**config;
+        let described = config.classes();
         let map = Vec2::new(world.map[0] as f32, world.map[1] as f32);
         let on_grid = |at: [f64; 2]| on_grid(DVec2::from(at).as_vec2(), map);
         let of_each: Vec<&PoiGroup> =
             described.group_of_each().into_iter().map(|group| &described.pois[group]).collect();
-        let (worth, total_worth) = worth(of_each.iter().map(|group| group.value));
+        let (mut worth, mut total_worth) = worth(of_each.iter().map(|group| group.value));
+        if config.needs_paths().is_some() {
+            // Scores are shares of these units.
+            let finer = MOST_UNITS / total_worth;
+            worth.iter_mut().for_each(|worth| *worth *= finer);
+            total_worth *= finer;
+        }
         let values: Vec<f32> = of_each.iter().map(|group| group.value as f32).collect();
         let classes = Class::all(&described, &values, world.map, world.dt);
         let learns = |class: &&Class| class.constants.shape.control() == Control::Policy;
@@ -102,7 +147,7 @@ impl World {
             class_count: classes.len() as u32,
             first_class: 0,
             map: MapConstants::new(world.map, world.dt),
-            policy: PolicyConstants::new(policy, config.as_ref().inputs()),
+            policy: PolicyConstants::new(policy, config.inputs()),
         };
         let observers: Vec<Vec<Range<usize>>> = described
             .group_of_each()
@@ -122,8 +167,9 @@ impl World {
             worth,
             total_worth,
             coupling: described.couplings(),
-            populations: config.as_ref().population_of_each(),
-            led: Led { within: learning.led_within, by: learning.led_by },
+            populations: config.population_of_each(),
+            led: Led { within: credit.led_within, by: credit.led_by },
+            paths: by_paths.then(|| PathRule::new(config, &of_each, leaders, agents)),
             rule: Rule::new(&observers, agents, &described.windows(world.steps), &described.after()),
             classes,
         })
@@ -194,6 +240,11 @@ impl World {
         self.steps() * self.followers() * self.leader_words()
     }
 
+    /// Returns the words of one team's path: moments × agents × 2.
+    pub(crate) fn path_words(&self) -> usize {
+        (self.steps() + 1) * self.agents() * 2
+    }
+
     /// Returns the words of one team's record of sets: steps × POIs × words per set.
     pub fn set_words(&self) -> usize {
         self.steps() * self.words_per_step()
@@ -204,6 +255,9 @@ impl World {
         self.pois.len() * self.constants.words as usize
     }
 }
+
+/// Maximum sum of [`WorldParts::worth`]: every share of it is an exact f32.
+const MOST_UNITS: u32 = 1 << 24;
 
 /// Returns values as whole multiples of a common unit, as small as possible, and their sum, at most 2^22. With equal values
 /// each is 1.

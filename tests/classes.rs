@@ -174,7 +174,7 @@ fn every_problem_names_key_line_found_and_allowed() {
         (
             leads,
             "leads = \"uav\"",
-            "11: agents[0].leads: found \"uav\", which learns: classes that learn cannot be led yet",
+            "3: agents[0].influence_radius: missing, and \"uav\" has no rule to take it from; allowed 0.01 to 10000",
         ),
         (leads, "leads = \"cat\"", "11: agents[0].leads: found \"cat\", allowed \"uav\" or \"dog\""),
         (
@@ -186,6 +186,36 @@ fn every_problem_names_key_line_found_and_allowed() {
             leads,
             "leads = \"dog\"\ninfluence_radius = 0",
             "12: agents[0].influence_radius: found 0, allowed 0.01 to 10000",
+        ),
+        (
+            control,
+            "control = \"still\"\nfitness = \"D\"",
+            "16: agents[1].rule: found with control = \"still\", allowed with \"follow\"\n17: agents[1].fitness: found with control = \"still\", allowed with \"policy\"",
+        ),
+        (
+            leads,
+            "fitness = \"E\"",
+            "11: agents[0].fitness: found \"E\", allowed \"G\" or \"D\" or \"Df\" or \"D++\" or \"Dt\"",
+        ),
+        (
+            steps,
+            "steps = 20\nstart_counts = true",
+            "18: pois: found POIs that come after others, allowed without world.start_counts",
+        ),
+        (
+            "after = \"a\"",
+            "score = \"near\"\nwhen = \"once\"",
+            "25: pois[1].score: found \"near\", allowed \"observed\" or \"closeness\"\n26: pois[1].when: found \"once\", allowed \"ever\" or \"end\" or \"mean\"",
+        ),
+        (
+            "after = \"a\"",
+            "score = \"closeness\"\n[credit]\nremoves = [[0], [3]]\nled_by = \"none\"",
+            "27: credit.removes[1][0]: found 3, allowed 0 to 2 (the last agent)\n28: credit.led_by: found \"none\", allowed \"most-seen\" or \"any-seen\" or \"first\" or \"alone\" or \"anyone\"",
+        ),
+        (
+            "after = \"a\"",
+            "[credit]\nremoves = [[0], [1], [2]]",
+            "26: credit.removes[0]: found 3 lists, allowed one, or 2 (one per learner)",
         ),
         (leads, "observes = 1", "11: agents[0].observes: found 1, allowed true or false"),
         (leads, "speed = 2", "11: agents[0].speed: found 2, allowed 0 to 1 (motion.max_speed)"),
@@ -199,7 +229,7 @@ fn every_problem_names_key_line_found_and_allowed() {
         (
             leads,
             "count = 3",
-            "11: agents[0].count: unknown key, allowed at, control, heading, influence_radius, leads, motion, name, observes, rule, senses, speed, wall_gain, wall_radius",
+            "11: agents[0].count: unknown key, allowed at, control, fitness, heading, influence_radius, leads, motion, name, observes, rule, senses, speed, wall_gain, wall_radius",
         ),
         (
             leads,
@@ -215,7 +245,7 @@ fn every_problem_names_key_line_found_and_allowed() {
         (
             control,
             "control = \"policy\"",
-            "11: agents[0].leads: found \"dog\", which learns: classes that learn cannot be led yet\n12: agents[1].senses: missing, allowed a list of 1 to 8 channels\n16: agents[1].rule: found with control = \"policy\", allowed with \"follow\"",
+            "12: agents[1].senses: missing, allowed a list of 1 to 8 channels\n16: agents[1].rule: found with control = \"policy\", allowed with \"follow\"",
         ),
         (
             control,

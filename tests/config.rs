@@ -5,8 +5,8 @@
 use std::path::Path;
 
 use flotilla::config::{
-    Actions, CheckpointConfig, Config, ConfigError, Coupling, Density, Elites, Fitness, Follow, Heading, Learning,
-    LedBy, Leniency, MAX_EPISODES, MAX_GENERATIONS, MAX_HALL_OF_FAME, MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS,
+    Actions, CheckpointConfig, Config, ConfigError, Coupling, CreditConfig, Density, Elites, Fitness, Follow, Heading,
+    Learning, LedBy, Leniency, MAX_EPISODES, MAX_GENERATIONS, MAX_HALL_OF_FAME, MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS,
     MAX_PARTNERS, MAX_POPULATION, MAX_STEPS, MAX_TRIALS, Method, Motion, Mutation, Observers, Override, Paradigm,
     Parents, Policy, Problem, Sense, Sharing, WorldConfig,
 };
@@ -39,6 +39,7 @@ fn every_key_but_leaders_and_pois_has_its_default() {
             windows: vec![],
             after: vec![],
             steps: 25,
+            start_counts: false,
             dt: 0.2,
             heading: Heading::Same(std::f64::consts::FRAC_PI_2),
             speed: 0.0,
@@ -77,13 +78,12 @@ fn every_key_but_leaders_and_pois_has_its_default() {
             mutation: Mutation::Scaled,
             mutation_probability: 0.15,
             mutation_sigma: 0.1,
-            led_within: 0,
-            led_by: LedBy::MostSeen,
             episodes_per_team: 1,
             start_jitter: 0.0,
             poi_jitter: 0.0,
             seed: 0,
         },
+        credit: CreditConfig { led_by: LedBy::MostSeen, led_within: 0, removes: vec![], add_g: false },
         checkpoint: CheckpointConfig { generations: 0, seconds: 30.0 },
         agents: vec![],
         pois: vec![],
@@ -268,6 +268,7 @@ fn worlds() -> impl Strategy<Value = (WorldConfig, Motion)> {
                             observation_radius,
                             observers,
                             windows,
+                            start_counts: after.is_empty() && kind & 1 > 0,
                             after,
                             steps,
                             dt,
@@ -303,7 +304,12 @@ fn configs() -> impl Strategy<Value = Config> {
     let teams = (2..=5000usize, 1..=MAX_PARTNERS, 0..=MAX_HALL_OF_FAME, choice());
     let sizes = (teams, 0..=MAX_GENERATIONS, 1..=9usize, (elites, choice()), 1..=MAX_EPISODES);
     let mutation = (choice(), size_or_zero(1e-6, 1.0), size_or_zero(1e-6, 100.0));
-    let mutation = (mutation, 0..=MAX_STEPS, choice());
+    let credit = (choice(), 0..=MAX_STEPS, proptest::bool::ANY).prop_map(|(led_by, led_within, add_g)| CreditConfig {
+        led_by,
+        led_within,
+        removes: vec![],
+        add_g,
+    });
     let search = (choice(), size(1e-6, 100.0), size(1e-6, 100.0));
     let jitters = (size_or_zero(1e-6, 1e4), size_or_zero(1e-6, 1e4));
     let learning = ((choice(), choice()), choice(), sizes, (mutation, search), jitters, 0..=i64::MAX as u64).prop_map(
@@ -315,7 +321,7 @@ fn configs() -> impl Strategy<Value = Config> {
             (start_jitter, poi_jitter),
             seed,
         )| {
-            let ((mutation, mutation_probability, mutation_sigma), led_within, led_by) = mutation;
+            let (mutation, mutation_probability, mutation_sigma) = mutation;
             Learning {
                 paradigm,
                 sharing,
@@ -339,8 +345,6 @@ fn configs() -> impl Strategy<Value = Config> {
                 mutation,
                 mutation_probability,
                 mutation_sigma,
-                led_within,
-                led_by,
                 episodes_per_team,
                 start_jitter,
                 poi_jitter,
@@ -350,8 +354,8 @@ fn configs() -> impl Strategy<Value = Config> {
     );
     let checkpoint = (0..=MAX_GENERATIONS, prop_oneof![Just(0.0), 0.01..=1e9])
         .prop_map(|(generations, seconds)| CheckpointConfig { generations, seconds });
-    (worlds(), follow, sense, policy, learning, checkpoint).prop_map(
-        |((mut world, motion), follow, sense, policy, mut learning, checkpoint)| {
+    (worlds(), follow, sense, policy, learning, (credit, checkpoint)).prop_map(
+        |((mut world, motion), follow, sense, policy, mut learning, (credit, checkpoint))| {
             if learning.elites == Elites::Count(0) {
                 learning.parents = Parents::All;
             }
@@ -365,6 +369,7 @@ fn configs() -> impl Strategy<Value = Config> {
                 sense,
                 policy,
                 learning,
+                credit,
                 checkpoint,
                 agents: vec![],
                 pois: vec![],

@@ -5,10 +5,11 @@
 use crate::support;
 use flotilla::backend::cpu::Cpu;
 use flotilla::backend::{Backend, Group, GroupScores};
-use flotilla::config::{Choice, Coupling, Fitness, LedBy, MAX_AGENTS, Observers, WorldConfig};
+use flotilla::config::{Choice, Coupling, Fitness, LedBy, MAX_AGENTS, Observers, Score, When, WorldConfig};
 use flotilla::credit::{Credit, Episode, RecordRequest, Scores, Seen, Strided, owner_bits};
+use flotilla::front;
 use flotilla::sample;
-use flotilla::world::{Led, World};
+use flotilla::world::{Led, PathRule, World};
 use rand::rngs::ChaCha8Rng;
 use rand::seq::SliceRandom;
 use rand::{RngExt, SeedableRng};
@@ -67,7 +68,7 @@ impl Record {
             after,
             ..config.world
         };
-        (config.learning.led_within, config.learning.led_by) = (self.led.within, self.led.by);
+        (config.credit.led_within, config.credit.led_by) = (self.led.within, self.led.by);
         World::new(&config.validate().unwrap())
     }
 
@@ -176,8 +177,12 @@ impl Record {
         let first = if self.led.within == 0 { 0 } else { (step + 1).saturating_sub(self.led.within) };
         let count =
             |leader: usize| (first..=step).filter(|&step| self.sights[step][follower].contains(&leader)).count();
+        let counted: Vec<usize> = (0..self.leaders).filter(|&leader| count(leader) > 0).collect();
         match self.led.by {
-            LedBy::AnySeen => count(leader) > 0,
+            LedBy::AnySeen => counted.contains(&leader),
+            LedBy::First => counted.first() == Some(&leader),
+            LedBy::Alone => counted == [leader],
+            LedBy::Anyone => !counted.is_empty(),
             LedBy::MostSeen => {
                 count(leader) > 0
                     && (0..leader).all(|other| count(other) < count(leader))
@@ -278,7 +283,7 @@ fn random(rng: &mut ChaCha8Rng, agents: usize) -> Record {
         sights.push(now);
     }
     let within = if rng.random_bool(0.3) { 0 } else { rng.random_range(1..=steps + 1) };
-    let led = Led { within, by: if rng.random_bool(0.5) { LedBy::MostSeen } else { LedBy::AnySeen } };
+    let led = Led { within, by: LedBy::ALL[rng.random_range(0..LedBy::ALL.len())].1 };
     Record { leaders, followers, coupling, near, seen, sights, rule: PLAIN, led }.with_enough_observers()
 }
 
@@ -323,7 +328,7 @@ fn compare(record: &Record, credit: &mut Credit, rng: &mut ChaCha8Rng, stride: u
     let [sets, seen, sights] = record.words(stride, offset, rng);
     let strided = |words| Strided { words, stride, offset };
     let (sights, seen) = (strided(&sights), Seen::Counts(strided(&seen)));
-    let episode = Episode { sets: strided(&sets), seen, sights };
+    let episode = Episode { sets: strided(&sets), seen, sights, paths: None };
     let expected = record.scores();
     assert_eq!(credit.all(&episode, &world), expected);
     let without_sights = Episode { sights: Strided::NONE, ..episode };
@@ -343,7 +348,7 @@ fn compare(record: &Record, credit: &mut Credit, rng: &mut ChaCha8Rng, stride: u
         let (sets, owners) = record.packed(RecordRequest(&request));
         let contiguous = |words| Strided { words, stride: 1, offset: 0 };
         let seen = Seen::Owners(contiguous(&owners));
-        let episode = Episode { sets: contiguous(&sets), seen, sights: Strided::NONE };
+        let episode = Episode { sets: contiguous(&sets), seen, sights: Strided::NONE, paths: None };
         let [fitness] = request[..] else {
             let found = Scores { dt: expected.dt.clone(), ..credit.all(&episode, &world) };
             assert_eq!(found, expected, "packed record");
@@ -588,4 +593,147 @@ fn played_teams_get_the_scores_of_their_records() {
         }
     }
     assert!(observed_by_rule.iter().all(|&teams| teams > 500), "{observed_by_rule:?}");
+}
+
+/// Every fitness, in the order of [`Scores`].
+const EVERY: [Fitness; 5] = [Fitness::G, Fitness::D, Fitness::Df, Fitness::Dpp, Fitness::Dt];
+
+/// Plays a few teams of random policies on the CPU. Returns their scores by [`EVERY`] fitness, `[teams][fitnesses][leaders]`,
+/// and their paths, `[teams][steps + 1][agents][2]`.
+fn paths_of(world: &World, seed: u64) -> (Vec<f32>, Vec<f32>) {
+    let (policies, leaders) = (4, world.leaders());
+    let weights = sample::weights(world, policies, seed);
+    let populations: Vec<u32> = (0..leaders as u32).collect();
+    let teams: Vec<u32> = (0..policies as u32).flat_map(|policy| vec![policy; leaders]).collect();
+    let group = Group {
+        world,
+        starts: &world.starts,
+        weights: weights[..].into(),
+        policies,
+        populations: &populations,
+        teams: &teams,
+        fitnesses: &EVERY,
+    };
+    let (mut cpu, mut positions) = (Cpu::default(), vec![]);
+    let trace = cpu.trace(&group).unwrap();
+    for team in 0..policies {
+        for step in 0..=world.steps() {
+            positions.extend((0..world.agents()).flat_map(|agent| trace.moment(step, team, agent).position));
+        }
+    }
+    (cpu.play(&[group]).unwrap().remove(0).scores, positions)
+}
+
+#[test]
+fn paths_and_sets_give_equal_scores() {
+    let (mut compared, mut lost) = (0, [0; 5]);
+    for seed in 0..240 {
+        let mut config = sample::any_world(seed);
+        config.world.after.clear();
+        config.pois.iter_mut().for_each(|group| group.after.clear());
+        let world = World::new(&config.validate().unwrap());
+        if world.paths.is_some() {
+            continue;
+        }
+        let (expected, positions) = paths_of(&world, seed);
+        let found = front::score(&config, &positions).unwrap();
+        let leaders = world.leaders();
+        for (team, expected) in expected.chunks_exact(5 * leaders).enumerate() {
+            for (row, expected) in expected.chunks_exact(leaders).enumerate() {
+                let each = [&found.d, &found.df, &found.dpp, &found.dt];
+                for (leader, expected) in expected.iter().enumerate() {
+                    let found = if row == 0 { found.g[team] } else { each[row - 1][team * leaders + leader] };
+                    assert_eq!(found, *expected, "world {seed}, team {team}, leader {leader}, {:?}", EVERY[row]);
+                    lost[row] += u32::from(*expected > 0.0);
+                }
+            }
+            compared += 1;
+        }
+    }
+    assert!(compared > 500 && lost.iter().all(|&count| count > 100), "{compared} teams, {lost:?}");
+}
+
+/// G by its definition, in units of worth, of the agents that count `times(moment, agent)` times.
+fn worth_of_path(world: &World, paths: &PathRule, positions: &[f32], times: impl Fn(usize, usize) -> usize) -> u32 {
+    let steps = world.steps();
+    let worth_of = |poi: usize| {
+        let (score, when) = paths.scores[poi];
+        let value = |moment: usize| {
+            let mut near = vec![];
+            for agent in (0..world.agents()).filter(|&agent| world.rule.counts_at(poi, agent)) {
+                let at = &positions[(moment * world.agents() + agent) * 2..][..2];
+                let (dx, dy) = (at[0] - world.pois[poi].x, at[1] - world.pois[poi].y);
+                let d2 = dx * dx + dy * dy;
+                near.extend(vec![d2; if d2 <= world.radii2[poi] { times(moment, agent) } else { 0 }]);
+            }
+            near.sort_by(f32::total_cmp);
+            let is_open = world.rule.window(poi).is_none_or(|[first, last]| (first..=last).contains(&(moment as u32)));
+            let coupling = world.coupling[poi] as usize;
+            match score {
+                _ if !is_open || near.len() < coupling => 0,
+                Score::Observed => world.worth[poi],
+                Score::Closeness => {
+                    let squared: f32 = near[..coupling].iter().map(|d2| d2.max(1.0)).product();
+                    (f64::from(world.worth[poi]) / f64::from(squared).sqrt()).round() as u32
+                }
+            }
+        };
+        let moments = usize::from(!paths.start_counts)..=steps;
+        match when {
+            When::Ever => moments.map(value).max().unwrap(),
+            When::End => value(steps),
+            When::Mean => {
+                let (count, sum) = (moments.clone().count() as u64, moments.map(|moment| u64::from(value(moment))));
+                ((sum.sum::<u64>() + count / 2) / count) as u32
+            }
+        }
+    };
+    (0..world.pois.len()).map(worth_of).sum()
+}
+
+#[test]
+fn scores_of_paths_equal_their_definition() {
+    let (mut teams, mut kinds, mut differ) = (0, std::collections::HashSet::new(), [0; 3]);
+    for seed in (1..401).step_by(2) {
+        let config = sample::classes_world(seed);
+        let world = World::new(&config.validate().unwrap());
+        let Some(paths) = &world.paths else { continue };
+        kinds.extend(paths.scores.iter().map(|kind| format!("{kind:?} {}", paths.start_counts)));
+        let (leaders, words) = (world.leaders(), world.agents().div_ceil(32));
+        let (scores, positions) = paths_of(&world, seed);
+        let total = world.total_worth as f32;
+        let size = positions.len() / 4;
+        for (scores, positions) in scores.chunks_exact(5 * leaders).zip(positions.chunks_exact(size)) {
+            let of = |times: &dyn Fn(usize, usize) -> usize| worth_of_path(&world, paths, positions, times);
+            let whole = of(&|_, _| 1);
+            for leader in 0..leaders {
+                let removed = |agent: usize| match paths.removes[..] {
+                    [] => agent == leader,
+                    _ => paths.removes[leader * words + agent / 32] >> (agent % 32) & 1 != 0,
+                };
+                let lost = whole - of(&|_, agent| usize::from(!removed(agent)));
+                let alone = whole - of(&|_, agent| usize::from(agent != leader));
+                let most = *world.coupling.iter().max().unwrap();
+                let gain = |copies: u32| of(&|_, agent| 1 + if agent == leader { copies as usize } else { 0 }) - whole;
+                // The largest of D++(n), up to the first that the next does not exceed.
+                let product = |a: u32, b: u32| u64::from(a) * u64::from(b);
+                let mut dpp = alone as f32 / total;
+                if product(alone, most) < u64::from(gain(most)) {
+                    let last = (1..most).find(|&n| product(gain(n + 1), n) <= product(gain(n), n + 1)).unwrap_or(most);
+                    dpp = gain(last) as f32 / (u64::from(world.total_worth) * u64::from(last)) as f32;
+                }
+                let row = |fitness: usize| scores[fitness * leaders + leader];
+                assert_eq!(row(0), whole as f32 / total, "world {seed}, G");
+                assert_eq!(row(1), lost as f32 / total, "world {seed}, D of leader {leader}");
+                assert_eq!(row(3), dpp, "world {seed}, D++ of leader {leader}");
+                let seen = [whole != 0 && whole != world.total_worth, lost != alone, dpp > alone as f32 / total];
+                differ.iter_mut().zip(seen).for_each(|(count, seen)| *count += u32::from(seen));
+            }
+            teams += 1;
+        }
+    }
+    assert!(
+        teams > 200 && kinds.len() == 12 && differ.iter().all(|&count| count > 20),
+        "{teams}, {kinds:?}, {differ:?}"
+    );
 }

@@ -637,7 +637,7 @@ fn experiments() -> Vec<Config> {
         }),
         config(CHAOTIC, |config| {
             small(config, 10, 3, 1);
-            (config.learning.fitness, config.learning.led_within) = (Fitness::Dt, 5);
+            (config.learning.fitness, config.credit.led_within) = (Fitness::Dt, 5);
             config.world.windows = vec![[1, 50], [10, 30], [1, 20], [1, 50]];
         }),
         config(GENERALLY_FORWARD, |config| {

@@ -3,6 +3,7 @@
 use std::fmt::Write;
 
 use flotilla::config::Config;
+use flotilla::front;
 use flotilla::stepping::{Recording, Stepper};
 use flotilla::world::World;
 use serde_json::Value;
@@ -122,4 +123,92 @@ fn sensors_measure_what_the_authors_program_measures() {
         }
     }
     assert!(compared > 10_000, "{compared} inputs");
+}
+
+/// 150 random paths with the rewards of the authors' program, of nine kinds.
+const PATHS: &str = include_str!("data/influence_rewards.jsonl");
+
+/// Returns the config of a case, with the sections of one kind of reward, and the factor between values and rewards.
+fn rewarded(case: &Value, fitness: &str, credit: &str) -> String {
+    let number = |key: &str| case[key].as_f64().unwrap();
+    let paths = case["paths"].as_array().unwrap();
+    let places = |range: std::ops::Range<usize>| {
+        let at: Vec<String> = range.map(|agent| paths[agent][0].to_string()).collect();
+        at.join(", ")
+    };
+    let (rovers, uavs) = (case["rovers"].as_u64().unwrap() as usize, case["uavs"].as_u64().unwrap() as usize);
+    let sense = "senses = [{ of = \"pois\", range = 1.0 }]\nmotion = { kind = \"free\", max_speed = 1.0 }";
+    let mut config = format!(
+        "[world]\nmap = [1000.0, 1000.0]\nsteps = {}\nstart_counts = true\n[learning]\nfitness = \"{fitness}\"\n[credit]\n\
+         {credit}\n[[agents]]\nname = \"rover\"\nat = [{}]\n{sense}\n[[agents]]\nname = \"uav\"\nat = [{}]\n{sense}\n\
+         observes = false\nleads = \"rover\"\ninfluence_radius = 5.0\n",
+        paths[0].as_array().unwrap().len() - 1,
+        places(0..rovers),
+        places(rovers..rovers + uavs),
+    );
+    for (index, poi) in case["pois"].as_array().unwrap().iter().enumerate() {
+        let (capture, coupling) = (poi["capture_radius"].as_f64().unwrap(), poi["coupling"].as_u64().unwrap());
+        let radius = capture.max(number("observation_radius").min(number("poi_observation_radius")));
+        let (value, when) = (poi["value"].as_f64().unwrap(), if poi["ever"] == true { "ever" } else { "end" });
+        write!(
+            config,
+            "[[pois]]\nname = \"poi{index}\"\nat = [{}]\nvalue = {}\ncoupling = {coupling}\nradius = {radius}\n\
+             score = \"closeness\"\nwhen = \"{when}\"\n",
+            poi["at"],
+            // The authors multiply closeness by the coupling.
+            value * coupling as f64,
+        )
+        .unwrap();
+    }
+    config
+}
+
+#[test]
+fn rewards_are_those_of_the_authors_program() {
+    const KINDS: [(&str, &str, &str); 9] = [
+        ("G", "G", ""),
+        ("D", "D", ""),
+        ("trajectory", "Df", ""),
+        ("step-local", "Dt", "led_by = \"any-seen\""),
+        ("step-all-or-nothing", "Dt", "led_by = \"first\""),
+        ("step-difference", "Dt", "led_by = \"alone\""),
+        ("step-system", "Dt", "led_by = \"anyone\""),
+        ("manual", "D", "removes = [MANUAL]"),
+        ("step-difference+G", "Dt", "led_by = \"alone\"\nadd_g = true"),
+    ];
+    let (mut compared, mut different) = (0, [0; KINDS.len()]);
+    for (line, case) in PATHS.lines().enumerate() {
+        let case: Value = serde_json::from_str(case).unwrap();
+        let paths = case["paths"].as_array().unwrap();
+        let moments = paths[0].as_array().unwrap().len();
+        let mut positions = vec![];
+        for moment in 0..moments {
+            for path in paths {
+                positions.extend([0, 1].map(|axis| path[moment][axis].as_f64().unwrap() as f32));
+            }
+        }
+        for (index, (kind, fitness, credit)) in KINDS.into_iter().enumerate() {
+            let text = rewarded(&case, fitness, &credit.replace("MANUAL", &case["manual"].to_string()));
+            let config =
+                Config::parse(&text, "case.toml").unwrap_or_else(|error| panic!("case {line}: {error}\n{text}"));
+            let total: f64 = config.pois.iter().map(|group| group.value).sum();
+            let scored = front::score(&config, &positions).unwrap();
+            for (agent, &found) in scored.fitness.iter().enumerate() {
+                // The authors' program credits agent 0 with what nobody influences.
+                if kind == "step-all-or-nothing" && agent == 0 {
+                    continue;
+                }
+                let expected = case["rewards"][kind][agent].as_f64().unwrap();
+                let found = f64::from(found) * total;
+                let error = (found - expected).abs();
+                assert!(
+                    error <= 1e-5 || error <= 1e-5 * expected.abs(),
+                    "case {line}, {kind}, agent {agent}: {found}, not {expected}\n{text}"
+                );
+                compared += 1;
+                different[index] += usize::from(expected != case["rewards"]["G"][agent].as_f64().unwrap());
+            }
+        }
+    }
+    assert!(compared > 6000 && different[1..].iter().all(|&count| count > 100), "{compared}, {different:?}");
 }

@@ -197,7 +197,7 @@ fn training_gives_the_same_metrics_and_weights() {
     jittered.learning.fitness = Fitness::Dpp;
     let mut relay = Config::parse(include_str!("../configs/generally_forward.toml"), "config").unwrap();
     (relay.learning.trials, relay.learning.generations, relay.learning.population) = (1, 3, 20);
-    (relay.learning.fitness, relay.learning.led_within) = (Fitness::Dt, 4);
+    (relay.learning.fitness, relay.credit.led_within) = (Fitness::Dt, 4);
     (relay.world.observers, relay.world.coupling) = (Observers::Followers, Coupling::Same(1));
     (relay.world.steps, relay.world.after) = (40, vec![vec![], vec![0], vec![], vec![2]]);
     let train = |backend: &mut dyn Backend, configs: &[Config]| {

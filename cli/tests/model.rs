@@ -493,7 +493,7 @@ fn check_team<'a>(
                     *most += (near || tie) as u32;
                     let words = leaders.div_ceil(32);
                     let row = (team * steps + step - 1) * (agents - leaders) + agent - leaders;
-                    let sees = trace.sights[row * words + leader / 32] >> (leader % 32) & 1 == 1;
+                    let sees = trace.trail[row * words + leader / 32] >> (leader % 32) & 1 == 1;
                     if sees != near && !tie {
                         tally.wrong.push(format!("{place}: sees leader {leader} {sees}, expected {near}"));
                     }

@@ -30,10 +30,11 @@ windows = [[3, 12], [2, 20]]
 after = [[], [0]]
 [learning]
 fitness = \"Dt\"
-led_within = 4
 population = 20
 generations = 15
 trials = 1
+[credit]
+led_within = 4
 ";
 
 fn succeed(arguments: &[&str]) -> String {
@@ -57,18 +58,19 @@ fn text(path: &Path) -> &str {
 
 #[test]
 fn every_rule_key_can_be_a_grid_axis() {
-    let plain = RELAY.replace("windows = [[3, 12], [2, 20]]\nafter = [[], [0]]\n", "").replace("led_within = 4\n", "");
+    let plain = RELAY
+        .replace("windows = [[3, 12], [2, 20]]\nafter = [[], [0]]\n", "")
+        .replace("[credit]\nled_within = 4\n", "");
     let grid = "[grid]\n\"world.observers\" = ['all', 'followers']\n\"world.windows\" = [[], [[1, 9], [4, 20]]]\n\
                 \"world.after\" = [[], [[1], []]]\n\"learning.fitness\" = ['D', 'Dt']\n\
-                \"learning.led_within\" = [0, 3]\n\"learning.led_by\" = ['most-seen', 'any-seen']\n";
+                \"credit.led_within\" = [0, 3]\n\"credit.led_by\" = ['most-seen', 'any-seen']\n";
     let base = plain.replace("observers = \"followers\"\n", "").replace("fitness = \"Dt\"\n", "");
     let sweep = Sweep::read(&format!("{base}{grid}"), "x.toml", &[], false).unwrap();
     assert_eq!(sweep.points.len(), 64);
     let last = &sweep.points[63].config;
     assert_eq!((last.world.observers, &last.world.windows), (Observers::Followers, &vec![[1, 9], [4, 20]]));
     assert_eq!(last.world.after, [vec![1], vec![]]);
-    let learning = &last.learning;
-    assert_eq!((learning.fitness, learning.led_within, learning.led_by), (Fitness::Dt, 3, LedBy::AnySeen));
+    assert_eq!((last.learning.fitness, last.credit.led_within, last.credit.led_by), (Fitness::Dt, 3, LedBy::AnySeen));
     assert_eq!(*sweep.points[0].config, Config::parse(&base, "x").unwrap().with(&[fitness("D")]).unwrap());
 }
 
@@ -197,8 +199,8 @@ fn default_values_do_not_change_a_configs_digest() {
         ("world.observers", "'leaders'"),
         ("world.windows", "[[1, 25], [1, 25], [1, 25], [1, 25]]"),
         ("world.after", "[[], [], [], [0]]"),
-        ("learning.led_within", "1"),
-        ("learning.led_by", "'any-seen'"),
+        ("credit.led_within", "1"),
+        ("credit.led_by", "'any-seen'"),
         ("sense.gain", "2.0"),
         ("learning.parents", "'elites'"),
         ("learning.partners", "2"),

@@ -16,7 +16,7 @@ from flotilla import _native, loggers
 from flotilla._coevolution import Coevolution, Played, Proposal
 from flotilla._config import Config, Key
 from flotilla._errors import ConfigError, Error, Problem
-from flotilla._play import Collected, Rollout, Trace, collect, forward, replay, rollout, to_onnx
+from flotilla._play import Collected, Rollout, Scores, Trace, collect, forward, replay, rollout, score, to_onnx
 from flotilla._program import Comparison, compare, devices, paper, verify
 from flotilla._run import Generation, Run, plot, train
 from flotilla._show import Episode, Figure, Replay
@@ -47,6 +47,7 @@ __all__ = [
     "Replay",
     "Rollout",
     "Run",
+    "Scores",
     "Sweep",
     "Trace",
     "VectorEnv",
@@ -60,6 +61,7 @@ __all__ = [
     "plot",
     "replay",
     "rollout",
+    "score",
     "sweep",
     "team_env",
     "to_onnx",

@@ -105,6 +105,64 @@ class Rollout:
         return f"<flotilla.Rollout: {teams} teams of {leaders} leaders, G {self.g.mean():.3f} on average>"
 
 
+@dataclass(frozen=True)
+class Scores:
+    """The scores of given paths. `scores["Df"]` is a score by the name of the fitness.
+
+    Attributes:
+        value: the values of the POIs observed, weighted by their scores, float64 `[teams]`.
+        g: G, this as a share of the values of all POIs, `[teams]`.
+        d: what the team would have lost without each learner, `[teams, learners]`, or without the agents of
+            `credit.removes`.
+        df: without the learner and the agents that it led.
+        dpp: D, or the gain per added copy of the learner if that is larger.
+        dt: without the learner and, at each step, the agents that it led then.
+        fitness: what each learner's policies would be selected by, with G if `credit.add_g` is set.
+    """
+
+    value: NDArray[np.float64]
+    g: Floats
+    d: Floats
+    df: Floats
+    dpp: Floats
+    dt: Floats
+    fitness: Floats
+
+    def __getitem__(self, fitness: str) -> Floats:
+        """Returns a score by the name of the fitness: `"G"`, `"D"`, `"Df"`, `"D++"` or `"Dt"`."""
+        scores = {"G": self.g, "D": self.d, "Df": self.df, "D++": self.dpp, "Dt": self.dt}
+        if fitness not in scores:
+            raise no_key(fitness, "score", list(scores))
+        return scores[fitness]
+
+
+def score(config: Config, positions: ArrayLike) -> Scores:
+    """Scores paths from anywhere, such as a real experiment or another simulator. Nothing is simulated.
+
+    Args:
+        config: the world. Its start positions and rules of motion do not matter.
+        positions: the positions of all agents at the start and after each step, in map units,
+            `[teams, steps + 1, agents, 2]`; classes follow each other in the order of the config.
+
+    Raises:
+        ValueError: the positions have another shape, or hold a NaN or an infinity; or POIs come after others.
+
+    Example:
+        >>> config = flotilla.Config.paper()
+        >>> still = np.tile(np.zeros((12, 2)), (1, 26, 1, 1))
+        >>> flotilla.score(config, still).g
+        array([0.], dtype=float32)
+    """
+    check_config(config)
+    axes = "[teams, steps + 1, agents, 2]"
+    array = floats("positions", positions, axes)
+    shape = (config._native.sizes[2] + 1, config._native.sizes[0], 2)
+    if array.shape[1:] != shape or array.shape[0] == 0:
+        expected = ["1 or more", *shape]
+        raise ValueError(f"positions are {list(array.shape)}, allowed is {axes} = {expected}")
+    return Scores(*_native.score(config._native, array))
+
+
 FIELDS = ("positions", "headings", "speeds", "inputs", "outputs", "agents_at_poi", "poi_distances", "agent_distances")
 # Seconds that a block of episodes should take, so that Ctrl-C is answered soon.
 BLOCK_SECONDS = 0.2

@@ -56,6 +56,8 @@ class TeamBatch:
             raise ValueError(f"render_mode {render_mode!r}, allowed are None and 'rgb_array'")
         self.config, self.reward, self.render_mode = config, reward, render_mode
         self.count = whole("the number of teams", teams, 1, MAX_TEAMS)
+        # Otherwise rewards need a record of the episode, and are given at its end.
+        self.by_step = reward == "G" and not config._native.needs_paths
         self.stepper = self._make_stepper()
         self.leaders, (self.agents, self.pois, self.length) = config.num_learners, config._native.sizes
         self.jitters = jitters(config, jitter, poi_jitter)
@@ -69,7 +71,7 @@ class TeamBatch:
     def _make_stepper(self) -> _native.Stepper:
         # The fitness decides what the stepper records.
         scored = self.config.replace(learning={"fitness": self.reward})
-        return _native.Stepper(scored._native, self.count, self.reward != "G")
+        return _native.Stepper(scored._native, self.count, not self.by_step)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "stepper": self.stepper.save()}
@@ -92,6 +94,10 @@ class TeamBatch:
     @property
     def g(self) -> NDArray[np.float64]:
         """G of each team's episode so far, `[teams]`."""
+        if self.config._native.needs_paths:
+            scores = np.empty((self.count, self.leaders), np.float32)
+            self.stepper.fitness("G", scores)
+            return scores[:, 0].astype(np.float64)
         g: NDArray[np.float64] = self.observed @ self.worth / self.worth.sum()
         return g
 
@@ -119,7 +125,7 @@ class TeamBatch:
         """Plays a step and sets `rewards`. Returns which teams have just finished, except the `idle` ones."""
         if not self.started:
             raise Error("step was called before the first reset; call reset() first")
-        finished_before = None if self.reward == "G" else self.steps >= self.length
+        finished_before = None if self.by_step else self.steps >= self.length
         self.stepper.step(actions, self.rewards if finished_before is None else None)
         finished: NDArray[np.bool_] = self.steps >= self.length
         if idle is not None:
@@ -159,7 +165,8 @@ class VectorEnv(Base):
         config: the world. Of its learning section, only the paradigm and the jitter of starts matter here.
         num_envs: number of teams.
         reward: `"G"` gives what the newly observed POIs add to G at each step, the same to all leaders;
-            `"D"`, `"Df"`, `"D++"` and `"Dt"` give each leader that fitness at the last step, and 0 before.
+            `"D"`, `"Df"`, `"D++"` and `"Dt"` give each leader that fitness at the last step, and 0 before. So does `"G"` if
+            POIs count by distance or by when, or the start counts.
         layout: shape of rewards and environments. `"leaders"`: one environment per team and one reward per leader,
             `[num_envs, leaders]`. `"team"`: one environment per team and one reward, `[num_envs]`, the mean over its
             leaders, as gymnasium's wrappers expect. `"flat"`: one environment per leader, `num_envs * leaders` in all,

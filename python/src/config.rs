@@ -96,6 +96,12 @@ impl Config {
         if negative { f64::NEG_INFINITY } else { 0.0 }
     }
 
+    /// Whether scores are computed from paths.
+    #[getter]
+    fn needs_paths(&self) -> PyResult<bool> {
+        Ok(World::new(&self.0.validate().raise()?).paths.is_some())
+    }
+
     /// The worth of each POI, as a multiple of a common unit.
     #[getter]
     fn worth(&self) -> PyResult<Vec<u32>> {

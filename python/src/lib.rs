@@ -25,7 +25,7 @@ mod _native {
     #[pymodule_export]
     use crate::config::{Config, keys, sweep};
     #[pymodule_export]
-    use crate::play::{forward, record, rollout, starts};
+    use crate::play::{forward, record, rollout, score, starts};
     #[pymodule_export]
     use crate::program::{adapters, answer, main};
     #[pymodule_export]

@@ -7,14 +7,14 @@ use flotilla::backend::cpu::{self, StepArrays};
 use flotilla::config::{Fitness, MAX_HIDDEN_UNITS};
 use flotilla::evaluate::{self, Batch, Spread, Starts, Tally};
 use flotilla::evolve::{self, MAX_WEIGHT};
-use flotilla::front::{self, ActionNoise, Failure, Played};
+use flotilla::front::{self, ActionNoise, Failure, Played, Scored};
 use flotilla::model::policy::{MAX_HIDDEN_LAYERS, PolicyConstants};
 use flotilla::world::{OUTPUTS, World};
 use flotilla_app::choice::Work;
 use glam::Vec2;
 use numpy::{
     Element, PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3,
-    PyReadwriteArray2, PyReadwriteArrayDyn, PyUntypedArrayMethods,
+    PyReadonlyArray4, PyReadwriteArray2, PyReadwriteArrayDyn, PyUntypedArrayMethods,
 };
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
@@ -59,6 +59,33 @@ type Spreads<'py> = (Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<u32>>);
 
 /// Minimum time between checks for Ctrl-C.
 const PATIENCE: Duration = Duration::from_millis(50);
+
+type PathScores<'py> = (
+    Bound<'py, PyArray1<f64>>,
+    Bound<'py, PyArray1<f32>>,
+    Bound<'py, PyArray2<f32>>,
+    Bound<'py, PyArray2<f32>>,
+    Bound<'py, PyArray2<f32>>,
+    Bound<'py, PyArray2<f32>>,
+    Bound<'py, PyArray2<f32>>,
+);
+
+/// Scores paths, `[teams, steps + 1, agents, 2]`. Returns the values observed and G, `[teams]`, and D, Df, D++, Dt and the
+/// fitness of the config, `[teams, learners]`.
+#[pyfunction]
+pub fn score<'py>(
+    py: Python<'py>,
+    config: &Config,
+    positions: PyReadonlyArray4<'py, f32>,
+) -> PyResult<PathScores<'py>> {
+    let teams = positions.shape()[0];
+    let positions = positions.as_slice().map_err(|_| PyValueError::new_err("positions are not C-contiguous"))?;
+    let scored = workers::aside(py, || front::score(&config.0, positions).raise())?;
+    let rows = |scores: Vec<f32>| PyArray1::from_vec(py, scores).reshape([teams, config.0.learners()]);
+    let Scored { value, g, d, df, dpp, dt, fitness, .. } = scored;
+    let (value, g) = (PyArray1::from_vec(py, value), PyArray1::from_vec(py, g));
+    Ok((value, g, rows(d)?, rows(df)?, rows(dpp)?, rows(dt)?, rows(fitness)?))
+}
 
 /// Plays teams. Returns what the observed POIs are worth, `[teams]`, and D, Df, D++ and Dt, `[teams, leaders]`. Dt is
 /// `None` unless it is the config's fitness.

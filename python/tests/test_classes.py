@@ -199,3 +199,71 @@ def test_inputs_of_another_width_are_refused():
         forward(policy, np.zeros((7, 8)), wide)
     with pytest.raises(ValueError, match="out is .*allowed is"):
         VectorEnv(wide, 2)._teams.inputs(np.zeros((2, 5, 8), np.float32))
+
+
+LED = """
+[world]
+map = [20, 20]
+steps = 2
+start_counts = true
+
+[[agents]]
+name = "rover"
+at = [[10, 10]]
+senses = [{ of = "uav", range = 5 }]
+
+[[agents]]
+name = "uav"
+at = [[10, 11]]
+senses = [{ of = "pois" }]
+observes = false
+leads = "rover"
+influence_radius = 3
+fitness = "Dt"
+
+[[pois]]
+name = "poi"
+at = [[10, 15], [3, 3]]
+value = 3
+coupling = 1
+radius = 4
+score = "closeness"
+
+[learning]
+fitness = "D"
+trials = 2
+generations = 2
+population = 4
+
+[credit]
+led_by = "alone"
+"""
+
+
+def test_paths_are_scored_by_distance():
+    config = Config.parse(LED)
+    # The rover comes within 2 of the first POI, while the UAV is near; or while it is far away.
+    near = [[[10, 10], [10, 11]], [[10, 12], [10, 12]], [[10, 13], [10, 12]]]
+    far = [[[10, 10], [10, 11]], [[10, 12], [1, 1]], [[10, 13], [1, 1]]]
+    scores = flotilla.score(config, [near, far])
+    assert scores.value.tolist() == [1.5, 1.5] and scores.g.tolist() == [0.25, 0.25]
+    assert scores.d.tolist() == [[0.25, 0], [0.25, 0]] and scores["Dt"].tolist() == [[0.25, 0.25], [0.25, 0]]
+    assert scores.fitness.tolist() == scores.dt.tolist()
+    added = flotilla.score(config.replace(credit={"add_g": True}), [near]).fitness
+    assert added.tolist() == [[0.5, 0.5]]
+    with pytest.raises(ValueError, match=r"positions are \[2, 2, 2, 2\], allowed is .* = \['1 or more', 3, 2, 2\]"):
+        flotilla.score(config, np.zeros((2, 2, 2, 2)))
+    with pytest.raises(ValueError, match="agent 1 of team 0 is at inf after step 2"):
+        flotilla.score(config, np.where(np.arange(12).reshape(1, 3, 2, 2) == 10, np.inf, 1.0))
+
+
+def test_environments_reward_closeness_at_the_end():
+    config = Config.parse(LED)
+    env = VectorEnv(config, 3)
+    env.reset(seed=0)
+    rewards = [env.step(np.ones((3, 2, 2), np.float32))[1] for _ in range(2)]
+    assert not rewards[0].any() and np.allclose(rewards[1], env._teams.g[:, None])
+    policies = random_policies(config, 3)
+    trace = rollout(config, policies, record=("positions",))
+    assert np.array_equal(trace.g, flotilla.score(config, trace.trace.positions).g)
+    assert flotilla.train(config).metrics["best_g"].shape == (2, 3)

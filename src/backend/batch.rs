@@ -43,9 +43,14 @@ impl<'a> Group<'a> {
         Some(&self.starts[self.world.agents()..]).filter(|pois| !pois.is_empty())
     }
 
-    /// Returns the part of a record that the fitnesses are computed from.
+    /// Returns the POI positions.
+    pub fn pois(&self) -> &'a [Vec2] {
+        self.moved_pois().unwrap_or(&self.world.pois)
+    }
+
+    /// Returns the part of a record that the fitnesses are computed from, besides paths.
     pub(crate) fn records(&self) -> RecordRequest<'a> {
-        RecordRequest(self.fitnesses)
+        RecordRequest(if self.world.paths.is_some() { &[] } else { self.fitnesses })
     }
 
     /// Returns the number of populations.

@@ -1,6 +1,8 @@
 //! The trace of a group: all quantities of every step.
 
-use crate::credit::Episode;
+use glam::Vec2;
+
+use crate::credit::{Episode, Paths, Strided};
 use crate::gpu_struct::gpu_struct;
 use crate::world::{OUTPUTS, World};
 
@@ -43,9 +45,12 @@ pub struct Trace {
     /// The number of steps at which each follower saw each leader, `[teams][followers][leaders]`.
     pub seen: Vec<u32>,
     /// The leaders that each follower saw before the move of each step, one bit per leader,
-    /// `[teams][steps][followers][words of leaders]`. Empty unless Dt is among the group's
-    /// [fitnesses](super::Group::fitnesses).
-    pub sights: Vec<u32>,
+    /// `[teams][steps][followers][words of leaders]`; empty unless Dt is among the group's
+    /// [fitnesses](super::Group::fitnesses). If [scores need paths](crate::world::WorldParts::paths), instead the positions,
+    /// f32 as bits, `[teams][steps + 1][agents][2]`.
+    pub trail: Vec<u32>,
+    /// Positions of the POIs, `[pois]`.
+    pub pois: Vec<Vec2>,
 }
 
 impl Trace {
@@ -64,6 +69,11 @@ impl Trace {
     pub fn episode(&self, world: &World, team: usize) -> Episode<'_> {
         let part = |words, size: usize| <[u32]>::get(words, team * size..(team + 1) * size).unwrap_or_default();
         let counts = part(&self.seen, world.leaders() * world.followers());
-        Episode::whole(part(&self.sets, world.set_words()), counts, part(&self.sights, world.sight_words()))
+        let sets = part(&self.sets, world.set_words());
+        if world.paths.is_none() {
+            return Episode::whole(sets, counts, part(&self.trail, world.sight_words()));
+        }
+        let positions = Strided::contiguous(part(&self.trail, world.path_words()));
+        Episode { paths: Some(Paths { positions, pois: &self.pois }), ..Episode::whole(sets, counts, &[]) }
     }
 }

@@ -3,9 +3,9 @@
 //! `[[agents]]` and `[[pois]]` write them in full. The sections `[motion]`, `[follow]` and `[sense]`, and the keys of
 //! `[world]` for leaders, followers and POIs, are short for two classes, `leader` and `follower`, and one group of POIs.
 
-use super::{Config, Coupling, Density, Follow, Heading, Observers, Paradigm, Sense, Sharing, WorldConfig};
+use super::{Config, Coupling, Density, Fitness, Follow, Heading, Observers, Paradigm, Sense, Sharing, WorldConfig};
 use crate::model::classes::{
-    AGENTS, AgentClass, Channel, Classes, Combine, Control, Frame, Measure, POIS, PoiGroup, Term,
+    AGENTS, AgentClass, Channel, Classes, Combine, Control, Frame, Measure, POIS, PoiGroup, Score, Term, When,
 };
 use crate::model::motion::Mobility;
 use crate::reader::{OneOrEach, Reader, includes};
@@ -128,7 +128,8 @@ impl Config {
     /// Returns the config with the defaults of all keys that its tables replace, as it is read from a file.
     pub(crate) fn without_replaced(mut self) -> Config {
         let defaults = Config::ask(&mut Reader::default());
-        let world = WorldConfig { map: self.world.map, steps: self.world.steps, dt: self.world.dt, ..defaults.world };
+        let WorldConfig { map, steps, start_counts, dt, .. } = self.world;
+        let world = WorldConfig { map, steps, start_counts, dt, ..defaults.world };
         if !self.agents.is_empty() {
             let WorldConfig { pois, coupling, observation_radius, windows, after, .. } = self.world;
             self.world = WorldConfig { pois, coupling, observation_radius, windows, after, ..world.clone() };
@@ -146,6 +147,40 @@ impl Config {
     pub(super) fn is_written(&self, key: &str) -> bool {
         let has = |keys: &[&str]| keys.iter().any(|name| includes(name, key));
         (self.agents.is_empty() || !has(REPLACED_BY_AGENTS)) && (self.pois.is_empty() || !has(REPLACED_BY_POIS))
+    }
+
+    /// Returns what, if anything, makes scores depend on more than the agents at each POI and step, so that they are
+    /// computed from paths.
+    pub(crate) fn needs_paths(&self) -> Option<&'static str> {
+        let learn = |name: &String| self.agents.iter().any(|class| class.name == *name && class.learns());
+        match self {
+            _ if self.world.start_counts => Some("world.start_counts"),
+            _ if !self.credit.removes.is_empty() => Some("credit.removes"),
+            _ if self.pois.iter().any(|group| group.score != Score::Observed) => Some("score = \"closeness\""),
+            _ if self.pois.iter().any(|group| group.when != When::Ever) => Some("another `when` than \"ever\""),
+            _ if self.agents.iter().flat_map(|class| &class.leads).any(learn) => Some("classes that learn and are led"),
+            _ => None,
+        }
+    }
+
+    /// Returns the fitness of each learner, `[learners]`.
+    pub fn fitness_of_each(&self) -> Vec<Fitness> {
+        let of_class = |class: &AgentClass| vec![class.fitness.unwrap_or(self.learning.fitness); class.at.len()];
+        match &self.agents[..] {
+            [] => vec![self.learning.fitness; self.learners()],
+            classes => classes.iter().filter(|class| class.learns()).flat_map(of_class).collect(),
+        }
+    }
+
+    /// Returns the fitnesses of all learners, each once.
+    pub fn fitnesses(&self) -> Vec<Fitness> {
+        let mut fitnesses = vec![];
+        for fitness in self.fitness_of_each() {
+            if !fitnesses.contains(&fitness) {
+                fitnesses.push(fitness);
+            }
+        }
+        fitnesses
     }
 
     /// Returns the classes and groups, written out in full.
@@ -176,6 +211,7 @@ impl Config {
             wall_gain: follow.wall_gain,
             leads: vec![],
             influence_radius: None,
+            fitness: None,
             observes: match world.observers {
                 Observers::All => true,
                 Observers::Leaders => control == Control::Policy,
@@ -208,6 +244,8 @@ impl Config {
             radius: world.observation_radius,
             observers: vec![],
             windows: windows.to_vec(),
+            score: Score::Observed,
+            when: When::Ever,
             after: vec![],
         };
         if world.after.iter().all(Vec::is_empty) {

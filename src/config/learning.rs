@@ -1,7 +1,8 @@
 //! The sections `[learning]` and `[checkpoint]`: their data and keys.
 
-use super::{MAX_AGENTS, MAX_STEPS};
+use super::MAX_AGENTS;
 use crate::config_enum::config_enum;
+use crate::model::classes::Fitness;
 use crate::model::{LEAST, LONGEST};
 use crate::reader::{CountOrPercentage, Reader, between, section};
 
@@ -18,7 +19,7 @@ pub const MAX_TRIALS: usize = 4096;
 /// Maximum number of episodes that a team's score is averaged over.
 pub const MAX_EPISODES: usize = 1000;
 section! {
-    /// `[learning]`: the cooperative coevolution. `led_within` and `led_by` are a world's [`Led`](crate::world::Led).
+    /// `[learning]`: the cooperative coevolution.
     Learning = "learning" {
         /// who learns: the leaders, or every agent
         paradigm: Paradigm = "", "4.1, 4.4",
@@ -66,11 +67,6 @@ section! {
         mutation_probability: f64 = "", "2.4, 4.3",
         /// σ: standard deviation of a mutation
         mutation_sigma: f64 = "", "2.4, 4.3",
-        /// for Dt: number of last steps, the present one included, that decide who leads a follower; 0 means all steps
-        /// so far
-        led_within: usize = "steps", "",
-        /// for Dt: a follower is led by the leader that it saw in most of these steps, or by every leader that it saw
-        led_by: LedBy = "", "4.2, 5",
         /// number of episodes over which a team's scores are averaged
         episodes_per_team: usize = "episodes", "",
         /// j: in every episode each agent's start is moved by a uniform offset in −j to j on both axes, the same for
@@ -102,22 +98,6 @@ config_enum! {
         Group = "group",
         /// All leaders: there is one population.
         Shared = "all",
-    }
-}
-
-config_enum! {
-    /// The score that policies are selected by (see [`crate::credit`]).
-    Fitness {
-        /// The team's score.
-        G = "G",
-        /// Difference evaluation without the leader.
-        D = "D",
-        /// Difference evaluation without the leader and its followers.
-        Df = "Df",
-        /// Difference evaluation with copies of the leader as stepping stones.
-        Dpp = "D++",
-        /// Difference evaluation without the leader and, at each step, the followers that it leads then.
-        Dt = "Dt",
     }
 }
 
@@ -165,16 +145,6 @@ impl Elites {
             Elites::Percentage(percentage) => ((population as f64 * percentage / 100.0).round() as usize).max(1),
         };
         count.min(population)
-    }
-}
-
-config_enum! {
-    /// The leaders that lead a follower, of those that it saw.
-    LedBy {
-        /// The leader that it saw at the most steps.
-        MostSeen = "most-seen",
-        /// All leaders that it saw.
-        AnySeen = "any-seen",
     }
 }
 
@@ -269,8 +239,6 @@ impl Learning {
             mutation: Learning::mutation(r).choice(Mutation::Scaled),
             mutation_probability: Learning::mutation_probability(r).number(between(LEAST, 1.0).or_zero(), 0.15),
             mutation_sigma: Learning::mutation_sigma(r).number(between(LEAST, 100.0).or_zero(), 0.1),
-            led_within: Learning::led_within(r).number(between(0, MAX_STEPS), 0),
-            led_by: Learning::led_by(r).choice(LedBy::MostSeen),
             episodes_per_team: Learning::episodes_per_team(r).number(between(1, MAX_EPISODES), 1),
             start_jitter: Learning::start_jitter(r).number(between(LEAST, LONGEST).or_zero(), 0.0),
             poi_jitter: Learning::poi_jitter(r).number(between(LEAST, LONGEST).or_zero(), 0.0),

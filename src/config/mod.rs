@@ -19,8 +19,8 @@ use classes::Summary;
 
 pub use crate::config_enum::Choice;
 pub use crate::model::classes::{
-    AGENTS, AgentClass, Channel, Classes, Combine, Control, Frame, MAX_CHANNELS, MAX_CLASSES, MAX_INPUTS, MAX_SECTORS,
-    MAX_TERMS, Measure, POIS, PoiGroup, Term,
+    AGENTS, AgentClass, Channel, Classes, Combine, Control, Fitness, Frame, MAX_CHANNELS, MAX_CLASSES, MAX_INPUTS,
+    MAX_SECTORS, MAX_TERMS, Measure, POIS, PoiGroup, Score, Term, When,
 };
 pub use crate::model::follow::Follow;
 pub use crate::model::motion::{Mobility, Motion};
@@ -30,9 +30,10 @@ pub use crate::model::sense::{Density, Sense};
 pub use crate::model::start::Heading;
 pub use crate::reader::{Definition, Override, Problem};
 
+pub use credit::{CreditConfig, LedBy};
 pub use learning::{
-    CheckpointConfig, Elites, Fitness, Learning, LedBy, Leniency, MAX_EPISODES, MAX_GENERATIONS, MAX_HALL_OF_FAME,
-    MAX_PARTNERS, MAX_POPULATION, MAX_TRIALS, Method, Mutation, Paradigm, Parents, Sharing,
+    CheckpointConfig, Elites, Learning, Leniency, MAX_EPISODES, MAX_GENERATIONS, MAX_HALL_OF_FAME, MAX_PARTNERS,
+    MAX_POPULATION, MAX_TRIALS, Method, Mutation, Paradigm, Parents, Sharing,
 };
 pub use load::name;
 pub use load::{is_standard_input, read_file, read_text};
@@ -43,6 +44,7 @@ pub use valid::{StageConfig, ValidConfig};
 pub use world::{MAX_AGENTS, MAX_POIS, MAX_STEPS, WorldConfig};
 
 mod classes;
+mod credit;
 mod learning;
 mod load;
 mod populations;
@@ -98,6 +100,8 @@ pub struct Config {
     pub policy: Policy,
     /// `[learning]`: the coevolution.
     pub learning: Learning,
+    /// `[credit]`: what is taken out to see what a learner was worth.
+    pub credit: CreditConfig,
     /// `[checkpoint]`: how often a run saves.
     pub checkpoint: CheckpointConfig,
     /// `[[agents]]`: classes of agents, written in full. Empty if they are written in short, see [`Config::classes`].
@@ -207,9 +211,9 @@ impl Config {
 
     /// Returns the value of each dotted key, without the stages.
     fn values(&self) -> impl Iterator<Item = (&'static str, reader::Value<'static>)> {
-        let Config { world, motion, follow, sense, policy, learning, checkpoint, .. } = self;
+        let Config { world, motion, follow, sense, policy, learning, credit, checkpoint, .. } = self;
         let sections = [world.values(), motion.values(), follow.values(), sense.values(), policy.values()];
-        let values = sections.into_iter().chain([learning.values(), checkpoint.values()]).flatten();
+        let values = sections.into_iter().chain([learning.values(), credit.values(), checkpoint.values()]).flatten();
         let agents = (!self.agents.is_empty()).then(|| (AGENTS, reader::Value::of(&self.agents)));
         let pois = (!self.pois.is_empty()).then(|| (POIS, reader::Value::of(&self.pois)));
         values.filter(|(key, _)| self.is_written(key)).chain(agents).chain(pois)
@@ -229,6 +233,7 @@ impl Config {
         section(map, &self.sense, self)?;
         section(map, &self.policy, self)?;
         section(map, &self.learning, self)?;
+        section(map, &self.credit, self)?;
         section(map, &self.checkpoint, self)
     }
 
@@ -352,6 +357,10 @@ impl Config {
             Paradigm::LeaderFollower => world.leaders.len(),
             Paradigm::AllLeaders => world.leaders.len() + world.followers.len(),
         };
+        let agent_count = match has_agents {
+            true => agents.iter().map(|class| class.at.len()).sum(),
+            false => world.leaders.len() + world.followers.len(),
+        };
         let config = Config {
             world,
             motion,
@@ -359,6 +368,7 @@ impl Config {
             sense: Sense::read(r),
             policy: Policy::read(r),
             learning: Learning::read(r, paradigm, learners),
+            credit: CreditConfig::read(r, learners, agent_count),
             checkpoint: CheckpointConfig::read(r),
             agents,
             pois,
@@ -372,6 +382,13 @@ impl Config {
                 class.name
             );
             r.report_key("policy.actions", message);
+        }
+        if r.error_count() == 0
+            && let Some(why) = config.needs_paths()
+            && config.classes().pois.iter().any(|group| !group.after.is_empty())
+        {
+            let key = if has_pois { POIS } else { "world.after" };
+            r.report_key(key, format!("found POIs that come after others, allowed without {why}"));
         }
         if has_agents && config.learning.sharing == Sharing::Group && !r.has("learning.groups") {
             r.report_key("learning.sharing", "found \"group\" with [[agents]], which needs learning.groups".into());

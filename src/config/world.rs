@@ -45,6 +45,8 @@ section! {
         after: Vec<Vec<usize>>,
         /// T: length of an episode
         steps: usize = "steps", "3.2, Eq. 2",
+        /// whether the start counts as a step, step 0, at which agents observe and influence others
+        start_counts: bool = "", "3.2, Eq. 2",
         /// duration of a step
         dt: f64 = "s", "",
         /// Agents' headings at the start, in radians from the x axis towards the y axis.
@@ -107,6 +109,7 @@ impl WorldConfig {
             pois: pois.unwrap_or_default(),
             observation_radius: observation_radius(r),
             steps,
+            start_counts: WorldConfig::start_counts(r).flag(false),
             dt: WorldConfig::dt(r).number(between(1e-4, 10.0), 0.2),
             heading,
             speed: WorldConfig::speed(r).number(start_speed, 0.0),

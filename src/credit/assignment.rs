@@ -51,19 +51,26 @@ pub(super) fn gather(owner: &[u32], world: &World, groups: &mut Vec<u32>) {
 
 /// Writes which leaders lead each follower at each step, one bit per leader, `[steps][followers][words of leaders]`.
 /// `sights` has the leaders that each follower saw, in the same shape.
-///
-/// Only the steps that [count](crate::world::Led) matter. The leader that the follower saw at most of them leads it,
-/// ties to the lower index; or with [`LedBy::AnySeen`] every leader that it saw.
 pub fn find_leading(sights: &Strided<'_>, world: &World, led: &mut Vec<u32>) {
-    let (followers, words) = (world.followers(), world.leader_words());
-    let (steps, Led { within, by }) = (sights.len() / (followers * words).max(1), world.led);
+    lead(sights, world.followers(), world.leaders(), world.led, led);
+}
+
+/// Computes [`find_leading`] for so many followers, or other agents that are led. Only the steps that [count](Led) matter.
+pub(super) fn lead(sights: &Strided<'_>, followers: usize, leaders: usize, rule: Led, led: &mut Vec<u32>) {
+    let words = leaders.div_ceil(32);
+    let (steps, Led { within, by }) = (sights.len() / (followers * words).max(1), rule);
     led.clear();
     led.resize(sights.len(), 0);
-    let mut counts = vec![0u32; world.leaders()];
+    let mut counts = vec![0u32; leaders];
     for follower in 0..followers {
         counts.fill(0);
         for step in 0..steps {
             let place = |step: usize| (step * followers + follower) * words;
+            let leading = &mut led[place(step)..][..words];
+            if within == 1 && words == 1 {
+                leading[0] = choose(by, sights.get(place(step)), leaders);
+                continue;
+            }
             let seen = |step: usize| {
                 (0..words)
                     .flat_map(move |word| each_bit(sights.get(place(step) + word)).map(move |bit| word * 32 + bit))
@@ -72,17 +79,45 @@ pub fn find_leading(sights: &Strided<'_>, world: &World, led: &mut Vec<u32>) {
             if within > 0 && step >= within {
                 seen(step - within).for_each(|leader| counts[leader] -= 1);
             }
-            let leading = &mut led[place(step)..][..words];
             let mut lead = |leader: usize| leading[leader / 32] |= 1 << (leader % 32);
             let mut counted = counts.iter().enumerate().filter(|(_, count)| **count > 0);
             match by {
                 LedBy::AnySeen => counted.for_each(|(leader, _)| lead(leader)),
+                LedBy::First => counted.next().into_iter().for_each(|(leader, _)| lead(leader)),
+                LedBy::Alone => match (counted.next(), counted.next()) {
+                    (Some((leader, _)), None) => lead(leader),
+                    _ => {}
+                },
+                LedBy::Anyone if counted.next().is_some() => (0..leaders).for_each(lead),
+                LedBy::Anyone => {}
                 LedBy::MostSeen => {
                     let first = counted.next();
                     let most =
                         first.map(|first| counted.fold(first, |most, next| if next.1 > most.1 { next } else { most }));
                     most.into_iter().for_each(|(leader, _)| lead(leader));
                 }
+            }
+        }
+    }
+}
+
+/// Returns who leads, of up to 32 leaders that were seen at the one step that counts.
+fn choose(by: LedBy, seen: u32, leaders: usize) -> u32 {
+    match by {
+        LedBy::AnySeen => seen,
+        LedBy::MostSeen | LedBy::First => seen & seen.wrapping_neg(),
+        LedBy::Alone => {
+            if seen.count_ones() == 1 {
+                seen
+            } else {
+                0
+            }
+        }
+        LedBy::Anyone => {
+            if seen == 0 {
+                0
+            } else {
+                u32::MAX >> (32 - leaders)
             }
         }
     }

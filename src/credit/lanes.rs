@@ -48,13 +48,17 @@ impl<S: Simd> LaneCredit<S> {
             critical: vec![zero; words],
             groups: vec![zero; world.leaders() * words],
             total,
-            shares: if total > MOST_SHARES { vec![] } else { (0..=total).map(|worth| share(worth, total)).collect() },
+            shares: if total > MOST_SHARES {
+                vec![]
+            } else {
+                (0..=total).map(|worth| share(worth, total.into())).collect()
+            },
         }
     }
 
     /// Reports whether a world's teams can be scored by a fitness.
     pub(crate) fn can_score(world: &World, fitness: Fitness) -> bool {
-        !world.rule.is_timed() && matches!(fitness, Fitness::G | Fitness::D | Fitness::Df)
+        world.paths.is_none() && !world.rule.is_timed() && matches!(fitness, Fitness::G | Fitness::D | Fitness::Df)
     }
 
     /// Scores episodes. `sets` has the agents at each POI after each step, `[steps][pois][words][lanes]`, and `seen` the
@@ -109,7 +113,7 @@ impl<S: Simd> LaneCredit<S> {
     pub(crate) fn scores(&self, lane: usize) -> impl Iterator<Item = f32> {
         let of = move |lost: &S::u32s| {
             let lost = lost[lane];
-            self.shares.get(lost as usize).copied().unwrap_or_else(|| share(lost, self.total))
+            self.shares.get(lost as usize).copied().unwrap_or_else(|| share(lost, self.total.into()))
         };
         self.lost.iter().map(of)
     }
@@ -272,7 +276,7 @@ mod tests {
                 for lane in 0..lanes {
                     let strided = |words| Strided { words, stride: lanes, offset: lane };
                     let seen = Seen::Counts(strided(&words));
-                    let episode = Episode { sets: strided(&sets), seen, sights: Strided::NONE };
+                    let episode = Episode { sets: strided(&sets), seen, sights: Strided::NONE, paths: None };
                     let observed = plain.score(&episode, &world, fitness, &mut scores);
                     assert_eq!(vector.observed(lane), observed, "world {seed}, lane {lane}");
                     assert!(vector.scores(lane).eq(scores.iter().copied()), "world {seed}, lane {lane}, {fitness:?}");

@@ -14,14 +14,17 @@
 mod assignment;
 mod fast;
 mod lanes;
+mod paths;
 mod record;
 mod replay;
 
 pub use assignment::{UNASSIGNED, assign};
 pub use assignment::{find_leading, is_led_by};
 pub(crate) use lanes::LaneCredit;
-pub use record::{Episode, RecordRequest, Seen, Strided, owner_bits};
+pub use record::{Episode, Paths, RecordRequest, Seen, Strided, owner_bits};
 pub use replay::observed_at;
+
+use paths::PathCredit;
 
 use crate::config::Fitness;
 use crate::world::World;
@@ -72,12 +75,16 @@ pub struct Credit {
     counterfactual: Vec<u32>,
     /// The output of [`find_leading`].
     led: Vec<u32>,
+    paths: PathCredit,
 }
 
 impl Credit {
     /// Scores every leader of the team by `fitness` into `scores`, `[leaders]`, and returns what the POIs are worth that
     /// the team observed. The episode must be of `world`, with the [record](RecordRequest) that the fitness needs.
     pub fn score(&mut self, episode: &Episode<'_>, world: &World, fitness: Fitness, scores: &mut [f32]) -> u32 {
+        if let (Some(rule), Some(paths)) = (&world.paths, &episode.paths) {
+            return self.paths.score(paths, world, rule, fitness, scores);
+        }
         if world.rule.is_timed() || fitness == Fitness::Dt {
             return self.replay(episode, world, fitness, scores);
         }
@@ -87,7 +94,7 @@ impl Credit {
         match fitness {
             Fitness::G => {
                 self.observe(episode, world);
-                scores.fill(share(self.observed_worth(world), total));
+                scores.fill(share(self.observed_worth(world), total.into()));
             }
             Fitness::D | Fitness::Df => {
                 match fitness == Fitness::Df && world.followers() > 0 {
@@ -95,7 +102,7 @@ impl Credit {
                     false => self.find_critical_leaders(episode, world),
                 }
                 self.count_lost(world);
-                scores.iter_mut().zip(&self.lost).for_each(|(score, &lost)| *score = share(lost, total));
+                scores.iter_mut().zip(&self.lost).for_each(|(score, &lost)| *score = share(lost, total.into()));
             }
             Fitness::Dt => unreachable!("it was replayed"),
             Fitness::Dpp => {
@@ -109,6 +116,11 @@ impl Credit {
         self.observed_worth(world)
     }
 
+    /// Returns every fitness of every leader of a team that took some paths, in a world that is scored by them.
+    pub(crate) fn of_paths(&mut self, paths: &Paths<'_>, world: &World) -> Scores {
+        self.all(&Episode { paths: Some(*paths), ..Episode::whole(&[], &[], &[]) }, world)
+    }
+
     /// Returns every fitness of every leader. The episode must be of `world`, with the [record](RecordRequest) that D++
     /// and Df need.
     pub fn all(&mut self, episode: &Episode<'_>, world: &World) -> Scores {
@@ -119,12 +131,12 @@ impl Credit {
             (observed, scores)
         };
         let ((observed, d), (_, df), (_, dpp)) = (by(Fitness::D), by(Fitness::Df), by(Fitness::Dpp));
-        let dt = match (world.followers(), episode.sights.is_empty()) {
-            (0, _) => d.clone(),
-            (_, true) => vec![],
-            (_, false) => by(Fitness::Dt).1,
+        let dt = match world.followers() {
+            _ if episode.paths.is_some() || !episode.sights.is_empty() => by(Fitness::Dt).1,
+            0 => d.clone(),
+            _ => vec![],
         };
-        Scores { observed, g: share(observed, world.total_worth), d, df, dpp, dt }
+        Scores { observed, g: share(observed, world.total_worth.into()), d, df, dpp, dt }
     }
 }
 
@@ -136,21 +148,21 @@ impl Credit {
 #[inline(always)]
 fn stepping_stone(lost: u32, most: u32, at_most: u32, total: u32, mut gain: impl FnMut(u32) -> u32) -> f32 {
     if u64::from(lost) * u64::from(most) >= u64::from(at_most) {
-        return share(lost, total);
+        return share(lost, total.into());
     }
     let mut now = gain(1);
     for copies in 1..most {
         let next = gain(copies + 1);
         if u64::from(next) * u64::from(copies) <= u64::from(now) * (u64::from(copies) + 1) {
-            return share(now, total * copies);
+            return share(now, u64::from(total) * u64::from(copies));
         }
         now = next;
     }
-    share(now, total * most)
+    share(now, u64::from(total) * u64::from(most))
 }
 
 /// Returns a ratio of two numbers, each exact in f32 up to 2^24.
-fn share(count: u32, of: u32) -> f32 {
+fn share(count: u32, of: u64) -> f32 {
     count as f32 / of as f32
 }
 

@@ -1,5 +1,7 @@
 //! The record of one team's episode: who was at which POI, and which leaders followers saw.
 
+use glam::Vec2;
+
 use crate::config::Fitness;
 
 /// The record of one team's episode. Credit is computed from it.
@@ -13,13 +15,20 @@ pub struct Episode<'a> {
     /// The leaders that each follower saw before the move of each step, one bit per leader, `[steps][followers][words
     /// of leaders]`. Empty unless [needed](RecordRequest::sights).
     pub sights: Strided<'a>,
+    /// Where the agents were, if [scores need it](crate::world::WorldParts::paths).
+    pub paths: Option<Paths<'a>>,
 }
 
 impl<'a> Episode<'a> {
     /// Returns the record of a team whose words are not interleaved with those of other teams.
     pub fn whole(sets: &'a [u32], counts: &'a [u32], sights: &'a [u32]) -> Episode<'a> {
         let [sets, counts, sights] = [sets, counts, sights].map(Strided::contiguous);
-        Episode { sets, seen: Seen::Counts(counts), sights }
+        Episode { sets, seen: Seen::Counts(counts), sights, paths: None }
+    }
+
+    /// Returns the sightings, or the positions of its paths.
+    pub(crate) fn trail(&self) -> Strided<'a> {
+        self.paths.map_or(self.sights, |paths| paths.positions)
     }
 }
 
@@ -80,6 +89,15 @@ impl<'a> Seen<'a> {
 /// Returns the bits per follower in [`Seen::Owners`].
 pub fn owner_bits(leaders: u32) -> u32 {
     if leaders < 255 { 8 } else { 16 }
+}
+
+/// The paths of one team: where its agents were.
+#[derive(Clone, Copy, Debug)]
+pub struct Paths<'a> {
+    /// Positions at the start and after each step in units, f32 as bits, `[steps + 1][agents][2]`.
+    pub positions: Strided<'a>,
+    /// Positions of the POIs in units, `[pois]`.
+    pub pois: &'a [Vec2],
 }
 
 /// The words of one team in an array that interleaves several: word i is `words[i * stride + offset]`.

@@ -52,8 +52,8 @@ impl Credit {
                 observed - worth(world, counterfactual)
             };
             *score = match fitness {
-                Fitness::G => share(observed, total),
-                Fitness::D | Fitness::Df | Fitness::Dt => share(lost(), total),
+                Fitness::G => share(observed, total.into()),
+                Fitness::D | Fitness::Df | Fitness::Dt => share(lost(), total.into()),
                 Fitness::Dpp => {
                     let (lost, most) = (lost(), world.coupling.iter().copied().max().unwrap_or(0));
                     let mut gain = |copies| {

@@ -91,6 +91,9 @@ pub enum Failure {
     /// The given fitness has the wrong size, or is not finite.
     #[error("fitness: {0}")]
     Fitness(String),
+    /// The paths cannot be scored.
+    #[error("positions: {0}")]
+    Paths(String),
     /// A saved state does not fit the config.
     #[error("the state is of another config, or damaged")]
     State,

@@ -14,12 +14,14 @@
 //! | `coevolution` | the driver of a training, whose caller may score the policies (ask and tell) |
 //! | `train` | training with a callback |
 //! | `play` | playing, tracing and stepping of given policies |
+//! | `score` | scores of given paths |
 
 mod coevolution;
 mod error;
 mod open;
 mod play;
 mod results;
+mod score;
 mod train;
 
 pub use coevolution::{Coevolution, Progress};
@@ -29,4 +31,5 @@ pub use open::cpu;
 pub use open::{GpuSearch, Processor, find_gpu, on_gpu, open};
 pub use play::{ActionNoise, Played, Traced, play, play_until, record, stepper, trace, with_team};
 pub use results::{Generation, Trained};
+pub use score::{Scored, score};
 pub use train::{train, train_from, train_with_champions};

@@ -67,6 +67,9 @@ table! {
         influence_radius: Option<f64> = "units",
         /// whether it counts at POIs that do not name their observers
         observes: bool = "",
+        /// what its policies are selected by, by default learning.fitness
+        #[serde(skip_serializing_if = "Option::is_none")]
+        fitness: Option<Fitness> = "",
     }
 }
 
@@ -79,6 +82,22 @@ config_enum! {
         Follow = "follow",
         /// It stays where it is.
         Still = "still",
+    }
+}
+
+config_enum! {
+    /// The score that policies are selected by (see [`crate::credit`]).
+    Fitness {
+        /// The team's score.
+        G = "G",
+        /// Difference evaluation without the leader.
+        D = "D",
+        /// Difference evaluation without the leader and its followers.
+        Df = "Df",
+        /// Difference evaluation with copies of the leader as stepping stones.
+        Dpp = "D++",
+        /// Difference evaluation without the leader and, at each step, the followers that it leads then.
+        Dt = "Dt",
     }
 }
 
@@ -193,9 +212,36 @@ table! {
         /// the first and the last step, from 1, at which each POI can be observed; one pair for all, or one per POI
         #[serde(skip_serializing_if = "Vec::is_empty")]
         windows: Vec<[usize; 2]> = "steps",
+        /// what it counts for at a step with enough observers within its radius: 1 if observed; if closeness, the product
+        /// of 1/max(d, 1) over the distances d of as many of the nearest as it needs
+        score: Score = "",
+        /// which step counts: the best if ever, the last if end, or all if mean
+        when: When = "",
         /// groups whose POIs must all have been observed at earlier steps
         #[serde(skip_serializing_if = "Vec::is_empty", serialize_with = "one_or_list")]
         after: Vec<String> = "",
+    }
+}
+
+config_enum! {
+    /// What a POI counts for at a step with enough observers within its radius.
+    Score {
+        /// 1.
+        Observed = "observed",
+        /// The product of 1/max(d, 1) over the distances d of the nearest observers, as many as the POI needs.
+        Closeness = "closeness",
+    }
+}
+
+config_enum! {
+    /// The step whose score a POI counts with.
+    When {
+        /// The best.
+        Ever = "ever",
+        /// The last.
+        End = "end",
+        /// All: the mean over steps.
+        Mean = "mean",
     }
 }
 

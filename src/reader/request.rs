@@ -197,20 +197,23 @@ impl<'a> KeyRequest<'_, 'a> {
         CountOrPercentage::Count(allowed.nearest(default))
     }
 
-    /// Returns the value of a word, or the default without the key.
-    pub fn choice<T: Choice>(mut self, default: T) -> T {
+    /// Returns the value of a word, or the default without the key or if the word is wrong.
+    pub fn choice<T: Choice>(self, default: T) -> T {
+        self.optional_choice(&written(&default)).unwrap_or(default)
+    }
+
+    /// Returns the value of a word, or `None` without the key or if the word is wrong. `default` describes what that
+    /// means.
+    pub fn optional_choice<T: Choice>(mut self, default: &str) -> Option<T> {
         let words = || T::names().map(|word| format!("{word:?}")).collect::<Vec<_>>().join(" or ");
-        let Some(entry) = self.take(|| ("word".into(), words(), Some(written(&default)))) else { return default };
+        let entry = self.take(|| ("word".into(), words(), Some(default.into())))?;
         let word = entry.value.word();
-        T::ALL.iter().find(|choice| Some(choice.0) == word).map_or_else(
-            || {
-                let hint = similar(word, T::names());
-                let message = format!("found {}, allowed {}{hint}", entry.value.found(), words());
-                self.reader.report(entry.place(), &entry.name, message);
-                default
-            },
-            |choice| choice.1,
-        )
+        let found = T::ALL.iter().find(|choice| Some(choice.0) == word);
+        if found.is_none() {
+            let message = format!("found {}, allowed {}{}", entry.value.found(), words(), similar(word, T::names()));
+            self.reader.report(entry.place(), &entry.name, message);
+        }
+        found.map(|choice| choice.1)
     }
 
     /// Returns two numbers, or the default without the key.

@@ -6,7 +6,7 @@ use fearless_simd::{Simd, prelude::*};
 use glam::Vec2;
 
 use crate::backend::cpu::{Agent, Block, BlockState, StepArrays, load_pois, step_sizes, transpose_rows, with_pois};
-use crate::credit::Episode;
+use crate::credit::{Episode, Paths, Strided};
 use crate::kernels::{clamp_to, count_ones, splat};
 use crate::parallel::*;
 use crate::world::{OUTPUTS, World};
@@ -50,8 +50,15 @@ pub(super) enum Command<'a> {
 pub(super) trait Vectors: Send + Sync {
     /// Executes a command. `moved` are the POI positions, `[teams][pois]`; empty if all teams have the world's.
     fn run(&mut self, world: &World, moved: &[Vec2], command: Command<'_>, observations: &mut Observations);
-    /// Returns the record of a team, if one is kept. `seen` is scratch memory that holds a part of it.
-    fn episode<'a>(&'a self, team: usize, world: &World, seen: &'a mut Vec<u32>) -> Option<Episode<'a>>;
+    /// Returns the record of a team, if one is kept. `moved` are POI positions, as in [`Vectors::run`]. `seen` is scratch
+    /// memory that holds a part of it.
+    fn episode<'a>(
+        &'a self,
+        team: usize,
+        world: &'a World,
+        moved: &'a [Vec2],
+        seen: &'a mut Vec<u32>,
+    ) -> Option<Episode<'a>>;
 }
 
 /// The state of one vector of teams between steps. It is small, because all of them pass through the caches in each
@@ -63,9 +70,14 @@ struct TeamBlock<S: Simd> {
     state: BlockState<S>,
     /// The agents at each POI at each step, `[teams][steps][pois][words]`; empty unless recorded.
     record: Vec<u32>,
-    /// The leaders that each follower saw at each step, `[teams][steps][followers][words of leaders]`; empty unless
-    /// recorded.
-    sights: Vec<u32>,
+    /// The leaders that each follower saw at each step, `[teams][steps][followers][words of leaders]`; or, if scores need
+    /// paths, the positions so far, f32 as bits, `[teams][steps + 1][agents][2]`. Empty unless recorded.
+    trail: Vec<u32>,
+}
+
+/// Returns a word of a trail before it is recorded: no leader is seen, or an agent is at no place.
+fn unrecorded(world: &World) -> u32 {
+    if world.paths.is_some() { f32::NAN.to_bits() } else { 0 }
 }
 
 /// Scratch memory of a thread. Its block takes on the state of one vector of teams after the other.
@@ -88,12 +100,12 @@ struct TeamBlocks<S: Simd> {
     idle: Mutex<Vec<Box<Workspace<S>>>>,
 }
 
-/// Returns vectors of teams that record so many words of sets and of sightings per team.
-pub(super) fn vectors<S: Simd>(simd: S, world: &World, teams: usize, [sets, sights]: [usize; 2]) -> Box<dyn Vectors> {
+/// Returns vectors of teams that record so many words of sets and of their trail per team.
+pub(super) fn vectors<S: Simd>(simd: S, world: &World, teams: usize, [sets, trail]: [usize; 2]) -> Box<dyn Vectors> {
     let block = |first: usize| {
         let teams = S::f32s::LEN.min(teams - first);
         let state = Block::new(simd, world).into_state(sets > 0);
-        TeamBlock { first, teams, state, record: vec![0; teams * sets], sights: vec![0; teams * sights] }
+        TeamBlock { first, teams, state, record: vec![0; teams * sets], trail: vec![unrecorded(world); teams * trail] }
     };
     let blocks = (0..teams).step_by(S::f32s::LEN).map(block).collect();
     Box::new(TeamBlocks { simd, blocks, idle: Mutex::default() })
@@ -134,14 +146,26 @@ impl<S: Simd> Vectors for TeamBlocks<S> {
         }
     }
 
-    fn episode<'a>(&'a self, team: usize, world: &World, seen: &'a mut Vec<u32>) -> Option<Episode<'a>> {
+    fn episode<'a>(
+        &'a self,
+        team: usize,
+        world: &'a World,
+        moved: &'a [Vec2],
+        seen: &'a mut Vec<u32>,
+    ) -> Option<Episode<'a>> {
         let (block, lane) = (&self.blocks[team / S::f32s::LEN], team % S::f32s::LEN);
         let words = world.set_words();
         let sets = block.record.get(lane * words..(lane + 1) * words)?;
         seen.clear();
         seen.extend(block.state.counts.iter().map(|count| count[lane]));
-        let (first, words) = (lane * world.sight_words(), world.sight_words());
-        Some(Episode::whole(sets, seen, block.sights.get(first..first + words).unwrap_or_default()))
+        let words = block.trail.len() / block.teams;
+        let trail = &block.trail[lane * words..][..words];
+        if world.paths.is_none() {
+            return Some(Episode::whole(sets, seen, trail));
+        }
+        let pois = moved.chunks_exact(world.pois.len()).nth(team).unwrap_or(&world.pois);
+        let paths = Some(Paths { positions: Strided::contiguous(trail), pois });
+        Some(Episode { paths, ..Episode::whole(sets, seen, &[]) })
     }
 }
 
@@ -216,7 +240,7 @@ impl<S: Simd> Workspace<S> {
 
     #[inline(always)]
     fn restore(&mut self, world: &World, block: &mut TeamBlock<S>, saved: &Saved<'_>) -> bool {
-        let TeamBlock { first, teams, ref mut record, ref mut sights, .. } = *block;
+        let TeamBlock { first, teams, ref mut record, ref mut trail, .. } = *block;
         let (agents, pairs) = (world.agents(), world.followers() * world.leaders());
         for (lane, team) in lanes::<S>(teams) {
             let at = (first + team) * agents;
@@ -230,9 +254,9 @@ impl<S: Simd> Workspace<S> {
                 self.block.counts.iter_mut().zip(counts).for_each(|(count, &saved)| count[lane] = saved);
             }
         }
-        let (size, seen) = (record.len() / teams, sights.len() / teams);
+        let (size, trailed) = (record.len() / teams, trail.len() / teams);
         record.copy_from_slice(&saved.record[first * size..][..teams * size]);
-        sights.copy_from_slice(&saved.sights[first * seen..][..teams * seen]);
+        trail.copy_from_slice(&saved.trail[first * trailed..][..teams * trailed]);
         true
     }
 
@@ -247,7 +271,7 @@ impl<S: Simd> Workspace<S> {
         Slices { arrays, newly, observed, steps }: &mut Slices<'_>,
     ) -> bool {
         let (agents, pois, words) = (world.agents(), world.pois.len(), world.words_per_step());
-        let TeamBlock { first, teams, ref mut record, ref mut sights, .. } = *block;
+        let TeamBlock { first, teams, ref mut record, ref mut trail, .. } = *block;
         let is_chosen = |team: usize| chosen.is_none_or(|chosen| chosen[team]);
         if !(first..first + teams).any(is_chosen) {
             return false;
@@ -264,14 +288,15 @@ impl<S: Simd> Workspace<S> {
                 self.block.start_lane(lane);
             }
         }
-        let (size, seen) = (record.len() / teams, sights.len() / teams);
+        let (size, trailed) = (record.len() / teams, trail.len() / teams);
         for team in (0..teams).filter(|team| is_chosen(first + team)) {
             arrays.agents_at_poi[team * words..][..words].fill(0);
             newly[team * pois..][..pois].fill(false);
             observed[team * pois..][..pois].fill(false);
             steps[team] = 0;
             record[team * size..][..size].fill(0);
-            sights[team * seen..][..seen].fill(0);
+            trail[team * trailed..][..trailed].fill(unrecorded(world));
+            self.record_positions(world, trail, team, 0);
         }
         true
     }
@@ -289,7 +314,7 @@ impl<S: Simd> Workspace<S> {
         let last = world.constants.steps;
         let playing = (0..).zip(&**steps).map(|(team, &step)| u64::from(step < last) << team).sum::<u64>();
         newly.fill(false);
-        let TeamBlock { first, teams, ref mut record, ref mut sights, .. } = *block;
+        let TeamBlock { first, teams, ref mut record, ref mut trail, .. } = *block;
         if playing == 0 {
             return false;
         }
@@ -300,7 +325,8 @@ impl<S: Simd> Workspace<S> {
             agents.clone_from(&self.block.agents);
             counts.clone_from(&self.block.counts);
         }
-        let seen = if sights.is_empty() { &mut [][..] } else { &mut self.sights };
+        let records_sights = world.paths.is_none() && !trail.is_empty();
+        let seen = if records_sights { &mut self.sights } else { &mut [][..] };
         with_pois!(self.moved, world, pois => {
             self.block.step(pois, seen, &mut self.sets);
             if is_partial {
@@ -311,8 +337,11 @@ impl<S: Simd> Workspace<S> {
             }
         });
         arrays.write_sets(simd, &self.sets, (0, 1));
-        if !sights.is_empty() {
-            self.record_sightings(world, steps, sights);
+        if records_sights {
+            self.record_sightings(world, steps, trail);
+        }
+        for (team, &step) in steps.iter().enumerate().filter(|(_, step)| **step < last) {
+            self.record_positions(world, trail, team, step as usize + 1);
         }
         let (pois, words, width) = (world.pois.len(), world.constants.words as usize, S::f32s::LEN);
         // A POI that this step observes opens another one from the next step on.
@@ -348,6 +377,17 @@ impl<S: Simd> Workspace<S> {
         for (team, &step) in steps.iter().enumerate().filter(|(_, step)| **step < world.constants.steps) {
             let to = &mut sights[team * world.sight_words() + step as usize * size..][..size];
             to.iter_mut().zip(self.sights[team..].iter().step_by(S::f32s::LEN)).for_each(|(to, &seen)| *to = seen);
+        }
+    }
+
+    /// Records where the agents of a team are after so many steps, if scores need it.
+    #[inline(always)]
+    fn record_positions(&self, world: &World, trail: &mut [u32], team: usize, step: usize) {
+        if world.paths.is_some() && !trail.is_empty() {
+            let to = &mut trail[team * world.path_words() + step * world.agents() * 2..][..world.agents() * 2];
+            for (to, agent) in to.chunks_exact_mut(2).zip(&self.block.agents) {
+                to.copy_from_slice(&[agent.x[team], agent.y[team]].map(f32::to_bits));
+            }
         }
     }
 

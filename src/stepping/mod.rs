@@ -167,18 +167,19 @@ impl Stepper {
         let words = world.constants.words as usize;
         // Probed first, because a failing allocation below would abort. Counts a team's numbers, both in the vectors and
         // as shown.
-        let [sets, sights] = match recording {
+        let [sets, trail] = match recording {
             Recording::None => [0, 0],
+            _ if world.paths.is_some() => [world.set_words(), world.path_words()],
             Recording::Sets => [world.set_words(), 0],
             Recording::SetsAndSights => [world.set_words(), world.sight_words()],
         };
         let in_vectors =
             agents * 6 + leaders * (world.inputs() + OUTPUTS) + world.followers() * (11 + leaders) + pois * words;
-        let numbers = in_vectors + sets + sights + leaders * world.inputs() + agents * 5 + pois * (words + 1) + 1;
+        let numbers = in_vectors + sets + trail + leaders * world.inputs() + agents * 5 + pois * (words + 1) + 1;
         let bytes = numbers as u128 * 4 * teams as u128;
         let probe = usize::try_from(bytes).ok().and_then(|bytes| Vec::<u8>::new().try_reserve_exact(bytes).ok());
         probe.ok_or(StepError::Memory { teams, bytes })?;
-        let vectors = dispatch!(level, simd => vectors(simd, &world, teams, [sets, sights]));
+        let vectors = dispatch!(level, simd => vectors(simd, &world, teams, [sets, trail]));
         let observations = Observations {
             inputs: vec![0.0; teams * leaders * world.inputs()],
             agents_at_poi: vec![0; teams * pois * words],
@@ -329,7 +330,7 @@ impl Stepper {
             return Err(StepError::NoTeam { team, teams: self.teams() });
         }
         let mut seen = Vec::new();
-        let episode = self.vectors.episode(team, &self.world, &mut seen).ok_or(StepError::NotRecorded)?;
+        let episode = self.vectors.episode(team, &self.world, &self.moved, &mut seen).ok_or(StepError::NotRecorded)?;
         Ok(Credit::default().all(&episode, &self.world))
     }
 
@@ -344,8 +345,9 @@ impl Stepper {
         scores.par_chunks_exact_mut(leaders).with_min_len(VECTORS_PER_TASK).enumerate().try_for_each(
             |(team, scores)| {
                 CREDIT.with_borrow_mut(|(credit, seen)| {
-                    let episode = self.vectors.episode(team, &self.world, seen).ok_or(StepError::NotRecorded)?;
-                    if fitness == Fitness::Dt && self.world.followers() > 0 && episode.sights.is_empty() {
+                    let episode =
+                        self.vectors.episode(team, &self.world, &self.moved, seen).ok_or(StepError::NotRecorded)?;
+                    if fitness == Fitness::Dt && self.world.followers() > 0 && episode.trail().is_empty() {
                         return Err(StepError::NotSeen);
                     }
                     credit.score(&episode, &self.world, fitness, scores);

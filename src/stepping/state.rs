@@ -22,8 +22,8 @@ pub(super) struct Saved<'a> {
     pub counts: &'a [u32],
     /// `[teams][steps][pois][words]`.
     pub record: &'a [u32],
-    /// `[teams][steps][followers][words of leaders]`.
-    pub sights: &'a [u32],
+    /// `[teams][steps][followers][words of leaders]`, or `[teams][steps + 1][agents][2]`.
+    pub trail: &'a [u32],
 }
 
 /// Takes the arrays of a saved state one after the other.
@@ -56,16 +56,16 @@ impl Stepper {
         }
         words.extend_from_slice(&observations.steps);
         words.extend_from_slice(bytemuck::cast_slice(&self.moved));
-        let (mut seen, mut sets, mut sights) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut seen, mut sets, mut trail) = (Vec::new(), Vec::new(), Vec::new());
         for team in 0..self.teams() {
-            if let Some(episode) = self.vectors.episode(team, &self.world, &mut seen) {
+            if let Some(episode) = self.vectors.episode(team, &self.world, &self.moved, &mut seen) {
                 words.extend(episode.seen.words().iter());
                 sets.extend(episode.sets.iter());
-                sights.extend(episode.sights.iter());
+                trail.extend(episode.trail().iter());
             }
         }
         words.extend_from_slice(&sets);
-        words.extend_from_slice(&sights);
+        words.extend_from_slice(&trail);
         words.iter_mut().for_each(|word| *word = word.to_le());
         bytemuck::cast_slice(&words).to_vec()
     }
@@ -81,10 +81,10 @@ impl Stepper {
         let (agents, pois) = (world.agents(), world.pois.len());
         let moved = if words.get(HEADER - 1) == Some(&0) { 0 } else { pois };
         let header = self.header(moved);
-        let [_, _, _, record, sights, _] = header.map(|size| size as usize);
+        let [_, _, _, record, trail, _] = header.map(|size| size as usize);
         let counts = if record > 0 { world.followers() * world.leaders() } else { 0 };
         let sets = pois * world.constants.words as usize;
-        let of_team = agents * 5 + sets + pois * 2 + 1 + moved * 2 + counts + record + sights;
+        let of_team = agents * 5 + sets + pois * 2 + 1 + moved * 2 + counts + record + trail;
         if words.get(..HEADER) != Some(&header) || state.len() != (HEADER + teams * of_team) * 4 {
             return Err(StepError::State("it is of another world, number of teams or kind of record"));
         }
@@ -101,7 +101,7 @@ impl Stepper {
             speeds,
             counts: words.take(teams * counts),
             record: words.take(teams * record),
-            sights: words.take(teams * sights),
+            trail: words.take(teams * trail),
         };
         check(world, agents_at_poi, &saved, moved)?;
         if newly.iter().chain(observed).any(|&flag| flag > 1) || steps.iter().any(|&step| step > world.constants.steps)
@@ -118,12 +118,12 @@ impl Stepper {
     }
 
     /// Returns the format, and the sizes that a saved state has to match: teams, agents, and each team's words of
-    /// record, sightings and moved POIs.
+    /// record, trail and moved POIs.
     fn header(&self, moved: usize) -> [u32; HEADER] {
         let mut seen = Vec::new();
-        let episode = self.vectors.episode(0, &self.world, &mut seen);
-        let [record, sights] = episode.map_or([0, 0], |episode| [episode.sets.len(), episode.sights.len()]);
-        [MAGIC, self.teams() as u32, self.world.agents() as u32, record as u32, sights as u32, moved as u32]
+        let episode = self.vectors.episode(0, &self.world, &self.moved, &mut seen);
+        let [record, trail] = episode.map_or([0, 0], |episode| [episode.sets.len(), episode.trail().len()]);
+        [MAGIC, self.teams() as u32, self.world.agents() as u32, record as u32, trail as u32, moved as u32]
     }
 }
 
@@ -140,7 +140,8 @@ fn check(world: &World, agents_at_poi: &[u32], saved: &Saved<'_>, moved: &[Vec2]
     }
     // Scores use the members of sets as indices.
     let agents = |sets: &[u32]| has_only(world.agents(), sets);
-    if !agents(agents_at_poi) || !agents(saved.record) || !has_only(world.leaders(), saved.sights) {
+    let is_seen = world.paths.is_some() || has_only(world.leaders(), saved.trail);
+    if !agents(agents_at_poi) || !agents(saved.record) || !is_seen {
         return Err(StepError::State("a set has an agent that does not exist"));
     }
     Ok(())

@@ -5,7 +5,6 @@
 use glam::Vec2;
 
 use super::Trainer;
-use super::results::mean_score;
 use crate::world::World;
 
 /// Teams that one trial plays in a generation.
@@ -45,14 +44,15 @@ impl Trainer {
     /// Returns G, `[trials][teams]`, and the config's fitness of each leader, `[trials][teams][leaders]`, of the teams
     /// that [`Trainer::play`] played, as means over episodes. Both are empty if only the champions were left to play.
     pub(crate) fn scores(&self) -> (Vec<f64>, Vec<f32>) {
-        let (world, teams) = self.world_and_teams();
+        let (stage, (world, teams)) = (self.experiments[0].stage(), self.world_and_teams());
         let (mut g, mut scores) = (Vec::new(), Vec::new());
         for trial in &self.experiments[0].trials {
             let all = f64::from(world.total_worth) * trial.scores.len() as f64;
             let observed =
                 |team: usize| trial.scores.iter().map(|episode| u64::from(episode.observed[team])).sum::<u64>();
             g.extend((0..teams).map(|team| observed(team) as f64 / all));
-            scores.extend((0..teams * world.leaders()).map(|place| mean_score(&trial.scores, place)));
+            let places = (0..teams).flat_map(|team| (0..world.leaders()).map(move |leader| (team, leader)));
+            scores.extend(places.map(|place| stage.mean_score(&trial.scores, place)));
         }
         (g, scores)
     }

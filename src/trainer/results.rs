@@ -38,7 +38,7 @@ pub(super) fn play<'a>(
                     policies: learning.slots(),
                     populations: &stage.world.populations,
                     teams: &schedule.teams[range.start * leaders..range.end * leaders],
-                    fitnesses: std::slice::from_ref(&learning.fitness),
+                    fitnesses: &stage.fitnesses,
                 }));
             };
             // Champions play in the stage that they come from.
@@ -77,7 +77,8 @@ impl ExperimentState {
     pub fn collect_results(&mut self, index: usize, given_scores: Option<&[f32]>) -> Vec<Row> {
         let (generation, size) = (self.residency.generation(), self.teams() * self.stage().world.leaders());
         let ExperimentState { stages, trials, schedules, .. } = self;
-        let Stage { config, world, .. } = stages.of(generation);
+        let stage = stages.of(generation);
+        let Stage { config, world, .. } = stage;
         let (teams, hall) = (config.learning.teams(), config.hall_teams(generation) > 0);
         let total_before = stages.ending_before(generation).map_or(world.total_worth, |stage| stage.world.total_worth);
         let mut rows = Vec::with_capacity(trials.len());
@@ -87,9 +88,9 @@ impl ExperimentState {
             rows.extend(trial.pending.map(|row| Row { champion_g: trial.champion_g(total_before), ..row }));
             trial.pending =
                 Some(Row { experiment: index, trial: trial.index, generation, best_g, mean_g, champion_g: 0.0 });
-            let score = |place: usize| match given_scores {
-                Some(given_scores) => given_scores[number * size + place],
-                None => mean_score(&trial.scores, place),
+            let score = |team: usize, leader: usize| match given_scores {
+                Some(given_scores) => given_scores[number * size + team * world.leaders() + leader],
+                None => stage.mean_score(&trial.scores, (team, leader)),
             };
             assign_fitness(score, schedule, &world.populations, hall, &config.learning, &mut trial.fitness);
             trial.forget_scores();
@@ -144,11 +145,11 @@ fn team_g(episodes: &[GroupScores], worth: u32, teams: usize) -> [f64; 2] {
 
 /// Assigns each policy the mean score of its leaders in its team, or the mean or the largest over several teams.
 /// `populations` are the leaders', and `hall` means that the last of a policy's teams has past champions. `score` takes
-/// a place of `[teams][leaders]`, `fitness` is `[populations][policies]`.
+/// a team and a leader, `fitness` is `[populations][policies]`.
 ///
 /// Means add in 64 bits, in the order of the leaders and of the teams. The fitness is rounded to 32 bits once.
 fn assign_fitness(
-    score: impl Fn(usize) -> f32 + Sync,
+    score: impl Fn(usize, usize) -> f32 + Sync,
     schedule: &TeamSchedule,
     populations: &[u32],
     hall: bool,
@@ -161,7 +162,7 @@ fn assign_fitness(
     of_each.enumerate().for_each(|(index, fitness)| {
         let members: Vec<usize> = (0..leaders).filter(|&leader| populations[leader] as usize == index).collect();
         let in_team = |team: usize| {
-            let total: f64 = members.iter().map(|&leader| f64::from(score(team * leaders + leader))).sum();
+            let total: f64 = members.iter().map(|&leader| f64::from(score(team, leader))).sum();
             (schedule.teams[team * leaders + members[0]] as usize, total / members.len() as f64)
         };
         let contemporary = partners * population;
@@ -187,11 +188,4 @@ fn assign_fitness(
             }
         }
     });
-}
-
-/// Returns the score at one place of `[teams][leaders]`, averaged over episodes.
-#[inline(always)]
-pub(super) fn mean_score(episodes: &[GroupScores], place: usize) -> f32 {
-    let total: f64 = episodes.iter().map(|episode| f64::from(episode.scores[place])).sum();
-    (total / episodes.len() as f64) as f32
 }

@@ -7,6 +7,7 @@ use flotilla::config::{Config, Override};
 const GENERALLY_FORWARD: &str = include_str!("../../configs/generally_forward.toml");
 const STRICTLY_FORWARD: &str = include_str!("../../configs/strictly_forward.toml");
 const CHAOTIC: &str = include_str!("../../configs/chaotic.toml");
+const ROVERS_AND_UAVS: &str = include_str!("../../configs/influence/3_rovers_3_uavs.toml");
 /// Ten groups of one leader and three followers. A set of 40 agents needs two words.
 const FORTY_AGENTS: &str = "
 [world]
@@ -24,7 +25,7 @@ coupling = 4
 pub type Case = (&'static str, &'static str, &'static str, &'static [(&'static str, &'static str)]);
 
 /// Together these cases cover every choice in a config, and sizes on both sides of every special case.
-pub const CASES: [Case; 36] = [
+pub const CASES: [Case; 41] = [
     ("generally-forward", "first layout, leader-follower, Df", GENERALLY_FORWARD, &[]),
     ("strictly-forward", "second layout, D++", STRICTLY_FORWARD, &[("learning.fitness", "'D++'")]),
     ("chaotic", "third layout, G", CHAOTIC, &[("learning.fitness", "'G'")]),
@@ -164,15 +165,60 @@ pub const CASES: [Case; 36] = [
         CHAOTIC,
         &[
             ("learning.fitness", "'Dt'"),
-            ("learning.led_within", "3"),
+            ("credit.led_within", "3"),
             ("learning.seed", "1"),
-            ("learning.led_by", "'any-seen'"),
+            ("credit.led_by", "'any-seen'"),
             ("world.observers", "'followers'"),
             ("world.coupling", "2"),
             ("world.after", "[[], [0], [1], []]"),
             ("world.windows", "[[1, 50], [20, 50], [25, 50], [10, 30]]"),
         ],
     ),
+    (
+        "first",
+        "Dt, followers led by the first leader of those that they saw in the last 2 steps",
+        CHAOTIC,
+        &[
+            ("learning.fitness", "'Dt'"),
+            ("credit.led_within", "2"),
+            ("credit.led_by", "'first'"),
+            ("world.coupling", "3"),
+        ],
+    ),
+    (
+        "alone",
+        "Dt, followers led by a leader that is the only one they see, added to G",
+        CHAOTIC,
+        &[
+            ("learning.fitness", "'Dt'"),
+            ("credit.led_by", "'alone'"),
+            ("credit.add_g", "true"),
+            ("world.coupling", "3"),
+        ],
+    ),
+    (
+        "anyone",
+        "Dt, followers led by all leaders if they see one, the start counts",
+        GENERALLY_FORWARD,
+        &[
+            ("learning.fitness", "'Dt'"),
+            ("credit.led_by", "'anyone'"),
+            ("world.start_counts", "true"),
+            ("world.coupling", "2"),
+        ],
+    ),
+    (
+        "removes",
+        "D without the agents of a list, all-leaders",
+        GENERALLY_FORWARD,
+        &[
+            ("learning.fitness", "'D'"),
+            ("learning.paradigm", "'all-leaders'"),
+            ("credit.removes", "[[0, 4, 5]]"),
+            ("world.coupling", "2"),
+        ],
+    ),
+    ("influence", "rovers under D and UAVs that lead them under Dt, scores by distance", ROVERS_AND_UAVS, &[]),
     (
         "truncation",
         "a fifth of each population are elites, and only they become parents",

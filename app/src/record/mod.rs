@@ -316,7 +316,11 @@ pub(crate) fn load_config(place: Place<'_>) -> Result<Config, ConfigError> {
 
 /// Keys of later versions with their default values. A config's digest omits these lines, so that runs of earlier
 /// versions can be resumed.
-const DEFAULTS_ADDED_LATER: [&str; 17] = [
+const DEFAULTS_ADDED_LATER: [&str; 21] = [
+    "[credit]\n",
+    "start_counts = false\n",
+    "removes = []\n",
+    "add_g = false\n",
     "observers = \"all\"\n",
     "windows = []\n",
     "after = []\n",
@@ -340,7 +344,8 @@ const DEFAULTS_ADDED_LATER: [&str; 17] = [
 pub fn config_digest(config: &Config) -> String {
     let text = without_checkpoint(config).to_toml();
     let lines: String = text.split_inclusive('\n').filter(|line| !DEFAULTS_ADDED_LATER.contains(line)).collect();
-    hex(&Sha256::digest(lines))
+    // A section without lines leaves the space before it.
+    hex(&Sha256::digest(lines.replace("\n\n\n", "\n\n")))
 }
 
 /// Returns the config with the default `[checkpoint]`, because that section may differ between sessions of a run.

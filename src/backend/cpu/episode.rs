@@ -8,7 +8,7 @@ use super::block::Block;
 use super::network::Network;
 use super::pois::{load_pois, with_pois};
 use crate::config::Fitness;
-use crate::credit::{Episode, LaneCredit, Seen, Strided};
+use crate::credit::{Episode, LaneCredit, Paths, Seen, Strided};
 use crate::model::class::Class;
 use crate::world::World;
 
@@ -42,6 +42,9 @@ pub(super) struct EpisodeBlock<S: Simd> {
     seen: Vec<u32>,
     /// The sightings, `[steps][followers][words of leaders][lanes]`; empty unless recorded.
     sights: Vec<u32>,
+    /// The positions at the start and after each step, f32 as bits, `[steps + 1][agents][2][lanes]`; empty unless scores
+    /// need them.
+    paths: Vec<u32>,
     credit: LaneCredit<S>,
 }
 
@@ -61,6 +64,7 @@ impl<S: Simd> EpisodeBlock<S> {
             sets: vec![0; world.set_words() * S::f32s::LEN],
             seen: vec![0; world.followers() * world.leaders() * S::f32s::LEN],
             sights: vec![0; sight_words(world, sighted) * S::f32s::LEN],
+            paths: vec![0; if world.paths.is_some() { world.path_words() * S::f32s::LEN } else { 0 }],
             credit: LaneCredit::new(simd, world),
         }
     }
@@ -71,6 +75,7 @@ impl<S: Simd> EpisodeBlock<S> {
             && self.block.world.constants == world.constants
             && [&self.block.radii2, &self.block.values] == [&world.radii2, &world.values]
             && self.sights.len() == sight_words(world, sighted) * S::f32s::LEN
+            && self.paths.is_empty() == world.paths.is_none()
     }
 
     /// Puts teams at their start, see [`EpisodeBlock::play`].
@@ -97,10 +102,13 @@ impl<S: Simd> EpisodeBlock<S> {
     #[inline(always)]
     pub(super) fn play(&mut self, batch: &WorldBatch<'_>, first: usize, teams: usize, observer: &mut impl Observer<S>) {
         self.load(batch, first, teams);
-        let EpisodeBlock { block, network, moved, sets, seen, sights, .. } = self;
+        let EpisodeBlock { block, network, moved, sets, seen, sights, paths, .. } = self;
         let steps = batch.world.steps();
         let [sets_per_step, sights_per_step] = [sets.len() / steps, sights.len() / steps];
+        let moment = (paths.len() / (steps + 1)).max(1);
+        let mut moments = paths.chunks_exact_mut(moment);
         observer.started(block);
+        write_positions(block, &mut moments);
         with_pois!(moved, batch.world, pois => for step in 0..steps {
             block.sense(pois);
             network.decide(&block.inputs, &mut block.outputs);
@@ -108,6 +116,7 @@ impl<S: Simd> EpisodeBlock<S> {
             let sets = &mut sets[step * sets_per_step..][..sets_per_step];
             block.step(pois, &mut sights[step * sights_per_step..][..sights_per_step], sets);
             observer.moved(block, sets, step);
+            write_positions(block, &mut moments);
         });
         for (words, count) in seen.chunks_exact_mut(S::f32s::LEN).zip(&block.counts) {
             count.store_slice(words);
@@ -127,7 +136,7 @@ impl<S: Simd> EpisodeBlock<S> {
         let Some(counted) = counted.filter(|fitnesses| fitnesses.iter().all(in_lanes)) else {
             for lane in 0..teams {
                 let (group, team) = places(lane);
-                scores.score(group, team, &self.episode(lane));
+                scores.score(group, team, &self.episode(batch, lane));
             }
             return;
         };
@@ -139,10 +148,23 @@ impl<S: Simd> EpisodeBlock<S> {
         }
     }
 
-    /// Returns one lane's record.
-    pub(super) fn episode(&self, lane: usize) -> Episode<'_> {
+    /// Returns one lane's record of a batch that was played.
+    pub(super) fn episode<'a>(&'a self, batch: &WorldBatch<'a>, lane: usize) -> Episode<'a> {
         let strided = |words| Strided { words, stride: S::f32s::LEN, offset: lane };
         let seen = Seen::Counts(strided(&self.seen));
-        Episode { sets: strided(&self.sets), seen, sights: strided(&self.sights) }
+        let pois = batch.groups[self.places[lane].0].pois();
+        let paths = batch.world.paths.is_some().then(|| Paths { positions: strided(&self.paths), pois });
+        Episode { sets: strided(&self.sets), seen, sights: strided(&self.sights), paths }
+    }
+}
+
+/// Writes the positions of a moment, `[agents][2][lanes]`, if they are recorded.
+#[inline(always)]
+fn write_positions<'a, S: Simd>(block: &Block<S>, moments: &mut impl Iterator<Item = &'a mut [u32]>) {
+    let Some(moment) = moments.next() else { return };
+    for (agent, to) in block.agents.iter().zip(moment.chunks_exact_mut(2 * S::f32s::LEN)) {
+        let (x, y) = to.split_at_mut(S::f32s::LEN);
+        agent.x.bitcast::<S::u32s>().store_slice(x);
+        agent.y.bitcast::<S::u32s>().store_slice(y);
     }
 }

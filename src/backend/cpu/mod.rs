@@ -191,7 +191,7 @@ fn trace<S: Simd>(simd: S, group: &Group<'_>) -> Trace {
     let mut moments = vec![bytemuck::Zeroable::zeroed(); (steps + 1) * teams * agents];
     let of_team = world.leaders() * world.inputs();
     let mut inputs = vec![0.0; (steps + 1) * teams * of_team];
-    let (mut sets, mut seen, mut sights) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut sets, mut seen, mut trail) = (Vec::new(), Vec::new(), Vec::new());
     let mut episodes = EpisodeBlock::new(simd, world, batch.sighted);
     for first in (0..teams).step_by(S::f32s::LEN) {
         let lanes = S::f32s::LEN.min(teams - first);
@@ -201,13 +201,13 @@ fn trace<S: Simd>(simd: S, group: &Group<'_>) -> Trace {
             || episodes.play(&batch, first, lanes, &mut observer),
         );
         for lane in 0..lanes {
-            let episode = episodes.episode(lane);
+            let episode = episodes.episode(&batch, lane);
             sets.extend(episode.sets.iter());
             seen.extend(episode.seen.words().iter());
-            sights.extend(episode.sights.iter());
+            trail.extend(episode.trail().iter());
         }
     }
-    Trace { teams, agents, leaders: world.leaders(), moments, inputs, sets, seen, sights }
+    Trace { teams, agents, leaders: world.leaders(), moments, inputs, sets, seen, trail, pois: group.pois().to_vec() }
 }
 
 /// Writes the moments of a vector of teams to those of all teams, `[steps + 1][teams][agents]`, and the inputs, of which
@@ -256,7 +256,8 @@ pub fn lanes() -> u64 {
 /// Returns the bytes of one vector of teams that are scored by a fitness.
 pub(crate) fn block_bytes(world: &World, fitness: Fitness) -> u64 {
     let (agents, leaders, followers) = (world.agents(), world.leaders(), world.followers());
-    let record = world.set_words() + followers * leaders + sight_words(world, fitness == Fitness::Dt);
+    let paths = if world.paths.is_some() { world.path_words() } else { 0 };
+    let record = world.set_words() + followers * leaders + sight_words(world, fitness == Fitness::Dt) + paths;
     let words = 8 * agents + leaders * world.constants.policy.words() + 3 * followers + record;
     words as u64 * lanes() * 4 + (8 * world.parameters() + agents * agents.div_ceil(64) * 8) as u64
 }

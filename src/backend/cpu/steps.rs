@@ -211,7 +211,7 @@ fn record<S: Simd>(
                 },
             );
             for (lane, to) in arrays.observed_at.chunks_exact_mut(batch.world.pois.len()).enumerate() {
-                let steps = credit::observed_at(block.episode(lane).sets, batch.world);
+                let steps = credit::observed_at(block.episode(batch, lane).sets, batch.world);
                 to.iter_mut().zip(steps).for_each(|(to, step)| *to = step.unwrap_or(0) as u32);
             }
         }

@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use crate::config::{
     AGENTS, AgentClass, Channel, Choice, Combine, Control, Frame, MAX_AGENTS, MAX_CHANNELS, MAX_CLASSES, MAX_INPUTS,
-    MAX_POIS, MAX_SECTORS, MAX_TERMS, Measure, Mobility, Motion, POIS, PoiGroup, Term,
+    MAX_POIS, MAX_SECTORS, MAX_TERMS, Measure, Mobility, Motion, POIS, PoiGroup, Score, Term, When,
 };
 use crate::model::rule::cycle;
 use crate::model::{LEAST, LONGEST, MAX_RANGES};
@@ -218,13 +218,9 @@ impl AgentClass {
         } else if control != Control::Follow && !rule.is_empty() {
             r.report_key("agents.rule", format!("found with control = \"{control}\", allowed with \"follow\""));
         }
-        let learners = |name: &str| {
-            let found = summary.classes.iter().any(|class| class.name == name && class.learns());
-            found.then(|| format!("found {name:?}, which learns: classes that learn cannot be led yet"))
-        };
         let errors = r.error_count();
         let names = summary.class_names(&[]);
-        let leads = AgentClass::leads(r).names("names of classes that do not learn", false, names.as_deref(), learners);
+        let leads = AgentClass::leads(r).names("names of classes", false, names.as_deref(), |_| None);
         if !leads.is_empty() && is_known && !learns {
             let message =
                 format!("found with control = \"{control}\", allowed with \"policy\": others cannot lead yet");
@@ -242,6 +238,11 @@ impl AgentClass {
             let message = format!("missing, and {:?} has no rule to take it from; allowed 0.01 to {LONGEST}", led.name);
             r.report_key("agents.influence_radius", message);
         }
+        let fitness = AgentClass::fitness(r).optional_choice("learning.fitness");
+        if fitness.is_some() && is_known && !learns {
+            let message = format!("found with control = \"{control}\", allowed with \"policy\"");
+            r.report_key("agents.fitness", message);
+        }
         AgentClass {
             name,
             at,
@@ -256,6 +257,7 @@ impl AgentClass {
             leads,
             influence_radius,
             observes: AgentClass::observes(r).flag(true),
+            fitness,
         }
     }
 }
@@ -399,6 +401,8 @@ impl PoiGroup {
             radius: PoiGroup::radius(r).number(between(0.01, LONGEST), 5.0),
             observers,
             windows: windows(r, steps, at.len()),
+            score: PoiGroup::score(r).choice(Score::Observed),
+            when: PoiGroup::when(r).choice(When::Ever),
             after,
             at,
         }

@@ -28,9 +28,10 @@ use crate::backend::{
     BATCH_BYTES, Backend, BackendError, DevicePopulation, Group, GroupScores, HELD_FROM, MOMENT_WORDS, Moment,
     PACKED_FROM, Trace, WeightVector, Weights, check_sizes,
 };
-use crate::credit::{Episode, Seen, Strided};
+use crate::credit::{Episode, Paths, Seen, Strided};
 use crate::host::Instant;
 use crate::parallel::*;
+use crate::world::World;
 
 mod inspect;
 mod plan;
@@ -82,6 +83,18 @@ impl Records {
             Records::PackedFrom(minimum) => bytes >= minimum,
             Records::Packed => true,
         }
+    }
+}
+
+/// Writes the positions of a team at some moments, f32 as bits, `[moments][agents][2]`, from the moments of a trace.
+fn write_path(moments: impl Iterator<Item = usize>, world: &World, traced: &[f32], positions: &mut Vec<u32>) {
+    const POSITION: usize = std::mem::offset_of!(Moment, position) / size_of::<f32>();
+    positions.clear();
+    for moment in moments {
+        let agents = traced[moment * world.agents() * MOMENT_WORDS..].chunks_exact(MOMENT_WORDS);
+        positions.extend(
+            agents.take(world.agents()).flat_map(|agent| [agent[POSITION], agent[POSITION + 1]]).map(f32::to_bits),
+        );
     }
 }
 
@@ -409,7 +422,9 @@ impl Backend for GpuBackend {
     fn play(&mut self, groups: &[Group<'_>]) -> Result<Vec<GroupScores>, BackendError> {
         groups.iter().try_for_each(Group::check)?;
         let scores = ScoreTable::new(groups);
-        self.play_tasks(groups, false, &|planned, record, _| {
+        // Paths are read from traces.
+        let trace = groups.iter().any(|group| group.world.paths.is_some());
+        self.play_tasks(groups, trace, &|planned, record, traced| {
             let world = groups[planned.group].world;
             let Task { sets, counts, table, owners, .. } = planned.task;
             let stride = planned.task.teams as usize;
@@ -421,10 +436,16 @@ impl Backend for GpuBackend {
                     let counted = world.leaders() * world.followers() * stride;
                     let (counts, sights) = words[counts as usize..].split_at(counted);
                     let sights = &sights[..sight_words * stride];
+                    let (mut positions, pois) = (Vec::new(), groups[group].pois());
                     for offset in 0..stride {
                         let strided = |words| Strided { words, stride, offset };
                         let (sets, seen, sights) = (strided(sets), Seen::Counts(strided(counts)), strided(sights));
-                        scores.score(group, first + offset, &Episode { sets, seen, sights });
+                        let paths = world.paths.is_some().then(|| {
+                            let moments = (0..=world.steps()).map(|step| step * stride + offset);
+                            write_path(moments, world, &traced[planned.task.traced as usize..], &mut positions);
+                            Paths { positions: Strided::contiguous(&positions), pois }
+                        });
+                        scores.score(group, first + offset, &Episode { sets, seen, sights, paths });
                     }
                 }
                 RecordWords::Packed(words) => {
@@ -437,7 +458,11 @@ impl Backend for GpuBackend {
                         let words = &words[ends[0] as usize..ends[1] as usize];
                         let sets = Strided::contiguous(words);
                         let seen = Seen::Owners(Strided { words: owners, stride, offset });
-                        scores.score(group, first + offset, &Episode { sets, seen, sights: Strided::NONE });
+                        scores.score(
+                            group,
+                            first + offset,
+                            &Episode { sets, seen, sights: Strided::NONE, paths: None },
+                        );
                     }
                 }
             }
@@ -460,7 +485,8 @@ impl Backend for GpuBackend {
             inputs: vec![0.0; (steps + 1) * teams * inputs],
             sets: vec![0; teams * set_words],
             seen: vec![0; teams * seen_words],
-            sights: vec![0; teams * sight_words],
+            trail: vec![0; teams * sight_words],
+            pois: group.pois().to_vec(),
         });
         self.play_tasks(std::slice::from_ref(group), true, &|planned, record, traced| {
             let RecordWords::Whole(record) = record else { unreachable!("no trace is packed") };
@@ -479,7 +505,7 @@ impl Backend for GpuBackend {
                     all[(step * teams + planned.first_team) * size..][..words.len()].copy_from_slice(words);
                 }
             }
-            let Trace { sets, seen, sights, .. } = all;
+            let Trace { sets, seen, trail, .. } = all;
             // Copies words that are interleaved by team.
             let scatter = |from: usize, words: usize, all: &mut [u32]| {
                 for (word, numbers) in record[from..].chunks_exact(stride).take(words).enumerate() {
@@ -489,9 +515,18 @@ impl Backend for GpuBackend {
             };
             scatter(first_set, set_words, sets);
             scatter(first_count, seen_words, seen);
-            scatter(first_count + seen_words * stride, sight_words, sights);
+            scatter(first_count + seen_words * stride, sight_words, trail);
         })?;
-        Ok(trace.into_inner().unwrap_or_else(PoisonError::into_inner))
+        let mut trace = trace.into_inner().unwrap_or_else(PoisonError::into_inner);
+        if world.paths.is_some() {
+            let mut positions = Vec::new();
+            for team in 0..teams {
+                let moments = (0..=steps).map(|step| step * teams + team);
+                write_path(moments, world, bytemuck::cast_slice(&trace.moments), &mut positions);
+                trace.trail.extend(&positions);
+            }
+        }
+        Ok(trace)
     }
 
     fn hold(&mut self, weights: &[f32], sizes: [usize; 3]) -> Result<Option<Box<dyn DevicePopulation>>, BackendError> {

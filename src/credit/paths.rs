@@ -1,0 +1,359 @@
+//! Scores from paths: for POIs that count by distance or by when, and for learners that lead learners.
+
+use fearless_simd::{Level, Simd, dispatch, prelude::*};
+use glam::Vec2;
+
+use super::assignment::lead;
+use super::{Paths, Strided, each_bit, share, stepping_stone};
+use crate::config::{Fitness, Score, When};
+use crate::kernels::math::within;
+use crate::kernels::{larger, select, smaller, splat};
+use crate::model::couple::observes;
+use crate::world::{PathRule, World};
+
+/// Scratch memory for scores from paths. Moment m of an episode is its state after m steps. Vectors have neighbouring
+/// moments, so rows have as many as fill whole vectors.
+#[derive(Clone, Debug, Default)]
+pub(super) struct PathCredit {
+    /// The moments of a row.
+    width: usize,
+    /// `[2][agents][width]`.
+    positions: Vec<f32>,
+    /// The learners that influence each agent, and those that lead it, `[moments][agents][words of leaders]`.
+    sights: Vec<u32>,
+    led: Vec<u32>,
+    /// The number of moments at which each agent was influenced by each learner, `[agents][leaders]`.
+    counts: Vec<u32>,
+    /// The agents that are taken out for each learner, `[leaders][words][width]`, and at any moment, `[leaders][words]`.
+    taken: Vec<u32>,
+    ever_taken: Vec<u32>,
+    /// Agents that are ever near the POI and count there, and at each moment their squared distance, infinite unless it
+    /// is near: `[observers]`, `[observers][width]`.
+    observers: Vec<usize>,
+    near: Vec<f32>,
+    /// The squared distances of the nearest observers, `[coupling][lanes]`.
+    nearest: Vec<f32>,
+    /// What each learner would lose, `[leaders]`, and gain by so many copies, `[leaders][copies]`.
+    lost: Vec<u32>,
+    gains: Vec<u32>,
+}
+
+/// A change of the team.
+#[derive(Clone, Copy)]
+enum Change {
+    None,
+    /// Without those that are taken out for a learner.
+    Without(usize),
+    /// With more copies of a learner.
+    With(usize, u32),
+}
+
+impl PathCredit {
+    /// Scores every learner of a team by `fitness` into `scores`, `[leaders]`, and returns what the POIs are worth that
+    /// the team observed.
+    pub(super) fn score(
+        &mut self,
+        paths: &Paths<'_>,
+        world: &World,
+        rule: &PathRule,
+        fitness: Fitness,
+        scores: &mut [f32],
+    ) -> u32 {
+        dispatch!(Level::new(), simd => self.score_with(simd, paths, world, rule, fitness, scores))
+    }
+
+    #[inline(always)]
+    fn score_with<S: Simd>(
+        &mut self,
+        simd: S,
+        paths: &Paths<'_>,
+        world: &World,
+        rule: &PathRule,
+        fitness: Fitness,
+        scores: &mut [f32],
+    ) -> u32 {
+        let (leaders, words) = (world.leaders(), world.constants.words as usize);
+        self.load::<S>(paths, world);
+        if fitness != Fitness::G {
+            self.take_out(simd, world, rule, fitness);
+        }
+        let most = if fitness == Fitness::Dpp { world.coupling.iter().copied().max().unwrap_or(0) } else { 0 };
+        let row = most as usize + 1;
+        self.lost.clear();
+        self.lost.resize(leaders, 0);
+        self.gains.clear();
+        self.gains.resize(leaders * row, 0);
+        let mut observed = 0;
+        for (poi, &at) in paths.pois.iter().enumerate() {
+            self.find_observers(simd, world, rule, poi, at);
+            if self.observers.is_empty() {
+                continue;
+            }
+            let value = self.value(simd, world, rule, poi, Change::None);
+            observed += value;
+            if fitness == Fitness::G {
+                continue;
+            }
+            for leader in 0..leaders {
+                let ever = &self.ever_taken[leader * words..][..words];
+                let is_taken = |&agent: &usize| ever[agent / 32] >> (agent % 32) & 1 != 0;
+                if value > 0 && self.observers.iter().any(is_taken) {
+                    self.lost[leader] += value - self.value(simd, world, rule, poi, Change::Without(leader));
+                }
+                if self.observers.contains(&leader) {
+                    for copies in 1..=most {
+                        let gain = self.value(simd, world, rule, poi, Change::With(leader, copies)) - value;
+                        self.gains[leader * row + copies as usize] += gain;
+                    }
+                }
+            }
+        }
+        let total = world.total_worth;
+        for (leader, score) in scores.iter_mut().enumerate().take(leaders) {
+            let (lost, gains) = (self.lost[leader], &self.gains[leader * row..][..row]);
+            *score = match fitness {
+                Fitness::G => share(observed, total.into()),
+                Fitness::D | Fitness::Df | Fitness::Dt => share(lost, total.into()),
+                Fitness::Dpp => {
+                    stepping_stone(lost, most, gains[most as usize], total, |copies| gains[copies as usize])
+                }
+            };
+        }
+        observed
+    }
+
+    /// Copies positions, so that the moments of an agent follow each other.
+    #[inline(always)]
+    fn load<S: Simd>(&mut self, paths: &Paths<'_>, world: &World) {
+        let (agents, moments) = (world.agents(), world.steps() + 1);
+        self.width = moments.next_multiple_of(S::f32s::LEN);
+        self.positions.resize(2 * agents * self.width, 0.0);
+        for (index, row) in self.positions.chunks_exact_mut(self.width).enumerate() {
+            let (axis, agent) = (index / agents, index % agents);
+            for (moment, to) in row[..moments].iter_mut().enumerate() {
+                *to = f32::from_bits(paths.positions.get((moment * agents + agent) * 2 + axis));
+            }
+        }
+    }
+
+    /// Returns some neighbouring moments of an agent: its x and y.
+    #[inline(always)]
+    fn at<S: Simd>(&self, simd: S, agents: usize, agent: usize, first: usize) -> [S::f32s; 2] {
+        let row = |axis: usize| &self.positions[(axis * agents + agent) * self.width + first..][..S::f32s::LEN];
+        [S::f32s::from_slice(simd, row(0)), S::f32s::from_slice(simd, row(1))]
+    }
+
+    /// Finds whom each learner takes out, and when.
+    #[inline(always)]
+    fn take_out<S: Simd>(&mut self, simd: S, world: &World, rule: &PathRule, fitness: Fitness) {
+        let (leaders, agents, words) = (world.leaders(), world.agents(), world.constants.words as usize);
+        self.ever_taken.clear();
+        self.ever_taken.resize(leaders * words, 0);
+        match fitness {
+            Fitness::D if !rule.removes.is_empty() => self.ever_taken.copy_from_slice(&rule.removes),
+            _ => (0..leaders).for_each(|leader| self.ever_taken[leader * words + leader / 32] |= 1 << (leader % 32)),
+        }
+        if matches!(fitness, Fitness::Df | Fitness::Dt) {
+            self.find_influences(simd, world, rule);
+        }
+        if fitness == Fitness::Df {
+            for (agent, counts) in self.counts.chunks_exact(leaders).enumerate() {
+                let most = counts.iter().copied().max().filter(|&most| most > 0);
+                if let Some(leader) = most.and_then(|most| counts.iter().position(|&count| count == most)) {
+                    self.ever_taken[leader * words + agent / 32] |= 1 << (agent % 32);
+                }
+            }
+        }
+        let width = self.width;
+        self.taken.resize(leaders * words * width, 0);
+        for (row, &agents) in self.taken.chunks_exact_mut(width).zip(&self.ever_taken) {
+            row.fill(agents);
+        }
+        if fitness == Fitness::Dt {
+            lead(&Strided::contiguous(&self.sights), agents, leaders, world.led, &mut self.led);
+            let size = world.leader_words();
+            for (place, &word) in self.led.iter().enumerate() {
+                let (moment, agent) = (place / size / agents, place / size % agents);
+                for leader in each_bit(word).map(|bit| place % size * 32 + bit) {
+                    let (row, bit) = (leader * words + agent / 32, 1 << (agent % 32));
+                    self.taken[row * width + moment] |= bit;
+                    self.ever_taken[row] |= bit;
+                }
+            }
+        }
+    }
+
+    /// Finds which learners influence each agent at each moment, and how often.
+    ///
+    /// If the start counts, influence and observation are of the same moment. Otherwise agents influence others before they
+    /// move, as the leaders that followers see.
+    #[inline(always)]
+    fn find_influences<S: Simd>(&mut self, simd: S, world: &World, rule: &PathRule) {
+        let (leaders, agents, size) = (world.leaders(), world.agents(), world.leader_words());
+        let later = usize::from(!rule.start_counts);
+        let counted = world.steps() + 1 - later;
+        self.sights.clear();
+        self.sights.resize((world.steps() + 1) * agents * size, 0);
+        self.counts.clear();
+        self.counts.resize(agents * leaders, 0);
+        for (class, led) in world.classes.iter().enumerate() {
+            for leading in &world.classes {
+                let influence2 = leading.constants.influence2[class];
+                let learners = leading.agents().take_while(|&agent| agent < leaders && influence2 >= 0.0);
+                for (leader, agent) in learners.flat_map(|leader| led.agents().map(move |agent| (leader, agent))) {
+                    if leader == agent {
+                        continue;
+                    }
+                    for first in (0..counted).step_by(S::f32s::LEN) {
+                        let ([x, y], [led_x, led_y]) =
+                            (self.at(simd, agents, leader, first), self.at(simd, agents, agent, first));
+                        let sees = within::<S>(x - led_x, y - led_y, splat(simd, influence2)).to_bitmask();
+                        let all = (counted - first).min(S::f32s::LEN);
+                        let sees = sees & (u64::MAX >> (64 - all));
+                        self.counts[agent * leaders + leader] += sees.count_ones();
+                        let mut left = sees;
+                        while left != 0 {
+                            let moment = first + left.trailing_zeros() as usize + later;
+                            self.sights[(moment * agents + agent) * size + leader / 32] |= 1 << (leader % 32);
+                            left &= left - 1;
+                        }
+                    }
+                }
+            }
+        }
+    }
+
+    /// Finds the observers that are ever near a POI, and when.
+    #[inline(always)]
+    fn find_observers<S: Simd>(&mut self, simd: S, world: &World, rule: &PathRule, poi: usize, at: Vec2) {
+        let (agents, width) = (world.agents(), self.width);
+        let [first, last] =
+            world.rule.window(poi).map_or([0, world.steps()], |window| window.map(|step| step as usize));
+        let first = first.max(usize::from(!rule.start_counts));
+        self.observers.clear();
+        self.near.clear();
+        let radius2 = splat(simd, world.radii2[poi]);
+        for agent in (0..agents).filter(|&agent| world.rule.counts_at(poi, agent)) {
+            let start = self.near.len();
+            self.near.resize(start + width, f32::INFINITY);
+            let mut ever = false;
+            for chunk in (0..width).step_by(S::f32s::LEN) {
+                let [x, y] = self.at(simd, agents, agent, chunk);
+                let (dx, dy) = (x - at.x, y - at.y);
+                let is_near = observes::<S>(radius2, dx, dy);
+                if is_near.to_bitmask() != 0 {
+                    let near = select::<S>(splat(simd, f32::INFINITY), dx * dx + dy * dy, is_near);
+                    near.store_slice(&mut self.near[start + chunk..][..S::f32s::LEN]);
+                }
+            }
+            for (moment, near) in self.near[start..].iter_mut().enumerate() {
+                if moment < first || moment > last {
+                    *near = f32::INFINITY;
+                }
+                ever |= near.is_finite();
+            }
+            if ever {
+                self.observers.push(agent);
+            } else {
+                self.near.truncate(start);
+            }
+        }
+    }
+
+    /// Returns what a POI counts for, in units of its worth.
+    #[inline(always)]
+    fn value<S: Simd>(&mut self, simd: S, world: &World, rule: &PathRule, poi: usize, change: Change) -> u32 {
+        let ((score, when), coupling) = (rule.scores[poi], world.coupling[poi] as usize);
+        let value = |squared: f32| match squared.is_finite() {
+            true => (f64::from(world.worth[poi]) / f64::from(squared).sqrt()).round() as u32,
+            false => 0,
+        };
+        let (mut best, mut sum, steps) = (splat(simd, f32::INFINITY), 0_u64, world.steps());
+        for first in (0..self.width).step_by(S::f32s::LEN) {
+            let squared = match (score, coupling) {
+                (Score::Observed, _) => self.observed::<S>(simd, world, coupling as u32, first, change),
+                (Score::Closeness, 1) => self.closest::<S>(simd, world, first, change),
+                (Score::Closeness, _) => self.close::<S>(simd, world, coupling, first, change),
+            };
+            match when {
+                When::Ever => best = smaller::<S>(squared, best),
+                When::End if first + S::f32s::LEN > steps => best = splat(simd, squared.as_slice()[steps - first]),
+                When::End => {}
+                When::Mean => sum += squared.as_slice().iter().map(|&squared| u64::from(value(squared))).sum::<u64>(),
+            }
+            if let When::End = when
+                && first + S::f32s::LEN > steps
+            {
+                break;
+            }
+        }
+        if when == When::Mean {
+            let moments = steps as u64 + u64::from(rule.start_counts);
+            return ((sum + moments / 2) / moments) as u32;
+        }
+        value(best.as_slice().iter().copied().fold(f32::INFINITY, f32::min))
+    }
+
+    /// Returns the squared distance of an observer, infinite if it is not near or taken out, and how often it counts.
+    #[inline(always)]
+    fn near<S: Simd>(&self, simd: S, world: &World, index: usize, first: usize, change: Change) -> (S::f32s, u32) {
+        let agent = self.observers[index];
+        let near = S::f32s::from_slice(simd, &self.near[index * self.width + first..][..S::f32s::LEN]);
+        match change {
+            Change::Without(leader) => {
+                let row = leader * world.constants.words as usize + agent / 32;
+                let taken = S::u32s::from_slice(simd, &self.taken[row * self.width + first..][..S::f32s::LEN]);
+                let stays = (taken & S::u32s::splat(simd, 1 << (agent % 32))).simd_eq(0);
+                (select::<S>(splat(simd, f32::INFINITY), near, stays), 1)
+            }
+            Change::With(leader, copies) if leader == agent => (near, 1 + copies),
+            Change::With(..) | Change::None => (near, 1),
+        }
+    }
+
+    /// Returns 1 at moments with enough observers, else infinity.
+    #[inline(always)]
+    fn observed<S: Simd>(&self, simd: S, world: &World, coupling: u32, first: usize, change: Change) -> S::f32s {
+        let (infinity, mut count) = (splat(simd, f32::INFINITY), S::u32s::splat(simd, 0));
+        for index in 0..self.observers.len() {
+            let (near, times) = self.near(simd, world, index, first, change);
+            count += near.simd_lt(infinity).to_vector().bitcast::<S::u32s>() & S::u32s::splat(simd, times);
+        }
+        select::<S>(infinity, splat(simd, 1.0), count.simd_ge(coupling))
+    }
+
+    /// Returns the square of max(d, 1) for the distance d of the nearest observer.
+    #[inline(always)]
+    fn closest<S: Simd>(&self, simd: S, world: &World, first: usize, change: Change) -> S::f32s {
+        let mut closest = splat(simd, f32::INFINITY);
+        for index in 0..self.observers.len() {
+            closest = smaller::<S>(self.near(simd, world, index, first, change).0, closest);
+        }
+        larger::<S>(closest, splat(simd, 1.0))
+    }
+
+    /// Returns the product of the squares of max(d, 1) over the distances d of so many nearest observers.
+    #[inline(always)]
+    fn close<S: Simd>(&mut self, simd: S, world: &World, coupling: usize, first: usize, change: Change) -> S::f32s {
+        let mut nearest = std::mem::take(&mut self.nearest);
+        nearest.clear();
+        nearest.resize(coupling * S::f32s::LEN, f32::INFINITY);
+        for index in 0..self.observers.len() {
+            let (near, times) = self.near(simd, world, index, first, change);
+            for _ in 0..times {
+                let mut farther = near;
+                for row in nearest.chunks_exact_mut(S::f32s::LEN) {
+                    let kept = S::f32s::from_slice(simd, row);
+                    smaller::<S>(farther, kept).store_slice(row);
+                    farther = larger::<S>(farther, kept);
+                }
+            }
+        }
+        let mut product = splat(simd, 1.0);
+        for row in nearest.chunks_exact(S::f32s::LEN) {
+            product *= larger::<S>(S::f32s::from_slice(simd, row), splat(simd, 1.0));
+        }
+        self.nearest = nearest;
+        product
+    }
+}
