@@ -209,3 +209,42 @@ fn digests_are_the_same_in_small_batches() {
         check(&backend.describe(), &mut backend);
     }
 }
+
+/// Returns the configs of the repository for a few generations of small populations, each with its long form.
+#[cfg(not(target_family = "wasm"))]
+fn both_forms() -> Vec<(String, [Config; 2])> {
+    let mut paths = vec![];
+    for folder in ["configs", "configs/tasks", "configs/influence"] {
+        let files = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
+        paths.extend(files.filter(|path| path.extension().is_some_and(|extension| extension == "toml")));
+    }
+    let small = |path: std::path::PathBuf| {
+        let mut config = Config::load(&path).unwrap();
+        let learning = &mut config.learning;
+        (learning.trials, learning.generations, learning.population) = (1, 3, 16);
+        let long = config.expanded();
+        assert!(!long.agents.is_empty() && !long.pois.is_empty(), "{}", path.display());
+        (path.display().to_string(), [config, long])
+    };
+    paths.into_iter().map(small).collect()
+}
+
+#[cfg(not(target_family = "wasm"))]
+fn check_forms(backend: &mut dyn Backend) {
+    let forms = both_forms();
+    assert!(forms.len() >= 17);
+    for (name, forms) in forms {
+        let [short, long] = forms.map(|config| train(&[config], backend).remove(0));
+        assert_eq!(short, long, "{name}, {}", backend.describe());
+    }
+}
+
+#[cfg(not(target_family = "wasm"))]
+#[test]
+fn configs_and_their_long_forms_give_equal_digests() {
+    check_forms(&mut Cpu::default());
+    #[cfg(feature = "gpu")]
+    for (request, _) in support::adapters("configs_and_their_long_forms_give_equal_digests") {
+        check_forms(&mut GpuBackend::new(gpu::open(request).unwrap()).unwrap());
+    }
+}

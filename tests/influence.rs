@@ -1,8 +1,10 @@
 //! The authors' later program, influence shaping, as the reference: what its own sensors gave in random scenes.
 
 use std::fmt::Write;
+use std::ops::ControlFlow;
 
-use flotilla::config::Config;
+use flotilla::backend::cpu::Cpu;
+use flotilla::config::{Config, Fitness};
 use flotilla::front;
 use flotilla::stepping::{Recording, Stepper};
 use flotilla::world::World;
@@ -211,4 +213,41 @@ fn rewards_are_those_of_the_authors_program() {
         }
     }
     assert!(compared > 6000 && different[1..].iter().all(|&count| count > 100), "{compared}, {different:?}");
+}
+
+/// A UAV that always influences the only rover is worth what the rover is worth, which is all.
+#[test]
+fn one_rover_and_one_uav_learn_alike_under_any_credit() {
+    let trained = |fitness: Fitness| {
+        let mut config = Config::parse(include_str!("../configs/influence/rover_uav.toml"), "rover_uav.toml").unwrap();
+        (config.learning.trials, config.learning.generations) = (2, 30);
+        config.agents[1].influence_radius = Some(100.0);
+        config.agents.iter_mut().for_each(|class| class.fitness = None);
+        config.learning.fitness = fitness;
+        let trained = front::train(&config, &mut Cpu::default(), |_| ControlFlow::Continue(())).unwrap();
+        (trained.digest(), trained.champion_g.clone())
+    };
+    let (expected, g) = trained(Fitness::G);
+    assert!(g.iter().any(|&g| g > 0.0), "{g:?}");
+    for fitness in [Fitness::Df, Fitness::Dt] {
+        assert_eq!(trained(fitness).0, expected, "{fitness}");
+    }
+    assert_ne!(trained(Fitness::D).0, expected);
+}
+
+/// Rovers lead nobody, so that their Dt is D.
+#[test]
+fn each_class_may_have_its_own_fitness() {
+    let trained = |of_classes: [Option<Fitness>; 2], fitness: Fitness| {
+        let text = include_str!("../configs/influence/3_rovers_1_uav.toml");
+        let mut config = Config::parse(text, "3_rovers_1_uav.toml").unwrap();
+        (config.learning.trials, config.learning.generations) = (1, 20);
+        (config.agents[0].fitness, config.agents[1].fitness) = (of_classes[0], of_classes[1]);
+        config.learning.fitness = fitness;
+        front::train(&config, &mut Cpu::default(), |_| ControlFlow::Continue(())).unwrap().digest()
+    };
+    let expected = trained([None, None], Fitness::Dt);
+    assert_eq!(trained([Some(Fitness::D), Some(Fitness::Dt)], Fitness::G), expected);
+    assert_ne!(trained([Some(Fitness::Dt), None], Fitness::D), expected);
+    assert_ne!(trained([None, Some(Fitness::G)], Fitness::Dt), expected);
 }

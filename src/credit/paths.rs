@@ -62,7 +62,6 @@ impl PathCredit {
         dispatch!(Level::new(), simd => self.score_with(simd, paths, world, rule, fitness, scores))
     }
 
-    #[inline(always)]
     fn score_with<S: Simd>(
         &mut self,
         simd: S,
@@ -85,7 +84,10 @@ impl PathCredit {
         self.gains.resize(leaders * row, 0);
         let mut observed = 0;
         for (poi, &at) in paths.pois.iter().enumerate() {
-            self.find_observers(simd, world, rule, poi, at);
+            simd.vectorize(
+                #[inline(always)]
+                || self.find_observers(simd, world, rule, poi, at),
+            );
             if self.observers.is_empty() {
                 continue;
             }
@@ -123,7 +125,6 @@ impl PathCredit {
     }
 
     /// Copies positions, so that the moments of an agent follow each other.
-    #[inline(always)]
     fn load<S: Simd>(&mut self, paths: &Paths<'_>, world: &World) {
         let (agents, moments) = (world.agents(), world.steps() + 1);
         self.width = moments.next_multiple_of(S::f32s::LEN);
@@ -144,7 +145,6 @@ impl PathCredit {
     }
 
     /// Finds whom each learner takes out, and when.
-    #[inline(always)]
     fn take_out<S: Simd>(&mut self, simd: S, world: &World, rule: &PathRule, fitness: Fitness) {
         let (leaders, agents, words) = (world.leaders(), world.agents(), world.constants.words as usize);
         self.ever_taken.clear();
@@ -154,7 +154,10 @@ impl PathCredit {
             _ => (0..leaders).for_each(|leader| self.ever_taken[leader * words + leader / 32] |= 1 << (leader % 32)),
         }
         if matches!(fitness, Fitness::Df | Fitness::Dt) {
-            self.find_influences(simd, world, rule);
+            simd.vectorize(
+                #[inline(always)]
+                || self.find_influences(simd, world, rule),
+            );
         }
         if fitness == Fitness::Df {
             for (agent, counts) in self.counts.chunks_exact(leaders).enumerate() {
@@ -261,8 +264,15 @@ impl PathCredit {
     }
 
     /// Returns what a POI counts for, in units of its worth.
-    #[inline(always)]
     fn value<S: Simd>(&mut self, simd: S, world: &World, rule: &PathRule, poi: usize, change: Change) -> u32 {
+        simd.vectorize(
+            #[inline(always)]
+            || self.value_of(simd, world, rule, poi, change),
+        )
+    }
+
+    #[inline(always)]
+    fn value_of<S: Simd>(&mut self, simd: S, world: &World, rule: &PathRule, poi: usize, change: Change) -> u32 {
         let ((score, when), coupling) = (rule.scores[poi], world.coupling[poi] as usize);
         let value = |squared: f32| match squared.is_finite() {
             true => (f64::from(world.worth[poi]) / f64::from(squared).sqrt()).round() as u32,
