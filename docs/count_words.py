@@ -3,7 +3,7 @@
     python3 docs/count_words.py [PAGE ...]
 
 Code blocks, comments, link targets and headings do not count as prose. The totals are without generated pages and pages
-of tables. A page of tables is named *-tables.md. Fails if one has more than 250 words of prose, or another page of
+of tables. A page of tables is named *-tables.md. Fails if one has more than 300 words of prose, or another page of
 results more than 700 words. If pages are named, sentences of more than 30 words are printed, too.
 """
 
@@ -15,8 +15,8 @@ ROOT = Path(__file__).resolve().parent.parent
 GENERATED = {"docs/reference/config.md", "docs/reference/python.md",
              "docs/results/claims-measured.md", "docs/results/questions-tables.md", "benches/static-figures.md"}
 # The most words of a page of results, and of prose on a page of tables.
-MOST_RESULTS, MOST_AROUND_TABLES = 700, 250
-LOGS = ["benches/README.md", "benches/peers/README.md", "benches/static-figures.md"]
+MOST_RESULTS, MOST_AROUND_TABLES = 700, 300
+LOGS = ["benches/README.md", "benches/log-tables.md", "benches/peers/README.md", "benches/static-figures.md"]
 
 
 def parts(text):
