@@ -2,7 +2,7 @@
 
     pip install matplotlib
     python3 docs/scale_figure.py                 # from docs/results/scale/coupling6-curves.csv
-    python3 docs/scale_figure.py SWEEP...        # writes that file first, from equal-* of docs/results/scale.md
+    python3 docs/scale_figure.py SWEEP...        # writes that file first, from equal-* of docs/results/scale-tables.md
 """
 
 import csv

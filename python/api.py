@@ -34,6 +34,9 @@ ORDER = [
 ]
 
 
+CONTENTS = "Sections: " + ", ".join(f"[{title}](#{title.lower().replace(' ', '-')})" for title, _ in ORDER) + ".\n"
+
+
 def markdown(text: str) -> str:
     """Returns a docstring as Markdown: sections become paragraphs and lists, and examples become code blocks."""
     text = re.sub(r":(?:func|meth|class):`([^`]*)`", r"`\1`", text).replace("``", "`")
@@ -104,7 +107,7 @@ HIDDEN = {"Run", "Replay", "Figure", "Rollout", "Trace", "Sweep", "Generation", 
 
 
 def page() -> str:
-    parts = [OPENING]
+    parts = [OPENING, CONTENTS]
     for title, names in ORDER:
         parts.append(f"## {title}\n")
         for name in names:

@@ -1,5 +1,5 @@
-//! Tests the structure of the crate: modules import downwards, only one module reads the clock, and the browser page
-//! offers every fitness.
+//! Tests the structure of the crate: modules import downwards, only one module reads the clock, the browser page
+//! offers every fitness, and CONTRIBUTING.md knows the folders.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -237,6 +237,57 @@ fn the_browser_page_has_every_fitness() {
         assert!(select.contains(&format!("<option>{word}</option>")), "index.html does not offer {word}");
         assert!(compare.contains(&format!("\"{word}\"")), "compare.js does not compare {word}");
     }
+}
+
+/// Returns the number of lines of code below a folder.
+fn lines(folder: &Path) -> usize {
+    let endings = ["rs", "wgsl", "py", "pyi", "js", "mjs", "css", "html"];
+    let paths = fs::read_dir(folder).unwrap_or_else(|error| panic!("{}: {error}", folder.display()));
+    let of_path = |path: PathBuf| {
+        let is_made = ["dist", "node_modules", "target", ".venv"].iter().any(|made| path.ends_with(made));
+        match path.extension() {
+            _ if is_made => 0,
+            _ if path.is_dir() => lines(&path),
+            Some(ending) if endings.iter().any(|other| ending == *other) => {
+                fs::read_to_string(&path).unwrap().lines().count()
+            }
+            _ => 0,
+        }
+    };
+    paths.map(|entry| of_path(entry.unwrap().path())).sum()
+}
+
+#[test]
+fn the_map_in_contributing_has_the_size_of_each_folder() {
+    let page = fs::read_to_string("CONTRIBUTING.md").unwrap();
+    let mut rows = 0;
+    for (folders, rest) in page.lines().filter_map(|line| line.strip_prefix("| `")?.split_once("` | ")) {
+        let Ok(listed) = rest.split(" | ").next().unwrap_or_default().parse::<f64>() else { continue };
+        let counted = folders.split("`, `").map(|folder| lines(Path::new(folder))).sum::<usize>() as f64;
+        assert!(
+            (counted - listed).abs() < 0.2 * listed,
+            "{folders} has {counted} lines, CONTRIBUTING.md lists {listed}"
+        );
+        rows += 1;
+    }
+    assert!(rows > 10, "{rows}");
+}
+
+/// The worked examples are diffs of some lines, each below the name of its file.
+#[test]
+fn the_worked_examples_in_contributing_still_apply() {
+    let page = fs::read_to_string("CONTRIBUTING.md").unwrap();
+    let diffs = page.split("```diff\n").skip(1).map(|rest| rest.split("```").next().unwrap());
+    let mut hunks = 0;
+    for hunk in diffs.flat_map(|diff| diff.split("--- ").skip(1)) {
+        let (file, changes) = hunk.split_once('\n').unwrap();
+        let before = changes.lines().filter(|line| !line.starts_with('+')).map(|line| format!("{}\n", &line[1..]));
+        let before: String = before.collect();
+        let found = fs::read_to_string(file).unwrap().matches(&before).count();
+        assert!(!before.is_empty() && found == 1, "{file} has these lines {found} times:\n{before}");
+        hunks += 1;
+    }
+    assert!(hunks > 10, "{hunks}");
 }
 
 /// Returns the functions, types, constants and variables that a shader declares, and its code without comments.

@@ -431,6 +431,7 @@ fn every_relative_link_has_a_target() {
         "python/README.md",
         "benches/README.md",
         "benches/static-figures.md",
+        "benches/log-tables.md",
         "benches/peers/README.md",
     ];
     let pages = pages().into_iter().chain(others.map(|other| root.join(other)));
