@@ -13,6 +13,7 @@ mod golden;
 mod helpers;
 mod influence;
 mod math;
+#[cfg(feature = "gpu")]
 mod parity;
 mod stepping;
 mod strategy;
@@ -23,7 +24,7 @@ mod support {
 }
 mod structure;
 // Release builds have no faults to inject.
-#[cfg(debug_assertions)]
+#[cfg(all(debug_assertions, feature = "gpu"))]
 mod watchdog;
 
 /// The root of the checkout.

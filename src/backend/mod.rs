@@ -32,7 +32,7 @@ pub use scores::GroupScores;
 pub(crate) use size::{BATCH_BYTES, PACKED_FROM, held_bytes, state_bytes, weight_bytes};
 pub use size::{HELD_FROM, record_bytes};
 #[cfg(feature = "gpu")]
-use size::{VECTOR, WeightVector, check_sizes, record_words, weight_vectors};
+use size::{VECTOR, WeightVector, check_sizes, record_words, traced_words, weight_vectors};
 pub(crate) use trace::MOMENT_WORDS;
 pub use trace::{Moment, Trace};
 

@@ -1,6 +1,6 @@
 //! How many bytes episodes and populations take.
 
-use super::BackendError;
+use super::{BackendError, MOMENT_WORDS};
 use crate::config::Fitness;
 use crate::credit::RecordRequest;
 use crate::world::World;
@@ -26,9 +26,15 @@ pub(super) fn record_words(world: &World, records: RecordRequest<'_>) -> usize {
     world.set_words() + world.leaders() * world.followers() + sights
 }
 
-/// Returns the bytes of the record of a team that is scored by a fitness.
+/// Returns the bytes of the record of a team that is scored by a fitness, with its trace if scores need paths.
 pub fn record_bytes(world: &World, fitness: Fitness) -> u64 {
-    (record_words(world, RecordRequest(&[fitness])) * size_of::<u32>()) as u64
+    let traced = if world.paths.is_some() { (world.steps() + 1) * traced_words(world) } else { 0 };
+    ((record_words(world, RecordRequest(&[fitness])) + traced) * size_of::<u32>()) as u64
+}
+
+/// Returns the words of one step of a team's trace: moments, then inputs.
+pub(super) fn traced_words(world: &World) -> usize {
+    world.agents() * MOMENT_WORDS + world.leaders() * world.inputs()
 }
 
 /// Returns the vectors of a team's weights.

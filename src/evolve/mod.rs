@@ -12,7 +12,9 @@ mod strategy;
 mod weights;
 
 pub use mutation::{Breeding, InvalidInput, mutate};
-pub(crate) use mutation::{Offspring, breed, mutation_threshold};
+#[cfg(feature = "gpu")]
+pub(crate) use mutation::mutation_threshold;
+pub(crate) use mutation::{Offspring, breed};
 pub(crate) use random::noise;
 pub use random::{Key, Purpose};
 pub use schedule::{

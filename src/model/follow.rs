@@ -18,6 +18,7 @@ use crate::kernels::{
 use crate::reader::{Reader, between, section};
 
 /// The shader of this part.
+#[cfg(feature = "gpu")]
 pub(crate) const WGSL: &str = include_str!("../../shaders/follow.wgsl");
 
 /// Maximum gain of a force.
@@ -151,11 +152,10 @@ impl<S: Simd> Sum<S> {
         Sum { x: none, y: none, count: none }
     }
 
-    /// Adds an agent's offset or heading, on its lattice, where the squared distance is within the term's.
+    /// Adds an agent's offset or heading, on its lattice, in the lanes in which it counts.
     #[inline(always)]
-    pub(crate) fn add(&mut self, term: &TermLanes<S>, d2: S::f32s, [x, y]: [S::i32s; 2]) {
-        // Equal to the shader's comparison of bits, because no squared distance is negative.
-        let counts = (d2.simd_le(term.outer2) & d2.simd_gt(term.inner2)).to_vector();
+    pub(crate) fn add(&mut self, counts: S::mask32s, [x, y]: [S::i32s; 2]) {
+        let counts = counts.to_vector();
         self.x += x & counts;
         self.y += y & counts;
         self.count -= counts;

@@ -140,4 +140,5 @@ pub(crate) fn declarations() -> String {
 }
 
 /// The parts' shaders.
+#[cfg(feature = "gpu")]
 pub(crate) const WGSL: [&str; 5] = [sense::WGSL, policy::WGSL, follow::WGSL, motion::WGSL, couple::WGSL];

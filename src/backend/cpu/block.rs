@@ -218,8 +218,8 @@ impl<S: Simd> Block<S> {
             }
             for (index, (terms, others)) in plan.terms.iter().enumerate() {
                 let counting = index == 0 && plan.leaders.is_none();
-                let (terms, influences2) = (&class.terms[terms.clone()], &plan.influences2);
-                let attraction = Attraction { class, terms, agents, headings, near, others, influences2 };
+                let terms = &class.terms[terms.clone()];
+                let attraction = Attraction { class, terms, agents, headings, near, others, leaders };
                 match (terms.len(), counting) {
                     (1, true) => attraction.add::<1, true>(own.clone(), followers, counts),
                     (1, false) => attraction.add::<1, false>(own.clone(), followers, counts),
@@ -302,9 +302,9 @@ impl<S: Simd> Block<S> {
 struct Plan {
     /// The agents of each channel, `[channels]`.
     channels: Vec<Masks>,
-    /// Terms that are added together, one or two, and their agents.
+    /// Terms that are added together, one or two [rings](Attraction), and their agents.
     terms: Vec<(Range<usize>, Masks)>,
-    /// The leaders, unless the first terms count them because they visit all of them.
+    /// The leaders, unless the first terms count them because they visit all of them and have their radius.
     leaders: Option<Masks>,
     /// The squared distance up to which each leader leads agents of this class, `[leaders]`.
     influences2: Vec<f32>,
@@ -319,25 +319,34 @@ impl Plan {
             let mut terms: Vec<(Range<usize>, Masks)> = vec![];
             for (term, constants) in class.terms().iter().enumerate() {
                 match terms.last_mut().map(|(range, _)| range) {
-                    Some(range) if range.len() == 1 && class.terms()[range.start].shape == constants.shape => {
+                    Some(range) if range.len() == 1 && is_around(&class.terms()[range.start], constants) => {
                         range.end += 1;
                     }
                     _ => terms.push((term..term + 1, masks(model::each(&constants.shape.ranges)))),
                 }
             }
+            let influences2: Vec<f32> = leading.iter().map(|class| class.constants.influence2[index]).collect();
             let visits = |constants: &follow::TermConstants| {
                 model::each(&constants.shape.ranges).any(|range| range.start == 0 && range.end >= leaders.end)
+                    && influences2.iter().all(|&influence2| influence2 == constants.outer2)
             };
-            let counted = class.terms().first().is_some_and(visits);
+            let is_led = influences2.iter().any(|&influence2| influence2 >= 0.0);
+            let counted = terms.first().is_some_and(|(range, _)| visits(&class.terms()[range.end - 1]));
             Plan {
                 channels: class.channels().iter().map(|of| masks(model::each(&of.shape.ranges))).collect(),
                 terms,
-                leaders: (!counted).then(|| masks(std::iter::once(leaders.clone()))),
-                influences2: leading.iter().map(|class| class.constants.influence2[index]).collect(),
+                leaders: (!counted).then(|| masks(is_led.then(|| leaders.clone()))),
+                influences2,
             }
         };
         world.classes.iter().enumerate().map(plan).collect()
     }
+}
+
+/// Reports whether a term counts the same agents and adds the same quantity as one without an inner radius, in the ring
+/// around it.
+fn is_around(inner: &follow::TermConstants, outer: &follow::TermConstants) -> bool {
+    inner.shape == outer.shape && inner.inner2 < 0.0 && outer.inner2 == inner.outer2 && outer.outer2 >= inner.outer2
 }
 
 /// Returns the largest squared distance at which each agent and any after it matter to each other, `[agents]`.
@@ -537,7 +546,8 @@ fn count_leaders<S: Simd>(
     }
 }
 
-/// One or two terms of a rule that count the same agents and add the same quantity.
+/// One term of a rule, or two that count the same agents and add the same quantity: one without an inner radius, and one
+/// in the ring around it.
 struct Attraction<'a, S: Simd> {
     class: &'a ClassLanes<S>,
     terms: &'a [follow::TermLanes<S>],
@@ -545,7 +555,7 @@ struct Attraction<'a, S: Simd> {
     headings: &'a [[S::f32s; 2]],
     near: &'a [u64],
     others: &'a Masks,
-    influences2: &'a [f32],
+    leaders: usize,
 }
 
 impl<S: Simd> Attraction<'_, S> {
@@ -570,10 +580,11 @@ impl<S: Simd> Attraction<'_, S> {
         followers: &mut [Follower<S>],
         counts: &mut [S::u32s],
     ) {
-        let &Attraction { class, terms, agents, headings, near, others, influences2 } = self;
+        let &Attraction { class, terms, agents, headings, near, others, leaders } = self;
         let rule = &class.constants.rule;
         let terms: &[follow::TermLanes<S>; TERMS] = terms.try_into().expect("the caller counts the terms");
-        for ((index, follower), counts) in own.zip(&mut *followers).zip(counts.chunks_exact_mut(influences2.len())) {
+        let [inner, outer] = [&terms[0], &terms[TERMS - 1]];
+        for ((index, follower), counts) in own.zip(&mut *followers).zip(counts.chunks_exact_mut(leaders)) {
             let &Agent { x, y, .. } = &agents[index];
             let mut sums = [Sum::new(x.token()); TERMS];
             neighbours::each_near(
@@ -588,12 +599,17 @@ impl<S: Simd> Attraction<'_, S> {
                     let ([x, y], base) =
                         if ALIGNS { (headings[index], rule.heading_base) } else { ([dx, dy], rule.offset_base) };
                     let quantity = [on_lattice::<S>(x, base), on_lattice::<S>(y, base)];
-                    for (sum, term) in sums.iter_mut().zip(terms) {
-                        sum.add(term, d2, quantity);
+                    // Equal to the shader's comparisons of bits, because no squared distance is negative.
+                    let within = d2.simd_le(outer.outer2);
+                    if TERMS == 1 {
+                        sums[0].add(within & d2.simd_gt(inner.inner2), quantity);
+                    } else {
+                        let near = d2.simd_le(inner.outer2);
+                        sums[0].add(near, quantity);
+                        sums[1].add(within & !near, quantity);
                     }
                     if COUNTS && let Some(count) = counts.get_mut(index) {
-                        let sees = d2.simd_le(splat(d2.token(), influences2[index]));
-                        *count -= sees.to_vector().bitcast::<S::u32s>();
+                        *count -= within.to_vector().bitcast::<S::u32s>();
                     }
                 },
             );

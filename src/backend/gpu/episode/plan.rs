@@ -10,7 +10,7 @@ use crate::backend::gpu::population::Held;
 use crate::backend::gpu::recording::{BINDING_ALIGNMENT, Buffer, Command, Recording, Slice, grid};
 use crate::backend::gpu::shape::{Capacity, MAX_THREADS, Recorded, Shape, WORKGROUPS, Workgroup};
 use crate::backend::gpu::source::{GatherJob, LEADERS_PER_GATHER, NOWHERE, PACK_WORKGROUP, Pipeline, State, Task};
-use crate::backend::{BackendError, Group, MOMENT_WORDS, VECTOR, WeightVector, Weights, record_words, weight_vectors};
+use crate::backend::{BackendError, Group, VECTOR, WeightVector, Weights, record_words, traced_words, weight_vectors};
 use crate::credit::{RecordRequest, owner_bits};
 use crate::model::Constants;
 use crate::model::class::Class;
@@ -75,11 +75,6 @@ pub fn state_bytes(world: &World, request: RecordRequest<'_>) -> u64 {
     } else {
         0
     }
-}
-
-/// Returns the words of one step of a team's trace: moments, then inputs.
-fn traced_words(world: &World) -> usize {
-    world.agents() * MOMENT_WORDS + world.leaders() * world.inputs()
 }
 
 /// A task and where its teams come from.
