@@ -58,6 +58,8 @@ class Generation:
     @property
     def champion_g(self) -> _F64: ...
     @property
+    def test_g(self) -> _F64 | None: ...
+    @property
     def champions(self) -> _F32 | None: ...
 
 class Replay:
@@ -71,7 +73,7 @@ class Figure:
     def svg(self) -> str: ...
     def file(self, path: str, width: int | None) -> bytes: ...
 
-_Row = tuple[int, int, float, float, float]
+_Row = tuple[int, int, float, float, float, float | None]
 _State = tuple[int, _F32, _F32, list[_Row], list[_Row], bool]
 
 class Coevolution:

@@ -16,8 +16,9 @@ pub(crate) use mutation::{Offspring, breed, mutation_threshold};
 pub(crate) use random::noise;
 pub use random::{Key, Purpose};
 pub use schedule::{
-    aligned_teams, contemporary_teams, episode_positions, jitter_pois, jitter_starts, order_policies, past_champions,
+    Episodes, aligned_teams, contemporary_teams, episode_positions, jitter_pois, jitter_starts, order_policies,
+    past_champions,
 };
-pub use selection::{Selection, UNCHANGED, draw_parents, keep_parents, ranking, top_indices, tournament};
+pub use selection::{Selection, UNCHANGED, draw_parents, keep_parents, keep_teams, ranking, top_indices, tournament};
 pub use strategy::{Samples, Strategy};
-pub use weights::{MAX_WEIGHT, MIN_WEIGHT, flush_and_validate, is_weight, random_policy};
+pub use weights::{MAX_WEIGHT, MIN_WEIGHT, flush_and_validate, initial_policy, is_weight, random_policy};

@@ -24,7 +24,7 @@ coupling = 4
 pub type Case = (&'static str, &'static str, &'static str, &'static [(&'static str, &'static str)]);
 
 /// Together these cases cover every choice in a config, and sizes on both sides of every special case.
-pub const CASES: [Case; 36] = [
+pub const CASES: [Case; 39] = [
     ("generally-forward", "first layout, leader-follower, Df", GENERALLY_FORWARD, &[]),
     ("strictly-forward", "second layout, D++", STRICTLY_FORWARD, &[("learning.fitness", "'D++'")]),
     ("chaotic", "third layout, G", CHAOTIC, &[("learning.fitness", "'G'")]),
@@ -291,6 +291,39 @@ pub const CASES: [Case; 36] = [
             ("learning.fitness", "'G'"),
             ("world.coupling", "2"),
             ("stages", "[{from = 4, set = {'learning.search_step' = 1.5}}]"),
+        ],
+    ),
+    (
+        "softmax-teams",
+        "teams by softmax, uniform first weights, two test episodes from jittered starts, D",
+        GENERALLY_FORWARD,
+        &[
+            ("learning.teams", "'softmax'"),
+            ("learning.temperature", "0.3"),
+            ("learning.initial", "'uniform'"),
+            ("learning.initial_scale", "2.0"),
+            ("learning.start_jitter", "0.5"),
+            ("learning.test_episodes", "2"),
+            ("learning.fitness", "'D'"),
+            ("world.coupling", "2"),
+        ],
+    ),
+    (
+        "sorted-teams",
+        "teams of the best, the second best, and so on, all-leaders",
+        CHAOTIC,
+        &[("learning.teams", "'sorted'"), ("learning.paradigm", "'all-leaders'"), ("world.coupling", "3")],
+    ),
+    (
+        "team-elites",
+        "two teams play again, three policies survive by their team's G, moved POIs",
+        GENERALLY_FORWARD,
+        &[
+            ("learning.team_elites", "2"),
+            ("learning.team_g_elites", "3"),
+            ("learning.elites", "2"),
+            ("learning.poi_jitter", "1.0"),
+            ("world.coupling", "2"),
         ],
     ),
 ];

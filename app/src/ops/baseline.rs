@@ -126,7 +126,7 @@ pub fn run(
     Ok(BaselineOutcome {
         paradigm: learning.paradigm,
         pois,
-        teams: learning.teams() * (learning.generations + 1),
+        teams: learning.team_count() * (learning.generations + 1),
         seeds: outcomes.len(),
         episodes: if moves { request.episodes } else { 1 },
         constants: (0..baseline::constants(actions).len()).map(constant).collect(),
