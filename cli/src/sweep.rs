@@ -210,6 +210,7 @@ pub fn run(mut args: Args) -> Result<(), Error> {
         args.sweep = out.join(SWEEP);
     }
     let axes = ops::sweep::picture_axes(&sweep, &args.axes)?;
+    ops::sweep::check_measure(&sweep, args.measure)?;
     if let Some(file) = &args.slurm {
         return write_script(&args, &sweep, &out, file.as_deref());
     }

@@ -101,7 +101,7 @@ impl ExperimentState {
         }
         let ExperimentState { stages, schedules, trials, .. } = self;
         let pairs = schedules.par_iter_mut().zip(trials);
-        pairs.for_each(|(schedule, trial)| schedule.draw(level, stages, Draw { trial, generation }));
+        pairs.for_each(|(schedule, trial)| trial.draw(level, stages, generation, schedule));
     }
 
     /// Draws the next generation's schedules, unless they depend on the results of the generation that plays. Its
@@ -113,7 +113,7 @@ impl ExperimentState {
         }
         next.resize_with(self.trials.len(), TeamSchedule::new);
         let pairs = next.par_iter_mut().zip(&self.trials);
-        pairs.for_each(|(schedule, trial)| schedule.draw(level, &self.stages, Draw { trial, generation }));
+        pairs.for_each(|(schedule, trial)| trial.draw(level, &self.stages, generation, schedule));
     }
 
     /// Returns the experiment's state as far as the host has it.
@@ -163,11 +163,15 @@ impl ExperimentState {
 }
 
 impl TrialState {
-    /// Returns the score of the previous generation of a slot's policy, or of its parent; 0 in generation 0.
-    pub fn past_fitness(&self, generation: usize, [populations, policies]: [usize; 2], place: [usize; 2]) -> f32 {
-        let ([population, slot], slots) = (place, self.parents.len() / populations);
-        let parent = self.parents[population * slots + slot] & !evolve::UNCHANGED;
-        if generation == 0 { 0.0 } else { self.fitness[population * policies + parent as usize] }
+    /// Draws the schedule of a generation, which is planned if its teams depend on the plan.
+    fn draw(&self, level: Level, stages: &Stages, generation: usize, schedule: &mut TeamSchedule) {
+        let config = &stages.of(generation).config;
+        let (slots, policies) = (config.learning.slots(), config.learning.population);
+        let fitness = |population: usize, slot: usize| {
+            let parent = self.parents[population * slots + slot] & !evolve::UNCHANGED;
+            if generation == 0 { 0.0 } else { self.fitness[population * policies + parent as usize] }
+        };
+        schedule.draw(level, stages, Draw { trial: self.index, generation }, fitness);
     }
 
     /// Returns a trial with random policies.

@@ -6,7 +6,6 @@
 use fearless_simd::Level;
 use glam::Vec2;
 
-use super::experiment::TrialState;
 use super::stages::{Stage, Stages};
 use crate::config::population_count;
 use crate::evolve::{self, Episodes};
@@ -38,10 +37,10 @@ pub(super) struct TeamSchedule {
     pub test_starts: Vec<Vec<Vec2>>,
 }
 
-/// The generation of a trial that a schedule is drawn for. The trial has planned it, if its teams depend on that.
+/// The generation of a trial that a schedule is drawn for.
 #[derive(Clone, Copy)]
-pub(super) struct Draw<'a> {
-    pub trial: &'a TrialState,
+pub(super) struct Draw {
+    pub trial: usize,
     pub generation: usize,
 }
 
@@ -63,15 +62,16 @@ impl TeamSchedule {
         self.drawn_for == Some((generation, stages.index_of(generation)))
     }
 
-    /// Draws the schedule of a trial's generation, unless it is that already.
-    pub fn draw(&mut self, level: Level, stages: &Stages, draw: Draw<'_>) {
-        let Draw { trial: &TrialState { index: trial, .. }, generation } = draw;
+    /// Draws the schedule of a trial's generation, unless it is that already. `fitness` returns the score in the generation
+    /// before of a population's policy in a slot, or of its parent.
+    pub fn draw(&mut self, level: Level, stages: &Stages, draw: Draw, fitness: impl Fn(usize, usize) -> f32 + Sync) {
+        let Draw { trial, generation } = draw;
         if self.is_of(generation, stages) {
             return;
         }
         self.drawn_for = Some((generation, stages.index_of(generation)));
         let stage = stages.of(generation);
-        self.form_teams(level, stage, draw);
+        self.form_teams(level, stage, draw, fitness);
         let draw_starts = |stage: &Stage, episodes: Episodes, all: &mut Vec<Vec<Vec2>>| {
             let (learning, world) = (&stage.config.learning, &stage.world);
             let count = match episodes {
@@ -92,8 +92,8 @@ impl TeamSchedule {
     }
 
     /// Writes `teams`.
-    fn form_teams(&mut self, level: Level, Stage { config, world, .. }: &Stage, draw: Draw<'_>) {
-        let Draw { trial: state @ &TrialState { index: trial, .. }, generation } = draw;
+    fn form_teams(&mut self, level: Level, stage: &Stage, draw: Draw, fitness: impl Fn(usize, usize) -> f32 + Sync) {
+        let (Stage { config, world, .. }, Draw { trial, generation }) = (stage, draw);
         let (learning, populations) = (&config.learning, &world.populations);
         let (leaders, count) = (populations.len(), population_count(populations));
         let population = learning.population;
@@ -107,8 +107,7 @@ impl TeamSchedule {
             1 => order.iter_mut().zip(0..).for_each(|(policy, team)| *policy = team),
             _ => {
                 let [round, of] = [index / count, index % count];
-                let fitness =
-                    |slot| total_value * f64::from(state.past_fitness(generation, [count, population], [of, slot]));
+                let fitness = |slot| total_value * f64::from(fitness(of, slot));
                 evolve::order_policies(level, learning, trial, generation, [round, of], fitness, order);
             }
         });

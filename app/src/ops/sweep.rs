@@ -199,12 +199,17 @@ pub fn run(
 ) -> Result<SweepOutcome, Error> {
     let sweep = request.read()?;
     let axes = picture_axes(&sweep, &request.results.axes)?;
-    let measure = request.results.measure;
-    if let Some((point, why)) = sweep.points.iter().find_map(|point| Some((point, measure.missing(&point.config)?))) {
-        return Err(Error::Usage(format!("--measure {measure}: point {:04}: {why}", point.index).into()));
-    }
+    check_measure(&sweep, request.results.measure)?;
     let disk = train(request, &sweep, backends, context)?;
     write_results(request, &sweep, &axes, &disk, disk.at(&request.out))
+}
+
+/// Fails if a point's results will not have the measured team.
+pub fn check_measure(sweep: &Sweep, measure: TeamKind) -> Result<(), Error> {
+    match sweep.points.iter().find_map(|point| Some((point, measure.missing(&point.config)?))) {
+        Some((point, why)) => Err(Error::Usage(format!("--measure {measure}: point {:04}: {why}", point.index).into())),
+        None => Ok(()),
+    }
 }
 
 /// Returns the axes that pictures have across and down.
