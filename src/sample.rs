@@ -401,6 +401,8 @@ pub fn classes_world(seed: u64) -> Config {
         AgentClass {
             name: names[index].clone(),
             at,
+            count: None,
+            region: None,
             heading,
             speed: if rng.random_bool(0.5) { slow } else { fast },
             control,
@@ -414,7 +416,7 @@ pub fn classes_world(seed: u64) -> Config {
             observes: rng.random_bool(0.8),
         }
     };
-    let agents: Vec<AgentClass> = parts.into_iter().enumerate().map(class).collect();
+    let mut agents: Vec<AgentClass> = parts.into_iter().enumerate().map(class).collect();
     let mut order: Vec<usize> = (0..groups).collect();
     order.rotate_left(rng.random_range(0..groups));
     let steps = config.world.steps;
@@ -429,7 +431,7 @@ pub fn classes_world(seed: u64) -> Config {
                 [] => class.observes,
                 _ => observers.contains(&class.name),
             };
-            agents.iter().filter(counted).map(|class| class.at.len()).sum::<usize>()
+            agents.iter().filter(counted).map(|class| class.size()).sum::<usize>()
         };
         if count(&observers) == 0 {
             observers = vec![names[0].clone()];
@@ -453,6 +455,8 @@ pub fn classes_world(seed: u64) -> Config {
         let before = order[..place].iter().filter(|_| rng.random_bool(0.3));
         let after = before.map(|&other| group_names[other].clone()).collect();
         PoiGroup {
+            count: None,
+            region: None,
             name: group_names[index].clone(),
             value: [1.0, 0.5, 3.0][rng.random_range(0..3)],
             coupling,
@@ -463,9 +467,18 @@ pub fn classes_world(seed: u64) -> Config {
             at,
         }
     };
-    let pois = parts.into_iter().enumerate().map(group).collect();
+    let mut pois: Vec<PoiGroup> = parts.into_iter().enumerate().map(group).collect();
+    if seed % 10 == 7 {
+        let [width, height] = config.world.map;
+        let middle = [width / 2.0, height / 2.0, width.min(height) / 4.0];
+        for (class, region) in agents.iter_mut().zip([Region::Box([0.0, 0.0, width, height]), Region::Disc(middle)]) {
+            (class.count, class.region, class.at) = (Some(class.size()), Some(region), vec![]);
+        }
+        let group = &mut pois[0];
+        (group.count, group.region, group.at) = (Some(group.size()), Some(Region::Circle(middle)), vec![]);
+    }
     if config.learning.sharing == Sharing::Group {
-        let learners = agents.iter().filter(|class| class.learns()).map(|class| class.at.len()).sum();
+        let learners = agents.iter().filter(|class| class.learns()).map(|class| class.size()).sum();
         let of_group = |group: usize| (0..learners).filter(|learner| learner % 2 == group).collect();
         config.learning.groups = (0..learners.min(2)).map(of_group).collect();
     }

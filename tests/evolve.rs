@@ -16,7 +16,8 @@ use flotilla::config::{
     ValidConfig, own_populations,
 };
 use flotilla::credit::Credit;
-use flotilla::evolve::{self, Key, MAX_WEIGHT, MIN_WEIGHT, Purpose, Selection, UNCHANGED};
+use flotilla::evaluate::Starts;
+use flotilla::evolve::{self, Episodes, Key, MAX_WEIGHT, MIN_WEIGHT, Purpose, Selection, UNCHANGED};
 use flotilla::trainer::{Row, Trainer};
 use flotilla::world::{GRID, World};
 use glam::Vec2;
@@ -248,6 +249,67 @@ fn start_jitter_is_uniform_and_differs_between_episodes() {
     }
     assert_distribution("offsets", &counts, |_| 1.0 / 30.0);
     assert_eq!(seen.len(), 1000, "no two episodes start alike");
+}
+
+/// Every generation, episode and purpose has starts and POIs of its own, which jitter moves further.
+#[test]
+fn starts_and_pois_are_drawn_from_their_regions() {
+    let text = "
+[[agents]]
+name = \"a\"
+at = [[1, 2]]
+senses = [{ of = \"pois\" }]
+[[agents]]
+name = \"b\"
+count = 2
+in = { box = [10, 20, 14, 22] }
+control = \"still\"
+[[pois]]
+name = \"p\"
+at = [[3, 4]]
+coupling = 1
+[[pois]]
+name = \"q\"
+count = 3
+in = { disc = [40, 30, 5] }
+coupling = 1
+";
+    let config = Config::parse(text, "regions").unwrap();
+    let world = World::new(&config.validate().unwrap());
+    let draw = |learning: &Learning, trial, generation, episode| {
+        let mut places = Vec::new();
+        evolve::episode_positions(learning, trial, generation, episode, &world, &mut places);
+        places
+    };
+    let is_within = |places: &[Vec2], more: f32| {
+        let [fixed, b, c, poi, pois @ ..] = places else { panic!("{places:?}") };
+        let in_box = |at: &Vec2| (at - Vec2::new(12.0, 21.0)).abs().cmple(Vec2::new(2.0 + more, 1.0 + more)).all();
+        (*fixed - Vec2::new(1.0, 2.0)).abs().max_element() <= more
+            && (*poi - Vec2::new(3.0, 4.0)).abs().max_element() <= more
+            && [b, c].into_iter().all(in_box)
+            && pois.iter().all(|at| at.distance(Vec2::new(40.0, 30.0)) <= 5.0 + 2.0 * more + 1e-3)
+    };
+    let mut seen = HashSet::new();
+    let mut add = |places: Vec<Vec2>| {
+        assert!(is_within(&places, 0.0) && places.len() == 7, "{places:?}");
+        let drawn = places[1..3].iter().chain(&places[4..]);
+        drawn.for_each(|place| assert!(seen.insert(place.to_array().map(f32::to_bits)), "{place} again"));
+    };
+    for (generation, episode) in (0..20).flat_map(|generation| (0..5).map(move |episode| (generation, episode))) {
+        for trial in 0..2 {
+            add(draw(&config.learning, trial, generation, (Episodes::Training, episode)));
+            add(draw(&config.learning, trial, generation, (Episodes::Test, episode)));
+        }
+    }
+    let held_out = Starts::Drawn { episodes: 100, seed: 0, jitter: 0.0, poi_jitter: 0.0 };
+    (0..100).for_each(|episode| add(held_out.of(episode, &world)));
+    // The world's own places are an example, and an episode from them has no moved POIs.
+    assert!(is_within(&[&world.starts[..], &world.pois].concat(), 0.0));
+    assert_eq!(Starts::Own.of(0, &world), world.starts);
+    let moved = Learning { start_jitter: 0.5, poi_jitter: 0.5, ..config.learning.clone() };
+    let (still, moved) =
+        [&config.learning, &moved].map(|learning| draw(learning, 0, 3, (Episodes::Training, 1))).into();
+    assert!(is_within(&moved, 0.5) && still.iter().zip(&moved).all(|(still, moved)| still != moved));
 }
 
 #[test]

@@ -95,3 +95,72 @@ fn the_tested_team_is_in_files_pictures_and_tables() {
     assert!(error.contains("--measure test: point 0000: it has no tested best team"), "{error}");
     place.good("sweep tested.toml --out measured --measure test --quiet --backend cpu");
 }
+
+/// Rovers and POIs that are drawn from regions.
+const REGIONS: &str = "
+[world]
+steps = 30
+dt = 1.0
+[[agents]]
+name = 'rover'
+count = 3
+in = { disc = [25, 25, 4] }
+motion = { kind = 'free', max_speed = 1.0 }
+senses = [{ of = 'pois', measure = 'closeness', range = 50 }, { of = 'agents' }]
+[[agents]]
+name = 'beacon'
+at = [[25, 30]]
+control = 'still'
+[[pois]]
+name = 'ring'
+count = 2
+in = { circle = [25, 25, 10] }
+coupling = 1
+[[pois]]
+name = 'field'
+count = 1
+in = { box = [20, 30, 30, 40] }
+coupling = 1
+[learning]
+population = 8
+generations = 3
+trials = 2
+test_episodes = 4
+";
+
+#[test]
+fn every_command_takes_starts_and_pois_in_regions() {
+    let place = Place::new(&[("x.toml", REGIONS)]);
+    let (checked, warnings) = place.good("check x.toml --out layout.svg");
+    assert!(checked.contains("of which 3 learn") && !warnings.contains("cannot be reached"), "{checked} {warnings}");
+    let layout = fs::read_to_string(place.path("layout.svg")).unwrap();
+    assert!(layout.contains("long dashes: regions from which rover, POIs of ring"));
+    assert_eq!(layout.matches("stroke-dasharray=\"18 10").count(), 3);
+    let (full, _) = place.good("check x.toml --expand");
+    assert!(full.contains("in = { circle = [25.0, 25.0, 10.0] }"), "{full}");
+    place.write("full.toml", &full);
+
+    let trained = json(&place, "train x.toml --out run --quiet --json --backend cpu");
+    assert_eq!(trained["digest"], json(&place, "train full.toml --out full --quiet --json --backend cpu")["digest"]);
+    place.good("train x.toml --generations 1 --out short --quiet --backend cpu");
+    let extended = json(&place, "train x.toml --out short --resume --quiet --json --backend cpu");
+    assert_eq!(trained["digest"], extended["digest"]);
+
+    let once = json(&place, "rollout run --json --backend cpu");
+    assert_eq!((&once["episodes"], &once["seed"]), (&1.into(), &0.into()));
+    let [first, again, other] = [0, 0, 1].map(|seed| {
+        let played = json(&place, &format!("rollout run --episodes 40 --seed {seed} --json --backend cpu"));
+        played["mean"]["mean"].as_f64().unwrap()
+    });
+    assert!(first == again && first != other, "{first} {again} {other}");
+
+    place.good("replay run --generation 2 --out page.html --backend cpu");
+    place.good("replay run --team best --out still.svg --backend cpu");
+    let error = place.refused(2, "replay run --generation 1 --compare 2 --out both.html --backend cpu");
+    assert!(error.contains("POIs are elsewhere in every generation (pois.in): show one alone"), "{error}");
+    let baseline = json(&place, "baseline x.toml --seeds 2 --episodes 5 --json --backend cpu");
+    assert!(baseline["episodes"] == 5 && baseline["constant"]["interval_95"].is_array(), "{baseline}");
+    place.good("bench x.toml --rollout-only --teams 4 --json --backend cpu");
+    let error = place.refused(1, "check x.toml --set world.map=[30,30]");
+    assert!(error.contains("pois[0].in.circle: found a circle from (15, 15) to (35, 35)"), "{error}");
+}

@@ -32,6 +32,8 @@ use crate::workers;
 ///     best_g: G of its best team, float64 `[trials]`.
 ///     mean_g: mean G of its teams, of the same shape.
 ///     champion_g: G of the champion, the team of every population's best policy, of the same shape.
+///     test_g: mean G of the best team over its test episodes, of the same shape. None without
+///         `learning.test_episodes`.
 ///     champions: the policies of the champion, float32 `[trials, leaders, parameters]`, or
 ///         `[trials, 1, parameters]` if leaders share a policy. None unless `train` was asked for `champions`.
 ///

@@ -381,8 +381,7 @@ impl Setting {
 
     /// Reports whether starts or POIs move.
     fn moves(&self) -> bool {
-        let Learning { start_jitter, poi_jitter, .. } = self.config.learning;
-        start_jitter != 0.0 || poi_jitter != 0.0
+        self.config.starts_move() || self.config.pois_move()
     }
 
     /// Returns the number of constants that play in a generation. If nothing moves, they play only once, because every

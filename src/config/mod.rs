@@ -25,6 +25,7 @@ pub use crate::model::classes::{
 pub use crate::model::follow::Follow;
 pub use crate::model::motion::{Mobility, Motion};
 pub use crate::model::policy::{Actions, MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, Policy};
+pub use crate::model::region::Region;
 pub use crate::model::rule::{Coupling, Observers};
 pub use crate::model::sense::{Density, Sense};
 pub use crate::model::start::Heading;
@@ -252,7 +253,7 @@ impl Config {
     pub fn learners(&self) -> usize {
         match self.learning.paradigm {
             _ if !self.agents.is_empty() => {
-                self.agents.iter().filter(|class| class.learns()).map(|class| class.at.len()).sum()
+                self.agents.iter().filter(|class| class.learns()).map(|class| class.size()).sum()
             }
             Paradigm::LeaderFollower => self.world.leaders.len(),
             Paradigm::AllLeaders => self.world.leaders.len() + self.world.followers.len(),

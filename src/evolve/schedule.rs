@@ -1,11 +1,11 @@
 //! Who plays with whom and from where: teams of a generation, and the start positions of its episodes.
 
 use fearless_simd::{Level, Simd, dispatch, prelude::*};
-use glam::Vec2;
+use glam::{DVec2, Vec2};
 
 use super::random::{Key, Purpose, index_below};
 use super::selection::Selection;
-use crate::config::{Learning, Method, Teams, population_count};
+use crate::config::{Learning, Method, Region, Teams, population_count};
 use crate::world::{World, on_grid};
 
 /// Returns the teams of contemporaries in one generation of a trial, `[teams][leaders]`, round by round. `populations`
@@ -157,20 +157,30 @@ pub fn episode_positions(
     jitter_pois(pois, generation, episode, world, learning.poi_jitter, positions);
 }
 
-/// Writes the start positions of one episode, `[agents]`: the world's, each moved by a uniform offset in
-/// `-jitter..jitter` units on both axes. `key` is of [`Purpose::Starts`] or [`Purpose::HeldOut`].
+/// Writes the start positions of one episode, `[agents]`: the world's, or drawn from its regions, each moved by a uniform
+/// offset in `-jitter..jitter` units on both axes. `key` is of [`Purpose::Starts`] or the like.
 pub fn jitter_starts(key: Key, generation: usize, episode: usize, world: &World, jitter: f64, starts: &mut Vec<Vec2>) {
     starts.clone_from(&world.starts);
+    spawn(key.at(generation, episode, 1), world.map(), &world.start_regions, starts);
     scatter(key.at(generation, episode, 0), world.map(), jitter, starts);
 }
 
-/// Appends the POI positions of one episode, `[pois]`, moved the same way. Appends nothing if `jitter` is 0. `key` is
-/// of [`Purpose::Pois`] or [`Purpose::HeldOutPois`].
+/// Appends the POI positions of one episode, `[pois]`, drawn and moved the same way. Appends nothing if no POI moves.
+/// `key` is of [`Purpose::Pois`] or the like.
 pub fn jitter_pois(key: Key, generation: usize, episode: usize, world: &World, jitter: f64, positions: &mut Vec<Vec2>) {
-    if jitter > 0.0 {
+    if jitter > 0.0 || !world.poi_regions.is_empty() {
         let first = positions.len();
         positions.extend(&world.pois);
+        spawn(key.at(generation, episode, 1), world.map(), &world.poi_regions, &mut positions[first..]);
         scatter(key.at(generation, episode, 0), world.map(), jitter, &mut positions[first..]);
+    }
+}
+
+/// Draws the positions in regions.
+fn spawn(key: Key, map: Vec2, regions: &[(usize, Region)], positions: &mut [Vec2]) {
+    for &(index, region) in regions {
+        let [x, y, ..] = key.draw(index as u32);
+        positions[index] = on_grid(DVec2::from(region.place([x, y])).as_vec2(), map);
     }
 }
 
