@@ -36,9 +36,9 @@ const TRACE_BYTES: usize = 1 << 26;
 /// The start positions of agents and the positions of POIs in each episode.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Starts {
-    /// One episode from the config's own starts.
+    /// One episode from the config's own starts, with examples for those drawn from regions.
     Own,
-    /// Several episodes with moved starts. Each agent moves by a uniform offset in `-jitter..jitter` on both axes, and
+    /// Several episodes with moved starts. Starts and POIs are drawn from their regions. Then each agent moves by a uniform offset in `-jitter..jitter` on both axes, and
     /// each POI by one in `-poi_jitter..poi_jitter`. The draws are held out: no training uses them, whatever its seed.
     Drawn {
         /// Number of episodes per team.

@@ -7,7 +7,7 @@ use std::fmt::{self, Display};
 
 use glam::DVec2;
 
-use crate::config::{AgentClass, Classes, Config, Control, MAX_STEPS, Mobility, StageConfig, WorldConfig};
+use crate::config::{AgentClass, Classes, Config, Control, MAX_STEPS, Mobility, Region, StageConfig, WorldConfig};
 use crate::model::rule::{NEVER, Rule};
 use crate::world::{GRID, on_grid};
 
@@ -122,21 +122,32 @@ struct Distances {
 
 impl Distances {
     fn new(config: &StageConfig, classes: &Classes, steps: usize) -> Distances {
-        // Jitter moves agent and POI, each by up to this much per axis.
+        // Jitter moves agent and POI, each by up to this much per axis. Regions are replaced by their middles.
         let jitter = 2f64.sqrt() * (config.learning.start_jitter + config.learning.poi_jitter);
+        let middles = |mut places: Vec<[f64; 2]>, regions: Vec<(usize, Region)>| {
+            let mut reach = vec![0.0; places.len()];
+            for (index, region) in regions {
+                (places[index], reach[index]) = region.extent();
+            }
+            (places, reach)
+        };
+        let (starts, start_reach) = middles(classes.starts(), classes.start_regions());
+        let (places, poi_reach) = middles(classes.places(), classes.poi_regions());
         let map = DVec2::from(config.world.map).as_vec2();
         let on_grid = |places: Vec<[f64; 2]>| -> Vec<DVec2> {
             places.into_iter().map(|at| on_grid(DVec2::from(at).as_vec2(), map).as_dvec2()).collect()
         };
-        let (starts, of_class) = (on_grid(classes.starts()), classes.class_of_each());
+        let (starts, of_class) = (on_grid(starts), classes.class_of_each());
         let groups = classes.group_of_each();
-        let observers = |(place, &group): (DVec2, &usize)| {
-            let counted = starts.iter().zip(&of_class).filter(|(_, class)| classes.observes(**class, group));
-            counted.map(|(start, &class)| (class, (start.distance(place) - jitter).max(0.0))).collect()
+        let observers = |((place, &group), &poi_reach): ((DVec2, &usize), &f64)| {
+            let counted = starts.iter().zip(&of_class).zip(&start_reach);
+            let counted = counted.filter(|((_, class), _)| classes.observes(**class, group));
+            let left = |start: &DVec2, reach: f64| (start.distance(place) - jitter - poi_reach - reach).max(0.0);
+            counted.map(|((start, &class), &reach)| (class, left(start, reach))).collect()
         };
         Distances {
             travel: classes.agents.iter().map(|class| travel(config, class, steps)).collect(),
-            observers: on_grid(classes.places()).into_iter().zip(&groups).map(observers).collect(),
+            observers: on_grid(places).into_iter().zip(&groups).zip(&poi_reach).map(observers).collect(),
             couplings: classes.couplings(),
             radii: groups.iter().map(|&group| classes.pois[group].radius).collect(),
         }
@@ -346,6 +357,26 @@ mod tests {
     fn jitter_brings_starts_and_pois_nearer() {
         assert!(found("coupling = 1\nsteps = 25\n[learning]\nstart_jitter = 0.5\n").is_empty());
         assert!(found("coupling = 1\nsteps = 25\n[learning]\npoi_jitter = 0.5\n").is_empty());
+    }
+
+    /// Only what no episode allows is reported.
+    #[test]
+    fn regions_count_from_their_nearest_places() {
+        let found = |agents: &str, pois: &str| {
+            let text = format!(
+                "[world]\nsteps = 25\n[[agents]]\nname = \"a\"\n{agents}\n\
+                 motion = {{ kind = \"free\", max_speed = 1 }}\nsenses = [{{ of = \"pois\" }}]\n\
+                 [[pois]]\nname = \"p\"\ncoupling = 1\n{pois}\n"
+            );
+            let config = Config::parse(&text, "test").unwrap().validate().unwrap();
+            unreachable(config.as_ref()).len()
+        };
+        // 7.1 units of travel, and an observation radius of 5.
+        assert_eq!(found("at = [[10, 10]]", "at = [[23, 10]]"), 1);
+        assert_eq!(found("at = [[10, 10]]", "count = 2\nin = { circle = [24, 10, 2] }"), 0);
+        assert_eq!(found("at = [[10, 10]]", "count = 2\nin = { circle = [25, 10, 2] }"), 2);
+        assert_eq!(found("count = 2\nin = { box = [7, 10, 13, 10] }", "count = 1\nin = { disc = [26, 10, 1] }"), 0);
+        assert_eq!(found("count = 2\nin = { box = [7, 10, 13, 10] }", "count = 1\nin = { disc = [27, 10, 1] }"), 1);
     }
 
     #[test]

@@ -263,11 +263,17 @@ fn plain_world(seed: u64) -> Config {
             fitness: word(rng),
             population: rng.random_range(2..=20),
             partners: 1,
+            teams: Teams::Random,
+            temperature: 1.0,
             hall_of_fame: 0,
             leniency: Leniency::Mean,
             generations: 3,
             trials: 1,
+            initial: if seed % 5 == 2 { Initial::Uniform } else { Initial::Normal },
+            initial_scale: if seed % 5 < 2 { 1.0 } else { 2.0 },
             elites: Elites::Count(1),
+            team_elites: 0,
+            team_g_elites: 0,
             parents: Parents::All,
             method: Method::Tournament,
             search_sigma: 0.3,
@@ -278,6 +284,7 @@ fn plain_world(seed: u64) -> Config {
             episodes_per_team: 1,
             start_jitter: 0.0,
             poi_jitter: if later.random_bool(0.3) { later.random_range(0.5..5.0) } else { 0.0 },
+            test_episodes: usize::from(seed % 6 == 4),
             seed,
         },
         credit: CreditConfig { led_by: LedBy::MostSeen, led_within: 0, removes: vec![], add_g: false },
@@ -394,6 +401,8 @@ pub fn classes_world(seed: u64) -> Config {
         AgentClass {
             name: names[index].clone(),
             at,
+            count: None,
+            region: None,
             heading,
             speed: if rng.random_bool(0.5) { slow } else { fast },
             control,
@@ -408,7 +417,7 @@ pub fn classes_world(seed: u64) -> Config {
             fitness: None,
         }
     };
-    let agents: Vec<AgentClass> = parts.into_iter().enumerate().map(class).collect();
+    let mut agents: Vec<AgentClass> = parts.into_iter().enumerate().map(class).collect();
     let mut order: Vec<usize> = (0..groups).collect();
     order.rotate_left(rng.random_range(0..groups));
     let steps = config.world.steps;
@@ -423,7 +432,7 @@ pub fn classes_world(seed: u64) -> Config {
                 [] => class.observes,
                 _ => observers.contains(&class.name),
             };
-            agents.iter().filter(counted).map(|class| class.at.len()).sum::<usize>()
+            agents.iter().filter(counted).map(|class| class.size()).sum::<usize>()
         };
         if count(&observers) == 0 {
             observers = vec![names[0].clone()];
@@ -447,6 +456,8 @@ pub fn classes_world(seed: u64) -> Config {
         let before = order[..place].iter().filter(|_| rng.random_bool(0.3));
         let after = before.map(|&other| group_names[other].clone()).collect();
         PoiGroup {
+            count: None,
+            region: None,
             name: group_names[index].clone(),
             value: [1.0, 0.5, 3.0][rng.random_range(0..3)],
             coupling,
@@ -459,9 +470,18 @@ pub fn classes_world(seed: u64) -> Config {
             at,
         }
     };
-    let pois = parts.into_iter().enumerate().map(group).collect();
+    let mut pois: Vec<PoiGroup> = parts.into_iter().enumerate().map(group).collect();
+    if seed % 10 == 7 {
+        let [width, height] = config.world.map;
+        let middle = [width / 2.0, height / 2.0, width.min(height) / 4.0];
+        for (class, region) in agents.iter_mut().zip([Region::Box([0.0, 0.0, width, height]), Region::Disc(middle)]) {
+            (class.count, class.region, class.at) = (Some(class.size()), Some(region), vec![]);
+        }
+        let group = &mut pois[0];
+        (group.count, group.region, group.at) = (Some(group.size()), Some(Region::Circle(middle)), vec![]);
+    }
     if config.learning.sharing == Sharing::Group {
-        let learners = agents.iter().filter(|class| class.learns()).map(|class| class.at.len()).sum();
+        let learners = agents.iter().filter(|class| class.learns()).map(|class| class.size()).sum();
         let of_group = |group: usize| (0..learners).filter(|learner| learner % 2 == group).collect();
         config.learning.groups = (0..learners.min(2)).map(of_group).collect();
     }

@@ -4,7 +4,7 @@ use std::ops::{Deref, Range};
 
 use glam::{DVec2, Vec2};
 
-use crate::config::{Config, Control, LedBy, PoiGroup, Score, StageConfig, When};
+use crate::config::{Config, Control, LedBy, PoiGroup, Region, Score, StageConfig, When};
 use crate::model::class::Class;
 use crate::model::motion::MapConstants;
 use crate::model::policy::PolicyConstants;
@@ -34,8 +34,12 @@ pub struct WorldParts {
     pub starts: Vec<Vec2>,
     /// Initial headings, unit vectors, `[agents]`.
     pub headings: Vec<Vec2>,
+    /// The agents that start in regions. Their starts here are examples.
+    pub start_regions: Vec<(usize, Region)>,
     /// POI positions in units, on the kernels' grid, `[pois]`.
     pub pois: Vec<Vec2>,
+    /// The POIs in regions. Their positions here are examples.
+    pub poi_regions: Vec<(usize, Region)>,
     /// The squared observation radius of each POI, `[pois]`.
     pub radii2: Vec<f32>,
     /// The value of each POI, `[pois]`.
@@ -161,7 +165,9 @@ impl World {
             constants,
             starts,
             headings: described.headings().into_iter().map(unit).collect(),
+            start_regions: described.start_regions(),
             pois: described.places().into_iter().map(on_grid).collect(),
+            poi_regions: described.poi_regions(),
             radii2: of_each.iter().map(|group| (group.radius * group.radius) as f32).collect(),
             values,
             worth,

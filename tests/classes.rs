@@ -56,6 +56,7 @@ fn many(count: usize) -> String {
 /// Each part of the text is replaced by another, with the problems that this causes.
 #[test]
 fn every_problem_names_key_line_found_and_allowed() {
+    let at = "at = [[20, 25]]";
     let leads = "leads = \"dog\"";
     let rule = "to = 5, gain = -1";
     let control = "control = \"follow\"";
@@ -190,7 +191,7 @@ fn every_problem_names_key_line_found_and_allowed() {
         (
             control,
             "control = \"still\"\nfitness = \"D\"",
-            "16: agents[1].rule: found with control = \"still\", allowed with \"follow\"\n17: agents[1].fitness: found with control = \"still\", allowed with \"policy\"",
+            "16: agents[1].fitness: found with control = \"still\", allowed with \"policy\"\n17: agents[1].rule: found with control = \"still\", allowed with \"follow\"",
         ),
         (
             leads,
@@ -228,8 +229,8 @@ fn every_problem_names_key_line_found_and_allowed() {
         (leads, "wall_gain = 2000", "11: agents[0].wall_gain: found 2000, allowed 0 to 1000"),
         (
             leads,
-            "count = 3",
-            "11: agents[0].count: unknown key, allowed at, control, fitness, heading, influence_radius, leads, motion, name, observes, rule, senses, speed, wall_gain, wall_radius",
+            "foo = 3",
+            "11: agents[0].foo: unknown key, allowed at, control, count, fitness, heading, in, influence_radius, leads, motion, name, observes, rule, senses, speed, wall_gain, wall_radius",
         ),
         (
             leads,
@@ -306,7 +307,52 @@ fn every_problem_names_key_line_found_and_allowed() {
         ),
         ("name = \"dog\"", "name = 3", "13: agents[1].name: found 3, allowed a name of letters, digits, _ and -"),
         ("name = \"uav\"\n", "", "3: agents[0].name: missing, allowed a name of letters, digits, _ and -"),
-        ("at = [[20, 25]]\n", "", "12: agents[1].at: missing, allowed a list of 1 to 1024 positions [x, y]"),
+        (
+            "at = [[20, 25]]\n",
+            "",
+            "12: agents[1].at: missing, allowed a list of 1 to 1024 positions [x, y], or `count` with `in`",
+        ),
+        (at, "count = 2", "12: agents[1].in: missing, allowed a table with one of box, disc and circle"),
+        (at, "in = { disc = [25, 25, 5] }", "12: agents[1].count: missing, allowed 1 to 1024, the number of agents"),
+        (
+            at,
+            "at = [[20, 25]]\nin = { disc = [25, 25, 5] }",
+            "15: agents[1].in: found with `at`, allowed either of them",
+        ),
+        (at, "at = [[20, 25]]\ncount = 1", "15: agents[1].count: found with `at`, allowed with `in`"),
+        (at, "count = 0\nin = { disc = [25, 25, 5] }", "14: agents[1].count: found 0, allowed 1 to 1024"),
+        (
+            at,
+            "count = 2\nin = { disc = [45, 25, 6] }",
+            "15: agents[1].in.disc: found a circle from (39, 19) to (51, 31), allowed within the map, (0, 0) to (50, 50)",
+        ),
+        (
+            at,
+            "count = 2\nin = { circle = [25, 4, 5] }",
+            "15: agents[1].in.circle: found a circle from (20, -1) to (30, 9), allowed within the map, (0, 0) to (50, 50)",
+        ),
+        (
+            at,
+            "count = 2\nin = { box = [10, 10, 51, 20] }",
+            "15: agents[1].in.box[2]: found 51, allowed 0 to 50 (the map)",
+        ),
+        (
+            at,
+            "count = 2\nin = { box = [10, 30, 20, 20] }",
+            "15: agents[1].in.box: found [10, 30, 20, 20], allowed x0 <= x1 and y0 <= y1",
+        ),
+        (
+            at,
+            "count = 2\nin = { box = [10, 30, 20] }",
+            "15: agents[1].in.box: found a list of 3, allowed a list of 4 numbers",
+        ),
+        (at, "count = 2\nin = {}", "15: agents[1].in: found none of its keys, allowed one of box, disc and circle"),
+        (
+            at,
+            "count = 2\nin = { disc = [9, 9, 2], circle = [9, 9, 2] }",
+            "15: agents[1].in: found several of its keys, allowed one of box, disc and circle",
+        ),
+        (at, "count = 2\nin = 3", "15: agents[1].in: found 3, allowed a table"),
         (
             "at = [[20, 25]]",
             "at = []",
@@ -356,8 +402,8 @@ fn every_problem_names_key_line_found_and_allowed() {
         ("after = \"a\"", "after = \"b\"", "25: pois[1].after: found \"b\" after \"b\", which can never begin"),
         (
             "after = \"a\"",
-            "count = 3",
-            "25: pois[1].count: unknown key, allowed after, at, coupling, name, observers, radius, value, windows",
+            "foo = 3",
+            "25: pois[1].foo: unknown key, allowed after, at, count, coupling, in, name, observers, radius, value, windows",
         ),
         ("name = \"b\"", "name = \"a\"", "22: pois[1].name: found \"a\" again, allowed another name"),
         (
@@ -580,6 +626,34 @@ fn one_list_may_be_in_full_and_the_other_in_short() {
         assert_eq!(parse(&config.to_toml()), config);
         assert_eq!(parse(&config.expanded().to_toml()).classes(), config.classes());
     }
+}
+
+/// Numbers are those of the order of agents and POIs, whether these are listed or drawn.
+#[test]
+fn classes_and_groups_in_regions_have_their_sizes() {
+    let text = with("at = [[25, 25], [26, 25]]", "count = 3\nin = { box = [10, 10, 20, 30] }\nheading = [1, 2, 3]");
+    let text = text.replace("at = [[5, 6]]", "count = 2\nin = { circle = [25, 25, 10] }\nwindows = [[1, 5], [2, 6]]");
+    let config = parse(&text);
+    assert_eq!((config.agent_count(), config.learners(), config.poi_count()), (4, 3, 4));
+    assert_eq!((config.starts_move(), config.pois_move(), config.has_regions()), (true, true, true));
+    let classes = config.classes();
+    assert_eq!(classes.class_of_each(), [0, 0, 0, 1]);
+    assert_eq!(classes.group_of_each(), [0, 0, 1, 1]);
+    assert_eq!(classes.headings()[..3], [1.0, 2.0, 3.0]);
+    assert_eq!(
+        (classes.couplings(), classes.after()),
+        (vec![1, 1, 2, 2], vec![vec![], vec![], vec![0, 1], vec![0, 1]])
+    );
+    // Places are examples.
+    let (starts, places) = (classes.starts(), classes.places());
+    assert!(starts[..3].iter().all(|[x, y]| (10.0..20.0).contains(x) && (10.0..30.0).contains(y)), "{starts:?}");
+    assert!(starts[0] != starts[1] && starts[3] == [20.0, 25.0] && places[..2] == [[1.0, 2.0], [3.0, 4.0]]);
+    let far = |[x, y]: [f64; 2]| ((x - 25.0) * (x - 25.0) + (y - 25.0) * (y - 25.0)).sqrt();
+    assert!(places[2..].iter().all(|&place| (far(place) - 10.0).abs() < 1e-9), "{places:?}");
+    // The text has the regions in one line each.
+    let written = config.to_toml();
+    assert!(written.contains("count = 3\nin = { box = [10.0, 10.0, 20.0, 30.0] }\n"), "{written}");
+    assert_eq!((parse(&written), config.validate().unwrap().into_config()), (config.clone(), config));
 }
 
 /// Stages cannot set keys of tables, so what they set stays in short.

@@ -6,9 +6,9 @@ use std::path::Path;
 
 use flotilla::config::{
     Actions, CheckpointConfig, Config, ConfigError, Coupling, CreditConfig, Density, Elites, Fitness, Follow, Heading,
-    Learning, LedBy, Leniency, MAX_EPISODES, MAX_GENERATIONS, MAX_HALL_OF_FAME, MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS,
-    MAX_PARTNERS, MAX_POPULATION, MAX_STEPS, MAX_TRIALS, Method, Motion, Mutation, Observers, Override, Paradigm,
-    Parents, Policy, Problem, Sense, Sharing, WorldConfig,
+    Initial, Learning, LedBy, Leniency, MAX_EPISODES, MAX_GENERATIONS, MAX_HALL_OF_FAME, MAX_HIDDEN_LAYERS,
+    MAX_HIDDEN_UNITS, MAX_PARTNERS, MAX_POPULATION, MAX_STEPS, MAX_TRIALS, Method, Motion, Mutation, Observers,
+    Override, Paradigm, Parents, Policy, Problem, Sense, Sharing, Teams, WorldConfig,
 };
 use flotilla::reader::Document;
 use proptest::collection::vec;
@@ -66,11 +66,17 @@ fn every_key_but_leaders_and_pois_has_its_default() {
             fitness: Fitness::Df,
             population: 50,
             partners: 1,
+            teams: Teams::Random,
+            temperature: 1.0,
             hall_of_fame: 0,
             leniency: Leniency::Mean,
             generations: 100,
             trials: 5,
+            initial: Initial::Normal,
+            initial_scale: 1.0,
             elites: Elites::Count(1),
+            team_elites: 0,
+            team_g_elites: 0,
             parents: Parents::All,
             method: Method::Tournament,
             search_sigma: 0.3,
@@ -81,6 +87,7 @@ fn every_key_but_leaders_and_pois_has_its_default() {
             episodes_per_team: 1,
             start_jitter: 0.0,
             poi_jitter: 0.0,
+            test_episodes: 0,
             seed: 0,
         },
         credit: CreditConfig { led_by: LedBy::MostSeen, led_within: 0, removes: vec![], add_g: false },
@@ -311,17 +318,24 @@ fn configs() -> impl Strategy<Value = Config> {
         add_g,
     });
     let search = (choice(), size(1e-6, 100.0), size(1e-6, 100.0));
+    let first = (choice(), size(1e-6, 1e3), 0..=MAX_EPISODES);
+    let forming = (choice(), size(1e-6, 1e6), 0..=3usize, 0..=3usize);
     let jitters = (size_or_zero(1e-6, 1e4), size_or_zero(1e-6, 1e4));
-    let learning = ((choice(), choice()), choice(), sizes, (mutation, search), jitters, 0..=i64::MAX as u64).prop_map(
+    let added = (jitters, first, forming);
+    let learning = ((choice(), choice()), choice(), sizes, (mutation, search), added, 0..=i64::MAX as u64).prop_map(
         |(
             (paradigm, sharing),
             fitness,
             ((population, partners, hall_of_fame, leniency), generations, trials, (part, parents), episodes_per_team),
             (mutation, (method, search_sigma, search_step)),
-            (start_jitter, poi_jitter),
+            ((start_jitter, poi_jitter), (initial, initial_scale, test_episodes), (teams, temperature, kept, by_g)),
             seed,
         )| {
             let (mutation, mutation_probability, mutation_sigma) = mutation;
+            // Teams are chosen only in simple tournaments of several populations, whose policies play once.
+            let chosen = sharing != Sharing::Shared && method == Method::Tournament && partners == 1 && population > 20;
+            let (teams, kept, by_g) = if chosen { (teams, kept, by_g) } else { (Teams::Random, 0, 0) };
+            let chosen = teams != Teams::Random || kept + by_g > 0;
             Learning {
                 paradigm,
                 sharing,
@@ -330,14 +344,24 @@ fn configs() -> impl Strategy<Value = Config> {
                 population,
                 partners: if sharing == Sharing::Shared { 1 } else { partners },
                 // A hall of fame requires leaders with partners and the tournament method.
-                hall_of_fame: if sharing == Sharing::Shared || method != Method::Tournament { 0 } else { hall_of_fame },
+                hall_of_fame: match sharing == Sharing::Shared || method != Method::Tournament || chosen {
+                    true => 0,
+                    false => hall_of_fame,
+                },
+                teams,
+                temperature,
                 leniency,
                 generations,
                 trials,
+                initial,
+                initial_scale,
                 elites: match part {
+                    _ if kept + by_g > 0 => Elites::Count(1),
                     Ok(part) => Elites::Count((population as f64 * part) as usize),
                     Err(percentage) => Elites::Percentage(percentage),
                 },
+                team_elites: kept,
+                team_g_elites: by_g,
                 parents,
                 method,
                 search_sigma,
@@ -348,6 +372,7 @@ fn configs() -> impl Strategy<Value = Config> {
                 episodes_per_team,
                 start_jitter,
                 poi_jitter,
+                test_episodes,
                 seed,
             }
         },
@@ -376,7 +401,8 @@ fn configs() -> impl Strategy<Value = Config> {
                 stages: vec![],
             };
             if config.populations() == 1 {
-                config.learning.hall_of_fame = 0;
+                let Learning { hall_of_fame, teams, team_elites, team_g_elites, .. } = &mut config.learning;
+                (*hall_of_fame, *teams, *team_elites, *team_g_elites) = (0, Teams::Random, 0, 0);
             }
             config
         },

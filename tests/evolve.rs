@@ -6,16 +6,18 @@
 
 use crate::support;
 use std::collections::HashSet;
+use std::ops::Range;
 
 use fearless_simd::Level;
 use flotilla::backend::cpu::{Cpu, level_name};
 use flotilla::backend::{Backend, Group};
 use flotilla::config::{
-    Actions, Config, Elites, Fitness, Learning, Leniency, Method, Mutation, Paradigm, Parents, Sharing, ValidConfig,
-    own_populations,
+    Actions, Config, Elites, Fitness, Initial, Learning, Leniency, Method, Mutation, Paradigm, Parents, Sharing, Teams,
+    ValidConfig, own_populations,
 };
 use flotilla::credit::Credit;
-use flotilla::evolve::{self, Key, MAX_WEIGHT, MIN_WEIGHT, Purpose, Selection, UNCHANGED};
+use flotilla::evaluate::Starts;
+use flotilla::evolve::{self, Episodes, Key, MAX_WEIGHT, MIN_WEIGHT, Purpose, Selection, UNCHANGED};
 use flotilla::trainer::{Row, Trainer};
 use flotilla::world::{GRID, World};
 use glam::Vec2;
@@ -184,6 +186,11 @@ fn rotations_put_elites_on_independent_teams() {
     assert_distribution("teams of the elites", &joint, |_| 1.0 / 125.0);
 }
 
+/// Returns a selection without any policies that survive.
+fn selection(parents: Parents) -> Selection {
+    Selection { elites: 0, team_elites: 0, team_g_elites: 0, parents }
+}
+
 /// The champions of tied teams: with G, the policies of one team have equal scores in all populations.
 #[test]
 fn tied_champions_are_drawn_independently_unless_the_elite_is_among_them() {
@@ -191,7 +198,7 @@ fn tied_champions_are_drawn_independently_unless_the_elite_is_among_them() {
     let tied = [3, 4, 9, 17];
     tied.iter().for_each(|&policy| scores[policy] = 0.75);
     let key = Key::new(5, 0, Purpose::Tournament);
-    let selection = Selection { elites: 1, parents: Parents::All };
+    let selection = Selection { elites: 1, ..selection(Parents::All) };
     let mut joint = vec![0; 16];
     let mut plan = vec![0; 21];
     for generation in 0..8000 {
@@ -244,6 +251,67 @@ fn start_jitter_is_uniform_and_differs_between_episodes() {
     assert_eq!(seen.len(), 1000, "no two episodes start alike");
 }
 
+/// Every generation, episode and purpose has starts and POIs of its own, which jitter moves further.
+#[test]
+fn starts_and_pois_are_drawn_from_their_regions() {
+    let text = "
+[[agents]]
+name = \"a\"
+at = [[1, 2]]
+senses = [{ of = \"pois\" }]
+[[agents]]
+name = \"b\"
+count = 2
+in = { box = [10, 20, 14, 22] }
+control = \"still\"
+[[pois]]
+name = \"p\"
+at = [[3, 4]]
+coupling = 1
+[[pois]]
+name = \"q\"
+count = 3
+in = { disc = [40, 30, 5] }
+coupling = 1
+";
+    let config = Config::parse(text, "regions").unwrap();
+    let world = World::new(&config.validate().unwrap());
+    let draw = |learning: &Learning, trial, generation, episode| {
+        let mut places = Vec::new();
+        evolve::episode_positions(learning, trial, generation, episode, &world, &mut places);
+        places
+    };
+    let is_within = |places: &[Vec2], more: f32| {
+        let [fixed, b, c, poi, pois @ ..] = places else { panic!("{places:?}") };
+        let in_box = |at: &Vec2| (at - Vec2::new(12.0, 21.0)).abs().cmple(Vec2::new(2.0 + more, 1.0 + more)).all();
+        (*fixed - Vec2::new(1.0, 2.0)).abs().max_element() <= more
+            && (*poi - Vec2::new(3.0, 4.0)).abs().max_element() <= more
+            && [b, c].into_iter().all(in_box)
+            && pois.iter().all(|at| at.distance(Vec2::new(40.0, 30.0)) <= 5.0 + 2.0 * more + 1e-3)
+    };
+    let mut seen = HashSet::new();
+    let mut add = |places: Vec<Vec2>| {
+        assert!(is_within(&places, 0.0) && places.len() == 7, "{places:?}");
+        let drawn = places[1..3].iter().chain(&places[4..]);
+        drawn.for_each(|place| assert!(seen.insert(place.to_array().map(f32::to_bits)), "{place} again"));
+    };
+    for (generation, episode) in (0..20).flat_map(|generation| (0..5).map(move |episode| (generation, episode))) {
+        for trial in 0..2 {
+            add(draw(&config.learning, trial, generation, (Episodes::Training, episode)));
+            add(draw(&config.learning, trial, generation, (Episodes::Test, episode)));
+        }
+    }
+    let held_out = Starts::Drawn { episodes: 100, seed: 0, jitter: 0.0, poi_jitter: 0.0 };
+    (0..100).for_each(|episode| add(held_out.of(episode, &world)));
+    // The world's own places are an example, and an episode from them has no moved POIs.
+    assert!(is_within(&[&world.starts[..], &world.pois].concat(), 0.0));
+    assert_eq!(Starts::Own.of(0, &world), world.starts);
+    let moved = Learning { start_jitter: 0.5, poi_jitter: 0.5, ..config.learning.clone() };
+    let (still, moved) =
+        [&config.learning, &moved].map(|learning| draw(learning, 0, 3, (Episodes::Training, 1))).into();
+    assert!(is_within(&moved, 0.5) && still.iter().zip(&moved).all(|(still, moved)| still != moved));
+}
+
 #[test]
 fn a_tournament_draws_every_pair_of_policies_with_the_same_probability() {
     let population = 20;
@@ -280,7 +348,7 @@ fn a_policy_has_different_partners_in_every_round() {
     let (single, own) = (Learning { partners: 1, ..learning.clone() }, own_populations(4));
     let (all_rounds, first_round) =
         (evolve::contemporary_teams(&learning, 1, 5, own), evolve::contemporary_teams(&single, 1, 5, own));
-    assert_eq!((all_rounds.len(), learning.teams()), (3 * 20 * 4, 60));
+    assert_eq!((all_rounds.len(), learning.team_count()), (3 * 20 * 4, 60));
     assert_eq!(all_rounds[..20 * 4], first_round, "the first round equals that with a single partner");
     let mut teams: Vec<&[u32]> = all_rounds.chunks(4).collect();
     teams.sort_unstable();
@@ -312,12 +380,75 @@ fn past_champions_are_drawn_uniformly_from_the_hall_of_fame() {
     assert_distribution("ages of past champions", &counts, |_| 0.25);
 }
 
+/// The first policy is drawn with probability ∝ exp(fitness / temperature), the second in the same way from the others.
+#[test]
+fn softmax_draws_fitter_policies_earlier_and_sorting_always() {
+    let mut learning = config(GENERALLY_FORWARD, |config| config.learning.population = 4).learning;
+    (learning.teams, learning.temperature) = (Teams::Softmax, 0.5);
+    let fitness = [0.0, 1.0, 0.25, -0.5];
+    let (mut order, mut counts) = ([0; 4], vec![0; 12]);
+    let mut draw = |learning: &Learning, generation: usize, fitness: &[f64; 4]| {
+        evolve::order_policies(Level::new(), learning, 0, generation, [0, 1], |slot| fitness[slot], &mut order);
+        order.map(|policy| policy as usize)
+    };
+    for generation in 0..8000 {
+        let [first, second, ..] = draw(&learning, generation, &fitness);
+        counts[3 * first + second - usize::from(second > first)] += 1;
+    }
+    let weights = fitness.map(|fitness: f64| (fitness / 0.5).exp());
+    let total: f64 = weights.iter().sum();
+    let probability = |pair: usize| {
+        let (first, rest) = (pair / 3, pair % 3);
+        let second = rest + usize::from(rest >= first);
+        weights[first] / total * weights[second] / (total - weights[first])
+    };
+    assert_distribution("the first two policies", &counts, probability);
+    learning.teams = Teams::Sorted;
+    let mut tied = vec![0; 2];
+    for generation in 0..2000 {
+        assert_eq!(draw(&learning, generation, &fitness), [1, 2, 0, 3]);
+        let [first, second, rest @ ..] = draw(&learning, generation, &[0.0, 0.5, -0.0, 0.5]);
+        assert!([first, second].contains(&1) && [first, second].contains(&3) && rest.iter().all(|slot| slot % 2 == 0));
+        tied[rest[0] / 2] += 1;
+    }
+    assert_distribution("ties", &tied, |_| 0.5);
+}
+
+/// A policy that survives twice, as an elite and with its team, is in two slots. Further policies survive once.
+#[test]
+fn teams_survive_after_the_elites_and_further_policies_by_their_g() {
+    let mut learning = config(GENERALLY_FORWARD, |config| config.learning.population = 8).learning;
+    (learning.elites, learning.team_elites, learning.team_g_elites) = (1.into(), 2, 2);
+    let selection = Selection::of(&learning);
+    // Policy 3 is of the best team, policy 5 of the second, and so on. Policy 6 is the elite.
+    let ranks = [-7.0, -4.0, -5.0, 0.0, -6.0, -1.0, -2.0, -3.0];
+    let kept = |elite: u32| {
+        let mut parents = vec![0; 9];
+        parents[0] = elite | UNCHANGED;
+        evolve::keep_teams(selection, &ranks, &mut parents);
+        parents.into_iter().map(|parent| parent & !UNCHANGED).collect::<Vec<_>>()
+    };
+    assert_eq!(kept(6), [6, 3, 5, 7, 1, 0, 0, 0, 0]);
+    assert_eq!(kept(3), [3, 3, 5, 6, 7, 0, 0, 0, 0]);
+    for generation in 0..200 {
+        let own = own_populations(3);
+        let teams = evolve::contemporary_teams(&learning, 0, generation, own);
+        for population in 0..3 {
+            let mut policies: Vec<u32> = teams.iter().skip(population).step_by(3).copied().collect();
+            assert!(generation == 0 || policies[..2] == [1, 2], "{policies:?}");
+            policies.sort_unstable();
+            assert_eq!(policies, (0..8).collect::<Vec<_>>(), "every policy plays once");
+        }
+    }
+}
+
 #[test]
 fn the_champion_replaces_the_oldest_of_the_hall_of_fame() {
     let scores = [0.1, 0.3, 0.2];
     for generation in 0..7 {
         let (mut plan, mut last_plan) = ([0; 6], [0; 6]);
-        let (key, selection) = (Key::new(3, 0, Purpose::Tournament), Selection { elites: 1, parents: Parents::All });
+        let (key, selection) =
+            (Key::new(3, 0, Purpose::Tournament), Selection { elites: 1, ..selection(Parents::All) });
         evolve::draw_parents(Level::new(), key, generation, 0, selection, &scores, &mut plan);
         let mut expected = [1, 4, 5].map(|slot| slot | UNCHANGED);
         if generation % 2 == 0 {
@@ -344,7 +475,7 @@ fn truncation_draws_every_elite_as_parent_with_the_same_probability() {
     let mut counts = vec![0; elites];
     let mut plan = vec![0; policies + 1];
     for generation in 0..60 {
-        let selection = Selection { elites, parents: Parents::Elites };
+        let selection = Selection { elites, ..selection(Parents::Elites) };
         let key = Key::new(3, 0, Purpose::Tournament);
         evolve::draw_parents(Level::new(), key, generation, 1, selection, &scores, &mut plan);
         for (rank, &parent) in plan[..elites].iter().enumerate() {
@@ -711,6 +842,43 @@ fn experiments() -> Vec<Config> {
             small(config, 10, 0, 1);
             (config.learning.method, config.learning.sharing) = (Method::Snes, Sharing::Shared);
         }),
+        config(GENERALLY_FORWARD, |config| {
+            small(config, 12, 5, 2);
+            (config.learning.teams, config.learning.temperature) = (Teams::Softmax, 0.3);
+            (config.learning.start_jitter, config.learning.test_episodes) = (0.5, 3);
+            (config.learning.initial, config.learning.initial_scale) = (Initial::Uniform, 2.0);
+            config.world.coupling = flotilla::config::Coupling::Same(2);
+        }),
+        config(CHAOTIC, |config| {
+            small(config, 14, 6, 2);
+            (config.learning.teams, config.learning.fitness) = (Teams::Sorted, Fitness::D);
+            (config.learning.elites, config.learning.team_elites, config.learning.team_g_elites) = (2.into(), 3, 2);
+            config.world.coupling = flotilla::config::Coupling::Same(2);
+        }),
+        config(GENERALLY_FORWARD, |config| {
+            small(config, 10, 6, 1);
+            (config.learning.sharing, config.learning.paradigm) = (Sharing::Group, Paradigm::AllLeaders);
+            (config.learning.elites, config.learning.team_elites) = (0.into(), 2);
+            (config.learning.poi_jitter, config.learning.test_episodes) = (2.0, 2);
+            config.world.coupling = flotilla::config::Coupling::Same(2);
+        }),
+        // Teams are formed by the fitness in an earlier stage.
+        staged(
+            STRICTLY_FORWARD,
+            "[learning]
+population = 10
+generations = 6
+trials = 2
+team_g_elites = 2
+initial_scale = 0.5
+[[stages]]
+from = 2
+set = { 'learning.teams' = 'sorted', 'world.coupling' = 1, 'world.pois' = [[10, 12], [40, 20], [20, 9]] }
+[[stages]]
+from = 4
+set = { 'learning.teams' = 'softmax' }
+",
+        ),
         staged(
             GENERALLY_FORWARD,
             "[learning]
@@ -849,17 +1017,29 @@ impl PlainTrial<'_> {
     /// Plays a team in a stage, with the random numbers of a generation. Returns the share of POIs observed over all
     /// episodes, and each leader's mean score.
     fn play(&self, generation: usize, stage: &Config, team: &[usize]) -> (f64, Vec<f32>) {
-        let Learning { fitness, episodes_per_team, start_jitter, poi_jitter, .. } = stage.learning;
+        self.play_episodes(generation, stage, team, [Purpose::Starts, Purpose::Pois], stage.learning.episodes_per_team)
+    }
+
+    /// Plays a number of episodes with random numbers of these purposes.
+    fn play_episodes(
+        &self,
+        generation: usize,
+        stage: &Config,
+        team: &[usize],
+        purposes: [Purpose; 2],
+        episodes: usize,
+    ) -> (f64, Vec<f32>) {
+        let Learning { fitness, start_jitter, poi_jitter, .. } = stage.learning;
         let world = World::new(&stage.validate().unwrap());
         let population = |leader: usize| &self.policies[self.populations[leader]];
         let weights: Vec<f32> =
             team.iter().enumerate().flat_map(|(leader, &policy)| population(leader)[policy].clone()).collect();
         let (mut observed, mut totals) = (0, vec![0.0; team.len()]);
-        for episode in 0..episodes_per_team {
+        for episode in 0..episodes {
             let mut starts = Vec::new();
-            let key = self.key(Purpose::Starts);
-            evolve::jitter_starts(key, generation, episode, &world, start_jitter, &mut starts);
-            evolve::jitter_pois(self.key(Purpose::Pois), generation, episode, &world, poi_jitter, &mut starts);
+            let [of_starts, of_pois] = purposes.map(|purpose| self.key(purpose));
+            evolve::jitter_starts(of_starts, generation, episode, &world, start_jitter, &mut starts);
+            evolve::jitter_pois(of_pois, generation, episode, &world, poi_jitter, &mut starts);
             let teams = vec![0; team.len()];
             let group = Group {
                 world: &world,
@@ -884,14 +1064,44 @@ impl PlainTrial<'_> {
             totals.iter_mut().zip(by_leader).for_each(|(total, score)| *total += f64::from(score));
         }
         (
-            f64::from(observed) / (world.pois.len() * episodes_per_team) as f64,
-            totals.iter().map(|total| (total / episodes_per_team as f64) as f32).collect(),
+            f64::from(observed) / (world.pois.len() * episodes) as f64,
+            totals.iter().map(|total| (total / episodes as f64) as f32).collect(),
         )
+    }
+
+    /// Returns the policy of each population in each team, `[teams][populations]`. `past` is the fitness of each slot's
+    /// policy in the generation before, or of its parent. `kept` are the slots of teams that play again.
+    fn form_teams(&self, generation: usize, stage: &Config, past: &[Vec<f64>], kept: Range<usize>) -> Vec<u32> {
+        let Learning { teams, temperature, population, .. } = stage.learning;
+        let count = past.len();
+        if teams == Teams::Random {
+            let own: Vec<u32> = (0..count as u32).collect();
+            return evolve::contemporary_teams(&stage.learning, self.trial, generation, &own);
+        }
+        let order = |of: usize| {
+            let others = (0..population).filter(|slot| !kept.contains(slot)).enumerate().map(|(index, slot)| {
+                let word = self.key(Purpose::Teams).at(generation, of, 0).draw(index as u32)[0];
+                let uniform = (f64::from(word) + 0.5) / 2f64.powi(32);
+                // Every POI of these worlds has the value 1.
+                let fitness = past[of][slot] * stage.world.pois.len() as f64;
+                let value = match teams {
+                    Teams::Softmax => fitness / temperature - (-uniform.ln()).ln(),
+                    _ => fitness,
+                };
+                (value, word, slot as u32)
+            });
+            let mut others: Vec<(f64, u32, u32)> = others.collect();
+            others.sort_by(|a, b| (b.0, b.1).partial_cmp(&(a.0, a.1)).unwrap());
+            kept.clone().map(|slot| slot as u32).chain(others.into_iter().map(|(_, _, slot)| slot)).collect::<Vec<_>>()
+        };
+        let orders: Vec<Vec<u32>> = (0..count).map(order).collect();
+        (0..population).flat_map(|team| orders.iter().map(move |order| order[team])).collect()
     }
 
     /// Trains to the end. Returns the rows, and the policies with the best first.
     fn train(mut self) -> (Vec<Row>, Vec<f32>) {
-        let Learning { population, generations, elites, parents, .. } = self.config.learning;
+        let Learning { population, generations, elites, team_elites, team_g_elites, parents, .. } =
+            self.config.learning;
         let parameters = self.world.parameters();
         let mut search = vec![vec![0.0; 2 * parameters]; self.policies.len()];
         let elites = match elites {
@@ -910,11 +1120,13 @@ impl PlainTrial<'_> {
         // The champions of all past generations.
         let mut past: Vec<Vec<Vec<f32>>> = Vec::new();
         let config = self.config.validate().unwrap();
+        let mut inherited = vec![vec![0.0; population]; count];
         for generation in 0..=generations {
             let stage = config.at(generation);
             let Learning { partners, leniency, hall_of_fame, .. } = stage.learning;
-            let own: Vec<u32> = (0..count as u32).collect();
-            let chosen = evolve::contemporary_teams(&stage.learning, self.trial, generation, &own);
+            let kept = if generation > 0 { elites..elites + team_elites } else { 0..0 };
+            let teams = self.form_teams(generation, stage, &inherited, kept);
+            let chosen = &teams[..];
             let (mut observed, mut fitness) = (Vec::new(), vec![vec![0.0; population]; count]);
             let mut scored = vec![vec![Vec::new(); population]; count];
             for chosen in chosen.chunks(count) {
@@ -961,6 +1173,14 @@ impl PlainTrial<'_> {
                     order
                 })
                 .collect();
+            // The teams by G, kept ones first.
+            let mut by_g: Vec<usize> = (0..observed.len()).collect();
+            by_g.sort_by(|&a, &b| observed[b].partial_cmp(&observed[a]).unwrap());
+            let team =
+                |index: usize| of_each.iter().map(move |&of| chosen[index * count + of] as usize).collect::<Vec<_>>();
+            let tests = stage.learning.test_episodes;
+            let purposes = [Purpose::TestStarts, Purpose::TestPois];
+            let test_g = (tests > 0).then(|| self.play_episodes(generation, stage, &team(by_g[0]), purposes, tests).0);
             // With an evolution strategy, the champion is the mean of its distribution. It is added to the policies for
             // one episode.
             let strategy = evolve::Strategy::of(Level::baseline(), &stage.learning, parameters);
@@ -985,6 +1205,7 @@ impl PlainTrial<'_> {
                 best_g: observed.iter().copied().fold(0.0, f64::max),
                 mean_g: mean(&observed, stage),
                 champion_g: champion,
+                test_g,
             });
             for (leader, (policies, order)) in self.policies.clone().iter().zip(&ranked).enumerate() {
                 let sorted = order.iter().take(population).map(|&policy| policies[policy].clone());
@@ -1007,7 +1228,17 @@ impl PlainTrial<'_> {
                     }
                     continue;
                 }
-                for slot in if generation < generations { elites..population } else { 0..0 } {
+                let of_team = |&team: &usize| chosen[team * count + leader] as usize;
+                let by_g: Vec<usize> = by_g.iter().map(of_team).collect();
+                let further = by_g.iter().skip(team_elites).filter(|policy| !order[..elites].contains(policy));
+                let kept = by_g.iter().take(team_elites).chain(further.take(team_g_elites));
+                let kept: Vec<usize> = order[..elites].iter().chain(kept).copied().collect();
+                inherited[leader] = kept.iter().map(|&policy| f64::from(fitness[leader][policy])).collect();
+                if generation < generations {
+                    (self.policies[leader].iter_mut().zip(&kept))
+                        .for_each(|(to, &kept)| to.clone_from(&policies[kept]));
+                }
+                for slot in if generation < generations { kept.len()..population } else { 0..0 } {
                     let key = self.key(Purpose::Tournament).at(generation, leader, slot);
                     let parent = match parents {
                         Parents::All => evolve::tournament(key, &fitness[leader]),
@@ -1018,6 +1249,7 @@ impl PlainTrial<'_> {
                     let key = self.key(Purpose::Mutation).at(generation, leader, slot);
                     mutate(Level::baseline(), key, &stage.learning, &mut child);
                     self.policies[leader][slot] = child;
+                    inherited[leader].push(f64::from(fitness[leader][parent]));
                 }
             }
         }
@@ -1103,7 +1335,7 @@ fn the_trainer_equals_algorithm_1() {
             let key = Key::new(config.learning.seed, trial, Purpose::Weights);
             let policy = |leader, slot| {
                 let mut weights = vec![0.0; world.parameters()];
-                evolve::random_policy(Level::baseline(), key.at(0, leader, slot), &mut weights);
+                evolve::initial_policy(Level::baseline(), key.at(0, leader, slot), &config.learning, &mut weights);
                 weights
             };
             let population = |leader| (0..config.learning.population).map(|slot| policy(leader, slot)).collect();

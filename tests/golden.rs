@@ -40,12 +40,17 @@ pub struct Golden {
 /// Trains all configs side by side. Returns the digests and the largest G for each.
 pub fn train(configs: &[Config], backend: &mut dyn Backend) -> Vec<(Golden, f64)> {
     let mut trainer = Trainer::new(ValidConfig::all(configs).unwrap());
-    let mut texts = vec![String::from("trial,generation,best_g,mean_g,champion_g\n"); configs.len()];
+    let header = |config: &Config| {
+        let test_g = if config.learning.test_episodes > 0 { ",test_g" } else { "" };
+        format!("trial,generation,best_g,mean_g,champion_g{test_g}\n")
+    };
+    let mut texts: Vec<String> = configs.iter().map(header).collect();
     let mut largest_g = vec![0f64; configs.len()];
     for row in trainer.finish(backend).unwrap() {
         largest_g[row.experiment] = largest_g[row.experiment].max(row.best_g);
-        let Row { experiment, trial, generation, best_g, mean_g, champion_g } = row;
-        writeln!(texts[experiment], "{trial},{generation},{best_g},{mean_g},{champion_g}").unwrap();
+        let Row { experiment, trial, generation, best_g, mean_g, champion_g, test_g } = row;
+        let test_g = test_g.map_or(String::new(), |test_g| format!(",{test_g}"));
+        writeln!(texts[experiment], "{trial},{generation},{best_g},{mean_g},{champion_g}{test_g}").unwrap();
     }
     let golden = |(experiment, text): (usize, &String)| {
         let mut hash = Sha256::new_with_prefix(text);

@@ -18,9 +18,9 @@ pub struct Args {
     /// several]
     #[arg(long, short, value_name = "FILE")]
     out: Option<PathBuf>,
-    /// Team whose G to show: the champion, the best of a generation, or the mean over all teams [default: all three of
-    /// one run, the champions of several]
-    #[arg(long, value_name = "champion|best|mean")]
+    /// Team whose G to show: the champion, the best of a generation, the mean over all teams, or the best in its test
+    /// episodes [default: all of one run, the champions of several]
+    #[arg(long, value_name = "champion|best|mean|test")]
     measure: Option<TeamKind>,
     /// Band around a mean: its 95 % interval, its standard error, or none
     #[arg(long, value_name = "interval|error|none", default_value = "interval")]

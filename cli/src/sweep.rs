@@ -86,8 +86,9 @@ pub struct Args {
     /// Also read files that differ from their digests in run.json, and mark the results as unverified
     #[arg(long, requires = "collect", help_heading = RESULTS)]
     unverified: bool,
-    /// Team whose G is shown: the champion, the best of a generation, or the mean over all teams
-    #[arg(long, value_name = "champion|best|mean", default_value = "champion", help_heading = RESULTS)]
+    /// Team whose G is shown: the champion, the best of a generation, the mean over all teams, or the best in
+    /// its test episodes
+    #[arg(long, value_name = "champion|best|mean|test", default_value = "champion", help_heading = RESULTS)]
     measure: TeamKind,
     /// Range that pictures show around a mean: its 95 % interval, its standard error, or none
     #[arg(long, value_name = "interval|error|none", default_value = "interval", help_heading = RESULTS)]
@@ -209,6 +210,7 @@ pub fn run(mut args: Args) -> Result<(), Error> {
         args.sweep = out.join(SWEEP);
     }
     let axes = ops::sweep::picture_axes(&sweep, &args.axes)?;
+    ops::sweep::check_measure(&sweep, args.measure)?;
     if let Some(file) = &args.slurm {
         return write_script(&args, &sweep, &out, file.as_deref());
     }

@@ -7,11 +7,11 @@ use super::console::Console;
 use super::recovery::{Checkpoints, quoted};
 use super::{ConfigArgs, Error, ExistingResults, Printed, RunOptions};
 use flotilla::escape::PathExt;
-use flotilla::trainer::Row;
 use flotilla_app::ops::train::{self, Extremes, TrainOutcome, TrainRequest};
 use flotilla_app::record::folder::{CONFIG, METRICS, POLICIES, RUN};
 use flotilla_app::record::ownership::CURVES;
 use flotilla_app::report::map::counted;
+use flotilla_app::report::runs::TeamKind;
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -44,11 +44,8 @@ pub fn run(args: Args) -> Result<(), Error> {
     printed.summary(&found, report)
 }
 
-/// A score of a row, as G in 0..1.
-type Score = fn(&Row) -> f64;
-/// All scores, with their names.
-const SCORES: [(&str, Score); 3] =
-    [("best team", |row| row.best_g), ("mean team", |row| row.mean_g), ("champion", |row| row.champion_g)];
+/// The scores of a row, in order.
+const SCORES: [TeamKind; 4] = [TeamKind::Best, TeamKind::Mean, TeamKind::Champion, TeamKind::Test];
 
 /// Returns a time in seconds, or in milliseconds if it is short.
 fn time(seconds: f64) -> String {
@@ -79,22 +76,26 @@ fn report(found: &TrainOutcome) -> String {
     let pois = pois_of_all.unwrap_or(1);
     let mut text = format!("{trained}.\n\n{what}: mean over trials (lowest to highest trial)\n");
     let last = format!("generation {}", found.generations);
-    let mut table = vec![["", SCORES[0].0, SCORES[1].0, SCORES[2].0].map(String::from)];
+    let known = SCORES.into_iter().filter(|score| ends.last.iter().all(|row| score.of(row).is_some()));
+    let known: Vec<TeamKind> = known.collect();
+    let mut table = vec![[""].into_iter().chain(known.iter().map(|score| score.name())).map(String::from).collect()];
     let rows = [("start", &ends.first), (&*last, &ends.last)];
     // A run without generations after the start has one row.
     let shown = if found.generations == 0 { 1 } else { rows.len() };
     for (name, rows) in rows.into_iter().take(shown) {
-        let [best, mean, champion] = SCORES.map(|(_, share)| {
-            let Extremes { mean, lowest, highest } = Extremes::of(rows.iter().map(|row| share(row) * pois as f64));
+        let cells = known.iter().map(|score| {
+            let shares = rows.iter().filter_map(|row| score.of(row));
+            let Extremes { mean, lowest, highest } = Extremes::of(shares.map(|share| share * pois as f64));
             format!("{mean:.2} ({lowest:.2} to {highest:.2})")
         });
-        table.push([name.into(), best, mean, champion]);
+        table.push([name.to_string()].into_iter().chain(cells).collect::<Vec<String>>());
     }
     // Columns fit their contents, because 100 POIs need more room than 4.
     let width = |column: usize| table.iter().map(|row| row[column].len()).max().unwrap_or(0);
-    for [name, best, mean, champion] in &table {
-        let line =
-            format!("  {name:<a$}  {best:<b$}   {mean:<c$}   {champion}", a = width(0), b = width(1), c = width(2));
+    for row in &table {
+        let cells: Vec<String> =
+            row.iter().zip(0..).map(|(cell, column)| format!("{cell:<0$}", width(column))).collect();
+        let line = format!("  {}  {}", cells[0], cells[1..].join("   "));
         let _ = writeln!(text, "{}", line.trim_end());
     }
     let replayed = quoted(folder);

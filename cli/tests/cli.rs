@@ -301,6 +301,36 @@ fn wrong_values_are_reported_with_line_and_range() {
             "hall_of_fame = 3\npopulation = 400000",
             "learning.hall_of_fame: found 3, which makes 1200000 teams per generation, allowed 1048576",
         ),
+        (
+            23,
+            "teams = \"sorted\"\nsharing = \"all\"",
+            "learning.teams: found \"sorted\" with learning.sharing = \"all\", allowed \"random\": a team has a single policy",
+        ),
+        (
+            23,
+            "teams = \"softmax\"\nmethod = \"snes\"",
+            "learning.teams: found \"softmax\", allowed \"random\" unless learning.method is \"tournament\"",
+        ),
+        (
+            23,
+            "team_elites = 2\npartners = 3",
+            "learning.team_elites: found 2 with learning.partners = 3, allowed 0: a policy plays in several teams",
+        ),
+        (
+            23,
+            "team_g_elites = 1\nhall_of_fame = 4",
+            "learning.team_g_elites: found 1 with learning.hall_of_fame = 4, allowed 0: a policy plays in several teams",
+        ),
+        (
+            23,
+            "team_elites = 40\nteam_g_elites = 10",
+            "learning.team_elites: found 1 elites, 40 team_elites and 10 team_g_elites, allowed 50 together: learning.population",
+        ),
+        (23, "team_elites = 51", "learning.team_elites: found 51, allowed 0 to 50 (learning.population)"),
+        (23, "temperature = 0", "learning.temperature: found 0, allowed 0.000001 to 1000000"),
+        (23, "initial = \"zero\"", "learning.initial: found \"zero\", allowed \"normal\" or \"uniform\""),
+        (23, "initial_scale = 0", "learning.initial_scale: found 0, allowed 0.000001 to 1000"),
+        (23, "test_episodes = 1001", "learning.test_episodes: found 1001, allowed 0 to 1000"),
         (23, "leniency = \"min\"", "learning.leniency: found \"min\", allowed \"mean\" or \"max\""),
         (23, "generations = -1", "learning.generations: found -1, allowed 0 to 1000000"),
         (23, "trials = 0", "learning.trials: found 0, allowed 1 to 4096"),
@@ -347,9 +377,13 @@ fn wrong_values_are_reported_with_line_and_range() {
     let crowd =
         GOOD.replace("[[12, 2], [8, 2], [22, 2], [18, 2]]", &many(1023)).replace("[[10, 5], [20, 5]]", &many(5));
     assert_eq!(failure_message(check(crowd, &[])), format!("x.toml:4: world.followers: {agents}"));
-    let single = GOOD.replace("[[10, 5], [20, 5]]", "[[10, 5]]") + "hall_of_fame = 3\n";
-    let expected = "x.toml:24: learning.hall_of_fame: found 3 with a single leader, allowed 0: it has no partners";
-    assert_eq!(failure_message(check(single, &[])), expected);
+    for (key, problem) in [
+        ("hall_of_fame = 3", "hall_of_fame: found 3 with a single leader, allowed 0: it has no partners"),
+        ("teams = 'sorted'", "teams: found \"sorted\" with a single leader, allowed \"random\": it has no partners"),
+    ] {
+        let single = GOOD.replace("[[10, 5], [20, 5]]", "[[10, 5]]") + key + "\n";
+        assert_eq!(failure_message(check(single, &[])), format!("x.toml:24: learning.{problem}"));
+    }
 }
 
 #[test]
@@ -371,8 +405,8 @@ x.toml:6: world.coupling: found 9, allowed 1 to 6 (the number of agents)
 x.toml:13: motion.max_sped: unknown key, did you mean `motion.max_speed`?
 x.toml:21: policy.hidden[0]: found 65, allowed 1 to 64
 x.toml:24: learning.trials: found 0, allowed 1 to 4096
-x.toml:25: learning.foo: unknown key; [learning] has elites, episodes_per_team, fitness, generations, groups, hall_of_fame, led_by, \
-         led_within, leniency, method, mutation, mutation_probability, mutation_sigma, paradigm, parents, partners, poi_jitter, population, search_sigma, search_step, seed, sharing, start_jitter, trials
+x.toml:25: learning.foo: unknown key; [learning] has elites, episodes_per_team, fitness, generations, groups, hall_of_fame, initial, \
+         initial_scale, led_by, led_within, leniency, method, mutation, mutation_probability, mutation_sigma, paradigm, parents, partners, poi_jitter, population, search_sigma, search_step, seed, sharing, start_jitter, team_elites, team_g_elites, teams, temperature, test_episodes, trials
 --population: found 1, allowed 2 to 1048576"
     );
 }

@@ -25,6 +25,7 @@ mod first;
 mod front;
 mod input;
 mod json;
+mod learning;
 mod manners;
 mod memory;
 mod model;

@@ -15,7 +15,8 @@ use flotilla::backend::gpu::episode::{GpuBackend, ResidencyPolicy};
 use flotilla::backend::{Backend, BackendError, DevicePopulation, Group, GroupScores, HELD_FROM, Trace, Weights};
 use flotilla::backend::{Machine, OpenBackend};
 use flotilla::config::{
-    Config, Coupling, Elites, Fitness, Learning, Leniency, Method, Mutation, Paradigm, Parents, Sharing, ValidConfig,
+    Config, Coupling, Elites, Fitness, Learning, Leniency, Method, Mutation, Paradigm, Parents, Sharing, Teams,
+    ValidConfig,
 };
 use flotilla::evolve::{self, Breeding, Key, Purpose, UNCHANGED};
 use flotilla::trainer::{Row, Snapshot, SnapshotError, Trainer};
@@ -128,7 +129,16 @@ fn experiments() -> Vec<Config> {
     let mut ninth = support::layout("generally_forward");
     (ninth.learning.trials, ninth.learning.generations, ninth.learning.population) = (2, 6, 9);
     (ninth.learning.hall_of_fame, ninth.world.coupling) = (3, Coupling::Same(2));
-    vec![first, second, third, fourth, fifth, sixth, seventh, eighth, ninth]
+    // Teams depend on results, and some play again.
+    let mut tenth = support::layout("generally_forward");
+    (tenth.learning.trials, tenth.learning.generations, tenth.learning.population) = (2, 5, 11);
+    (tenth.learning.teams, tenth.world.coupling) = (Teams::Softmax, Coupling::Same(2));
+    (tenth.learning.temperature, tenth.learning.test_episodes, tenth.learning.start_jitter) = (0.3, 2, 0.5);
+    let mut eleventh = support::layout("chaotic");
+    (eleventh.learning.trials, eleventh.learning.generations, eleventh.learning.population) = (1, 5, 12);
+    (eleventh.learning.teams, eleventh.world.coupling) = (Teams::Sorted, Coupling::Same(2));
+    (eleventh.learning.team_elites, eleventh.learning.team_g_elites) = (2, 2);
+    vec![first, second, third, fourth, fifth, sixth, seventh, eighth, ninth, tenth, eleventh]
 }
 
 /// The metrics and the final policies of [`experiments`].

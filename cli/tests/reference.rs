@@ -22,7 +22,7 @@ This page is made from the program's table of keys by `FLOTILLA_WRITE=1 cargo te
 ";
 
 /// The heading and the text above the table of each list or table.
-const TABLES: [(&str, &str); 5] = [
+const TABLES: [(&str, &str); 7] = [
     (
         "agents",
         "\
@@ -31,6 +31,14 @@ const TABLES: [(&str, &str); 5] = [
 Classes of agents, in the place of `world.leaders`, `followers`, `heading`, `speed` and `observers`, `[motion]`, `[follow]`, `[sense]` and
 `learning.paradigm`. A config that has them cannot have these keys. `flotilla check --expand CONFIG` prints a config with them. There are
 up to 8 classes.
+",
+    ),
+    (
+        "agents.in",
+        "\
+### `in`
+
+The region in which the `count` agents of a class start: `in = { disc = [25.0, 25.0, 5.0] }`. It has one of these keys.
 ",
     ),
     (
@@ -68,6 +76,14 @@ Groups of POIs, in the place of `world.pois`, `coupling`, `observation_radius`, 
 cannot have these keys.
 ",
     ),
+    (
+        "pois.in",
+        "\
+### `in` of POIs
+
+The region of the `count` POIs of a group, with one of these keys.
+",
+    ),
 ];
 
 const CLOSING: &str = "
@@ -79,7 +95,7 @@ Any number of stages, in order of `from`. Each starts from the file's own keys a
 | key | unit | type | range | default | meaning | paper |
 |---|---|---|---|---|---|---|
 | `from` | generations | whole number | 0 to learning.generations, more than that of the stage before | none: it has to be given | the first generation of the stage; it lasts until that of the next | 2.1 |
-| `set` |  | table of keys | any of the keys of sections but `policy.*`, `checkpoint.*`, `learning.paradigm`, `sharing`, `groups`, `population`, `elites`, `parents`, `method`, `search_sigma`, `generations`, `trials` and `seed`; as many leaders learn | `{}` | the keys that differ from the file, `{ \"world.coupling\" = 1 }` | 2.1 |
+| `set` |  | table of keys | any of the keys of sections but `policy.*`, `checkpoint.*`, `learning.paradigm`, `sharing`, `groups`, `population`, `hall_of_fame`, `elites`, `team_elites`, `team_g_elites`, `parents`, `method`, `search_sigma`, `generations`, `trials`, `initial`, `initial_scale`, `test_episodes` and `seed`; as many leaders learn | `{}` | the keys that differ from the file, `{ \"world.coupling\" = 1 }` | 2.1 |
 ";
 
 /// Returns text as a cell of a Markdown table.

@@ -647,7 +647,7 @@ fn curves_show_the_requested_team_and_band() {
     let largest = |heights: &[f64]| heights.iter().copied().fold(0.0, f64::max);
     assert!(largest(&interval) > 1.5 * largest(&error), "{interval:?} {error:?}");
     fail_with(2, &["plot", &first.text(), "--band", "wide"], &["allowed interval, error or none"]);
-    fail_with(2, &["plot", &first.text(), "--measure", "worst"], &["allowed champion, best or mean"]);
+    fail_with(2, &["plot", &first.text(), "--measure", "worst"], &["allowed champion, best, mean or test"]);
 }
 
 #[test]

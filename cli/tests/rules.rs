@@ -209,6 +209,13 @@ fn default_values_do_not_change_a_configs_digest() {
         ("learning.method", "'snes'"),
         ("learning.search_sigma", "0.5"),
         ("learning.search_step", "0.5"),
+        ("learning.initial", "'uniform'"),
+        ("learning.initial_scale", "0.5"),
+        ("learning.teams", "'sorted'"),
+        ("learning.temperature", "0.5"),
+        ("learning.team_elites", "1"),
+        ("learning.team_g_elites", "1"),
+        ("learning.test_episodes", "1"),
     ] {
         let coupling = Override { key: "world.coupling".into(), text: "1".into(), name: "coupling".into() };
         let change = Override { key: key.into(), text: value.into(), name: key.into() };
@@ -216,5 +223,5 @@ fn default_values_do_not_change_a_configs_digest() {
     }
     digests.sort();
     digests.dedup();
-    assert_eq!(digests.len(), 14, "each key changes the digest");
+    assert_eq!(digests.len(), 21, "each key changes the digest");
 }

@@ -66,7 +66,7 @@ fn each_stage_changes_the_config_of_the_file() {
     assert_eq!(immediate.at(0).world.coupling, flotilla::config::Coupling::Same(1));
     // `metrics.csv` numbers the stages in the same way.
     let column = |config: &Config, generation: usize| {
-        let row = Row { experiment: 0, trial: 0, generation, best_g: 0.0, mean_g: 0.0, champion_g: 0.0 };
+        let row = Row { experiment: 0, trial: 0, generation, best_g: 0.0, mean_g: 0.0, champion_g: 0.0, test_g: None };
         Lines::of(config).line(&row, 0.0).trim_end().rsplit(',').next().unwrap().parse().unwrap()
     };
     assert_eq!((0..7).map(|generation| column(&config, generation)).collect::<Vec<usize>>(), [0, 0, 1, 1, 2, 2, 2]);

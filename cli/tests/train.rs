@@ -619,7 +619,7 @@ fn a_trace_has_the_inputs_and_outputs_of_leaders() {
 fn held_out_starts_are_never_training_starts() {
     use flotilla::config::Config;
     use flotilla::evaluate::Starts;
-    use flotilla::evolve::episode_positions;
+    use flotilla::evolve::{Episodes, episode_positions};
     use flotilla::world::World;
 
     let mut config = Config::parse(SMALL, "small").unwrap();
@@ -641,7 +641,7 @@ fn held_out_starts_are_never_training_starts() {
     for (seed, trial) in (0..4).flat_map(|seed| (0..3).map(move |trial| (seed, trial))) {
         config.learning.seed = seed;
         for (generation, episode) in (0..64).flat_map(|generation| (0..4).map(move |episode| (generation, episode))) {
-            episode_positions(&config.learning, trial, generation, episode, &world, &mut drawn);
+            episode_positions(&config.learning, trial, generation, (Episodes::Training, episode), &world, &mut drawn);
             assert!(
                 bits(&drawn).iter().all(|places| !held_out.contains(places)),
                 "seed {seed}, generation {generation}"
@@ -806,7 +806,7 @@ fn compare_files(method: &str) {
     let row = |(generation, trial): (usize, usize)| {
         let at = trial * columns + generation;
         let (best_g, mean_g, champion_g) = (trained.best_g[at], trained.mean_g[at], trained.champion_g[at]);
-        (Row { experiment: 0, trial, generation, best_g, mean_g, champion_g }, generation as f64)
+        (Row { experiment: 0, trial, generation, best_g, mean_g, champion_g, test_g: None }, generation as f64)
     };
     let rows: Vec<(Row, f64)> =
         (0..columns).flat_map(|generation| (0..3).map(move |trial| (generation, trial))).map(row).collect();

@@ -207,9 +207,9 @@ def _drawn(config: Config, episodes: int, seed: int, jitter: float | None, poi_j
 def _starts(
     config: Config, episodes: int | None, seed: int, jitter: float | None, poi_jitter: float | None
 ) -> Starts | None:
-    """Returns held-out starts, or None for the config's own start."""
-    if episodes is not None:
-        return _drawn(config, episodes, seed, jitter, poi_jitter)
+    """Returns held-out starts, or None for the config's own start. A config with regions has none."""
+    if episodes is not None or config._native.has_regions:
+        return _drawn(config, 1 if episodes is None else episodes, seed, jitter, poi_jitter)
     if jitter is not None or poi_jitter is not None:
         raise ValueError("a jitter applies to drawn starts; pass episodes= with their number")
     return None
@@ -270,7 +270,8 @@ def rollout(
             `[populations, teams, parameters]` if leaders share policies (`learning.sharing`; 1 if all share one).
             C-contiguous float32 arrays are not copied.
             A policy's parameters are its layers in order, each as weights `W[in, out]` (row-major), then biases `b[out]`.
-        episodes: number of held-out starts that every team plays from. None plays once, from the config's own start.
+        episodes: number of held-out starts that every team plays from. None plays once, from the config's own start
+            or from a drawn one if it has regions.
         seed: seed of these starts, which are the same for all policies.
         jitter: largest offset of a start on each axis, in map units; None takes the config's `learning.start_jitter`.
         poi_jitter: the same for POIs; None takes the config's `learning.poi_jitter`.
@@ -302,7 +303,7 @@ def rollout(
     array, name = _checked(config, policies), word("backend", backend)
     fields = _fields(record, trace, out)
     starts = _starts(config, episodes, seed, jitter, poi_jitter)
-    if starts is not None and starts[0] > 1 and max(starts[2:]) == 0:
+    if starts is not None and starts[0] > 1 and max(starts[2:]) == 0 and not config._native.has_regions:
         warn(f"{episodes} episodes without jitter are all the same; pass jitter= or poi_jitter=", UserWarning)
     total = sum(config._native.worth)
     # What a POI is worth on average. It is 1 if all have the same value.

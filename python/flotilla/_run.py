@@ -27,7 +27,7 @@ Generation = _native.Generation
 Callback = Callable[[Generation], Any]
 Init = Any
 
-METRICS = ("best_g", "mean_g", "champion_g")
+METRICS = ("best_g", "mean_g", "champion_g", "test_g")
 
 
 class Metrics(dict[str, NDArray[np.float64]]):
@@ -44,7 +44,8 @@ class Run:
         config: the config that was trained. If a callback stopped training, it has fewer generations.
         metrics: `best_g`, `mean_g` and `champion_g`, each float64 `[trials, generations + 1]`, the random start
             first: the share of POIs observed, 0 to 1, by each generation's best and mean team, and by the team of every
-            population's best policy.
+            population's best policy. `test_g`, the best team's in its test episodes, is there if
+            `learning.test_episodes` is.
         policies: one float32 array `[populations, policies, parameters]` per trial. There is a population per leader, per
             group, or one for all (`learning.sharing`). The best policy is first, so that team 0 of a rollout is the champion.
             These arrays and those of `metrics` are read-only: copy them to change them.
@@ -166,7 +167,7 @@ class Run:
         trials, generations = self.metrics["best_g"].shape
         trial, generation = np.indices((trials, generations))
         columns = {"trial": trial.T.ravel(), "generation": generation.T.ravel()}
-        return pandas.DataFrame({**columns, **{name: self.metrics[name].T.ravel() for name in METRICS}})
+        return pandas.DataFrame({**columns, **{name: self.metrics[name].T.ravel() for name in self.metrics}})
 
     def replay(
         self,
@@ -212,7 +213,7 @@ class Run:
         """The learning curves: champion, best team and mean team, each with its 95 % interval over trials.
 
         Args:
-            measure: draw only one of them: `"best"`, `"champion"` or `"mean"`.
+            measure: draw only one of them: `"best"`, `"champion"`, `"mean"` or `"test"`.
 
         Example:
             >>> run = flotilla.train(flotilla.Config.paper().replace(learning={"generations": 2}))
@@ -261,7 +262,7 @@ def plot(runs: Runs, measure: str | None = None) -> Figure:
 
     Args:
         runs: runs or their directories, one or a list.
-        measure: the teams that are drawn: `"best"`, `"champion"` or `"mean"`. None draws all three of one run, and the
+        measure: the teams that are drawn: `"best"`, `"champion"`, `"mean"` or `"test"`. None draws all of one run, and the
             champions of several.
 
     Raises:

@@ -35,11 +35,14 @@ def scalars(generation: Generation) -> dict[str, float]:
         >>> sorted(told[0])
         ['best_g', 'champion_g', 'mean_g']
     """
-    return {
+    numbers = {
         "best_g": float(generation.best_g.mean()),
         "mean_g": float(generation.mean_g.mean()),
         "champion_g": float(generation.champion_g.mean()),
     }
+    if generation.test_g is not None:
+        numbers["test_g"] = float(generation.test_g.mean())
+    return numbers
 
 
 def tensorboard(folder: str | os.PathLike[str]) -> Logger:

@@ -14,24 +14,10 @@ use crate::errors::Raise;
 use crate::train::{Generation, Outcomes, outcomes};
 use crate::workers;
 
-/// The state of a training, with one array for all trials, the rows as `[generation, trial, best, mean, champion]`, and
+/// The state of a training, with one array for all trials, the rows, and
 /// whether any fitness was not the config's.
-type State<'py> = (
-    usize,
-    Bound<'py, PyArray1<f32>>,
-    Bound<'py, PyArray1<f32>>,
-    Vec<(usize, usize, f64, f64, f64)>,
-    Vec<(usize, usize, f64, f64, f64)>,
-    bool,
-);
-type Given<'py> = (
-    usize,
-    PyReadonlyArray1<'py, f32>,
-    PyReadonlyArray1<'py, f32>,
-    Vec<(usize, usize, f64, f64, f64)>,
-    Vec<(usize, usize, f64, f64, f64)>,
-    bool,
-);
+type State<'py> = (usize, Bound<'py, PyArray1<f32>>, Bound<'py, PyArray1<f32>>, Vec<Flat>, Vec<Flat>, bool);
+type Given<'py> = (usize, PyReadonlyArray1<'py, f32>, PyReadonlyArray1<'py, f32>, Vec<Flat>, Vec<Flat>, bool);
 /// Policies `[trials, populations, slots, parameters]`, teams `[trials, teams, leaders]`, and starts
 /// `[trials, episodes, agents (+ pois), 2]`.
 type Candidates<'py> = (Bound<'py, PyArray4<f32>>, Bound<'py, PyArray3<u32>>, Bound<'py, PyArray4<f32>>);
@@ -56,12 +42,15 @@ impl Coevolution {
     }
 }
 
-fn flat(row: &Row) -> (usize, usize, f64, f64, f64) {
-    (row.generation, row.trial, row.best_g, row.mean_g, row.champion_g)
+/// A row: generation, trial, best, mean, champion and test G.
+type Flat = (usize, usize, f64, f64, f64, Option<f64>);
+
+fn flat(row: &Row) -> Flat {
+    (row.generation, row.trial, row.best_g, row.mean_g, row.champion_g, row.test_g)
 }
 
-fn row((generation, trial, best_g, mean_g, champion_g): (usize, usize, f64, f64, f64)) -> Row {
-    Row { experiment: 0, trial, generation, best_g, mean_g, champion_g }
+fn row((generation, trial, best_g, mean_g, champion_g, test_g): Flat) -> Row {
+    Row { experiment: 0, trial, generation, best_g, mean_g, champion_g, test_g }
 }
 
 #[pymethods]

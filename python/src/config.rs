@@ -118,6 +118,12 @@ impl Config {
     fn parameters(&self) -> usize {
         self.0.parameters()
     }
+
+    /// Whether starts or POIs are drawn from regions.
+    #[getter]
+    fn has_regions(&self) -> bool {
+        self.0.has_regions()
+    }
 }
 
 /// Returns every config key: name, unit, kind, range, default, meaning, and the paper's section.

@@ -338,8 +338,8 @@ pub fn forward(
     Ok(())
 }
 
-/// Draws start positions, `[count, agents, 2]`, moved by at most `jitter` on each axis, in map units. If `poi_jitter`
-/// is above 0, the POIs follow, `[count, agents + pois, 2]`, moved by at most that.
+/// Draws start positions, `[count, agents, 2]`, moved by at most `jitter` on each axis, in map units. If POIs
+/// move, they follow, `[count, agents + pois, 2]`, moved by at most that.
 ///
 /// Team `i` uses draw number `first + i`.
 #[pyfunction]
@@ -353,7 +353,7 @@ pub fn starts<'py>(
     count: usize,
 ) -> PyResult<Bound<'py, PyArray3<f32>>> {
     let world = World::new(&config.0.validate().raise()?);
-    let places = world.agents() + if poi_jitter > 0.0 { world.pois.len() } else { 0 };
+    let places = world.agents() + if poi_jitter > 0.0 || !world.poi_regions.is_empty() { world.pois.len() } else { 0 };
     let bytes = (count as u128) * places as u128 * 8;
     if ![jitter, poi_jitter].iter().all(|jitter| jitter.is_finite() && *jitter >= 0.0)
         || !(usize::try_from(bytes).is_ok_and(|bytes| bytes < 1 << 36))

@@ -32,6 +32,8 @@ use crate::workers;
 ///     best_g: G of its best team, float64 `[trials]`.
 ///     mean_g: mean G of its teams, of the same shape.
 ///     champion_g: G of the champion, the team of every population's best policy, of the same shape.
+///     test_g: mean G of the best team over its test episodes, of the same shape. None without
+///         `learning.test_episodes`.
 ///     champions: the policies of the champion, float32 `[trials, leaders, parameters]`, or
 ///         `[trials, 1, parameters]` if leaders share a policy. None unless `train` was asked for `champions`.
 ///
@@ -83,6 +85,12 @@ impl Generation {
     }
 
     #[getter]
+    fn test_g<'py>(&self, py: Python<'py>) -> Option<Bound<'py, PyArray1<f64>>> {
+        let test = self.rows.iter().map(|row| row.test_g).collect::<Option<Vec<f64>>>()?;
+        Some(PyArray1::from_vec(py, test))
+    }
+
+    #[getter]
     fn champions<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyArray3<f32>>>> {
         let Some((champions, populations)) = &self.champions else { return Ok(None) };
         let trials = self.rows.len();
@@ -125,18 +133,19 @@ impl Watcher<'_> {
 
 /// The result of a training: config, metrics, policies and digest.
 ///
-/// Each of the three metrics is `[trials, generations + 1]`, and each trial's policies are
+/// The metrics are best, mean and champion G, and test G if the config has test episodes. Each is `[trials, generations + 1]`, and each trial's policies are
 /// `[leaders or 1, policies, parameters]`.
 pub type Outcomes<'py> =
-    (Config, [Bound<'py, PyArray2<f64>>; 3], Vec<Bound<'py, PyArray3<f32>>>, String, End<Bound<'py, PyArray1<f32>>>);
+    (Config, Vec<Bound<'py, PyArray2<f64>>>, Vec<Bound<'py, PyArray3<f32>>>, String, End<Bound<'py, PyArray1<f32>>>);
 
 pub fn outcomes(py: Python<'_>, trained: Trained, digest: String) -> PyResult<Outcomes<'_>> {
-    let Trained { config, best_g, mean_g, champion_g, policies, ending, .. } = trained;
+    let Trained { config, best_g, mean_g, champion_g, test_g, policies, ending, .. } = trained;
     let learning = &config.learning;
     let table = |values| PyArray1::from_vec(py, values).reshape([learning.trials, learning.generations + 1]);
     let shape = [config.populations(), learning.population, config.parameters()];
     let policies = policies.into_iter().map(|trial| PyArray1::from_vec(py, trial).reshape(shape));
-    let metrics = [table(best_g)?, table(mean_g)?, table(champion_g)?];
+    let metrics = [best_g, mean_g, champion_g, test_g].into_iter().filter(|metric| !metric.is_empty());
+    let metrics = metrics.map(table).collect::<PyResult<_>>()?;
     let policies = policies.collect::<PyResult<_>>()?;
     let arrays = |trials: Vec<Vec<f32>>| trials.into_iter().map(|trial| PyArray1::from_vec(py, trial)).collect();
     let end = ending.map(|Ending { weights, fitness }| (arrays(weights), arrays(fitness)));
@@ -253,7 +262,7 @@ pub fn open(py: Python<'_>, folder: PathBuf, unverified: bool) -> PyResult<(Outc
 pub fn save(
     py: Python<'_>,
     config: &Config,
-    metrics: [PyReadonlyArray2<'_, f64>; 3],
+    metrics: Vec<PyReadonlyArray2<'_, f64>>,
     policies: Vec<PyReadonlyArray3<'_, f32>>,
     end: End<PyReadonlyArray1<'_, f32>>,
     times: Vec<f64>,
@@ -265,13 +274,14 @@ pub fn save(
     let (config, learning) = (&config.0, &config.0.learning);
     let (trials, columns) = (learning.trials, learning.generations + 1);
     let shape = [config.populations(), learning.population, config.parameters()];
-    let fits = metrics.iter().all(|metrics| metrics.shape() == [trials, columns])
+    let fits = metrics.len() == 3 + usize::from(learning.test_episodes > 0)
+        && metrics.iter().all(|metrics| metrics.shape() == [trials, columns])
         && policies.len() == trials
         && policies.iter().all(|policies| policies.shape() == shape)
         && times.len() == columns
         && end.iter().all(|(weights, fitness)| {
             let slots = config.populations() * learning.slots() * config.parameters();
-            let scores = config.populations() * learning.population;
+            let scores = config.fitness_len();
             let of =
                 |all: &[PyReadonlyArray1<'_, f32>], len| all.len() == trials && all.iter().all(|one| one.len() == len);
             (weights.is_empty() || of(weights, slots)) && of(fitness, scores)
@@ -292,7 +302,8 @@ pub fn save(
     let row = |(generation, trial): (usize, usize)| {
         let of = |score: &[f64]| score[trial * columns + generation];
         let (best_g, mean_g, champion_g) = (of(scores[0]), of(scores[1]), of(scores[2]));
-        (Row { experiment: 0, trial, generation, best_g, mean_g, champion_g }, times[generation])
+        let test_g = scores.get(3).map(|test_g| of(test_g));
+        (Row { experiment: 0, trial, generation, best_g, mean_g, champion_g, test_g }, times[generation])
     };
     let rows: Vec<(Row, f64)> = rows.map(row).collect();
     workers::aside(py, || {

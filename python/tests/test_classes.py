@@ -267,3 +267,23 @@ def test_environments_reward_closeness_at_the_end():
     trace = rollout(config, policies, record=("positions",))
     assert np.array_equal(trace.g, flotilla.score(config, trace.trace.positions).g)
     assert flotilla.train(config).metrics["best_g"].shape == (2, 3)
+
+
+def test_starts_and_pois_in_regions_are_drawn_for_every_episode():
+    text = TEXT.replace("at = [[30, 12], [30, 16]]", "count = 2\nin = { disc = [30, 14, 6] }")
+    text = text.replace("at = [[31, 20], [25, 12], [5, 25]]", "count = 3\nin = { circle = [20, 20, 15] }")
+    config = Config.parse(text).replace(learning={"test_episodes": 3})
+    assert config["agents"][1]["in"] == {"disc": [30, 14, 6]} and config.num_learners == 5
+    env = VectorEnv(config, 4)
+    first, second, again = env.reset(seed=1)[0], env.reset()[0], env.reset(seed=1)[0]
+    assert np.array_equal(first, again) and not np.array_equal(first, second)
+    # The teams of one environment start apart, too.
+    assert not np.array_equal(first[0], first[1])
+    policies = random_policies(config, 6)
+    assert np.array_equal(rollout(config, policies).g, rollout(config, policies, episodes=1).g)
+    assert rollout(config, policies, episodes=9, spread=True).episodes.shape == (9, 6)
+    run = flotilla.train(config, seed=5)
+    assert run.metrics["test_g"].shape == (2, 3) and (run.metrics["test_g"] <= 1).all()
+    run.save("run")
+    assert np.array_equal(flotilla.Run.open("run").metrics["test_g"], run.metrics["test_g"])
+    assert "test_g" not in flotilla.train(CONFIG).metrics

@@ -47,9 +47,9 @@ impl Genome {
     }
 
     /// Writes a random part.
-    fn draw(self, key: Key, part: &mut [f32]) {
+    fn draw(self, key: Key, learning: &Learning, part: &mut [f32]) {
         match self {
-            Genome::Networks { .. } => evolve::random_policy(Level::new(), key, part),
+            Genome::Networks { .. } => evolve::initial_policy(Level::new(), key, learning, part),
             Genome::Segments { .. } => {
                 let uniform = |counter| (f64::from(key.draw(counter)[0]) / (1u64 << 31) as f64 - 1.0) as f32;
                 part.iter_mut().zip(0..).for_each(|(number, counter)| *number = uniform(counter));
@@ -103,7 +103,7 @@ impl Climber {
             for (index, part) in team.chunks_exact_mut(size).enumerate() {
                 let key = key.at(generation, index, slot);
                 if self.parent.is_empty() {
-                    self.genome.draw(key, part);
+                    self.genome.draw(key, learning, part);
                     continue;
                 }
                 part.copy_from_slice(&self.parent[index * size..(index + 1) * size]);

@@ -19,7 +19,7 @@ use glam::Vec2;
 use crate::backend::{Backend, BackendError, Group};
 use crate::config::{Actions, Config, Learning, ValidConfig};
 use crate::evaluate::Starts;
-use crate::evolve::{self, Key, MIN_WEIGHT, Purpose};
+use crate::evolve::{self, Episodes, Key, MIN_WEIGHT, Purpose};
 use crate::model::policy::BEHAVIOURS;
 use crate::parallel::*;
 use crate::world::World;
@@ -235,7 +235,7 @@ impl Baselines {
                 });
             }
         }
-        let climbing = playing.iter().map(|setting| setting.config.learning.teams()).max().unwrap_or(0);
+        let climbing = playing.iter().map(|setting| setting.config.learning.team_count()).max().unwrap_or(0);
         let trials = playing.iter_mut().flat_map(|setting| &mut setting.trials);
         let before: Vec<_> = trials.map(|trial| trial.climbers.clone()).collect();
         let mut rounds = (0..climbing).step_by(ROUND);
@@ -370,7 +370,7 @@ impl Setting {
             index,
             weights: vec![],
             starts: vec![vec![]; episodes_per_team],
-            observed: Vec::with_capacity(constants.len() + RANDOM.len() * config.learning.teams()),
+            observed: Vec::with_capacity(constants.len() + RANDOM.len() * config.learning.team_count()),
             last_constants: vec![],
             constants: vec![0; constants.len()],
             finalists: Default::default(),
@@ -381,8 +381,7 @@ impl Setting {
 
     /// Reports whether starts or POIs move.
     fn moves(&self) -> bool {
-        let Learning { start_jitter, poi_jitter, .. } = self.config.learning;
-        start_jitter != 0.0 || poi_jitter != 0.0
+        self.config.starts_move() || self.config.pois_move()
     }
 
     /// Returns the number of constants that play in a generation. If nothing moves, they play only once, because every
@@ -393,12 +392,12 @@ impl Setting {
 
     /// Returns the number of teams of a trial that play in a generation.
     fn teams(&self, generation: usize) -> usize {
-        self.played_constants(generation) + RANDOM.len() * self.config.learning.teams()
+        self.played_constants(generation) + RANDOM.len() * self.config.learning.team_count()
     }
 
     /// Returns the number of teams of a climber's round that begins at slot `first` of a generation.
     fn round_size(&self, first: usize) -> usize {
-        self.config.learning.teams().saturating_sub(first).min(ROUND)
+        self.config.learning.team_count().saturating_sub(first).min(ROUND)
     }
 
     /// Draws the teams of each climber's round.
@@ -422,7 +421,7 @@ impl Setting {
 
     /// Returns the team at a place among a generation's teams.
     fn team(&self, generation: usize, place: usize) -> Team {
-        let (constants, teams) = (self.played_constants(generation), self.config.learning.teams());
+        let (constants, teams) = (self.played_constants(generation), self.config.learning.team_count());
         match place.checked_sub(constants) {
             None => Team::Constant(place),
             Some(slot) => RANDOM[slot / teams](generation, slot % teams),
@@ -439,10 +438,12 @@ impl Setting {
                 random_action(key, self.config.policy.actions.outputs(), policy);
             }
             Team::Network(generation, slot) => {
-                evolve::random_policy(level, key(Purpose::Baseline).at(generation, population, slot), policy);
+                let key = key(Purpose::Baseline).at(generation, population, slot);
+                evolve::initial_policy(level, key, &self.config.learning, policy);
             }
             Team::Shared(generation, slot) => {
-                evolve::random_policy(level, key(Purpose::SharedBaseline).at(generation, 0, slot), policy);
+                let key = key(Purpose::SharedBaseline).at(generation, 0, slot);
+                evolve::initial_policy(level, key, &self.config.learning, policy);
             }
             Team::Climbed => {
                 trial.climbers.iter().for_each(|climbers| climbers.networks.write_policy(population, policy));
@@ -464,6 +465,7 @@ impl Setting {
     fn start(&mut self, generation: usize) {
         for Trial { index, starts, observed, .. } in &mut self.trials {
             for (episode, starts) in starts.iter_mut().enumerate() {
+                let episode = (Episodes::Training, episode);
                 evolve::episode_positions(&self.config.learning, *index, generation, episode, &self.world, starts);
             }
             observed.clear();
@@ -503,7 +505,8 @@ impl Setting {
                 open_loop[place].push(climbers.segments.observed() as f64 / whole);
                 hill_climbing[place].push(climbers.networks.observed() as f64 / whole);
             }
-            let kinds = random.chunks_exact(self.config.learning.teams()).zip([actions, networks, shared]).zip(RANDOM);
+            let kinds =
+                random.chunks_exact(self.config.learning.team_count()).zip([actions, networks, shared]).zip(RANDOM);
             for (((observed, best), team), finalists) in kinds.zip(&mut trial.finalists) {
                 let best = &mut best[place];
                 for (slot, &observed) in observed.iter().enumerate() {
@@ -542,7 +545,7 @@ impl Setting {
                 &self.config.learning,
                 trial.index,
                 generations + 2,
-                episode,
+                (Episodes::Training, episode),
                 &self.world,
                 starts,
             );

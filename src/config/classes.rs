@@ -39,7 +39,7 @@ impl Config {
     pub fn agent_count(&self) -> usize {
         match &self.agents[..] {
             [] => self.world.leaders.len() + self.world.followers.len(),
-            classes => classes.iter().map(|class| class.at.len()).sum(),
+            classes => classes.iter().map(|class| class.size()).sum(),
         }
     }
 
@@ -47,7 +47,7 @@ impl Config {
     pub fn poi_count(&self) -> usize {
         match &self.pois[..] {
             [] => self.world.pois.len(),
-            groups => groups.iter().map(|group| group.at.len()).sum(),
+            groups => groups.iter().map(|group| group.size()).sum(),
         }
     }
 
@@ -63,11 +63,9 @@ impl Config {
         let mut world = self.world.clone();
         let classes = self.classes();
         if !self.agents.is_empty() {
-            let places = |learn: bool| {
-                let shown = classes.agents.iter().filter(|class| class.learns() == learn);
-                shown.flat_map(|class| class.at.iter().copied()).collect::<Vec<_>>()
-            };
-            (world.leaders, world.followers) = (places(true), places(false));
+            // Classes that learn come first.
+            world.leaders = classes.starts();
+            world.followers = world.leaders.split_off(self.learners());
             world.heading = Heading::Each(classes.headings());
         }
         if !self.pois.is_empty() {
@@ -88,6 +86,21 @@ impl Config {
             };
         }
         world
+    }
+
+    /// Reports whether starts or POIs are drawn from regions, so that the config has no start of its own.
+    pub fn has_regions(&self) -> bool {
+        self.agents.iter().any(|class| class.region.is_some()) || self.pois.iter().any(|group| group.region.is_some())
+    }
+
+    /// Reports whether agents start elsewhere in every episode.
+    pub fn starts_move(&self) -> bool {
+        self.learning.start_jitter > 0.0 || self.agents.iter().any(|class| class.region.is_some())
+    }
+
+    /// Reports whether POIs are elsewhere in every episode.
+    pub fn pois_move(&self) -> bool {
+        self.learning.poi_jitter > 0.0 || self.pois.iter().any(|group| group.region.is_some())
     }
 
     /// Returns the largest distance in units up to which any agent influences another: in short, the attraction radius.
@@ -202,6 +215,8 @@ impl Config {
                 Heading::Each(_) => OneOrEach::Each(headings[first..first + at.len()].to_vec()),
             },
             at,
+            count: None,
+            region: None,
             speed: world.speed,
             control,
             motion: Mobility::Steered(motion.clone()),
@@ -239,6 +254,8 @@ impl Config {
         let group = |name: String, at: &[[f64; 2]], coupling: Coupling, windows: &[[usize; 2]]| PoiGroup {
             name,
             at: at.to_vec(),
+            count: None,
+            region: None,
             value: 1.0,
             coupling,
             radius: world.observation_radius,

@@ -40,6 +40,12 @@ section! {
         partners: usize = "teams", "",
         /// what a policy's fitness is: the mean score of its teams, or the largest, which is lenient with bad partners
         leniency: Leniency = "", "",
+        /// how teams are formed: at random; population by population, drawing policies with probability ∝
+        /// exp(fitness / temperature); or the best of each population together, then the second best, and so on.
+        /// A policy's fitness is its last, or its parent's if it is new
+        teams: Teams = "", "",
+        /// for teams = "softmax": temperature in the unit of POI values, such as 1 for one observed POI of value 1
+        temperature: f64 = "", "",
         /// h: last generations whose champions are kept; from generation 1 on, each policy also plays in a team with
         /// the champions of one of them, drawn at random; 0 means none
         hall_of_fame: usize = "generations", "",
@@ -47,9 +53,17 @@ section! {
         generations: usize = "generations", "4.3, Alg. 1",
         /// independent repetitions
         trials: usize = "trials", "5",
+        /// distribution of the weights of the first policies: normal, or uniform in −1 to 1
+        initial: Initial = "", "4.3, Alg. 1",
+        /// what these weights are multiplied by
+        initial_scale: f64 = "", "",
         /// n: the best of a population, which survive unchanged; a share is rounded to the nearest whole number, and is
         /// at least 1
         elites: Elites = "policies", "4.3, Alg. 1",
+        /// teams with the largest G that play again unchanged; their policies are selected among the others, too
+        team_elites: usize = "teams", "",
+        /// further policies of a population that survive unchanged: those whose teams had the largest G
+        team_g_elites: usize = "policies", "",
         /// which policies the parents of a generation are drawn from: by binary tournaments of the whole population, or
         /// uniformly from its elites (truncation selection)
         parents: Parents = "", "4.3, Alg. 1",
@@ -74,6 +88,9 @@ section! {
         start_jitter: f64 = "units", "",
         /// the same for POIs: largest offset of each POI on both axes in every episode
         poi_jitter: f64 = "units", "",
+        /// new episodes that the best team of each generation plays, with random numbers of their own; its mean G is
+        /// the column test_g of metrics.csv; 0 means none
+        test_episodes: usize = "episodes", "",
         /// random seed: config and seed decide every bit of a run
         seed: u64 = "", "",
     }
@@ -108,6 +125,28 @@ config_enum! {
         Mean = "mean",
         /// The largest.
         Max = "max",
+    }
+}
+
+config_enum! {
+    /// The way in which a generation's teams are formed.
+    Teams {
+        /// All ways have the same probability.
+        Random = "random",
+        /// Policies are drawn without replacement, fitter ones earlier with a higher probability.
+        Softmax = "softmax",
+        /// The best policies together, then the second best, and so on.
+        Sorted = "sorted",
+    }
+}
+
+config_enum! {
+    /// The distribution of the weights of the first policies.
+    Initial {
+        /// N(0, 1).
+        Normal = "normal",
+        /// Uniform in -1..1.
+        Uniform = "uniform",
     }
 }
 
@@ -180,8 +219,56 @@ impl Learning {
     }
 
     /// Returns the number of teams of contemporaries per generation of a trial, without the champions' team.
-    pub fn teams(&self) -> usize {
+    pub fn team_count(&self) -> usize {
         self.population * self.partners
+    }
+
+    /// Reports whether policies survive because of their team's G.
+    pub fn keeps_teams(&self) -> bool {
+        self.team_elites + self.team_g_elites > 0
+    }
+
+    /// Returns each key of teams whose value is not its default, with the value and the default.
+    pub(super) fn team_keys(&self) -> impl Iterator<Item = (&'static str, String, String)> + use<> {
+        let word = |word: Teams| format!("\"{word}\"");
+        let keys = [
+            ("learning.hall_of_fame", self.hall_of_fame.to_string(), "0".into()),
+            ("learning.teams", word(self.teams), word(Teams::Random)),
+            ("learning.team_elites", self.team_elites.to_string(), "0".into()),
+            ("learning.team_g_elites", self.team_g_elites.to_string(), "0".into()),
+        ];
+        keys.into_iter().filter(|(_, value, default)| value != default)
+    }
+
+    /// Reports keys of teams that the other keys do not allow.
+    fn check_teams(&self, r: &mut Reader<'_>) {
+        let Learning { partners, sharing, ref groups, hall_of_fame, method, population, .. } = *self;
+        let single = sharing == Sharing::Shared || groups.len() == 1;
+        for (key, found, default) in self.team_keys() {
+            let past = key == "learning.hall_of_fame";
+            let with = |other: &str, why: &str| format!(" with learning.{other}, allowed {default}: {why}");
+            let several = "a policy plays in several teams";
+            let problem = match () {
+                () if single => with(&format!("sharing = \"{sharing}\""), "a team has a single policy"),
+                () if method != Method::Tournament => {
+                    format!(", allowed {default} unless learning.method is \"tournament\"")
+                }
+                () if !past && partners > 1 => with(&format!("partners = {partners}"), several),
+                () if !past && hall_of_fame > 0 => with(&format!("hall_of_fame = {hall_of_fame}"), several),
+                () => continue,
+            };
+            r.report_key(key, format!("found {found}{problem}"));
+        }
+        let kept = [self.elites.count(population), self.team_elites, self.team_g_elites];
+        if r.error_count() == 0 && kept[1..] != [0, 0] && kept.iter().sum::<usize>() > population {
+            let [elites, of_teams, by_g] = kept;
+            let key = if of_teams > 0 { "learning.team_elites" } else { "learning.team_g_elites" };
+            let text = format!(
+                "found {elites} elites, {of_teams} team_elites and {by_g} team_g_elites, allowed {population} together: \
+                 learning.population"
+            );
+            r.report_key(key, text);
+        }
     }
 
     /// Reads the section. `learners` is the number of agents that learn.
@@ -202,16 +289,6 @@ impl Learning {
             r.report_key("learning.partners", text);
         }
         let method = Learning::method(r).choice(Method::Tournament);
-        let hall_of_fame = Learning::hall_of_fame(r).number(between(0, MAX_HALL_OF_FAME), 0);
-        if hall_of_fame > 0 && single {
-            let text = format!(
-                "found {hall_of_fame} with learning.sharing = \"{sharing}\", allowed 0: a team has a single policy"
-            );
-            r.report_key("learning.hall_of_fame", text);
-        } else if hall_of_fame > 0 && method != Method::Tournament {
-            let text = format!("found {hall_of_fame}, allowed 0 unless learning.method is \"tournament\"");
-            r.report_key("learning.hall_of_fame", text);
-        }
         let elites = Learning::elites(r).count_or_percentage(between(0, population).because("learning.population"), 1);
         let parents = Learning::parents(r).choice(Parents::All);
         if parents == Parents::Elites && elites == Elites::Count(0) {
@@ -220,7 +297,7 @@ impl Learning {
                 "found \"elites\" with learning.elites = 0, allowed with 1 or more".into(),
             );
         }
-        Learning {
+        let learning = Learning {
             paradigm,
             sharing,
             groups,
@@ -228,10 +305,16 @@ impl Learning {
             population,
             partners,
             leniency: Learning::leniency(r).choice(Leniency::Mean),
-            hall_of_fame,
+            teams: Learning::teams(r).choice(Teams::Random),
+            temperature: Learning::temperature(r).number(between(1e-6, 1e6), 1.0),
+            hall_of_fame: Learning::hall_of_fame(r).number(between(0, MAX_HALL_OF_FAME), 0),
             generations: Learning::generations(r).number(between(0, MAX_GENERATIONS), 100),
             trials: Learning::trials(r).number(between(1, MAX_TRIALS), 5),
+            initial: Learning::initial(r).choice(Initial::Normal),
+            initial_scale: Learning::initial_scale(r).number(between(LEAST, 1e3), 1.0),
             elites,
+            team_elites: Learning::team_elites(r).number(between(0, population).because("learning.population"), 0),
+            team_g_elites: Learning::team_g_elites(r).number(between(0, population).because("learning.population"), 0),
             parents,
             method,
             search_sigma: Learning::search_sigma(r).number(between(LEAST, 100.0), 0.3),
@@ -242,8 +325,11 @@ impl Learning {
             episodes_per_team: Learning::episodes_per_team(r).number(between(1, MAX_EPISODES), 1),
             start_jitter: Learning::start_jitter(r).number(between(LEAST, LONGEST).or_zero(), 0.0),
             poi_jitter: Learning::poi_jitter(r).number(between(LEAST, LONGEST).or_zero(), 0.0),
+            test_episodes: Learning::test_episodes(r).number(between(0, MAX_EPISODES), 0),
             seed: Learning::seed(r).number(between(0, i64::MAX as u64), 0),
-        }
+        };
+        learning.check_teams(r);
+        learning
     }
 }
 

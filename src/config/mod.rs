@@ -25,6 +25,7 @@ pub use crate::model::classes::{
 pub use crate::model::follow::Follow;
 pub use crate::model::motion::{Mobility, Motion};
 pub use crate::model::policy::{Actions, MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, Policy};
+pub use crate::model::region::Region;
 pub use crate::model::rule::{Coupling, Observers};
 pub use crate::model::sense::{Density, Sense};
 pub use crate::model::start::Heading;
@@ -32,8 +33,8 @@ pub use crate::reader::{Definition, Override, Problem};
 
 pub use credit::{CreditConfig, LedBy};
 pub use learning::{
-    CheckpointConfig, Elites, Learning, Leniency, MAX_EPISODES, MAX_GENERATIONS, MAX_HALL_OF_FAME, MAX_PARTNERS,
-    MAX_POPULATION, MAX_TRIALS, Method, Mutation, Paradigm, Parents, Sharing,
+    CheckpointConfig, Elites, Initial, Learning, Leniency, MAX_EPISODES, MAX_GENERATIONS, MAX_HALL_OF_FAME,
+    MAX_PARTNERS, MAX_POPULATION, MAX_TRIALS, Method, Mutation, Paradigm, Parents, Sharing, Teams,
 };
 pub use load::name;
 pub use load::{is_standard_input, read_file, read_text};
@@ -257,7 +258,7 @@ impl Config {
     pub fn learners(&self) -> usize {
         match self.learning.paradigm {
             _ if !self.agents.is_empty() => {
-                self.agents.iter().filter(|class| class.learns()).map(|class| class.at.len()).sum()
+                self.agents.iter().filter(|class| class.learns()).map(|class| class.size()).sum()
             }
             Paradigm::LeaderFollower => self.world.leaders.len(),
             Paradigm::AllLeaders => self.world.leaders.len() + self.world.followers.len(),
@@ -316,7 +317,14 @@ impl Config {
 
     /// Returns the largest number of teams in a generation of a trial, including the champions' team.
     pub fn max_teams(&self) -> usize {
-        self.learning.teams() + self.hall_teams(1) + 1
+        self.learning.team_count() + self.hall_teams(1) + 1
+    }
+
+    /// Returns the numbers of a trial's fitness, `[populations][policies]`, followed by the rank of each policy's team if
+    /// [teams are kept](Learning::keeps_teams).
+    pub fn fitness_len(&self) -> usize {
+        let scores = self.populations() * self.learning.population;
+        if self.learning.keeps_teams() { 2 * scores } else { scores }
     }
 
     /// Returns the number of weights in one policy, including biases.
@@ -394,17 +402,17 @@ impl Config {
             r.report_key("learning.sharing", "found \"group\" with [[agents]], which needs learning.groups".into());
         }
         let Learning { population, hall_of_fame, .. } = config.learning;
-        if r.error_count() == 0 && hall_of_fame > 0 {
-            let teams = config.max_teams() - 1;
-            if config.populations() == 1 {
-                let what = if config.learners() == 1 { "leader" } else { "population" };
-                let text = format!("found {hall_of_fame} with a single {what}, allowed 0: it has no partners");
-                r.report_key("learning.hall_of_fame", text);
-            } else if teams > MAX_POPULATION {
-                let text =
-                    format!("found {hall_of_fame}, which makes {teams} teams per generation, allowed {MAX_POPULATION}");
-                r.report_key("learning.hall_of_fame", text);
+        if r.error_count() == 0 && config.populations() == 1 {
+            let what = if config.learners() == 1 { "leader" } else { "population" };
+            for (key, found, default) in config.learning.team_keys() {
+                r.report_key(key, format!("found {found} with a single {what}, allowed {default}: it has no partners"));
             }
+        }
+        let teams = if r.error_count() == 0 { config.max_teams() - 1 } else { 0 };
+        if hall_of_fame > 0 && teams > MAX_POPULATION {
+            let text =
+                format!("found {hall_of_fame}, which makes {teams} teams per generation, allowed {MAX_POPULATION}");
+            r.report_key("learning.hall_of_fame", text);
         }
         // With too many agents there are no populations to count.
         let bytes = |config: &Config| config.policy_bytes() / population as u64 * (population + hall_of_fame) as u64;

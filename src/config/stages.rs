@@ -18,7 +18,7 @@ pub const MAX_STAGES: usize = 256;
 /// The key with the length of a run.
 pub const GENERATIONS: &str = "learning.generations";
 /// Keys that stages cannot change. A name that ends with a dot is a whole section.
-const FIXED: [&str; 18] = [
+const FIXED: [&str; 23] = [
     AGENTS,
     "agents.",
     POIS,
@@ -31,11 +31,16 @@ const FIXED: [&str; 18] = [
     "learning.population",
     "learning.hall_of_fame",
     "learning.elites",
+    "learning.team_elites",
+    "learning.team_g_elites",
     "learning.parents",
     "learning.method",
     "learning.search_sigma",
     GENERATIONS,
     "learning.trials",
+    "learning.initial",
+    "learning.initial_scale",
+    "learning.test_episodes",
     "learning.seed",
 ];
 

@@ -11,15 +11,16 @@ mod selection;
 mod strategy;
 mod weights;
 
-pub use mutation::{Breeding, InvalidInput, mutate};
 #[cfg(feature = "gpu")]
 pub(crate) use mutation::mutation_threshold;
+pub use mutation::{Breeding, InvalidInput, mutate};
 pub(crate) use mutation::{Offspring, breed};
 pub(crate) use random::noise;
 pub use random::{Key, Purpose};
 pub use schedule::{
-    aligned_teams, contemporary_teams, episode_positions, jitter_pois, jitter_starts, order_policies, past_champions,
+    Episodes, aligned_teams, contemporary_teams, episode_positions, jitter_pois, jitter_starts, order_policies,
+    past_champions,
 };
-pub use selection::{Selection, UNCHANGED, draw_parents, keep_parents, ranking, top_indices, tournament};
+pub use selection::{Selection, UNCHANGED, draw_parents, keep_parents, keep_teams, ranking, top_indices, tournament};
 pub use strategy::{Samples, Strategy};
-pub use weights::{MAX_WEIGHT, MIN_WEIGHT, flush_and_validate, is_weight, random_policy};
+pub use weights::{MAX_WEIGHT, MIN_WEIGHT, flush_and_validate, initial_policy, is_weight, random_policy};

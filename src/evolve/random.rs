@@ -40,6 +40,10 @@ pub enum Purpose {
     Climber = 15,
     /// Open-loop teams that a baseline climbs to.
     OpenLoop = 16,
+    /// Start positions of the episodes that test a generation's best team.
+    TestStarts = 17,
+    /// POI positions of these episodes.
+    TestPois = 18,
 }
 
 /// A key of the counter-based random number generator. [`Key::draw`] returns the words of a counter.

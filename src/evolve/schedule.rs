@@ -1,15 +1,15 @@
 //! Who plays with whom and from where: teams of a generation, and the start positions of its episodes.
 
 use fearless_simd::{Level, Simd, dispatch, prelude::*};
-use glam::Vec2;
+use glam::{DVec2, Vec2};
 
 use super::random::{Key, Purpose, index_below};
 use super::selection::Selection;
-use crate::config::{Learning, Method, population_count};
+use crate::config::{Learning, Method, Region, Teams, population_count};
 use crate::world::{World, on_grid};
 
 /// Returns the teams of contemporaries in one generation of a trial, `[teams][leaders]`, round by round. `populations`
-/// are the leaders'. If there is only one, team `t` is policy `t`; otherwise see [`order_policies`].
+/// are the leaders'. If there is only one, team `t` is policy `t`; otherwise see [`order_policies`], with a fitness of 0.
 pub fn contemporary_teams(learning: &Learning, trial: usize, generation: usize, populations: &[u32]) -> Vec<u32> {
     let (leaders, count) = (populations.len(), population_count(populations));
     let mut teams = aligned_teams(learning.population, leaders).repeat(learning.partners);
@@ -17,7 +17,8 @@ pub fn contemporary_teams(learning: &Learning, trial: usize, generation: usize, 
         let mut order = vec![0; learning.population];
         for (round, teams) in teams.chunks_exact_mut(learning.population * leaders).enumerate() {
             for population in 0..count {
-                order_policies(Level::new(), learning, trial, generation, [round, population], &mut order);
+                let place = [round, population];
+                order_policies(Level::new(), learning, trial, generation, place, |_| 0.0, &mut order);
                 for (team, &policy) in teams.chunks_exact_mut(leaders).zip(&order) {
                     let members = team.iter_mut().zip(populations).filter(|&(_, &of)| of as usize == population);
                     members.for_each(|(to, _)| *to = policy);
@@ -30,26 +31,63 @@ pub fn contemporary_teams(learning: &Learning, trial: usize, generation: usize, 
 
 /// Writes the policy of a population in each team of a round, `[teams]`: each policy is on exactly one team.
 ///
-/// All ways to form teams have the same probability. The children of tournaments are drawn independently, so a random
-/// rotation is enough unless there are several elites, partners or evolution strategies, or policies were given at the
-/// start. Neighbouring teams then have neighbouring policies, which is faster.
+/// With [`Teams::Random`] all ways to form teams have the same probability. The children of tournaments are drawn
+/// independently, so a random rotation is enough unless policies of other kinds survive, there are partners or evolution
+/// strategies, or policies were given at the start. Neighbouring teams then have neighbouring policies, which is faster.
+///
+/// With [`Teams::Softmax`] and [`Teams::Sorted`] the order depends on the `fitness` of each slot's policy, or of its
+/// parent, in the unit of POI values. Ties are in random order. Teams that were kept come first.
 pub fn order_policies(
     level: Level,
     learning: &Learning,
     trial: usize,
     generation: usize,
     [round, population]: [usize; 2],
+    fitness: impl Fn(usize) -> f64,
     order: &mut [u32],
 ) {
     let key = Key::new(learning.seed, trial, Purpose::Teams).at(generation, population, round);
-    let independent = learning.method == Method::Tournament && Selection::of(learning).elites <= 1;
-    if independent && learning.partners == 1 && generation > 0 {
-        let [word, ..] = key.draw(0);
-        let (last, first) = order.split_at_mut(order.len() - index_below(word, order.len()));
-        first.iter_mut().chain(last).zip(0..).for_each(|(policy, index)| *policy = index);
-    } else {
-        dispatch!(level, simd => shuffle(simd, key, order));
+    let Selection { elites, team_elites, team_g_elites, .. } = Selection::of(learning);
+    let independent = learning.method == Method::Tournament && elites <= 1 && team_elites + team_g_elites == 0;
+    // The slots of kept teams follow those of the elites.
+    let kept = if generation > 0 { team_elites } else { 0 };
+    let (teams, others) = order.split_at_mut(kept);
+    teams.iter_mut().zip(elites as u32..).for_each(|(policy, slot)| *policy = slot);
+    let slot = |index: u32| index + if index < elites as u32 { 0 } else { kept as u32 };
+    match learning.teams {
+        Teams::Random if independent && learning.partners == 1 && generation > 0 => {
+            let [word, ..] = key.draw(0);
+            let (last, first) = others.split_at_mut(others.len() - index_below(word, others.len()));
+            first.iter_mut().chain(last).zip(0..).for_each(|(policy, index)| *policy = index);
+        }
+        Teams::Random => dispatch!(level, simd => shuffle(simd, key, others)),
+        Teams::Softmax | Teams::Sorted => {
+            let sort_key = |index: u32| {
+                let [word, ..] = key.draw(index);
+                let fitness = fitness(slot(index) as usize);
+                let value = match learning.teams {
+                    Teams::Softmax => fitness / learning.temperature + gumbel(word),
+                    _ => fitness,
+                };
+                // Adding 0.0 turns -0.0 into 0.0, so that both are ties.
+                (value + 0.0, word)
+            };
+            let keys: Vec<(f64, u32)> = (0..others.len() as u32).map(sort_key).collect();
+            others.iter_mut().zip(0..).for_each(|(policy, index)| *policy = index);
+            others.sort_by(|&a, &b| {
+                let [a, b] = [a, b].map(|index| keys[index as usize]);
+                b.0.total_cmp(&a.0).then(b.1.cmp(&a.1))
+            });
+        }
     }
+    others.iter_mut().for_each(|policy| *policy = slot(*policy));
+}
+
+/// Returns a deviate of the standard Gumbel distribution. The order of x + deviate, largest first, is a draw without
+/// replacement with probabilities ∝ exp(x).
+fn gumbel(word: u32) -> f64 {
+    let uniform = (f64::from(word) + 0.5) / (1u64 << 32) as f64;
+    -libm::log(-libm::log(uniform))
 }
 
 /// Returns teams in which team `t` is every leader's policy `t`, `[teams][leaders]`.
@@ -85,38 +123,64 @@ fn shuffle<S: Simd>(simd: S, key: Key, order: &mut [u32]) {
     }
 }
 
+/// Episodes of a trial's generation, all with random numbers of their own.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Episodes {
+    /// Those that all teams play.
+    Training,
+    /// Those that test the best team.
+    Test,
+}
+
+impl Episodes {
+    /// Returns the purposes of random starts and POIs.
+    fn purposes(self) -> [Purpose; 2] {
+        match self {
+            Episodes::Training => [Purpose::Starts, Purpose::Pois],
+            Episodes::Test => [Purpose::TestStarts, Purpose::TestPois],
+        }
+    }
+}
+
 /// Writes the positions of one episode of a trial's generation, as [`Group::starts`](crate::backend::Group::starts) has
 /// them: the agents' starts, then the POIs if they move.
 pub fn episode_positions(
     learning: &Learning,
     trial: usize,
     generation: usize,
-    episode: usize,
+    (episodes, episode): (Episodes, usize),
     world: &World,
     positions: &mut Vec<Vec2>,
 ) {
-    let key = Key::new(learning.seed, trial, Purpose::Starts);
-    jitter_starts(key, generation, episode, world, learning.start_jitter, positions);
-    if learning.poi_jitter > 0.0 {
-        let key = Key::new(learning.seed, trial, Purpose::Pois);
-        jitter_pois(key, generation, episode, world, learning.poi_jitter, positions);
-    }
+    let [starts, pois] = episodes.purposes().map(|purpose| Key::new(learning.seed, trial, purpose));
+    jitter_starts(starts, generation, episode, world, learning.start_jitter, positions);
+    jitter_pois(pois, generation, episode, world, learning.poi_jitter, positions);
 }
 
-/// Writes the start positions of one episode, `[agents]`: the world's, each moved by a uniform offset in
-/// `-jitter..jitter` units on both axes. `key` is of [`Purpose::Starts`] or [`Purpose::HeldOut`].
+/// Writes the start positions of one episode, `[agents]`: the world's, or drawn from its regions, each moved by a uniform
+/// offset in `-jitter..jitter` units on both axes. `key` is of [`Purpose::Starts`] or the like.
 pub fn jitter_starts(key: Key, generation: usize, episode: usize, world: &World, jitter: f64, starts: &mut Vec<Vec2>) {
     starts.clone_from(&world.starts);
+    spawn(key.at(generation, episode, 1), world.map(), &world.start_regions, starts);
     scatter(key.at(generation, episode, 0), world.map(), jitter, starts);
 }
 
-/// Appends the POI positions of one episode, `[pois]`, moved the same way. Appends nothing if `jitter` is 0. `key` is
-/// of [`Purpose::Pois`] or [`Purpose::HeldOutPois`].
+/// Appends the POI positions of one episode, `[pois]`, drawn and moved the same way. Appends nothing if no POI moves.
+/// `key` is of [`Purpose::Pois`] or the like.
 pub fn jitter_pois(key: Key, generation: usize, episode: usize, world: &World, jitter: f64, positions: &mut Vec<Vec2>) {
-    if jitter > 0.0 {
+    if jitter > 0.0 || !world.poi_regions.is_empty() {
         let first = positions.len();
         positions.extend(&world.pois);
+        spawn(key.at(generation, episode, 1), world.map(), &world.poi_regions, &mut positions[first..]);
         scatter(key.at(generation, episode, 0), world.map(), jitter, &mut positions[first..]);
+    }
+}
+
+/// Draws the positions in regions.
+fn spawn(key: Key, map: Vec2, regions: &[(usize, Region)], positions: &mut [Vec2]) {
+    for &(index, region) in regions {
+        let [x, y, ..] = key.draw(index as u32);
+        positions[index] = on_grid(DVec2::from(region.place([x, y])).as_vec2(), map);
     }
 }
 

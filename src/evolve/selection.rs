@@ -65,6 +65,10 @@ pub const UNCHANGED: u32 = 1 << 31;
 pub struct Selection {
     /// The number of policies that survive unchanged.
     pub elites: usize,
+    /// The number of teams with the largest G that survive as teams.
+    pub team_elites: usize,
+    /// The number of further policies that survive because of their team's G.
+    pub team_g_elites: usize,
     /// The policies that may become parents.
     pub parents: Parents,
 }
@@ -72,7 +76,8 @@ pub struct Selection {
 impl Selection {
     /// Returns the selection that a config asks for.
     pub fn of(learning: &Learning) -> Selection {
-        Selection { elites: learning.elites.count(learning.population), parents: learning.parents }
+        let Learning { population, elites, team_elites, team_g_elites, parents, .. } = *learning;
+        Selection { elites: elites.count(population), team_elites, team_g_elites, parents }
     }
 
     /// Returns the elites, best first, or without any the champion.
@@ -145,6 +150,19 @@ pub fn draw_parents(
     if let Some(oldest) = generation.checked_rem(parents.len() - first) {
         parents[first + oldest] = champion;
     }
+}
+
+/// Keeps the policies of the best teams in a plan of [`draw_parents`], in the slots after the elites': first those of the
+/// teams that survive, then further ones by their team's G. `ranks` are minus the rank of each policy's team by G,
+/// `[policies]`.
+pub fn keep_teams(selection: Selection, ranks: &[f32], parents: &mut [u32]) {
+    let Selection { elites, team_elites, team_g_elites, .. } = selection;
+    let best = top_indices(ranks, elites + team_elites + team_g_elites);
+    let best = best.into_iter().map(|policy| policy as u32 | UNCHANGED);
+    let (elites, others) = parents.split_at_mut(elites);
+    let further = best.clone().skip(team_elites).filter(|policy| !elites.contains(policy));
+    let kept = best.take(team_elites).chain(further.take(team_g_elites));
+    others.iter_mut().zip(kept).for_each(|(parent, policy)| *parent = policy);
 }
 
 /// Plans the end of the last generation: every policy stays, and the champion gets its slot. Arguments are those of

@@ -30,6 +30,8 @@ pub struct Trained {
     pub mean_g: Vec<f64>,
     /// G of the champion, the team of every population's best policy: `[trials][generations + 1]`.
     pub champion_g: Vec<f64>,
+    /// Mean G of each generation's best team over the test episodes: `[trials][generations + 1]`, or empty without any.
+    pub test_g: Vec<f64>,
     /// The last generation's policies, best first in each population: `[trials]` of `[leaders][policies][parameters]`.
     pub policies: Vec<Vec<f32>>,
     /// State that a longer run continues from. `None` if the run was read from a folder without its last checkpoint.
@@ -44,6 +46,7 @@ impl Trained {
             best_g: vec![0.0; config.learning.trials * columns],
             mean_g: vec![0.0; config.learning.trials * columns],
             champion_g: vec![0.0; config.learning.trials * columns],
+            test_g: vec![0.0; if config.learning.test_episodes > 0 { config.learning.trials * columns } else { 0 }],
             config,
             policies,
             ending,
@@ -51,6 +54,9 @@ impl Trained {
         for row in rows {
             let at = row.trial * columns + row.generation;
             (trained.best_g[at], trained.mean_g[at], trained.champion_g[at]) = (row.best_g, row.mean_g, row.champion_g);
+            if let (Some(to), Some(test_g)) = (trained.test_g.get_mut(at), row.test_g) {
+                *to = test_g;
+            }
         }
         trained
     }
@@ -73,7 +79,8 @@ impl Trained {
             (0..trials).map(move |trial| {
                 let at = trial * (self.config.learning.generations + 1) + generation;
                 let (best_g, mean_g, champion_g) = (self.best_g[at], self.mean_g[at], self.champion_g[at]);
-                Row { experiment: 0, trial, generation, best_g, mean_g, champion_g }
+                let test_g = self.test_g.get(at).copied();
+                Row { experiment: 0, trial, generation, best_g, mean_g, champion_g, test_g }
             })
         });
         digest::hex(&digest::digest(rows, &self.policies))

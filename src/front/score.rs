@@ -31,12 +31,15 @@ pub struct Scored {
 /// `[teams][steps + 1][agents][2]`. They need not be on the map, and nothing is simulated.
 ///
 /// # Errors
-/// The config is invalid, has POIs that come after others, the number of positions is wrong, or one is not finite.
+/// The config is invalid, has POIs that come after others or are drawn from regions, the number of positions is wrong, or one is not finite.
 pub fn score(config: &Config, positions: &[f32]) -> Result<Scored, Failure> {
     let valid = config.validate()?;
     let world = World::scored_by_paths(&valid);
     if config.classes().pois.iter().any(|group| !group.after.is_empty()) {
         return Err(Failure::Paths("POIs that come after others cannot be scored from positions".into()));
+    }
+    if config.pois.iter().any(|group| group.region.is_some()) {
+        return Err(Failure::Paths("POIs in regions have no place to score positions by; give `at`".into()));
     }
     let size = world.path_words();
     if positions.is_empty() || !positions.len().is_multiple_of(size) {

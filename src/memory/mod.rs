@@ -49,18 +49,19 @@ impl StageBytes {
         let [trials, populations, policies] = sizes.map(|size| size as u64);
         let [leaders, teams, episodes] = [config.learners(), config.max_teams(), learning.episodes_per_team];
         let [leaders, teams, episodes] = [leaders, teams, episodes].map(|size| size as u64);
+        let tests = learning.test_episodes as u64;
         let (slots, parameters) = (learning.slots() as u64, config.parameters() as u64);
-        let moved = if learning.poi_jitter > 0.0 { world.pois.len() } else { 0 };
-        let starts = 4 * trials * episodes * 2 * (world.agents() + moved) as u64;
-        let schedules = 4 * trials * (populations * learning.teams() as u64 + leaders * teams) + starts;
+        let moved = if config.pois_move() { world.pois.len() } else { 0 };
+        let starts = 4 * trials * (episodes + tests) * 2 * (world.agents() + moved) as u64;
+        let schedules = 4 * trials * (populations * learning.team_count() as u64 + leaders * teams) + starts;
         // Fitness is summed in 64 bits if a policy plays in several teams.
         let is_summed = learning.partners > 1 || learning.hall_of_fame > 0;
         let words_of_trial = 2 * populations * slots * parameters // this generation and the next
-            + populations * (policies + slots) // fitness and parents
+            + config.fitness_len() as u64 + populations * slots // fitness and parents
             + episodes * teams * (1 + leaders) // POIs observed and scores
             + if is_summed { 2 * populations * policies } else { 0 }
-            + episodes * EPISODE_WORDS;
-        let played = trials * episodes * teams;
+            + (episodes + tests) * EPISODE_WORDS;
+        let played = trials * (episodes * teams).max(tests);
         let of_team = [
             backend::weight_bytes(&world),
             backend::record_bytes(&world, fitness),
@@ -203,8 +204,8 @@ pub fn copies_checkpoint<'a>(configs: impl IntoIterator<Item = &'a Config>) -> b
 /// Returns the bytes of the weights and scores in a [`Snapshot`](crate::trainer::Snapshot).
 pub(crate) fn snapshot_bytes(config: &Config) -> u64 {
     let (learning, populations) = (&config.learning, config.populations() as u64);
-    let numbers = learning.slots() as u64 * config.parameters() as u64 + learning.population as u64;
-    4 * learning.trials as u64 * populations * numbers
+    let weights = populations * learning.slots() as u64 * config.parameters() as u64;
+    4 * learning.trials as u64 * (weights + config.fitness_len() as u64)
 }
 
 /// Returns the bytes that a checkpoint copies.

@@ -58,8 +58,8 @@ impl Class {
     /// Computes the constants of all classes of a valid config. `values` are those of the POIs.
     pub(crate) fn all(described: &Classes, values: &[f32], map: [f64; 2], dt: f64) -> Vec<Class> {
         let classes = &described.agents;
-        let places = runs(classes.iter().map(|class| class.at.len()));
-        let groups = runs(described.pois.iter().map(|group| group.at.len()));
+        let places = runs(classes.iter().map(|class| class.size()));
+        let groups = runs(described.pois.iter().map(|group| group.size()));
         let end = places.last().map_or(0, |place| place.end);
         let of_class = |name: &str| {
             let index = classes.iter().position(|class| class.name == name);

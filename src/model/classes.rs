@@ -3,6 +3,7 @@
 use serde::{Serialize, Serializer};
 
 use super::motion::Mobility;
+use super::region::Region;
 use super::rule::Coupling;
 use crate::config_enum::config_enum;
 use crate::reader::{OneOrEach, table};
@@ -39,7 +40,15 @@ table! {
         /// the class's name: letters, digits, `_` and `-`
         name: String = "",
         /// start positions of its agents, which are numbered class by class
+        #[serde(skip_serializing_if = "Vec::is_empty")]
         at: Vec<[f64; 2]> = "units",
+        /// without `at`: how many agents start in the region `in`
+        #[serde(skip_serializing_if = "Option::is_none")]
+        count: Option<usize> = "agents",
+        /// without `at`: the region in which its agents start, drawn anew for every episode, the same for all teams of a
+        /// generation
+        #[serde(skip_serializing_if = "Option::is_none")]
+        region as "in": Option<Region> = "",
         /// headings at the start, from the x axis towards the y axis: one number for all its agents, or one per agent
         heading: OneOrEach<f64> = "rad",
         /// speed at the start
@@ -199,7 +208,14 @@ table! {
         /// the group's name: letters, digits, `_` and `-`
         name: String = "",
         /// positions of its POIs, which are numbered group by group
+        #[serde(skip_serializing_if = "Vec::is_empty")]
         at: Vec<[f64; 2]> = "units",
+        /// without `at`: how many POIs are in the region `in`
+        #[serde(skip_serializing_if = "Option::is_none")]
+        count: Option<usize> = "POIs",
+        /// without `at`: the region of its POIs, drawn anew for every episode, the same for all teams of a generation
+        #[serde(skip_serializing_if = "Option::is_none")]
+        region as "in": Option<Region> = "",
         /// weight of each POI in G
         value: f64 = "",
         /// agents that each POI needs at the same step; one number for all its POIs, or one per POI
@@ -251,36 +267,46 @@ fn one_or_list<S: Serializer>(names: &[String], serializer: S) -> Result<S::Ok, 
 }
 
 impl Classes {
-    /// Returns the start position of each agent in units, `[agents]`.
+    /// Returns the start position of each agent in units, `[agents]`: an example for those that start in regions.
     pub fn starts(&self) -> Vec<[f64; 2]> {
-        self.agents.iter().flat_map(|class| class.at.iter().copied()).collect()
+        examples(self.agents.iter().map(|class| (&class.at[..], class.size(), class.region)))
+    }
+
+    /// Returns the agents that start in regions.
+    pub fn start_regions(&self) -> Vec<(usize, Region)> {
+        regions(self.agents.iter().map(|class| (class.size(), class.region)))
     }
 
     /// Returns each agent's heading at the start in radians, `[agents]`.
     pub fn headings(&self) -> Vec<f64> {
-        self.agents.iter().flat_map(|class| class.heading.of_each(class.at.len())).collect()
+        self.agents.iter().flat_map(|class| class.heading.of_each(class.size())).collect()
     }
 
     /// Returns the index of each agent's class, `[agents]`.
     pub fn class_of_each(&self) -> Vec<usize> {
-        let of_class = |(index, class): (usize, &AgentClass)| vec![index; class.at.len()];
+        let of_class = |(index, class): (usize, &AgentClass)| vec![index; class.size()];
         self.agents.iter().enumerate().flat_map(of_class).collect()
     }
 
-    /// Returns the position of each POI in units, `[pois]`.
+    /// Returns the position of each POI in units, `[pois]`: an example for those in regions.
     pub fn places(&self) -> Vec<[f64; 2]> {
-        self.pois.iter().flat_map(|group| group.at.iter().copied()).collect()
+        examples(self.pois.iter().map(|group| (&group.at[..], group.size(), group.region)))
+    }
+
+    /// Returns the POIs that are in regions.
+    pub fn poi_regions(&self) -> Vec<(usize, Region)> {
+        regions(self.pois.iter().map(|group| (group.size(), group.region)))
     }
 
     /// Returns the index of each POI's group, `[pois]`.
     pub fn group_of_each(&self) -> Vec<usize> {
-        let of_group = |(index, group): (usize, &PoiGroup)| vec![index; group.at.len()];
+        let of_group = |(index, group): (usize, &PoiGroup)| vec![index; group.size()];
         self.pois.iter().enumerate().flat_map(of_group).collect()
     }
 
     /// Returns the number of agents that each POI needs, `[pois]`.
     pub fn couplings(&self) -> Vec<u32> {
-        self.pois.iter().flat_map(|group| group.coupling.of_each(group.at.len())).map(|count| count as u32).collect()
+        self.pois.iter().flat_map(|group| group.coupling.of_each(group.size())).map(|count| count as u32).collect()
     }
 
     /// Returns the first and the last step of each POI, `[pois]`, in episodes of so many steps. Empty without windows.
@@ -289,7 +315,7 @@ impl Classes {
             return vec![];
         }
         let of_group = |group: &PoiGroup| match group.windows.is_empty() {
-            true => vec![[1, steps]; group.at.len()],
+            true => vec![[1, steps]; group.size()],
             false => group.windows.clone(),
         };
         self.pois.iter().flat_map(of_group).collect()
@@ -306,7 +332,7 @@ impl Classes {
             groups.iter().enumerate().filter(is_before).map(|(poi, _)| poi).collect::<Vec<_>>()
         };
         let before = |group: &PoiGroup| group.after.iter().flat_map(of_name).collect::<Vec<_>>();
-        self.pois.iter().flat_map(|group| vec![before(group); group.at.len()]).collect()
+        self.pois.iter().flat_map(|group| vec![before(group); group.size()]).collect()
     }
 
     /// Reports whether the agents of a class count at a group's POIs.
@@ -323,7 +349,37 @@ impl Classes {
     }
 }
 
+/// Returns positions, or examples of those in regions.
+fn examples<'a>(tables: impl Iterator<Item = (&'a [[f64; 2]], usize, Option<Region>)>) -> Vec<[f64; 2]> {
+    let mut places = Vec::new();
+    for (at, count, region) in tables {
+        match region {
+            Some(region) => places.extend((places.len()..).take(count).map(|index| region.example(index))),
+            None => places.extend(at),
+        }
+    }
+    places
+}
+
+/// Returns the regions of those that are in one, with their indices.
+fn regions(tables: impl Iterator<Item = (usize, Option<Region>)>) -> Vec<(usize, Region)> {
+    let of_each = tables.flat_map(|(count, region)| std::iter::repeat_n(region, count));
+    of_each.enumerate().filter_map(|(index, region)| Some((index, region?))).collect()
+}
+
+impl PoiGroup {
+    /// Returns the number of its POIs.
+    pub fn size(&self) -> usize {
+        self.count.unwrap_or(self.at.len())
+    }
+}
+
 impl AgentClass {
+    /// Returns the number of its agents.
+    pub fn size(&self) -> usize {
+        self.count.unwrap_or(self.at.len())
+    }
+
     /// Reports whether its agents learn.
     pub fn learns(&self) -> bool {
         self.control == Control::Policy
@@ -347,7 +403,7 @@ impl Channel {
     /// Reports whether an agent of a class can never sense anything with this channel.
     pub(crate) fn is_blind(&self, class: &AgentClass, classes: &Classes) -> bool {
         let sensed = |other: &&AgentClass| self.of.contains(&other.name) || self.of == [AGENTS];
-        let others = || classes.agents.iter().filter(sensed).map(|other| other.at.len() - usize::from(other == class));
+        let others = || classes.agents.iter().filter(sensed).map(|other| other.size() - usize::from(other == class));
         self.range == 0.0 || self.of != [POIS] && others().sum::<usize>() == 0
     }
 }

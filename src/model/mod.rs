@@ -15,6 +15,7 @@ pub(crate) mod couple;
 pub(crate) mod follow;
 pub(crate) mod motion;
 pub mod policy;
+pub mod region;
 pub mod rule;
 pub mod sense;
 pub mod start;

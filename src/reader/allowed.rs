@@ -10,7 +10,7 @@ use super::value::{Kind, Value};
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Allowed<T> {
     low: T,
-    pub(super) high: T,
+    pub(crate) high: T,
     zero: bool,
     unlimited: bool,
     /// The open interval in which only 0 is allowed, if any.

@@ -288,13 +288,15 @@ macro_rules! section {
             }
         }
     };
-    (@key $section:tt, $field:ident { $($words:tt)+ }) => {};
-    (@key $section:tt, $field:ident { $($words:tt)+ } $unit:tt, $paper:tt) => {
+    (@key $section:tt, $field:ident $(as $key:literal)? { $($words:tt)+ }) => {};
+    (@key $section:tt, $field:ident $(as $key:literal)? { $($words:tt)+ } $unit:tt, $paper:tt) => {
         pub(crate) fn $field<'r, 'a>(r: &'r mut $crate::reader::Reader<'a>) -> $crate::reader::KeyRequest<'r, 'a> {
             let meaning = const { concat!($($words)+).trim_ascii() };
-            r.key(concat!($section, ".", stringify!($field)), $unit, meaning, $paper)
+            r.key(concat!($section, ".", $crate::reader::section!(@leaf $field $($key)?)), $unit, meaning, $paper)
         }
     };
+    (@leaf $field:ident) => { stringify!($field) };
+    (@leaf $field:ident $key:literal) => { $key };
     (@source "", "") => { "" };
     (@source $unit:tt, "") => { concat!(", in ", $unit) };
     (@source "", $paper:tt) => { concat!("; Section ", $paper) };
@@ -318,26 +320,31 @@ pub(crate) trait Section {
 }
 
 /// Declares a table in a list or in another table, as [`section!`] declares a section. Its keys are requested within
-/// [`KeyRequest::tables`] and the like.
+/// [`KeyRequest::tables`] and the like. A field may have another name than its key, `field as "key"`.
 macro_rules! table {
     ($(#[$($about:tt)*])* $name:ident = $table:literal {
-        $($(#[doc = $words:literal])+ $(#[serde($($serde:tt)+)])? $field:ident: $type:ty $(= $unit:tt)?,)+
+        $(
+            $(#[doc = $words:literal])+
+            $(#[serde($($serde:tt)+)])?
+            $field:ident $(as $key:literal)?: $type:ty = $unit:tt,
+        )+
     }) => {
         $(#[$($about)*])*
         #[derive(Clone, Debug, PartialEq, serde::Serialize)]
         pub struct $name {
             $(
                 $(#[doc = $words])+
-                $(#[doc = concat!("\n\n`", $table, ".", stringify!($field), "`", $crate::reader::section!(@source $unit, ""), ".")])?
+                #[doc = concat!("\n\n`", $table, ".", $crate::reader::section!(@leaf $field $($key)?), "`", $crate::reader::section!(@source $unit, ""), ".")]
                 $(#[serde($($serde)+)])?
+                $(#[serde(rename = $key)])?
                 pub $field: $type,
             )+
         }
 
         impl $name {
             /// The keys, in order.
-            pub(crate) const KEYS: &[&str] = &[$(stringify!($field)),+];
-            $($crate::reader::section! { @key $table, $field { $($words),+ } $($unit, "")? })+
+            pub(crate) const KEYS: &[&str] = &[$($crate::reader::section!(@leaf $field $($key)?)),+];
+            $($crate::reader::section! { @key $table, $field $(as $key)? { $($words),+ } $unit, "" })+
         }
     };
 }
@@ -559,6 +566,14 @@ impl<'a> Reader<'a> {
         if self.hints > MAX_HINTS { String::new() } else { hint(name, known, in_table) }
     }
 
+    /// Reports a problem with the table whose keys are requested.
+    pub(crate) fn report_table(&mut self, message: String) {
+        if let Some(Scope { name, place }) = &self.scope {
+            let (name, place) = (name.clone(), *place);
+            self.report(place, &name, message);
+        }
+    }
+
     /// Returns the number of problems found so far.
     pub(crate) fn error_count(&self) -> usize {
         self.problems.len()
@@ -619,9 +634,9 @@ impl<'a> Reader<'a> {
         }
     }
 
-    fn two(&mut self, entry: Entry<'a>, allowed: [Allowed<f64>; 2]) -> [f64; 2] {
+    fn tuple<const N: usize>(&mut self, entry: Entry<'a>, allowed: [Allowed<f64>; N]) -> [f64; N] {
         let most = allowed.map(|side| side.high);
-        let Some(items) = self.items(entry, 2..=2, "numbers") else { return most };
+        let Some(items) = self.items(entry, N..=N, "numbers") else { return most };
         let mut values = most;
         for ((value, item), side) in values.iter_mut().zip(&items).zip(allowed) {
             *value = self.check(item, side);

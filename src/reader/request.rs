@@ -168,6 +168,21 @@ impl<'a> KeyRequest<'_, 'a> {
         self.reader.within([self.name, table], Some(entry), read)
     }
 
+    /// Returns what `read` makes of a table, or `None` without the key. `table` is the section of its keys.
+    pub fn optional_table<T>(
+        mut self,
+        table: &'static str,
+        range: &str,
+        read: impl FnOnce(&mut Reader<'a>) -> T,
+    ) -> Option<T> {
+        let entry = self.take(|| ("table".into(), range.into(), Some("none".into())));
+        if entry.is_none() && self.reader.keys.is_none() {
+            return None;
+        }
+        let is_there = entry.is_some();
+        self.reader.within([self.name, table], entry, read).filter(|_| is_there)
+    }
+
     /// Returns a count, or a percentage of the number that bounds it, written as a word such as `"10%"`.
     pub fn count_or_percentage(mut self, allowed: Allowed<usize>, default: usize) -> CountOrPercentage {
         const PERCENTAGES: &str = "above \"0%\", up to \"100%\"";
@@ -220,7 +235,14 @@ impl<'a> KeyRequest<'_, 'a> {
     pub fn pair(mut self, allowed: Allowed<f64>, default: [f64; 2]) -> [f64; 2] {
         let about = || ("two numbers".into(), format!("each {}", allowed.in_general()), Some(written(&default)));
         let Some(entry) = self.take(about) else { return default };
-        self.reader.two(entry, [allowed; 2])
+        self.reader.tuple(entry, [allowed; 2])
+    }
+
+    /// Returns some numbers, or `None` without the key. `what` names them.
+    pub fn optional_tuple<const N: usize>(mut self, what: &str, allowed: [Allowed<f64>; N]) -> Option<[f64; N]> {
+        let ranges = || allowed.map(|side| side.in_general()).join(", ");
+        let entry = self.take(|| (format!("list of {what}"), ranges(), Some("none".into())))?;
+        Some(self.reader.tuple(entry, allowed))
     }
 
     /// Returns positions within these sides, or `None` if the required key is missing or not such a list.
@@ -241,7 +263,7 @@ impl<'a> KeyRequest<'_, 'a> {
             return default;
         };
         let items = self.reader.items(entry, counts, WHAT)?;
-        Some(items.into_iter().map(|item| self.reader.two(item, sides)).collect())
+        Some(items.into_iter().map(|item| self.reader.tuple(item, sides)).collect())
     }
 
     /// Returns a list of numbers, or the default without the key.

@@ -5,11 +5,11 @@ use std::ops::Range;
 use fearless_simd::Level;
 
 use super::residency::Residency;
-use super::schedule::TeamSchedule;
+use super::schedule::{Draw, TeamSchedule};
 use super::stages::{Stage, Stages};
 use super::{Row, Snapshot};
 use crate::backend::GroupScores;
-use crate::config::{Learning, ValidConfig};
+use crate::config::{Learning, Teams, ValidConfig};
 use crate::evolve::{self, Key, Purpose};
 use crate::host;
 use crate::parallel::*;
@@ -41,7 +41,10 @@ pub(super) struct TrialState {
     pub scores: Vec<GroupScores>,
     /// The scores of the champion's team if it played in the previous stage, `[episodes]`; else empty.
     pub previous_stage_scores: Vec<GroupScores>,
-    /// The mean score of every policy, `[populations][policies]`.
+    /// The scores of the episodes that tested the generation's best team, `[episodes]`.
+    pub test_scores: Vec<GroupScores>,
+    /// The mean score of every policy, `[populations][policies]`. If teams are kept, minus the rank of every policy's team
+    /// follows, see [`Config::fitness_len`](crate::config::Config::fitness_len).
     pub fitness: Vec<f32>,
     /// The plan of the next generation, see [`evolve::draw_parents`], `[populations][slots]`.
     pub parents: Vec<u32>,
@@ -81,7 +84,7 @@ impl ExperimentState {
     /// Teams of a trial in the generation of the populations, without the champion's.
     pub fn teams(&self) -> usize {
         let config = &self.stage().config;
-        config.learning.teams() + config.hall_teams(self.residency.generation())
+        config.learning.team_count() + config.hall_teams(self.residency.generation())
     }
 
     /// Numbers in the policies of one trial, without the champions' slots.
@@ -98,18 +101,19 @@ impl ExperimentState {
         }
         let ExperimentState { stages, schedules, trials, .. } = self;
         let pairs = schedules.par_iter_mut().zip(trials);
-        pairs.for_each(|(schedule, trial)| schedule.draw(level, stages, trial.index, generation));
+        pairs.for_each(|(schedule, trial)| trial.draw(level, stages, generation, schedule));
     }
 
-    /// Draws the next generation's schedules. Those of the generation that plays stay.
+    /// Draws the next generation's schedules, unless they depend on the results of the generation that plays. Its
+    /// schedules stay.
     pub fn prepare_next(&self, level: Level, next: &mut Vec<TeamSchedule>) {
-        if self.only_champions_left() {
+        let generation = self.residency.generation() + 1;
+        if self.only_champions_left() || self.stages.of(generation).config.learning.teams != Teams::Random {
             return;
         }
         next.resize_with(self.trials.len(), TeamSchedule::new);
-        let generation = self.residency.generation() + 1;
         let pairs = next.par_iter_mut().zip(&self.trials);
-        pairs.for_each(|(schedule, trial)| schedule.draw(level, &self.stages, trial.index, generation));
+        pairs.for_each(|(schedule, trial)| trial.draw(level, &self.stages, generation, schedule));
     }
 
     /// Returns the experiment's state as far as the host has it.
@@ -140,6 +144,13 @@ impl ExperimentState {
             (trial.weights, trial.fitness) = (weights, fitness);
             trial.pending = pending.map(|row| Row { experiment: index, ..row });
         }
+        // Schedules may depend on the results and the plan of the generation before.
+        self.schedules.fill_with(TeamSchedule::new);
+        self.next_schedules.clear();
+        if let Some(before) = generation.checked_sub(1).filter(|&before| before < self.last()) {
+            self.residency = Residency::on_host(before);
+            self.plan(level);
+        }
         self.residency = Residency::on_host(generation.min(self.last() + 2));
         if generation > last && last < self.last() {
             // The shorter run kept its last policies. This run breeds a next generation from them. The shorter run's
@@ -152,6 +163,17 @@ impl ExperimentState {
 }
 
 impl TrialState {
+    /// Draws the schedule of a generation, which is planned if its teams depend on the plan.
+    fn draw(&self, level: Level, stages: &Stages, generation: usize, schedule: &mut TeamSchedule) {
+        let config = &stages.of(generation).config;
+        let (slots, policies) = (config.learning.slots(), config.learning.population);
+        let fitness = |population: usize, slot: usize| {
+            let parent = self.parents[population * slots + slot] & !evolve::UNCHANGED;
+            if generation == 0 { 0.0 } else { self.fitness[population * policies + parent as usize] }
+        };
+        schedule.draw(level, stages, Draw { trial: self.index, generation }, fitness);
+    }
+
     /// Returns a trial with random policies.
     fn new(stages: &Stages, index: usize, level: Level) -> TrialState {
         let Stage { config, world, .. } = stages.of(0);
@@ -161,11 +183,11 @@ impl TrialState {
         let key = Key::new(seed, index, Purpose::Weights);
         let mut weights = host::zeros(populations * stride);
         weights.par_chunks_exact_mut(stride).enumerate().for_each(|(leader, policies)| {
-            policies[..population * parameters]
-                .par_chunks_exact_mut(parameters)
-                .with_min_len(64)
-                .enumerate()
-                .for_each(|(slot, policy)| evolve::random_policy(level, key.at(0, leader, slot), policy));
+            policies[..population * parameters].par_chunks_exact_mut(parameters).with_min_len(64).enumerate().for_each(
+                |(slot, policy)| {
+                    evolve::initial_policy(level, key.at(0, leader, slot), &config.learning, policy);
+                },
+            );
         });
         TrialState {
             index,
@@ -173,7 +195,8 @@ impl TrialState {
             weights,
             scores: vec![],
             previous_stage_scores: vec![],
-            fitness: vec![0.0; populations * population],
+            test_scores: vec![],
+            fitness: vec![0.0; config.fitness_len()],
             parents: vec![0; populations * config.learning.slots()],
             pending: None,
         }

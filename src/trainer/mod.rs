@@ -39,6 +39,7 @@ pub use ask_tell::Candidates;
 
 use experiment::ExperimentState;
 use schedule::TeamSchedule;
+use stages::Stage;
 
 /// Trains any number of experiments side by side. Each is at a generation of its own.
 pub struct Trainer {
@@ -64,6 +65,8 @@ pub struct Row {
     pub mean_g: f64,
     /// G of the team of every population's best policy.
     pub champion_g: f64,
+    /// Mean G of the best team over the config's test episodes, if there are any.
+    pub test_g: Option<f64>,
 }
 
 /// The state that an experiment resumes from: the populations about to play, and each trial's unfinished row.
@@ -79,7 +82,7 @@ pub struct Snapshot<N = Vec<f32>> {
     /// [`Config::populations`](crate::config::Config::populations) and
     /// [`Learning::slots`](crate::config::Learning::slots).
     pub weights: Vec<N>,
-    /// A trial's scores of the previous generation, `[populations][policies]`.
+    /// A trial's scores of the previous generation, see [`Config::fitness_len`](crate::config::Config::fitness_len).
     pub fitness: Vec<N>,
     /// A trial's row of the previous generation.
     pub pending: Vec<Option<Row>>,
@@ -91,7 +94,7 @@ pub struct Ending {
     /// A trial's weights after the last generation, as in [`Snapshot`]. Empty if the policies and their fitness are
     /// enough, see [`Learning::extends_from_policies`](crate::config::Learning::extends_from_policies).
     pub weights: Vec<Vec<f32>>,
-    /// A trial's scores of the last generation, `[populations][policies]`.
+    /// A trial's scores of the last generation, see [`Config::fitness_len`](crate::config::Config::fitness_len).
     pub fitness: Vec<Vec<f32>>,
 }
 
@@ -228,6 +231,7 @@ impl Trainer {
             playing.par_iter_mut().for_each(|(_, experiment)| experiment.prepare(level));
             let prepared = Instant::now();
             play_and_draw_next(&mut playing, level, backend)?;
+            results::test(backend, &mut playing)?;
             let mut over = playing.iter_mut().filter(|(_, experiment)| experiment.only_champions_left());
             over.try_for_each(|(_, experiment)| experiment.fetch())?;
             self.times.prepare += prepared - start;
@@ -308,6 +312,14 @@ impl Trainer {
         let experiment = &mut self.experiments[experiment];
         experiment.fetch()?;
         Ok(&experiment.trials[trial].weights)
+    }
+
+    /// Returns the policy of each leader in the teams of contemporaries that a trial plays next, `[teams][leaders]`.
+    pub fn teams(&mut self, experiment: usize, trial: usize) -> &[u32] {
+        let experiment = &mut self.experiments[experiment];
+        experiment.prepare(self.level);
+        let Stage { config, world, .. } = experiment.stages.of(experiment.residency.generation());
+        &experiment.schedules[trial].teams[..config.learning.team_count() * world.leaders()]
     }
 
     /// Returns the world that an experiment's next generation plays in.

@@ -86,18 +86,25 @@ impl ExperimentState {
     }
 
     /// Plans the next generation of all populations. After the last generation, every policy is kept.
-    fn plan(&mut self, level: Level) {
+    pub fn plan(&mut self, level: Level) {
         let (generation, last) = (self.residency.generation(), self.last());
         let ExperimentState { stages, trials, .. } = self;
-        let learning = &stages.of(generation).config.learning;
+        let config = &stages.of(generation).config;
+        let (learning, scores) = (&config.learning, config.populations() * config.learning.population);
         trials.par_iter_mut().for_each(|trial| {
             let key = Key::new(learning.seed, trial.index, Purpose::Tournament);
+            let (fitness, ranks) = trial.fitness.split_at(scores);
             let plans = trial.parents.par_chunks_exact_mut(learning.slots());
-            let plans = plans.zip(trial.fitness.par_chunks_exact(learning.population)).enumerate();
+            let plans = plans.zip(fitness.par_chunks_exact(learning.population)).enumerate();
             let selection = Selection::of(learning);
             plans.for_each(|(population, (parents, fitness))| match generation == last {
                 true => evolve::keep_parents(key, generation, population, selection, fitness, parents),
-                false => evolve::draw_parents(level, key, generation, population, selection, fitness, parents),
+                false => {
+                    evolve::draw_parents(level, key, generation, population, selection, fitness, parents);
+                    if let Some(ranks) = ranks.chunks_exact(learning.population).nth(population) {
+                        evolve::keep_teams(selection, ranks, parents);
+                    }
+                }
             });
         });
     }

@@ -1,5 +1,6 @@
 //! The results of a generation: plays it, scores it, and turns scores into rows and fitness.
 
+use std::cmp::Reverse;
 use std::ops::Range;
 
 use glam::Vec2;
@@ -9,7 +10,7 @@ use super::experiment::{ExperimentState, TrialState};
 use super::schedule::{MIN_POLICIES_PER_TASK, TeamSchedule, min_populations_per_task};
 use super::stages::Stage;
 use crate::backend::{Backend, BackendError, Group, GroupScores, Weights};
-use crate::config::{Learning, Leniency};
+use crate::config::{Fitness, Learning, Leniency};
 use crate::parallel::*;
 
 /// Teams per rayon task when their G is added up.
@@ -29,17 +30,9 @@ pub(super) fn play<'a>(
         let on_device = experiment.residency.on_device();
         for (index, (trial, schedule)) in experiment.trials.iter().zip(&experiment.schedules).enumerate() {
             let weights = on_device.get(index).map_or(trial.weights[..].into(), |held| Weights::OnDevice(&**held));
-            let mut add = |stage: &'a Stage, starts: &'a [Vec<Vec2>], range: Range<usize>| {
-                let learning = &stage.config.learning;
-                groups.extend(starts.iter().map(|starts| Group {
-                    world: &stage.world,
-                    starts,
-                    weights,
-                    policies: learning.slots(),
-                    populations: &stage.world.populations,
-                    teams: &schedule.teams[range.start * leaders..range.end * leaders],
-                    fitnesses: &stage.fitnesses,
-                }));
+            let mut add = |stage: &'a Stage, starts, range: Range<usize>| {
+                let teams = &schedule.teams[range.start * leaders..range.end * leaders];
+                groups.extend(episodes(stage, starts, weights, teams, &stage.fitnesses));
             };
             // Champions play in the stage that they come from.
             let end = if previous.is_some() { teams } else { range.end };
@@ -50,6 +43,54 @@ pub(super) fn play<'a>(
         }
     }
     backend.play(&groups)
+}
+
+/// Returns the group of each episode of some teams.
+fn episodes<'a>(
+    stage: &'a Stage,
+    starts: &'a [Vec<Vec2>],
+    weights: Weights<'a>,
+    teams: &'a [u32],
+    fitnesses: &'a [Fitness],
+) -> impl Iterator<Item = Group<'a>> {
+    let (world, policies) = (&stage.world, stage.config.learning.slots());
+    let populations = &world.populations;
+    starts.iter().map(move |starts| Group { world, starts, weights, policies, populations, teams, fitnesses })
+}
+
+/// Plays the episodes that test the best team of each trial, if the config has any. The scores of the generation are
+/// kept already.
+///
+/// # Errors
+/// The backend failed.
+pub(super) fn test(
+    backend: &mut dyn Backend,
+    experiments: &mut [(usize, &mut ExperimentState)],
+) -> Result<(), BackendError> {
+    let mut groups = Vec::new();
+    for (_, experiment) in experiments.iter().filter(|(_, experiment)| !experiment.only_champions_left()) {
+        let (stage, on_device) = (experiment.stage(), experiment.residency.on_device());
+        let (teams, leaders) = (stage.config.learning.team_count(), stage.world.leaders());
+        for (index, (trial, schedule)) in experiment.trials.iter().zip(&experiment.schedules).enumerate() {
+            if !schedule.test_starts.is_empty() {
+                let weights = on_device.get(index).map_or(trial.weights[..].into(), |held| Weights::OnDevice(&**held));
+                let sums = (0..teams).map(|team| observed(&trial.scores, team));
+                let best = sums.enumerate().max_by_key(|&(team, sum)| (sum, Reverse(team))).map_or(0, |(team, _)| team);
+                let best = &schedule.teams[best * leaders..(best + 1) * leaders];
+                groups.extend(episodes(stage, &schedule.test_starts, weights, best, &[]));
+            }
+        }
+    }
+    if groups.is_empty() {
+        return Ok(());
+    }
+    let mut scores = backend.play(&groups)?.into_iter();
+    for (_, experiment) in experiments.iter_mut().filter(|(_, experiment)| !experiment.only_champions_left()) {
+        for (trial, schedule) in experiment.trials.iter_mut().zip(&experiment.schedules) {
+            trial.test_scores = scores.by_ref().take(schedule.test_starts.len()).collect();
+        }
+    }
+    Ok(())
 }
 
 /// Gives each trial its scores, in the order in which [`play`] plays.
@@ -79,20 +120,30 @@ impl ExperimentState {
         let ExperimentState { stages, trials, schedules, .. } = self;
         let stage = stages.of(generation);
         let Stage { config, world, .. } = stage;
-        let (teams, hall) = (config.learning.teams(), config.hall_teams(generation) > 0);
+        let (teams, hall) = (config.learning.team_count(), config.hall_teams(generation) > 0);
         let total_before = stages.ending_before(generation).map_or(world.total_worth, |stage| stage.world.total_worth);
         let mut rows = Vec::with_capacity(trials.len());
         for (number, (trial, schedule)) in trials.iter_mut().zip(schedules).enumerate() {
             // Teams with past champions are not among the k·m teams whose best and mean count.
             let [best_g, mean_g] = team_g(&trial.scores, world.total_worth, teams);
             rows.extend(trial.pending.map(|row| Row { champion_g: trial.champion_g(total_before), ..row }));
-            trial.pending =
-                Some(Row { experiment: index, trial: trial.index, generation, best_g, mean_g, champion_g: 0.0 });
+            let test_g = (!trial.test_scores.is_empty()).then(|| last_g(&trial.test_scores, world.total_worth));
+            trial.pending = Some(Row {
+                experiment: index,
+                trial: trial.index,
+                generation,
+                best_g,
+                mean_g,
+                champion_g: 0.0,
+                test_g,
+            });
             let score = |team: usize, leader: usize| match given_scores {
                 Some(given_scores) => given_scores[number * size + team * world.leaders() + leader],
                 None => stage.mean_score(&trial.scores, (team, leader)),
             };
-            assign_fitness(score, schedule, &world.populations, hall, &config.learning, &mut trial.fitness);
+            let (fitness, ranks) = trial.fitness.split_at_mut(config.populations() * config.learning.population);
+            assign_fitness(score, schedule, &world.populations, hall, &config.learning, fitness);
+            rank_teams(&trial.scores, schedule, &world.populations, config.learning.population, ranks);
             trial.forget_scores();
         }
         rows
@@ -116,25 +167,50 @@ impl ExperimentState {
 impl TrialState {
     /// Returns G of the champion's team, the last of those that played. `total` is what all POIs are worth.
     fn champion_g(&self, total: u32) -> f64 {
-        let of_stage = if self.previous_stage_scores.is_empty() { &self.scores } else { &self.previous_stage_scores };
-        let observed = |episode: &GroupScores| u64::from(episode.observed.last().copied().unwrap_or(0));
-        of_stage.iter().map(observed).sum::<u64>() as f64 / (total as usize * of_stage.len()) as f64
+        last_g(if self.previous_stage_scores.is_empty() { &self.scores } else { &self.previous_stage_scores }, total)
     }
 
     /// Frees the memory of scores that were used.
     fn forget_scores(&mut self) {
-        (self.scores, self.previous_stage_scores) = (vec![], vec![]);
+        (self.scores, self.previous_stage_scores, self.test_scores) = (vec![], vec![], vec![]);
+    }
+}
+
+/// Returns G of the last team of some episodes. `total` is what all POIs are worth.
+fn last_g(episodes: &[GroupScores], total: u32) -> f64 {
+    let observed = |episode: &GroupScores| u64::from(episode.observed.last().copied().unwrap_or(0));
+    episodes.iter().map(observed).sum::<u64>() as f64 / (total as usize * episodes.len()) as f64
+}
+
+/// Returns what the POIs that a team observed in some episodes are worth.
+fn observed(episodes: &[GroupScores], team: usize) -> u64 {
+    episodes.iter().map(|episode| u64::from(episode.observed[team])).sum()
+}
+
+/// Writes minus the rank of each policy's team by G, `[populations][policies]`, unless `ranks` is empty. Ties go to the
+/// lower index, so that teams that were kept stay.
+fn rank_teams(episodes: &[GroupScores], schedule: &TeamSchedule, populations: &[u32], teams: usize, ranks: &mut [f32]) {
+    if ranks.is_empty() {
+        return;
+    }
+    let sums: Vec<u64> = (0..teams).map(|team| observed(episodes, team)).collect();
+    let mut order: Vec<usize> = (0..teams).collect();
+    order.sort_by_key(|&team| Reverse(sums[team]));
+    for (rank, team) in order.into_iter().enumerate() {
+        let policies = &schedule.teams[team * populations.len()..][..populations.len()];
+        for (&policy, &population) in policies.iter().zip(populations) {
+            ranks[population as usize * teams + policy as usize] = 0.0 - rank as f32;
+        }
     }
 }
 
 /// Returns G of the best team, and the mean over teams. `episodes` are the scores of each episode, and `worth` is what all
 /// POIs are worth.
 fn team_g(episodes: &[GroupScores], worth: u32, teams: usize) -> [f64; 2] {
-    let observed = |team: usize| episodes.iter().map(|episode| u64::from(episode.observed[team])).sum();
     let fold = |all: (u64, u64), (best, total)| (all.0.max(best), all.1 + total);
     let chunk = |first: usize| {
         let teams = first..teams.min(first + TEAMS_TOGETHER);
-        teams.map(observed).map(|g: u64| (g, g)).fold((0, 0), fold)
+        teams.map(|team| observed(episodes, team)).map(|g| (g, g)).fold((0, 0), fold)
     };
     let chunks: Vec<_> =
         (0..teams.div_ceil(TEAMS_TOGETHER)).into_par_iter().map(|index| chunk(index * TEAMS_TOGETHER)).collect();

@@ -1,13 +1,14 @@
 //! Team schedules: who plays with whom in one generation, and from where.
 //!
-//! A schedule depends on counters only, never on results, so the next one can be drawn while the present one plays.
+//! Unless teams are formed by fitness, a schedule depends on counters only, so that the next one can be drawn while the
+//! present one plays.
 
 use fearless_simd::Level;
 use glam::Vec2;
 
 use super::stages::{Stage, Stages};
-use crate::config::{Learning, population_count};
-use crate::evolve;
+use crate::config::population_count;
+use crate::evolve::{self, Episodes};
 use crate::parallel::*;
 
 /// Minimum number of policies per rayon task for cheap work. Fewer are finished before another thread wakes up.
@@ -32,12 +33,28 @@ pub(super) struct TeamSchedule {
     pub starts: Vec<Vec<Vec2>>,
     /// The same for the champions of the previous stage. Empty unless a stage ends just before this generation.
     pub previous_stage_starts: Vec<Vec<Vec2>>,
+    /// The same for the episodes that test the best team.
+    pub test_starts: Vec<Vec<Vec2>>,
+}
+
+/// The generation of a trial that a schedule is drawn for.
+#[derive(Clone, Copy)]
+pub(super) struct Draw {
+    pub trial: usize,
+    pub generation: usize,
 }
 
 impl TeamSchedule {
     /// Returns a schedule that is yet to be drawn.
     pub fn new() -> TeamSchedule {
-        TeamSchedule { drawn_for: None, orders: vec![], teams: vec![], starts: vec![], previous_stage_starts: vec![] }
+        TeamSchedule {
+            drawn_for: None,
+            orders: vec![],
+            teams: vec![],
+            starts: vec![],
+            previous_stage_starts: vec![],
+            test_starts: vec![],
+        }
     }
 
     /// Reports whether this is the schedule of a generation.
@@ -45,25 +62,42 @@ impl TeamSchedule {
         self.drawn_for == Some((generation, stages.index_of(generation)))
     }
 
-    /// Draws the schedule of a trial's generation, unless it is that already.
-    pub fn draw(&mut self, level: Level, stages: &Stages, trial: usize, generation: usize) {
+    /// Draws the schedule of a trial's generation, unless it is that already. `fitness` returns the score in the generation
+    /// before of a population's policy in a slot, or of its parent.
+    pub fn draw(&mut self, level: Level, stages: &Stages, draw: Draw, fitness: impl Fn(usize, usize) -> f32 + Sync) {
+        let Draw { trial, generation } = draw;
         if self.is_of(generation, stages) {
             return;
         }
         self.drawn_for = Some((generation, stages.index_of(generation)));
         let stage = stages.of(generation);
-        self.form_teams(level, &stage.config.learning, &stage.world.populations, trial, generation);
-        draw_starts(stage, trial, generation, &mut self.starts);
+        self.form_teams(level, stage, draw, fitness);
+        let draw_starts = |stage: &Stage, episodes: Episodes, all: &mut Vec<Vec<Vec2>>| {
+            let (learning, world) = (&stage.config.learning, &stage.world);
+            let count = match episodes {
+                Episodes::Training => learning.episodes_per_team,
+                Episodes::Test => learning.test_episodes,
+            };
+            all.resize(count, vec![]);
+            for (episode, starts) in all.iter_mut().enumerate() {
+                evolve::episode_positions(learning, trial, generation, (episodes, episode), world, starts);
+            }
+        };
+        draw_starts(stage, Episodes::Training, &mut self.starts);
+        draw_starts(stage, Episodes::Test, &mut self.test_starts);
         match stages.ending_before(generation) {
-            Some(stage) => draw_starts(stage, trial, generation, &mut self.previous_stage_starts),
+            Some(stage) => draw_starts(stage, Episodes::Training, &mut self.previous_stage_starts),
             None => self.previous_stage_starts.clear(),
         }
     }
 
     /// Writes `teams`.
-    fn form_teams(&mut self, level: Level, learning: &Learning, populations: &[u32], trial: usize, generation: usize) {
+    fn form_teams(&mut self, level: Level, stage: &Stage, draw: Draw, fitness: impl Fn(usize, usize) -> f32 + Sync) {
+        let (Stage { config, world, .. }, Draw { trial, generation }) = (stage, draw);
+        let (learning, populations) = (&config.learning, &world.populations);
         let (leaders, count) = (populations.len(), population_count(populations));
         let population = learning.population;
+        let total_value: f64 = world.values.iter().map(|&value| f64::from(value)).sum();
         let (of_round, orders_of_round) = (population * leaders, population * count);
         self.orders.resize(learning.partners * orders_of_round, 0);
         self.teams.resize(learning.partners * of_round, 0);
@@ -71,7 +105,11 @@ impl TeamSchedule {
         orders.with_min_len(min_populations_per_task(population)).enumerate().for_each(|(index, order)| match count {
             // Every order of a single population makes the same teams.
             1 => order.iter_mut().zip(0..).for_each(|(policy, team)| *policy = team),
-            _ => evolve::order_policies(level, learning, trial, generation, [index / count, index % count], order),
+            _ => {
+                let [round, of] = [index / count, index % count];
+                let fitness = |slot| total_value * f64::from(fitness(of, slot));
+                evolve::order_policies(level, learning, trial, generation, [round, of], fitness, order);
+            }
         });
         for (teams, orders) in self.teams.chunks_exact_mut(of_round).zip(self.orders.chunks_exact(orders_of_round)) {
             let teams = teams.par_chunks_exact_mut(leaders).with_min_len(MIN_POLICIES_PER_TASK);
@@ -94,14 +132,5 @@ impl TeamSchedule {
         }
         // The champions are in the slot after the policies.
         self.teams.extend(std::iter::repeat_n(population as u32, leaders));
-    }
-}
-
-/// Draws the start positions of all episodes of a stage's generation.
-fn draw_starts(stage: &Stage, trial: usize, generation: usize, episodes: &mut Vec<Vec<Vec2>>) {
-    let (learning, world) = (&stage.config.learning, &stage.world);
-    episodes.resize(learning.episodes_per_team, vec![]);
-    for (episode, starts) in episodes.iter_mut().enumerate() {
-        evolve::episode_positions(learning, trial, generation, episode, world, starts);
     }
 }

@@ -21,11 +21,43 @@ pois = [[5, 12], [20, 12], [45, 12], [10, 47], [30, 47], [48, 30]]
 coupling = 4
 ";
 
+/// Rovers that start in regions, a beacon that stays, and POIs in a region and at a place.
+const REGIONS: &str = "
+[world]
+steps = 30
+dt = 1.0
+[[agents]]
+name = \"rover\"
+count = 3
+in = { disc = [25, 25, 4] }
+motion = { kind = \"free\", max_speed = 1.0 }
+senses = [{ of = \"pois\", measure = \"closeness\", range = 50, combine = \"closest\" }, { of = \"agents\" }]
+[[agents]]
+name = \"scout\"
+count = 2
+in = { circle = [25, 25, 8] }
+senses = [{ of = \"pois\", measure = \"inverse\" }, { of = \"rover\", combine = \"mean\" }]
+[[agents]]
+name = \"beacon\"
+at = [[25, 25]]
+control = \"still\"
+[[pois]]
+name = \"near\"
+count = 2
+in = { box = [10, 10, 40, 40] }
+coupling = 1
+[[pois]]
+name = \"far\"
+at = [[25, 38]]
+coupling = 2
+value = 2.0
+";
+
 /// Name, description, config, and the keys that are changed.
 pub type Case = (&'static str, &'static str, &'static str, &'static [(&'static str, &'static str)]);
 
 /// Together these cases cover every choice in a config, and sizes on both sides of every special case.
-pub const CASES: [Case; 41] = [
+pub const CASES: [Case; 45] = [
     ("generally-forward", "first layout, leader-follower, Df", GENERALLY_FORWARD, &[]),
     ("strictly-forward", "second layout, D++", STRICTLY_FORWARD, &[("learning.fitness", "'D++'")]),
     ("chaotic", "third layout, G", CHAOTIC, &[("learning.fitness", "'G'")]),
@@ -337,6 +369,50 @@ pub const CASES: [Case; 41] = [
             ("learning.fitness", "'G'"),
             ("world.coupling", "2"),
             ("stages", "[{from = 4, set = {'learning.search_step' = 1.5}}]"),
+        ],
+    ),
+    (
+        "softmax-teams",
+        "teams by softmax, uniform first weights, two test episodes from jittered starts, D",
+        GENERALLY_FORWARD,
+        &[
+            ("learning.teams", "'softmax'"),
+            ("learning.temperature", "0.3"),
+            ("learning.initial", "'uniform'"),
+            ("learning.initial_scale", "2.0"),
+            ("learning.start_jitter", "0.5"),
+            ("learning.test_episodes", "2"),
+            ("learning.fitness", "'D'"),
+            ("world.coupling", "2"),
+        ],
+    ),
+    (
+        "sorted-teams",
+        "teams of the best, the second best, and so on, all-leaders",
+        CHAOTIC,
+        &[("learning.teams", "'sorted'"), ("learning.paradigm", "'all-leaders'"), ("world.coupling", "3")],
+    ),
+    (
+        "team-elites",
+        "two teams play again, three policies survive by their team's G, moved POIs",
+        GENERALLY_FORWARD,
+        &[
+            ("learning.team_elites", "2"),
+            ("learning.team_g_elites", "3"),
+            ("learning.elites", "2"),
+            ("learning.poi_jitter", "1.0"),
+            ("world.coupling", "2"),
+        ],
+    ),
+    (
+        "regions",
+        "classes that start in regions, two episodes per team, one test episode, jittered starts, D",
+        REGIONS,
+        &[
+            ("learning.episodes_per_team", "2"),
+            ("learning.test_episodes", "1"),
+            ("learning.start_jitter", "0.5"),
+            ("learning.fitness", "'D'"),
         ],
     ),
 ];

@@ -23,7 +23,7 @@ interface Config {
   follow: { attraction_radius: number };
   learning: {
     paradigm: Kind, fitness: string, seed: string, generations: number, trials: number, population: number, partners?: number, hall_of_fame?: number,
-    episodes_per_team: number,
+    episodes_per_team: number, test_episodes: number,
   };
 }
 /** Which agents count at POIs, when, and after which others. */
@@ -106,7 +106,7 @@ interface Picked { name: string, text: string, compared: Comparison }
 interface Gpu { name?: string, software?: boolean, reason?: string }
 
 /** G of a generation of a trial: of the best team, the mean, and of the champion. */
-interface Row { best: number, mean: number, champion: number, seconds: number }
+interface Row { best: number, mean: number, champion: number, test: number, seconds: number }
 /** What an arm is made of. `constant` and `random` are G of baselines. */
 interface Planned {
   name: string, label: string, toml: string, config: Config, pois: number | null, parameters: number, command?: string, digest?: string,

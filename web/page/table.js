@@ -1,7 +1,7 @@
 // Learning curves as CSV.
 
 /**
- * @typedef {{ best: number, mean: number, champion: number, seconds: number }} Row
+ * @typedef {{ best: number, mean: number, champion: number, test: number, seconds: number }} Row
  * @param {{ label: string, trials: Row[][] }[]} arms
  */
 export function csv(arms) {

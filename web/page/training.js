@@ -77,15 +77,15 @@ export class Training {
         }
         const { words, bytes } = await player.ask({ ask: "advance", generations: Math.min(most, 1000), milliseconds: 40 });
         const numbers = new Float64Array(bytes.buffer), seconds = (performance.now() - from - idle) / 1000;
-        for (let at = 0; at < numbers.length; at += 6) {
-          const [run, trial, generation, best, mean, champion] = numbers.subarray(at, at + 6);
-          this.arms[run].trials[trial][generation] = { best, mean, champion, seconds };
+        for (let at = 0; at < numbers.length; at += 7) {
+          const [run, trial, generation, best, mean, champion, test] = numbers.subarray(at, at + 7);
+          this.arms[run].trials[trial][generation] = { best, mean, champion, test, seconds };
           const { world, learning } = this.arms[run].config;
-          const { population, partners, hall_of_fame, paradigm, episodes_per_team } = learning;
+          const { population, partners, hall_of_fame, paradigm, episodes_per_team, test_episodes } = learning;
           const learners = world.leaders.length + (paradigm === "all-leaders" ? world.followers.length : 0);
           // Generation 0 has no past champions.
           const past = hall_of_fame && generation > 0 ? learners : 0;
-          this.teams += (population * ((partners ?? 1) + past) + 1) * episodes_per_team;
+          this.teams += (population * ((partners ?? 1) + past) + 1) * episodes_per_team + test_episodes;
         }
         this.busy[index] += words.seconds;
         next = words.next;
@@ -122,20 +122,20 @@ export class Training {
    */
   async record(arm, ended, buffers) {
     const { trials, toml: text, command } = arm, last = arm.config.learning.generations;
-    const rows = new Float64Array((last + 1) * trials.length * 7);
+    const rows = new Float64Array((last + 1) * trials.length * 8);
     let at = 0;
     for (let generation = 0; generation <= last; generation++) {
       let latest = 0;
       for (const trial of trials) latest = Math.max(latest, trial[generation].seconds);
       for (let trial = 0; trial < trials.length; trial++) {
-        const { best, mean, champion } = trials[trial][generation];
-        for (const value of [0, trial, generation, best, mean, champion, latest]) rows[at++] = value;
+        const { best, mean, champion, test } = trials[trial][generation];
+        for (const value of [0, trial, generation, best, mean, champion, test, latest]) rows[at++] = value;
       }
     }
     const { description, backend, adapter, driver, threads } = this.machine;
     const { words, bytes: zip } = await this.players[0].ask({
       ask: "record", name: `${arm.name}-${arm.label}`.replaceAll("++", "pp").replace(/[^\w.-]+/g, "-"), text, command, description, backend, adapter, driver, threads,
-      started: this.started, rows: rows.length / 7,
+      started: this.started, rows: rows.length / 8,
     }, [new Uint8Array(rows.buffer), ...ended.map(({ part }) => part)], {}, [rows.buffer, ...buffers]);
     Object.assign(arm, { digest: words.digest, zip });
   }
@@ -147,12 +147,12 @@ export class Training {
       return { name, label, toml, config, pois, parameters, digest, constant: null, random: [] };
     }), machine);
     opened.forEach(({ words, bytes }, run) => {
-      const own = training.arms[run], numbers = new Float64Array(bytes.buffer, bytes.byteOffset, words.rows * 7);
-      for (let at = 0; at < numbers.length; at += 7) {
-        const [, trial, generation, best, mean, champion, seconds] = numbers.subarray(at, at + 7);
-        own.trials[trial][generation] = { best, mean, champion, seconds };
+      const own = training.arms[run], numbers = new Float64Array(bytes.buffer, bytes.byteOffset, words.rows * 8);
+      for (let at = 0; at < numbers.length; at += 8) {
+        const [, trial, generation, best, mean, champion, test, seconds] = numbers.subarray(at, at + 8);
+        own.trials[trial][generation] = { best, mean, champion, test, seconds };
       }
-      const start = words.rows * 56, size = (bytes.byteLength - start) / own.trials.length;
+      const start = words.rows * 64, size = (bytes.byteLength - start) / own.trials.length;
       own.trials.forEach((_, trial) => { own.ended[trial] = champions(own, bytes.subarray(start + trial * size, start + (trial + 1) * size), size / 4); });
     });
     await training.revive(player);

@@ -24,7 +24,7 @@ const MAX_FILE_BYTES: u64 = 1 << 30;
 
 /// Describes a finished run to export.
 ///
-/// The numbers start with the rows, `[rows][7]` f64, in the order of `metrics.csv`. A row is run, trial, generation,
+/// The numbers start with the rows, `[rows][8]` f64, in the order of `metrics.csv`. A row is run, trial, generation,
 /// best, mean and champion G, seconds. After the rows follow each trial's policies and fitness, as f32, and with an
 /// evolution strategy or a hall of fame the weights after the last generation.
 #[derive(Deserialize)]
@@ -46,22 +46,23 @@ pub struct Recorded {
 pub fn write(recorded: &Recorded, bytes: &[u8]) -> Result<Answer, Refusal> {
     let config = Config::parse(&recorded.text, "the config")?;
     let (trials, last) = (config.learning.trials, config.learning.generations);
-    let fitness = config.populations() * config.learning.population;
-    let policies = fitness * config.parameters();
+    let fitness = config.fitness_len();
+    let policies = config.populations() * config.learning.population * config.parameters();
     let slots = config.populations() * config.learning.slots() * config.parameters();
     let weights = if config.learning.extends_from_policies() { 0 } else { slots };
-    let (numbers, trial) = (recorded.rows * 7 * size_of::<f64>(), (policies + fitness + weights) * size_of::<f32>());
+    let (numbers, trial) = (recorded.rows * 8 * size_of::<f64>(), (policies + fitness + weights) * size_of::<f32>());
     if bytes.len() != numbers + trials * trial || recorded.rows != trials * (last + 1) {
         return Err(refuse("the results of the run do not fit its config"));
     }
     let (numbers, rest) = bytes.split_at(numbers);
     let rows: Vec<(Row, f64)> = bytemuck::pod_collect_to_vec::<u8, f64>(numbers)
-        .as_chunks::<7>()
+        .as_chunks::<8>()
         .0
         .iter()
-        .map(|&[_, trial, generation, best_g, mean_g, champion_g, seconds]| {
+        .map(|&[_, trial, generation, best_g, mean_g, champion_g, test_g, seconds]| {
             let (trial, generation) = (trial as usize, generation as usize);
-            (Row { experiment: 0, trial, generation, best_g, mean_g, champion_g }, seconds)
+            let test_g = Some(test_g).filter(|test_g| !test_g.is_nan());
+            (Row { experiment: 0, trial, generation, best_g, mean_g, champion_g, test_g }, seconds)
         })
         .collect();
     let parts: Vec<Vec<f32>> = rest.chunks_exact(trial).map(floats).collect();
@@ -111,7 +112,7 @@ impl Storage for Zip {
 
 /// Reads a file that was dropped on the page.
 ///
-/// An archive of a run gives its config, the rows `[rows][7]` f64, and each trial's policies as f32. Any other file is
+/// An archive of a run gives its config, the rows `[rows][8]` f64, and each trial's policies as f32. Any other file is
 /// read as policies for the config in `text`.
 pub fn read(text: Option<&str>, bytes: &[u8]) -> Result<Answer, Refusal> {
     if !bytes.starts_with(b"PK") {
@@ -164,8 +165,9 @@ pub fn read(text: Option<&str>, bytes: &[u8]) -> Result<Answer, Refusal> {
     let mut plain = Vec::new();
     for row in &mut rows {
         let (row, seconds) = row.map_err(|error| refuse(format!("metrics.csv: {error}")))?;
-        let Row { trial, generation, best_g, mean_g, champion_g, .. } = row;
-        numbers.extend([0.0, trial as f64, generation as f64, best_g, mean_g, champion_g, seconds]);
+        let Row { trial, generation, best_g, mean_g, champion_g, test_g, .. } = row;
+        let test_g = test_g.unwrap_or(f64::NAN);
+        numbers.extend([0.0, trial as f64, generation as f64, best_g, mean_g, champion_g, test_g, seconds]);
         plain.push(row);
     }
     let (trials, whole) = (config.learning.trials, config.learning.trials * (config.learning.generations + 1));
@@ -183,7 +185,7 @@ pub fn read(text: Option<&str>, bytes: &[u8]) -> Result<Answer, Refusal> {
     if expected != digest {
         return Err(refuse(format!("the run is damaged: its digest is {digest}, run.json says {expected}")));
     }
-    let count = numbers.len() / 7;
+    let count = numbers.len() / 8;
     let mut bytes: Vec<u8> = bytemuck::cast_slice(&numbers).to_vec();
     weights.iter().for_each(|weights| bytes.extend_from_slice(bytemuck::cast_slice(weights)));
     let mut words = described(&config);

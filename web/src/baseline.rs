@@ -17,9 +17,9 @@ const EPISODES: u32 = 20;
 /// The backend fails.
 pub fn constant(mut config: Config) -> Result<Value, Refusal> {
     config.stages.clear();
-    let learning = &mut config.learning;
-    // Without jitter, all generations and trials are equal.
-    if learning.start_jitter == 0.0 && learning.poi_jitter == 0.0 {
+    // If nothing moves, all generations and trials are equal.
+    if !config.starts_move() && !config.pois_move() {
+        let learning = &mut config.learning;
         (learning.generations, learning.trials) = (0, 1);
     }
     let (actions, trials) = (config.policy.actions, config.learning.trials as f64);

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use flotilla::config::Config;
 use flotilla::statistics::Average;
+use flotilla::trainer::Row;
 use flotilla_app::report::comparison::{self, At, Cohort, Question, Trial};
 use flotilla_app::report::curves::{Band, Curve};
 use serde::Deserialize;
@@ -41,7 +42,16 @@ pub fn compare(experiments: Vec<Experiment>, bytes: &[u8]) -> Result<Value, Refu
             pairs = rest;
             best.iter_mut().zip(scores).for_each(|(best, [g, _])| best.add(*g));
             let key = (config.learning.seed, trial);
-            trials.push(Trial { key, scores: scores.to_vec(), from: config.last_from() });
+            let row = |(generation, &[best_g, champion_g]): (usize, &[f64; 2])| Row {
+                experiment: 0,
+                trial,
+                generation,
+                best_g,
+                mean_g: best_g,
+                champion_g,
+                test_g: None,
+            };
+            trials.push(Trial { key, rows: scores.iter().enumerate().map(row).collect(), from: config.last_from() });
         }
         let (curve, _) = Curve::new(&best, 1.0).thinned();
         let band = curve.outline(Band::Interval, 1.0);

@@ -77,12 +77,13 @@ impl Training {
 
     /// Plays at least one generation, at most `most`, and starts none after `time` milliseconds.
     ///
-    /// The numbers of the answer are the rows, `[rows][6]` f64: run, trial, generation, best, mean and champion G.
+    /// The numbers of the answer are the rows, `[rows][7]` f64: run, trial, generation, best, mean and champion G, and the
+    /// tested best team's, or NaN.
     pub fn advance(&mut self, backend: &mut dyn Backend, most: usize, time: f64) -> Result<Answer, Refusal> {
         let (start, mut rows, mut played) = (Instant::now(), Vec::new(), 0);
         while played < most && !self.is_done() && (played == 0 || start.elapsed().as_secs_f64() * 1000.0 < time) {
             for Batch { trainer, experiments } in self.batches.iter_mut().filter(|batch| !batch.trainer.is_done()) {
-                for Row { experiment, trial, generation, best_g, mean_g, champion_g } in
+                for Row { experiment, trial, generation, best_g, mean_g, champion_g, test_g } in
                     trainer.advance(backend).map_err(refuse)?
                 {
                     rows.extend([
@@ -92,6 +93,7 @@ impl Training {
                         best_g,
                         mean_g,
                         champion_g,
+                        test_g.unwrap_or(f64::NAN),
                     ]);
                 }
             }

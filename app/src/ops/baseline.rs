@@ -102,7 +102,7 @@ pub fn run(
     context.pause();
     let outcomes = outcomes?;
     let (learning, pois, actions) = (&config.learning, config.poi_count(), config.policy.actions);
-    let moves = learning.start_jitter > 0.0 || learning.poi_jitter > 0.0;
+    let moves = config.starts_move() || config.pois_move();
     let observed = |g: &dyn Fn(&baseline::Outcome) -> f64| -> Vec<f64> {
         outcomes.iter().map(|outcome| g(outcome) * pois as f64).collect()
     };
@@ -126,7 +126,7 @@ pub fn run(
     Ok(BaselineOutcome {
         paradigm: learning.paradigm,
         pois,
-        teams: learning.teams() * (learning.generations + 1),
+        teams: learning.team_count() * (learning.generations + 1),
         seeds: outcomes.len(),
         episodes: if moves { request.episodes } else { 1 },
         constants: (0..baseline::constants(actions).len()).map(constant).collect(),

@@ -105,7 +105,8 @@ impl Cost {
             // Generation 0 has no past champions.
             let without = if stage == 0 { wide(config.hall_teams(1)) } else { 0 };
             let of_trial = wide(generations) * wide(config.max_teams()) - without;
-            let played = wide(learning.trials) * of_trial * wide(learning.episodes_per_team);
+            let tests = wide(generations) * wide(learning.test_episodes);
+            let played = wide(learning.trials) * (of_trial * wide(learning.episodes_per_team) + tests);
             teams += played;
             team_steps += played * wide(world.steps());
             agent_steps += played * wide(world.steps()) * wide(world.agents());

@@ -109,7 +109,9 @@ pub fn run(args: &CompareRequest, context: Context<'_>) -> Result<CompareOutcome
         let place = if comparison.place.is_empty() { String::new() } else { format!("{}: ", comparison.place) };
         notes.extend(comparison.notes.iter().map(|note| format!("{place}{note}")));
     }
-    let nothing = |arm: &Cohort| arm.trials.iter().all(|trial| trial.scores.iter().flatten().all(|&g| g == 0.0));
+    let nothing = |arm: &Cohort| {
+        arm.trials.iter().flat_map(|trial| &trial.rows).all(|row| row.best_g == 0.0 && row.champion_g == 0.0)
+    };
     if groups.iter().all(|(_, arms)| arms.iter().all(nothing)) {
         notes.push(
             "no team of these runs observed any POI in any generation: there is nothing to compare; `flotilla check CONFIG` \

@@ -23,7 +23,7 @@ pub struct PlotRequest {
     /// The picture. By default `curves.svg` in the folder of one run, or `comparison.svg` here of several.
     #[serde(default)]
     pub out: Option<PathBuf>,
-    /// Team whose G is shown. By default all three of one run, and the champions of several.
+    /// Team whose G is shown. By default all of one run, and the champions of several.
     #[serde(default)]
     pub measure: Option<TeamKind>,
     /// Range that is shown around a mean.

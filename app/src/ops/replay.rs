@@ -276,8 +276,9 @@ fn stage<'a>(config: &'a ValidConfig, generations: &[usize]) -> Result<&'a Confi
         return refused(format!("generations {first} and {other} are of different stages: show one alone"));
     }
     let stage = config.at(first);
-    if generations.len() > 1 && stage.learning.poi_jitter > 0.0 {
-        return refused("POIs are elsewhere in every generation (learning.poi_jitter): show one alone".into());
+    if generations.len() > 1 && stage.pois_move() {
+        let key = if stage.learning.poi_jitter > 0.0 { "learning.poi_jitter" } else { "pois.in" };
+        return refused(format!("POIs are elsewhere in every generation ({key}): show one alone"));
     }
     Ok(stage)
 }

@@ -14,7 +14,7 @@ use crate::report::map;
 use crate::report::replay::numbered;
 use crate::report::runs::ReadError;
 use flotilla::backend::{Backend, Group};
-use flotilla::config::{self, Config, Override};
+use flotilla::config::{self, Config, Learning, Override};
 use flotilla::escape::PathExt;
 use flotilla::evaluate::{self, Batch, Evaluation, Spread, Starts};
 use flotilla::file;
@@ -120,10 +120,12 @@ pub struct Best {
 }
 
 impl RolloutRequest {
-    /// Returns where episodes start, given the config's jitters.
-    fn starts(&self, jitter: f64, poi_jitter: f64) -> Result<Starts, Error> {
-        let (Some(episodes), seed) = (self.episodes, self.seed.unwrap_or(0)) else { return Ok(Starts::Own) };
-        if jitter == 0.0 && poi_jitter == 0.0 && (episodes > 1 || self.seed.is_some()) {
+    /// Returns where episodes of a config start. Without own starts, an episode is drawn.
+    fn starts(&self, config: &Config) -> Result<Starts, Error> {
+        let Learning { start_jitter: jitter, poi_jitter, .. } = config.learning;
+        let episodes = self.episodes.or(config.has_regions().then_some(1));
+        let (Some(episodes), seed) = (episodes, self.seed.unwrap_or(0)) else { return Ok(Starts::Own) };
+        if !config.starts_move() && !config.pois_move() && (episodes > 1 || self.seed.is_some()) {
             return Err(Error::Usage(with_remedy(
                 format!("--episodes {episodes}: learning.start_jitter is 0, so all episodes are the same"),
                 "set it or learning.poi_jitter in the config, or give --start-jitter or --poi-jitter",
@@ -169,7 +171,7 @@ pub fn run(
             Config::clone(config)
         }
     };
-    let starts = request.starts(config.learning.start_jitter, config.learning.poi_jitter)?;
+    let starts = request.starts(&config)?;
     verify(&config_path, &policies, request.unverified)?;
     let policies = policies::read(&policies, &config, request.trial)?;
     let world = World::new(&config.validate()?);

@@ -126,6 +126,9 @@ pub struct PointScores {
     pub champion_g_interval_95: Option<[f64; 2]>,
     /// G of the best team in the last generation, mean over trials.
     pub best_g: f64,
+    /// G of the tested best team in the last generation, mean over trials, if the config has test episodes.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub test_g: Option<f64>,
     /// The number of trials that reached the G.
     pub reached: usize,
     /// The median generation that reached it.
@@ -196,8 +199,17 @@ pub fn run(
 ) -> Result<SweepOutcome, Error> {
     let sweep = request.read()?;
     let axes = picture_axes(&sweep, &request.results.axes)?;
+    check_measure(&sweep, request.results.measure)?;
     let disk = train(request, &sweep, backends, context)?;
     write_results(request, &sweep, &axes, &disk, disk.at(&request.out))
+}
+
+/// Fails if a point's results will not have the measured team.
+pub fn check_measure(sweep: &Sweep, measure: TeamKind) -> Result<(), Error> {
+    match sweep.points.iter().find_map(|point| Some((point, measure.missing(&point.config)?))) {
+        Some((point, why)) => Err(Error::Usage(format!("--measure {measure}: point {:04}: {why}", point.index).into())),
+        None => Ok(()),
+    }
 }
 
 /// Returns the axes that pictures have across and down.
@@ -507,6 +519,7 @@ fn write_results(
                 champion_g_interval_95: statistics::bounded(&outcome.champion, [0.0, 1.0])
                     .map(|mean| [mean.low, mean.high]),
                 best_g: outcome.best.mean(),
+                test_g: outcome.test.map(|test| test.mean()),
                 reached: outcome.reached.iter().flatten().count(),
                 median: outcome.median_reached(),
             }),

@@ -107,6 +107,9 @@ pub struct GenerationScores {
     pub mean_g: Extremes,
     /// G of the champion.
     pub champion_g: Extremes,
+    /// G of the tested best team, if the config has test episodes.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub test_g: Option<Extremes>,
 }
 
 impl GenerationScores {
@@ -116,6 +119,11 @@ impl GenerationScores {
             best_g: of(|row| row.best_g),
             mean_g: of(|row| row.mean_g),
             champion_g: of(|row| row.champion_g),
+            test_g: rows
+                .iter()
+                .map(|row| row.test_g)
+                .collect::<Option<Vec<f64>>>()
+                .map(|test| Extremes::of(test.into_iter())),
         }
     }
 }

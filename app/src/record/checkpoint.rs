@@ -115,11 +115,12 @@ impl<N: AsRef<[f32]>> Checkpoint<N> {
         );
         metadata.extend(init.iter().map(|digest| (INIT.to_string(), digest.clone())));
         let Shapes { weights, fitness, .. } = Shapes::of(of);
-        let pending: Vec<[f64; 2]> = snapshot.pending.iter().flatten().map(|row| [row.best_g, row.mean_g]).collect();
+        let pending: Vec<f64> = snapshot.pending.iter().flatten().flat_map(known).collect();
         let mut list = Vec::new();
         // The 8-byte numbers come first, so that all tensors are aligned.
         if !pending.is_empty() {
-            let (shape, parts) = (vec![pending.len(), 2], vec![bytemuck::cast_slice(&pending)]);
+            let columns = pending.len() / snapshot.pending.len();
+            let (shape, parts) = (vec![snapshot.pending.len(), columns], vec![bytemuck::cast_slice(&pending)]);
             list.push(Tensor { name: PENDING.into(), dtype: Dtype::F64, shape, parts });
         }
         if !snapshot.weights.is_empty() {
@@ -166,16 +167,18 @@ impl Checkpoint {
         let weights = if elsewhere { vec![] } else { floats(WEIGHTS, &shapes.weights)? };
         let fitness = floats(FITNESS, &shapes.fitness)?;
         // From generation 1 on, rows are pending until their champions have played.
-        let pending: Vec<[f64; 2]> = match generation {
+        let columns = 2 + usize::from(learning.test_episodes > 0);
+        let pending: Vec<f64> = match generation {
             0 => vec![],
-            _ => file.read(PENDING, Dtype::F64, &[learning.trials, 2], 1)?.pop().unwrap_or_default(),
+            _ => file.read(PENDING, Dtype::F64, &[learning.trials, columns], 1)?.pop().unwrap_or_default(),
         };
-        if pending.iter().flatten().any(|share| !(0.0..=1.0).contains(share)) {
+        if pending.iter().any(|share| !(0.0..=1.0).contains(share)) {
             return Err(format!("{PENDING} has numbers out of range"));
         }
         let row = |trial: usize| {
-            let &[best_g, mean_g] = pending.get(trial)?;
-            Some(Row { experiment: 0, trial, generation: generation - 1, best_g, mean_g, champion_g: 0.0 })
+            let known = pending.chunks_exact(columns).nth(trial)?;
+            let (best_g, mean_g, test_g) = (known[0], known[1], known.get(2).copied());
+            Some(Row { experiment: 0, trial, generation: generation - 1, best_g, mean_g, champion_g: 0.0, test_g })
         };
         let pending = (0..learning.trials).map(row).collect();
         let snapshot = Snapshot { generation, last, weights, fitness, pending };
@@ -222,6 +225,11 @@ impl Checkpoint {
     }
 }
 
+/// Returns the scores of a row whose champion has yet to play.
+fn known(row: &Row) -> impl Iterator<Item = f64> + use<> {
+    [row.best_g, row.mean_g].into_iter().chain(row.test_g)
+}
+
 /// Shapes of the tensors, with all trials in one tensor.
 struct Shapes {
     weights: [usize; 4],
@@ -234,7 +242,7 @@ impl Shapes {
             (config.learning.trials, config.populations(), config.learning.population);
         Shapes {
             weights: [trials, populations, config.learning.slots(), config.parameters()],
-            fitness: [trials, populations, policies],
+            fitness: [trials, config.fitness_len() / policies, policies],
         }
     }
 }

@@ -3,8 +3,9 @@
 //! The file has one line per trial and generation, sorted by generation and then by trial. G is in 0..1. `seconds` is
 //! the training time until the line was complete, including earlier sessions of a resumed run.
 //!
-//! If the config has stages, a last column `stage` gives the stage of the generation, from 0. G then refers to the POIs
-//! of that stage. All columns except `seconds` have the same bits on every backend.
+//! If the config has test episodes, a column `test_g` precedes `seconds`. If it has stages, a last column `stage` gives
+//! the stage of the generation, from 0. G then refers to the POIs of that stage. All columns except `seconds` have the
+//! same bits on every backend.
 
 use std::fs::File;
 use std::io::{self, BufRead, BufReader, BufWriter, Read, Write};
@@ -17,12 +18,10 @@ use super::{RecordError, hash_rest, hex};
 use flotilla::config::{Config, MAX_GENERATIONS, MAX_TRIALS};
 use flotilla::trainer::Row;
 pub use flotilla::trainer::digest::digest;
-use flotilla::trainer::digest::line as shared;
+use flotilla::trainer::digest::{columns, line as shared};
 
-/// Header of the file.
+/// Header of the file, without test episodes and stages.
 pub const HEADER: &str = "trial,generation,best_g,mean_g,champion_g,seconds";
-/// Header of the file if the config has stages.
-pub(crate) const STAGED: &str = "trial,generation,best_g,mean_g,champion_g,seconds,stage";
 /// Maximum number of bytes per line.
 const MAX_LINE: u64 = 256;
 
@@ -42,29 +41,55 @@ impl Extent {
     }
 }
 
+/// The optional columns of a file.
+#[derive(Clone, Copy, PartialEq, Eq)]
+struct Optional {
+    /// Whether there is a column `test_g`.
+    tested: bool,
+    /// Whether there is a column `stage`.
+    staged: bool,
+}
+
+impl Optional {
+    fn of(config: &Config) -> Optional {
+        Optional { tested: config.learning.test_episodes > 0, staged: !config.stages.is_empty() }
+    }
+
+    fn header(self) -> String {
+        let Optional { tested, staged } = self;
+        format!("{},seconds{}", columns(tested), if staged { ",stage" } else { "" })
+    }
+
+    /// Returns the columns of a file with this header.
+    fn of_header(header: &str) -> Option<Optional> {
+        let all = [false, true].map(|tested| [false, true].map(|staged| Optional { tested, staged }));
+        all.into_iter().flatten().find(|optional| optional.header() == header)
+    }
+}
+
 /// Formatter for the lines of a config's file. Each line includes its line break.
 pub struct Lines {
-    /// First generation of each stage after stage 0, and whether the file has the column `stage`.
+    /// First generation of each stage after stage 0.
     stages: Vec<usize>,
-    staged: bool,
+    optional: Optional,
 }
 
 impl Lines {
     /// Creates the formatter for runs of this config.
     pub fn of(config: &Config) -> Lines {
         let stages = config.stages.iter().map(|stage| stage.from).filter(|&from| from > 0).collect();
-        Lines { stages, staged: !config.stages.is_empty() }
+        Lines { stages, optional: Optional::of(config) }
     }
 
     /// Returns the header.
     pub fn header(&self) -> String {
-        format!("{}\n", if self.staged { STAGED } else { HEADER })
+        self.optional.header() + "\n"
     }
 
     /// Returns the line of a row. `seconds` is the training time until the row was complete.
     pub fn line(&self, row: &Row, seconds: f64) -> String {
         let stage = self.stages.partition_point(|&from| from <= row.generation);
-        let stage = if self.staged { format!(",{stage}") } else { String::new() };
+        let stage = if self.optional.staged { format!(",{stage}") } else { String::new() };
         format!("{},{seconds:.3}{stage}\n", shared(row))
     }
 }
@@ -92,7 +117,9 @@ impl Writer {
     pub fn resume(disk: &Disk, path: &Path, mark: &Extent, config: &Config) -> io::Result<Option<Writer>> {
         let Some((first, hash)) = before(disk.at(path), mark)? else { return Ok(None) };
         // A run that was shortened to end before its later stages keeps the column `stage`.
-        let lines = Lines { staged: first.starts_with(STAGED.as_bytes()), ..Lines::of(config) };
+        let header = String::from_utf8_lossy(&first);
+        let optional = Optional::of_header(header.trim_end()).unwrap_or(Optional::of(config));
+        let lines = Lines { optional, ..Lines::of(config) };
         let output = BufWriter::new(disk.append(path, mark.bytes)?);
         Ok(Some(Writer { output, bytes: mark.bytes, hash, lines }))
     }
@@ -172,8 +199,7 @@ pub struct Rows<R> {
     source: R,
     line: usize,
     done: bool,
-    /// Whether each line has a stage after the seconds.
-    staged: bool,
+    optional: Optional,
     /// SHA-256 of all lines without their seconds and stages.
     hash: Sha256,
 }
@@ -181,19 +207,17 @@ pub struct Rows<R> {
 impl<R: BufRead> Rows<R> {
     /// Reads the header of a metrics file.
     pub fn new(source: R) -> Result<Rows<R>, RowsError> {
-        let mut rows = Rows { source, line: 0, done: false, staged: false, hash: Sha256::new() };
-        match rows.line() {
-            Ok(Some(header)) if header == HEADER => Ok(rows),
-            Ok(Some(header)) if header == STAGED => {
-                // The digest must not depend on the column `stage`, so the plain header is hashed.
-                let mut hash = Sha256::new();
-                hash.update(without_last(HEADER));
-                hash.update("\n");
-                Ok(Rows { staged: true, hash, ..rows })
-            }
-            Err(error @ RowsError::Read(_)) => Err(error),
-            _ => Err(RowsError::Wrong { line: 1, what: HEADER.into() }),
-        }
+        let optional = Optional { tested: false, staged: false };
+        let mut rows = Rows { source, line: 0, done: false, optional, hash: Sha256::new() };
+        let optional = match rows.line() {
+            Ok(header) => header.and_then(|header| Optional::of_header(&header)),
+            Err(error @ RowsError::Read(_)) => return Err(error),
+            Err(_) => None,
+        };
+        let optional = optional.ok_or(RowsError::Wrong { line: 1, what: HEADER.into() })?;
+        // The digest must not depend on the column `stage`, so the header without it is hashed.
+        let hash = Sha256::new_with_prefix(columns(optional.tested)).chain_update("\n");
+        Ok(Rows { optional, hash, ..rows })
     }
 
     fn line(&mut self) -> Result<Option<String>, RowsError> {
@@ -206,7 +230,7 @@ impl<R: BufRead> Rows<R> {
             return Err(RowsError::CutShort(self.line));
         }
         let line = String::from_utf8(line).map_err(|_| self.wrong("UTF-8 text"))?;
-        self.hash.update(without_last(if self.staged { without_last(&line) } else { &line }));
+        self.hash.update(without_last(if self.optional.staged { without_last(&line) } else { &line }));
         self.hash.update("\n");
         Ok(Some(line))
     }
@@ -227,13 +251,13 @@ impl<R: BufRead> Rows<R> {
                 best_g: share(field()?)?,
                 mean_g: share(field()?)?,
                 champion_g: share(field()?)?,
+                test_g: if self.optional.tested { Some(share(field()?)?) } else { None },
             };
             let seconds = field()?.parse().ok().filter(|seconds: &f64| seconds.is_finite() && *seconds >= 0.0)?;
-            let whole = !self.staged || field()?.parse::<usize>().is_ok();
+            let whole = !self.optional.staged || field()?.parse::<usize>().is_ok();
             (whole && fields.next().is_none()).then_some((row, seconds))
         };
-        let header = if self.staged { STAGED } else { HEADER };
-        parse().map(Some).ok_or_else(|| self.wrong(format!("{header} with every G in 0..1")))
+        parse().map(Some).ok_or_else(|| self.wrong(format!("{} with every G in 0..1", self.optional.header())))
     }
 
     /// Returns the SHA-256 of all lines that were read, without seconds and stages.

@@ -316,7 +316,7 @@ pub(crate) fn load_config(place: Place<'_>) -> Result<Config, ConfigError> {
 
 /// Keys of later versions with their default values. A config's digest omits these lines, so that runs of earlier
 /// versions can be resumed.
-const DEFAULTS_ADDED_LATER: [&str; 21] = [
+const DEFAULTS_ADDED_LATER: [&str; 28] = [
     "[credit]\n",
     "start_counts = false\n",
     "removes = []\n",
@@ -338,6 +338,13 @@ const DEFAULTS_ADDED_LATER: [&str; 21] = [
     "method = \"tournament\"\n",
     "search_sigma = 0.3\n",
     "search_step = 1.0\n",
+    "initial = \"normal\"\n",
+    "initial_scale = 1.0\n",
+    "teams = \"random\"\n",
+    "temperature = 1.0\n",
+    "team_elites = 0\n",
+    "team_g_elites = 0\n",
+    "test_episodes = 0\n",
 ];
 
 /// Returns the SHA-256 of the part of a config that affects results.

@@ -12,6 +12,7 @@ use crate::record::digests::Verification;
 use flotilla::config::Config;
 use flotilla::escape::{self, PathExt};
 use flotilla::statistics::{self, Estimate, Tested, power_of};
+use flotilla::trainer::Row;
 
 /// The trials of one arm of a comparison.
 #[derive(Clone, Debug, PartialEq)]
@@ -31,8 +32,8 @@ pub struct Cohort {
 pub struct Trial {
     /// The run's seed and the trial's number. Trials of two arms with the same key form a pair.
     pub key: (u64, usize),
-    /// G of the best team and of the champion, `[generations]`.
-    pub scores: Vec<[f64; 2]>,
+    /// The trial's rows, `[generations]`.
+    pub rows: Vec<Row>,
     /// The first generation of the run's last stage; 0 without stages.
     pub from: usize,
 }
@@ -50,7 +51,7 @@ impl Cohort {
         let config = runs::config(&folder, verification)?;
         let trials = runs::trials(&folder, &config, verification)?.into_iter().enumerate();
         let from = config.last_from();
-        self.trials.extend(trials.map(|(trial, scores)| Trial { key: (config.learning.seed, trial), scores, from }));
+        self.trials.extend(trials.map(|(trial, rows)| Trial { key: (config.learning.seed, trial), rows, from }));
         self.planned = self.planned.max(config.learning.generations);
         self.folders.push(folder);
         Ok(config)
@@ -71,7 +72,7 @@ impl Cohort {
 
     /// Returns the last generation that all its trials have reached, if any.
     fn last(&self) -> Option<usize> {
-        self.trials.iter().map(|trial| trial.scores.len()).min()?.checked_sub(1)
+        self.trials.iter().map(|trial| trial.rows.len()).min()?.checked_sub(1)
     }
 
     fn keys(&self) -> Vec<(u64, usize)> {
@@ -143,6 +144,11 @@ pub enum Measure {
         /// The generation, from 0.
         generation: usize,
     },
+    /// Mean G of the best team at a generation over the episodes that test it.
+    TestG {
+        /// The generation, from 0.
+        generation: usize,
+    },
     /// The first generation at which the champion's G is at least `reach`. With stages, only the last stage counts.
     ///
     /// It is infinite for a trial that does not reach it by `generation`. Arms are described by their medians.
@@ -167,10 +173,11 @@ impl Measure {
     /// Returns the measured value of a trial, or none if the trial's scores do not determine it.
     fn of(self, trial: &Trial) -> Option<f64> {
         match self {
-            Measure::BestG { generation } => Some(trial.scores[generation][0]),
-            Measure::ChampionG { generation } => Some(trial.scores[generation][1]),
+            Measure::BestG { generation } => Some(trial.rows[generation].best_g),
+            Measure::ChampionG { generation } => Some(trial.rows[generation].champion_g),
+            Measure::TestG { generation } => trial.rows[generation].test_g,
             Measure::GenerationsToReach { reach, generation } => {
-                let reached = (trial.from..=generation).find(|&at| trial.scores[at][1] >= reach);
+                let reached = (trial.from..=generation).find(|&at| trial.rows[at].champion_g >= reach);
                 Some(reached.map_or(f64::INFINITY, |at| at as f64))
             }
             Measure::Played { .. } => None,
@@ -198,6 +205,7 @@ impl Measure {
         match self {
             Measure::BestG { .. } => "best_g",
             Measure::ChampionG { .. } => "champion_g",
+            Measure::TestG { .. } => "test_g",
             Measure::GenerationsToReach { .. } => "generations_to_reach",
             Measure::Played { poi_jitter: 0.0, .. } => "fixed_pois_g",
             Measure::Played { .. } => "moved_pois_g",
@@ -210,6 +218,7 @@ impl std::fmt::Display for Measure {
         match self {
             Measure::BestG { generation } => write!(f, "best team's G, generation {generation}"),
             Measure::ChampionG { generation } => write!(f, "champion's G, generation {generation}"),
+            Measure::TestG { generation } => write!(f, "tested best team's G, generation {generation}"),
             Measure::GenerationsToReach { reach, .. } => write!(f, "generations to G {reach}"),
             Measure::Played { poi_jitter: 0.0, .. } => f.write_str("champion's G, POIs where they stand"),
             Measure::Played { poi_jitter, .. } => write!(f, "champion's G, POIs moved by up to {poi_jitter}"),
@@ -310,8 +319,11 @@ pub fn compare(place: &str, arms: &[Cohort], options: &Question) -> Result<Compa
     }
     let champion = generations.iter().map(|&generation| Measure::ChampionG { generation });
     let best = generations.iter().map(|&generation| Measure::BestG { generation });
+    // All arms need test episodes.
+    let tested = arms.iter().flat_map(|arm| &arm.trials).all(|trial| trial.rows[last].test_g.is_some());
+    let test = generations.iter().filter(|_| tested).map(|&generation| Measure::TestG { generation });
     let reach = Measure::GenerationsToReach { reach: options.reach, generation: last };
-    let measures = champion.chain(best).chain([reach]).map(|measure| {
+    let measures = champion.chain(test).chain(best).chain([reach]).map(|measure| {
         let values = |arm: &Cohort| arm.trials.iter().filter_map(|trial| measure.of(trial)).collect();
         measured(measure, &arms.iter().map(values).collect::<Vec<_>>(), options.paired)
     });
@@ -510,7 +522,9 @@ pub fn csv(all: &[Comparison], output: impl io::Write) -> io::Result<()> {
     for Comparison { place, generation: last, arms: named, measures, .. } in all {
         for Measured { measure, arms, pairs } in measures {
             let (generation, reach) = match *measure {
-                Measure::BestG { generation } | Measure::ChampionG { generation } => (generation, String::new()),
+                Measure::BestG { generation } | Measure::ChampionG { generation } | Measure::TestG { generation } => {
+                    (generation, String::new())
+                }
                 Measure::GenerationsToReach { reach, generation } => (generation, reach.to_string()),
                 Measure::Played { .. } => (*last, String::new()),
             };

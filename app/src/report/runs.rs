@@ -31,11 +31,13 @@ pub enum TeamKind {
     Best,
     /// The mean over all teams.
     Mean,
+    /// The best team in the episodes that test it, if the config has any.
+    Test,
 }
 
 impl TeamKind {
     /// All kinds.
-    pub const ALL: [TeamKind; 3] = [TeamKind::Champion, TeamKind::Best, TeamKind::Mean];
+    pub const ALL: [TeamKind; 4] = [TeamKind::Champion, TeamKind::Best, TeamKind::Mean, TeamKind::Test];
 
     /// Returns the kind's name in pictures.
     pub fn name(self) -> &'static str {
@@ -43,6 +45,7 @@ impl TeamKind {
             TeamKind::Best => "best team",
             TeamKind::Champion => "champion",
             TeamKind::Mean => "mean team",
+            TeamKind::Test => "tested best team",
         }
     }
 
@@ -51,13 +54,20 @@ impl TeamKind {
         format!("G of the {}", self.name())
     }
 
-    /// Returns this kind's G from a row of metrics.
-    pub fn of(self, row: &Row) -> f64 {
+    /// Returns this kind's G from a row of metrics, if the row has it.
+    pub fn of(self, row: &Row) -> Option<f64> {
         match self {
-            TeamKind::Best => row.best_g,
-            TeamKind::Champion => row.champion_g,
-            TeamKind::Mean => row.mean_g,
+            TeamKind::Best => Some(row.best_g),
+            TeamKind::Champion => Some(row.champion_g),
+            TeamKind::Mean => Some(row.mean_g),
+            TeamKind::Test => row.test_g,
         }
+    }
+
+    /// Returns why a run of a config has no such G, if it has none.
+    pub fn missing(self, config: &Config) -> Option<String> {
+        let missing = self == TeamKind::Test && config.learning.test_episodes == 0;
+        missing.then(|| "it has no tested best team, because learning.test_episodes is 0".into())
     }
 }
 
@@ -72,7 +82,7 @@ impl std::str::FromStr for TeamKind {
 
     fn from_str(text: &str) -> Result<TeamKind, String> {
         let read = TeamKind::deserialize(text.into_deserializer());
-        read.map_err(|_: serde::de::value::Error| "allowed champion, best or mean".into())
+        read.map_err(|_: serde::de::value::Error| "allowed champion, best, mean or test".into())
     }
 }
 
@@ -94,19 +104,20 @@ impl RunMetrics {
     }
 
     pub(crate) fn add(&mut self, row: &Row) {
-        for (averages, kind) in self.0.iter_mut().zip(TeamKind::ALL) {
+        let known = self.0.iter_mut().zip(TeamKind::ALL).filter_map(|(averages, kind)| Some((averages, kind.of(row)?)));
+        for (averages, g) in known {
             if averages.len() <= row.generation {
                 averages.resize(row.generation + 1, Average::default());
             }
-            averages[row.generation].add(kind.of(row));
+            averages[row.generation].add(g);
         }
     }
 }
 
-/// Reads G of the best team and of the champion, `[trials][generations]`, as far as the run has progressed.
-pub fn trials(folder: &Path, config: &Config, verification: Verification) -> Result<Vec<Vec<[f64; 2]>>, ReadError> {
+/// Reads the rows of all trials, `[trials][generations]`, as far as the run has progressed.
+pub fn trials(folder: &Path, config: &Config, verification: Verification) -> Result<Vec<Vec<Row>>, ReadError> {
     let mut trials = vec![vec![]; config.learning.trials];
-    metrics(folder, config, verification, |row| trials[row.trial].push([row.best_g, row.champion_g]))?;
+    metrics(folder, config, verification, |row| trials[row.trial].push(*row))?;
     Ok(trials)
 }
 
@@ -121,6 +132,11 @@ pub fn figure(
     verification: Verification,
 ) -> Result<Figure, ReadError> {
     let configs = folders.iter().map(|folder| config(folder, verification)).collect::<Result<Vec<_>, _>>()?;
+    for (folder, config) in folders.iter().zip(&configs) {
+        if let Some(reason) = measure.and_then(|kind| kind.missing(config)) {
+            return Err(ReadError::Unfinished { folder: folder.clone(), reason });
+        }
+    }
     let all = folders.iter().zip(&configs).map(|(folder, config)| RunMetrics::read(folder, config, verification));
     let all = all.collect::<Result<Vec<_>, _>>()?;
     let shown = Figure {
@@ -156,7 +172,9 @@ fn figure_of_runs(
 ) -> Figure {
     let (legend, curves): (Vec<String>, Vec<Curve>) = match (all, measure) {
         ([run], None) => {
-            TeamKind::ALL.into_iter().map(|kind| (kind.name().to_string(), Curve::new(run.of(kind), 1.0))).unzip()
+            let known =
+                TeamKind::ALL.into_iter().filter(|&kind| configs.iter().all(|config| kind.missing(config).is_none()));
+            known.map(|kind| (kind.name().to_string(), Curve::new(run.of(kind), 1.0))).unzip()
         }
         ([run], Some(kind)) => (vec![kind.name().to_string()], vec![Curve::new(run.of(kind), 1.0)]),
         (all, kind) => {

@@ -39,6 +39,8 @@ pub struct PointResults {
     pub best: Average,
     /// The champion's G in the last generation, averaged over trials.
     pub champion: Average,
+    /// The tested best team's G in the last generation, averaged over trials, if the point has test episodes.
+    pub test: Option<Average>,
     /// The first generation of every trial at which [`Detail::measure`]'s G is at least [`Detail::reach`].
     pub reached: Vec<Option<usize>>,
     /// [`Detail::measure`]'s G by generation, averaged over the trials, for each row of `results.csv`. The last
@@ -106,15 +108,19 @@ pub fn write(
     let path = out.join(RESULTS);
     let rows = |output: &mut dyn Write| {
         let mut table = csv::Writer::from_writer(output);
-        let columns = ["point", "trial", "generation", "best_g", "mean_g", "champion_g"];
+        let tested = is_tested(sweep);
+        let columns = ["point", "trial", "generation", "best_g", "mean_g", "champion_g"].into_iter();
+        let columns = columns.chain(tested.then_some("test_g"));
         table.write_record(sweep.axes.iter().map(|axis| &*axis.key).chain(columns))?;
         for point in &sweep.points {
             outcomes.push(match read(point, place, options) {
                 Ok((rows, outcome)) => {
                     for row in rows {
-                        let Row { trial, generation, best_g, mean_g, champion_g, .. } = row;
+                        let Row { trial, generation, best_g, mean_g, champion_g, test_g, .. } = row;
                         let counts = [point.index, trial, generation].map(|count| count.to_string());
                         let shares = [best_g, mean_g, champion_g].map(|share| share.to_string());
+                        let test_g = tested.then(|| test_g.map_or(String::new(), |share| share.to_string()));
+                        let shares = shares.into_iter().chain(test_g);
                         table.write_record(labels(sweep, point).into_iter().chain(counts).chain(shares))?;
                     }
                     Ok(outcome)
@@ -132,6 +138,11 @@ pub fn write(
     Ok(outcomes)
 }
 
+/// Reports whether any point has test episodes.
+fn is_tested(sweep: &Sweep) -> bool {
+    sweep.points.iter().any(|point| point.config.learning.test_episodes > 0)
+}
+
 fn labels(sweep: &Sweep, point: &Point) -> Vec<String> {
     let label = |(axis, &value): (&Axis, &usize)| escape::csv_cell(&axis.label(value)).into_owned();
     sweep.axes.iter().zip(&point.values).map(label).collect()
@@ -147,6 +158,8 @@ fn summary(
     let mut table = csv::Writer::from_writer(output);
     let columns =
         "point,trials,generations,champion_g,champion_g_low,champion_g_high,best_g,reach,reached,median".split(',');
+    let tested = is_tested(sweep);
+    let columns = columns.chain(["test_g"].into_iter().filter(|_| tested));
     table.write_record(sweep.axes.iter().map(|axis| &*axis.key).chain(columns))?;
     for (point, outcome) in sweep.points.iter().zip(outcomes) {
         let Ok(outcome) = outcome else { continue };
@@ -166,7 +179,8 @@ fn summary(
             outcome.reached.iter().flatten().count().to_string(),
             outcome.median_reached().map_or(String::new(), |median| median.to_string()),
         ];
-        table.write_record(labels(sweep, point).into_iter().chain(fields))?;
+        let test_g = tested.then(|| outcome.test.map_or(String::new(), |test| test.mean().to_string()));
+        table.write_record(labels(sweep, point).into_iter().chain(fields).chain(test_g))?;
     }
     table.flush()
 }
@@ -182,6 +196,9 @@ fn read(point: &Point, place: Place<'_>, options: &Detail) -> Result<(Vec<Row>, 
     }
     let digests = Digests::read(place.at(&folder), options.verification).map_err(|error| damaged(&error))?;
     let config = load_config(place.at(&folder.join(CONFIG))).map_err(|error| damaged(&error))?;
+    if let Some(missing) = options.measure.missing(&point.config) {
+        return Err(Missing::Damaged(missing));
+    }
     if without_checkpoint(&config) != without_checkpoint(&point.config) {
         return Err(Missing::Damaged(format!("{}: it is of another config", folder.escaped())));
     }
@@ -192,7 +209,8 @@ fn read(point: &Point, place: Place<'_>, options: &Detail) -> Result<(Vec<Row>, 
     let found = metrics::visit(place.at(&path), &config, |row| {
         let &Row { trial, generation, .. } = row;
         // G of an easier stage is not comparable.
-        if options.measure.of(row) >= options.reach && reached[trial].is_none() && generation >= config.last_from() {
+        let measured = options.measure.of(row).unwrap_or(0.0);
+        if measured >= options.reach && reached[trial].is_none() && generation >= config.last_from() {
             reached[trial] = Some(generation);
         }
         if generation % options.every == 0 || generation == last {
@@ -207,12 +225,13 @@ fn read(point: &Point, place: Place<'_>, options: &Detail) -> Result<(Vec<Row>, 
     let ends = || rows.iter().filter_map(|rows| rows.last());
     let curve = (0..rows[0].len()).map(|at| {
         let mut average = Average::default();
-        rows.iter().for_each(|rows| average.add(options.measure.of(&rows[at])));
+        rows.iter().filter_map(|rows| options.measure.of(&rows[at])).for_each(|g| average.add(g));
         (rows[0][at].generation, average)
     });
     let outcome = PointResults {
         best: ends().map(|row| &row.best_g).collect(),
         champion: ends().map(|row| &row.champion_g).collect(),
+        test: ends().map(|row| row.test_g).collect::<Option<Vec<f64>>>().map(|test| test.iter().collect()),
         reached,
         curve: curve.collect(),
     };

@@ -616,8 +616,8 @@ impl<S: Simd> Attraction<'_, S> {
             follower.sums[..TERMS].copy_from_slice(&sums);
         }
         for follower in followers {
-            for term in 0..TERMS {
-                follower.force.add(&terms[term], &follower.sums[term]);
+            for (term, sum) in terms.iter().zip(&follower.sums) {
+                follower.force.add(term, sum);
             }
         }
     }

@@ -7,11 +7,11 @@ use serde::Serialize;
 
 use crate::config::{
     AGENTS, AgentClass, Channel, Choice, Combine, Control, Frame, MAX_AGENTS, MAX_CHANNELS, MAX_CLASSES, MAX_INPUTS,
-    MAX_POIS, MAX_SECTORS, MAX_TERMS, Measure, Mobility, Motion, POIS, PoiGroup, Score, Term, When,
+    MAX_POIS, MAX_SECTORS, MAX_TERMS, Measure, Mobility, Motion, POIS, PoiGroup, Region, Score, Term, When,
 };
 use crate::model::rule::cycle;
 use crate::model::{LEAST, LONGEST, MAX_RANGES};
-use crate::reader::{Allowed, Reader, Value, between, sized};
+use crate::reader::{Allowed, KeyRequest, Number, Reader, Value, between, sized};
 
 /// Maximum length of a name.
 const LONGEST_NAME: usize = 64;
@@ -60,6 +60,10 @@ impl Summary {
         }
         let word = |value: Option<&Value<'_>>| value.and_then(Value::word).unwrap_or_default().to_string();
         let count = |value: Option<&Value<'_>>| value.and_then(Value::list).map_or(0, <[_]>::len);
+        let size = |table: &[(String, Value<'_>)]| {
+            let given = get(table, "count").and_then(usize::read).flatten().unwrap_or(0);
+            count(get(table, "at")).max(given.min(MAX_AGENTS))
+        };
         let class = |table: &[(String, Value<'_>)]| {
             let control = get(table, "control").map_or(Some("policy"), Value::word);
             let control = Control::ALL.iter().find(|(word, _)| Some(*word) == control).map(|found| found.1);
@@ -67,14 +71,11 @@ impl Summary {
                 name: word(get(table, "name")),
                 control,
                 has_rule: control == Some(Control::Follow) || count(get(table, "rule")) > 0,
-                agents: count(get(table, "at")),
+                agents: size(table),
                 observes: get(table, "observes").and_then(|value| value.flag()).unwrap_or(true),
             }
         };
-        let group = |table: &[(String, Value<'_>)]| GroupSummary {
-            name: word(get(table, "name")),
-            pois: count(get(table, "at")),
-        };
+        let group = |table: &[(String, Value<'_>)]| GroupSummary { name: word(get(table, "name")), pois: size(table) };
         let tables = r.peek(POIS);
         let groups: Vec<GroupSummary> = tables.iter().map(|table| group(table)).collect();
         let index: HashMap<&str, usize> =
@@ -167,14 +168,50 @@ fn limit(r: &mut Reader<'_>, key: &'static str, what: &str, [before, own, most]:
     }
 }
 
+/// A key of a table.
+type Key = for<'r, 'a> fn(&'r mut Reader<'a>) -> KeyRequest<'r, 'a>;
+
+/// Reads where the agents of a class or the POIs of a group are: at given positions, or a number of them in a region.
+/// `names` are the keys' full names, and `before` is the number of agents or POIs in the tables before.
+fn places(
+    r: &mut Reader<'_>,
+    [at, count, region]: [Key; 3],
+    names: [&'static str; 3],
+    sides: [Allowed<f64>; 2],
+    (what, before, most): (&str, usize, usize),
+) -> (Vec<[f64; 2]>, Option<usize>, Option<Region>) {
+    let at = at(r).positions(1..=most, sides, Some(vec![])).unwrap_or_default();
+    let errors = r.error_count();
+    let count = count(r).optional_number(between(1, most), "none").filter(|_| r.error_count() == errors);
+    let region = region(r).optional_table("in", "one of the keys below", |r| Region::read(r, sides)).flatten();
+    let [at_name, count_name, region_name] = names;
+    match names.map(|name| r.has(name)) {
+        [true, _, true] => r.report_key(region_name, "found with `at`, allowed either of them".into()),
+        [true, true, false] => r.report_key(count_name, "found with `at`, allowed with `in`".into()),
+        [false, true, false] => {
+            r.report_key(region_name, "missing, allowed a table with one of box, disc and circle".into());
+        }
+        [false, false, true] => r.report_key(count_name, format!("missing, allowed 1 to {most}, the number of {what}")),
+        [false, false, false] => {
+            let message = format!("missing, allowed a list of 1 to {most} positions [x, y], or `count` with `in`");
+            r.report_key(at_name, message);
+        }
+        [true, false, false] | [false, true, true] => {}
+    }
+    let (key, own) = if at.is_empty() { (count_name, count.unwrap_or(0)) } else { (at_name, at.len()) };
+    limit(r, key, what, [before, own, most]);
+    (at, count, region)
+}
+
 impl AgentClass {
     fn read(r: &mut Reader<'_>, index: usize, sides: [Allowed<f64>; 2], summary: &Summary) -> AgentClass {
         let before = summary.classes.get(..index).unwrap_or_default();
         let name = AgentClass::name(r).name(NAME, |name| name_problem(name, before.iter().map(|class| &class.name)));
-        let at = AgentClass::at(r).positions(1..=MAX_AGENTS, sides, None).unwrap_or_default();
-        let agents_before = before.iter().map(|class| class.agents).sum();
-        limit(r, "agents.at", "agents", [agents_before, at.len(), MAX_AGENTS]);
-        let counts = if at.is_empty() { 0..=usize::MAX } else { at.len()..=at.len() };
+        let limits = ("agents", before.iter().map(|class| class.agents).sum(), MAX_AGENTS);
+        let keys: [Key; 3] = [AgentClass::at, AgentClass::count, AgentClass::region];
+        let (at, count, region) = places(r, keys, ["agents.at", "agents.count", "agents.in"], sides, limits);
+        let size = count.unwrap_or(at.len());
+        let counts = if size == 0 { 0..=usize::MAX } else { size..=size };
         let heading = AgentClass::heading(r).one_or_each(between(-1e3, 1e3), counts, FRAC_PI_2);
         let control = AgentClass::control(r).choice(Control::Policy);
         let learns = control == Control::Policy;
@@ -246,6 +283,8 @@ impl AgentClass {
         AgentClass {
             name,
             at,
+            count,
+            region,
             heading,
             speed,
             control,
@@ -371,9 +410,11 @@ impl PoiGroup {
     fn read(r: &mut Reader<'_>, index: usize, sides: [Allowed<f64>; 2], steps: usize, summary: &Summary) -> PoiGroup {
         let before = summary.groups.get(..index).unwrap_or_default();
         let name = PoiGroup::name(r).name(NAME, |name| name_problem(name, before.iter().map(|group| &group.name)));
-        let at = PoiGroup::at(r).positions(1..=MAX_POIS, sides, None).unwrap_or_default();
-        limit(r, "pois.at", "POIs", [before.iter().map(|group| group.pois).sum(), at.len(), MAX_POIS]);
-        let counts = if at.is_empty() { 0..=usize::MAX } else { at.len()..=at.len() };
+        let limits = ("POIs", before.iter().map(|group| group.pois).sum(), MAX_POIS);
+        let keys: [Key; 3] = [PoiGroup::at, PoiGroup::count, PoiGroup::region];
+        let (at, count, region) = places(r, keys, ["pois.at", "pois.count", "pois.in"], sides, limits);
+        let size = count.unwrap_or(at.len());
+        let counts = if size == 0 { 0..=usize::MAX } else { size..=size };
         let errors = r.error_count();
         let names = summary.class_names(&[]);
         let observers = PoiGroup::observers(r).names("names of classes", false, names.as_deref(), |_| None);
@@ -400,11 +441,13 @@ impl PoiGroup {
             coupling,
             radius: PoiGroup::radius(r).number(between(0.01, LONGEST), 5.0),
             observers,
-            windows: windows(r, steps, at.len()),
+            windows: windows(r, steps, size),
             score: PoiGroup::score(r).choice(Score::Observed),
             when: PoiGroup::when(r).choice(When::Ever),
             after,
             at,
+            count,
+            region,
         }
     }
 }

@@ -21,6 +21,10 @@ fn text(list: &str, of: &impl Serialize, keys: &[&str]) -> String {
         ("motion", Value::Table(motion)) => {
             format!("{key} = {}\n", inline(motion, &[&["kind"], Motion::KEYS].concat()))
         }
+        ("in", Value::Table(region)) => {
+            let region: Vec<&str> = region.keys().map(String::as_str).collect();
+            format!("{key} = {}\n", inline(value.as_table().unwrap_or(&Table::new()), &region))
+        }
         ("senses", Value::Array(channels)) => format!("{key} = [\n{}]\n", rows(channels, Channel::KEYS)),
         ("rule", Value::Array(terms)) => format!("{key} = [\n{}]\n", rows(terms, Term::KEYS)),
         _ => format!("{key} = {value}\n"),

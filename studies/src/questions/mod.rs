@@ -315,7 +315,7 @@ impl Answer {
     fn reported(&self) -> Vec<(usize, Measure)> {
         let measures = self.rows.first().map_or(&[][..], |row| &row.comparison.measures);
         let is_reported = |measure: &Measure| match measure {
-            Measure::ChampionG { .. } | Measure::Played { .. } => true,
+            Measure::ChampionG { .. } | Measure::TestG { .. } | Measure::Played { .. } => true,
             Measure::GenerationsToReach { .. } => self.part.reach.is_some(),
             Measure::BestG { .. } => false,
         };

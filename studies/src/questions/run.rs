@@ -108,7 +108,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
          one place.\n",
         first.trials,
         first.seed,
-        first.teams()
+        first.team_count()
     );
     let page = questions::page(&answers, &heading);
     write(&disk, &out.join(PAGE), Ok(page.clone().into_bytes()))?;

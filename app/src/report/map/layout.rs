@@ -2,9 +2,9 @@
 
 use glam::DVec2;
 
-use super::{Legend, Marker, Poi, Team, Viewport, counted, poi_label, radius_of, values_differ};
-use crate::report::scene::{Anchor, BLACK, Scene};
-use flotilla::config::{Observers, StageConfig};
+use super::{FAINT, Legend, Marker, Poi, Team, Viewport, counted, poi_label, radius_of, values_differ};
+use crate::report::scene::{Anchor, BLACK, Pen, Scene};
+use flotilla::config::{Observers, Region, StageConfig};
 use flotilla::world::World;
 
 /// Returns the team of a config before training.
@@ -30,6 +30,20 @@ fn team(config: &StageConfig, world: &World) -> Team {
         leaders,
         agents: world.starts.iter().enumerate().map(agent).collect(),
         pois: config.classes().places().iter().zip(&world.coupling).enumerate().map(poi).collect(),
+    }
+}
+
+/// Outlines a region from which starts or POIs are drawn.
+fn outline(view: &Viewport, scene: &mut Scene, region: Region) {
+    let pen = Pen { dash: &[1.8, 1.0], ..Pen::new(FAINT, 0.3) };
+    match region {
+        Region::Box([x0, y0, x1, y1]) => {
+            let corners = [[x0, y0], [x1, y0], [x1, y1], [x0, y1]];
+            scene.polygon(corners.map(|corner| view.at(corner.into())).to_vec(), None, Some(pen));
+        }
+        Region::Disc([x, y, radius]) | Region::Circle([x, y, radius]) => {
+            scene.circle(view.at([x, y].into()), radius * view.scale, None, Some(pen));
+        }
     }
 }
 
@@ -63,6 +77,13 @@ pub fn layout(name: &str, config: &StageConfig) -> Scene {
         _ => format!("what each POI needs has no room here; it counts {within}"),
     };
     legend.note(needs);
+    let agents = config.agents.iter().filter_map(|class| Some((class.name.clone(), class.region?)));
+    let pois = config.pois.iter().filter_map(|group| Some((format!("POIs of {}", group.name), group.region?)));
+    let regions: Vec<(String, Region)> = agents.chain(pois).collect();
+    let drawn = regions.iter().map(|(name, _)| name.as_str()).collect::<Vec<_>>().join(", ");
+    if !regions.is_empty() {
+        legend.note(format!("long dashes: regions from which {drawn} are drawn in every episode; shown is an example"));
+    }
     if config.learning.start_jitter > 0.0 {
         legend.note(format!("starts move by up to {} on each axis", config.learning.start_jitter));
     }
@@ -75,12 +96,13 @@ pub fn layout(name: &str, config: &StageConfig) -> Scene {
     let agents = match &config.agents[..] {
         [] => [counted(leaders, "leader"), counted(world.followers(), "follower")].join(", "),
         classes => {
-            classes.iter().map(|class| format!("{} {}", class.at.len(), class.name)).collect::<Vec<_>>().join(", ")
+            classes.iter().map(|class| format!("{} {}", class.size(), class.name)).collect::<Vec<_>>().join(", ")
         }
     };
     let described = format!("{agents}, {}", counted(team.pois.len(), "POI"));
     scene.bold([EDGE, 4.2], described.clone(), 3.0, Anchor::Start, BLACK);
     view.draw(&mut scene, &team);
+    regions.iter().for_each(|(_, region)| outline(&view, &mut scene, *region));
     view.rule(&mut scene);
     legend.draw(&mut scene, [EDGE, HEAD + height + 11.8], room);
     scene.title = format!("The layout of {name}: {described}");
@@ -108,8 +130,9 @@ pub fn layout(name: &str, config: &StageConfig) -> Scene {
     let timed = if world.rule.is_timed() { pois_in_words(&world) } else { String::new() };
     let starts: Vec<DVec2> = team.agents[..leaders].iter().map(|agent| agent.place).collect();
     let pois: Vec<DVec2> = team.pois.iter().map(|poi| poi.place).collect();
+    let drawn = if regions.is_empty() { String::new() } else { format!(" Drawn in every episode: {drawn}.") };
     scene.description = format!(
-        "A map of {} by {} units before any training. {}{}{couplings}, {within}.{who}{timed}",
+        "A map of {} by {} units before any training. {}{}{couplings}, {within}.{who}{timed}{drawn}",
         map.x,
         map.y,
         places("Leaders", &starts),

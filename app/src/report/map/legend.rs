@@ -63,7 +63,7 @@ fn roles(config: &Config, leaders: usize) -> [String; 3] {
     let (learning, others): (Vec<_>, Vec<_>) = config.agents.iter().partition(|class| class.learns());
     let mut first = 0;
     let numbered = learning.iter().map(|class| {
-        let last = first + class.at.len() - 1;
+        let last = first + class.size() - 1;
         let numbers = if first == last { first.to_string() } else { format!("{first} to {last}") };
         first = last + 1;
         if leaders > 1 { format!("{} {numbers}", class.name) } else { class.name.clone() }

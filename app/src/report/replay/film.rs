@@ -154,7 +154,7 @@ pub fn still(config: &Config, played: &[Replayed], step: usize) -> Scene {
 fn busy(config: &Config, played: &[Replayed]) -> [DVec2; 2] {
     let (map, drawn) = (DVec2::from(config.world.map), config.drawn());
     let around = |at: DVec2, margin: f64| [at - margin, at + margin];
-    let pois: Vec<DVec2> = match config.learning.poi_jitter > 0.0 {
+    let pois: Vec<DVec2> = match config.pois_move() {
         true => played.iter().flat_map(|played| &played.world.pois).map(|poi| poi.as_dvec2()).collect(),
         false => drawn.pois.iter().map(|&poi| poi.into()).collect(),
     };

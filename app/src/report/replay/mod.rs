@@ -21,7 +21,7 @@ use flotilla::config::{Config, StageConfig};
 use flotilla::credit::{self, Credit, Scores, Strided};
 use flotilla::escape::PathExt;
 use flotilla::evolve;
-use flotilla::trainer::{Snapshot, Trainer};
+use flotilla::trainer::{Row, Snapshot, Trainer};
 use flotilla::world::World;
 
 mod film;
@@ -194,10 +194,10 @@ pub struct Replayed {
 }
 
 /// Returns G of the champion in a generation of a trial if `which` requests it, otherwise of the best team. None without
-/// a row. `trial` is G of the best team and of the champion, `[generations]`.
-fn g_of(trial: &[[f64; 2]], generation: usize, which: Which) -> Option<f64> {
-    let &[best, champion] = trial.get(generation)?;
-    Some(if which == Which::Champion { champion } else { best })
+/// a row. `trial` are its rows, `[generations]`.
+fn g_of(trial: &[Row], generation: usize, which: Which) -> Option<f64> {
+    let row = trial.get(generation)?;
+    Some(if which == Which::Champion { row.champion_g } else { row.best_g })
 }
 
 /// Returns the trials with the largest and the smallest G of a generation. Ties go to the lower index.
@@ -245,7 +245,7 @@ pub fn replay(
     if trial >= trials {
         return Err(ReplayError::NoTrial { folder: name(), trial, trials });
     }
-    let teams = generations.iter().map(|&generation| config.at(generation).learning.teams()).min().unwrap_or(0);
+    let teams = generations.iter().map(|&generation| config.at(generation).learning.team_count()).min().unwrap_or(0);
     if let Which::Number(team) = which
         && team >= teams
     {
@@ -349,9 +349,8 @@ fn team(
     which: Which,
     backend: &mut dyn Backend,
 ) -> Result<(Replayed, f64), BackendError> {
-    let learning = &config.learning;
     let (generation, world) = (trainer.generation(0), trainer.world(0).clone());
-    let teams = evolve::contemporary_teams(learning, trial, generation, &world.populations);
+    let teams = trainer.teams(0, 0).to_vec();
     let episodes = Episodes::new(config, &world, trial, generation, trainer.weights(0, 0)?, &teams);
     let g = episodes.play(backend)?;
     let first_best = (0..g.len()).reduce(|a, b| if g[b] > g[a] { b } else { a }).unwrap_or(0);
@@ -399,6 +398,7 @@ impl<'a> Episodes<'a> {
     ) -> Episodes<'a> {
         let starts = |episode| {
             let mut starts = Vec::new();
+            let episode = (evolve::Episodes::Training, episode);
             evolve::episode_positions(&config.learning, trial, generation, episode, world, &mut starts);
             starts
         };

@@ -93,7 +93,7 @@ pub fn data(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Val
         .collect();
     let world = &config.drawn();
     // Moving POIs are listed where the first episode had them.
-    let pois = match played.first().filter(|_| config.learning.poi_jitter > 0.0) {
+    let pois = match played.first().filter(|_| config.pois_move()) {
         Some(first) => first.world.pois.iter().map(|poi| poi.as_dvec2().to_array()).collect(),
         None => world.pois.clone(),
     };
@@ -119,7 +119,7 @@ pub fn data(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Val
     if !config.agents.is_empty() {
         let class = |class: &AgentClass| {
             let free = matches!(class.motion, Mobility::Free { .. });
-            json!({ "name": class.name, "count": class.at.len(), "free": free, "senses": class.senses })
+            json!({ "name": class.name, "count": class.size(), "free": free, "senses": class.senses })
         };
         data["classes"] = config.agents.iter().map(class).collect();
     }
