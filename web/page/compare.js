@@ -56,6 +56,9 @@ export function label({ key, values }, value) {
   return `${key.split(".")[1].replaceAll("_", " ")} ${value}`;
 }
 
+/** Names the team of a config: by its paradigm, or by its classes. @param {Config} config */
+export const team = ({ learning, agents = [] }) => learning.paradigm ?? agents.map(({ name }) => name).join(" and ");
+
 /**
  * Returns the style of each arm: the index of its colour and dashes. Paradigms and fitnesses have their own. Other arms have theirs by the
  * order of their names, whatever the order of files.
