@@ -238,6 +238,10 @@ def check_map_in_view(tab, page):
         tab.window(width, height, dark=False)
         tab.load(page)
         look("the opening", width)
+        # The POIs that go dark without a leader are in view, too, and so is who is missing.
+        tab.evaluate("scrollTo(0, 100000); " + press('#credits button[data-credit="true 3"]'))
+        look("without a leader", width)
+        assert tab.text("#views p").endswith(", without leader 3 and its followers"), tab.text("#views p")
         for scroll in [0, 100000]:
             for mode in ["arrange", "drive", "watch"]:
                 tab.evaluate(f"scrollTo(0, {scroll}); {press(f'[data-mode={mode}]')}; 0")
@@ -322,6 +326,7 @@ def check_consistency(tab, page, downloads):
 def check_classes(tab, page, native):
     """Tests configs in full: they train, and their classes, radii and values are drawn, rearranged and steered."""
     view, episode = "page.state.views[0]", "page.state.views[0].data.episodes[0]"
+    choose = f"{view}.chosen = {{}}; dispatchEvent(new Event('resize')); 0".format
     texts = "element => [element.textContent.trim(), element.querySelector('polygon').outerHTML]"
     for name, classes, unit in [
         ("rovers", ["4 rover", "2 drone"], "share of the POIs' value"),
@@ -379,14 +384,14 @@ def check_classes(tab, page, native):
     # Classes are rearranged in their tables, and comments stay.
     tab.click("[data-mode=arrange]")
     comments = tab.evaluate("page.state.text").count("#")
-    tab.evaluate(f"{view}.canvas.focus(); {view}.chosen = ['leaders', 5]; 0")
+    tab.evaluate(f"{view}.canvas.focus(); " + choose(["leaders", 5]))
     tab.press("ArrowRight", "ArrowRight")
     tab.wait("page.state.toml.includes('at = [[24.0, 25.0], [27.0, 25.0]]')")
     tab.click('[data-add="agents.1"]')
     tab.wait("page.state.start.classes[1].count === 3")
     tab.click('[data-add="pois.1"]')
     tab.wait("page.state.start.groups[1].count === 3 && page.state.start.radii.length === 9")
-    tab.evaluate(f"{view}.chosen = ['pois', 0]; 0")
+    tab.evaluate(choose(["pois", 0]))
     tab.click("#remove")
     tab.wait("page.state.start.groups[0].count === 2")
     assert tab.evaluate("page.state.valid && page.state.text").count("#") == comments
@@ -407,7 +412,7 @@ def check_classes(tab, page, native):
     tab.evaluate("document.querySelector('[data-exhibit=relay]').click(); 0")
     tab.wait("page.state.training && page.state.training.reached >= 0")
     tab.click("[data-mode=arrange]")
-    tab.evaluate(f"{view}.chosen = ['pois', 1]; 0")
+    tab.evaluate(choose(["pois", 1]))
     tab.click("#remove")
     tab.wait("page.state.valid && page.state.config.world.windows.length === 2")
     tab.assert_no_errors()
@@ -1048,15 +1053,17 @@ def check_first_visit(tab, page, call, downloads):
     tab.wait("page.state.training.arms.every(arm => arm.constant === 0)", 60)
     sums = "arm => arm.trials.reduce((sum, trial) => sum + trial.at(-1).best, 0)"
     best = tab.evaluate(f"page.state.training.arms.map({sums})")
-    assert best[0] < best[1] < best[2], best
+    assert best[0] < 3 <= best[1] < best[2], best
     tab.wait(f"document.querySelector('#guide-says').textContent.includes('{best[2]:.2f} of 4 (population 500)')")
-    assert tab.text("#guide-says").startswith("You said: 20 are enough. It is: 500. "), tab.text("#guide-says")
+    assert tab.text("#guide-says").startswith("You said: 20 are enough. It is: 100. "), tab.text("#guide-says")
     assert not tab.text("#needless")
     tab.assert_no_errors()
     # The whole population of three generations is shown, as 50 faint teams each.
     tab.click("#guide-next")
     tab.click(predict)
     tab.wait("page.state.views.length === 3 && page.state.views.every(view => view.ghosts.length === 50)", 100)
+    # They are drawn once, so that the best team still moves. Drawing them for every picture took seconds.
+    tab.wait("page.state.views.every(view => view.place >= 25)", 20)
     titles = tab.evaluate("page.state.views.map(view => view.title.textContent)")
     assert titles == ["Generation 0", "Generation 15", "Generation 60"], titles
     spread = (
@@ -1070,7 +1077,7 @@ def check_first_visit(tab, page, call, downloads):
     # The surprise: with one population per group, teams without followers learn, too.
     tab.click("#guide-next")
     tab.click(predict)
-    tab.wait("page.state.training && page.state.training.arms[0].label === 'sharing none' && " + DONE, 400)
+    tab.wait("page.state.training && page.state.training.arms[0].label === 'a population per agent' && " + DONE, 400)
     none, group, _ = tab.evaluate(f"page.state.training.arms.map({sums})")
     assert none == 0 and group > 2, (none, group)
     assert "number of populations" in tab.text("#guide-says"), tab.text("#guide-says")

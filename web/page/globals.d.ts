@@ -83,7 +83,7 @@ declare const stage: {
 interface View {
   label: string, card: HTMLElement, title: HTMLElement, status: HTMLElement, marks: HTMLElement, sensed: HTMLElement, canvas: HTMLCanvasElement,
   data: Scene | null, place: number, playing: boolean, ended: number | null, over: number | null, wanted: number | null, asking: boolean,
-  crop: Crop, chosen: Chosen | null, removed: Removed | null, selected: number | null, drawn: Place[], ghosts: Scene[],
+  crop: Crop, chosen: Chosen | null, removed: Removed | null, selected: number | null, drawn: Place[], ghosts: Scene[], haunted: { look: string, picture: HTMLCanvasElement } | null,
   describe: ((step: number, observed: number, text: string) => [string, string]) | null,
 }
 /**

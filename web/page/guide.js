@@ -34,14 +34,14 @@ const STEPS = [
   },
   {
     of: "population", watch: () => exhibit("population", { trains: true }),
-    asks: "The same task, with followers. Each leader's policy is selected from a population of policies. How many does it take?",
-    choices: ["20 are enough", "100", "500"], right: 2,
+    asks: "The same task, with followers. Each leader's policy is selected from a population of policies. How many does it take until the best teams observe three of the four POIs?",
+    choices: ["20 are enough", "100", "500"], right: 1,
     why: "The first policies are random. Among few, hardly any two leaders meet. Among many, some do, and selection copies them.",
   },
   {
     of: "evolution", ready: evolution, watch: async () => show_exhibit(await evolution()),
     asks: "Selection changes whole populations. The 50 policies of each leader start at random. Where do they go after 60 generations?",
-    choices: ["Everywhere", "Nearly all the same way"], right: 1,
+    choices: ["Everywhere", "Most the same way"], right: 1,
     why: "Each faint line is the way of one policy, in the colour of its leader. At first they go everywhere. Selection keeps the few that meet, and their changed copies soon fill the population.",
   },
   {

@@ -19,7 +19,7 @@ export function add_view(label, crop, style = null) {
   /** @type {View} */
   const view = {
     label, card, title, status, canvas, marks, sensed, crop, data: null, place: 0, playing: false, ended: null, over: null, wanted: null,
-    asking: false, chosen: null, removed: null, selected: null, drawn: [], ghosts: [], describe: null,
+    asking: false, chosen: null, removed: null, selected: null, drawn: [], ghosts: [], haunted: null, describe: null,
   };
   canvas.addEventListener("pointermove", event => pointed(view, event));
   canvas.addEventListener("click", event => picked(view, event));
@@ -31,7 +31,12 @@ export function add_view(label, crop, style = null) {
 
 /** Sets the part of the map that a view shows, extended to the shape of its canvas: width divided by height. @param {View} view @param {Crop} crop */
 export function aim(view, [left, below, right, above], shape = (right - left) / (above - below)) {
-  const wide = Math.max(right - left, (above - below) * shape), tall = wide / shape, x = (left + right) / 2, y = (below + above) / 2;
+  const wide = Math.max(right - left, (above - below) * shape), tall = wide / shape;
+  // The middle moves so that no more than a margin beyond the walls is shown, unless the map is smaller than the canvas.
+  const [x, y] = [[left, right, wide], [below, above, tall]].map(([low, high, size], axis) => {
+    const most = state.config.world.map[axis] + 1.5 - size / 2, least = size / 2 - 1.5, middle = (low + high) / 2;
+    return most < least ? middle : Math.max(least, Math.min(most, middle));
+  });
   view.crop = [x - wide / 2, y - tall / 2, x + wide / 2, y + tall / 2];
   view.canvas.style.setProperty("--wide", String(shape));
 }
@@ -96,10 +101,22 @@ export function dark(data, removed) {
   return gone ? episode.observed.flatMap((at, poi) => at !== null && gone.observed[poi] === null ? [poi] : []) : [];
 }
 
-/** Draws the ways of the leaders of other teams as faint lines. @param {View} view */
-function haunt({ canvas, crop, ghosts }) {
-  const { X, Y } = stage.place_on(canvas, crop), pen = pen_of(canvas);
-  pen.lineWidth = 1;
+/** Draws the ways of the leaders of other teams as faint lines, once for each look of the view. @param {View} view */
+function haunt(view) {
+  const { canvas, ghosts, crop } = view, look = [canvas.width, canvas.height, stage.night.matches, ...crop].join();
+  if (!ghosts.length) return;
+  if (!view.haunted || view.haunted.look !== look) view.haunted = { look, picture: ways(canvas, crop, ghosts) };
+  const pen = pen_of(canvas);
+  pen.save();
+  pen.resetTransform();
+  pen.drawImage(view.haunted.picture, 0, 0);
+  pen.restore();
+}
+
+/** Returns a picture of the ways of leaders, of a canvas's size. @param {HTMLCanvasElement} canvas @param {Crop} crop @param {Scene[]} ghosts */
+function ways(canvas, crop, ghosts) {
+  const { X, Y } = stage.place_on(canvas, crop), picture = make("canvas", "", null, { width: canvas.width, height: canvas.height }), pen = pen_of(picture);
+  pen.setTransform(pen_of(canvas).getTransform());
   pen.globalAlpha = 0.2;
   for (const ghost of ghosts) {
     const [episode] = ghost.episodes, colors = stage.palette(ghost);
@@ -113,7 +130,7 @@ function haunt({ canvas, crop, ghosts }) {
       pen.stroke();
     }
   }
-  pen.globalAlpha = 1;
+  return picture;
 }
 
 /** Draws a ring around what is chosen in a view. @param {View} view @param {Chosen} chosen */

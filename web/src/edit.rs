@@ -30,18 +30,18 @@ fn put(table: &mut dyn TableLike, names: &[&str], mut value: Value) {
             }
             *item = Item::Value(value);
         }
-        // Reading the config reports a key that leads through anything else than tables and lists of tables.
         Some(item) => {
-            let index = rest[0].parse().ok();
-            match (item, index) {
-                (Item::ArrayOfTables(list), Some(index)) => {
-                    list.get_mut(index).map(|inner| put(inner, &rest[1..], value));
+            let (inner, rest): (Option<&mut dyn TableLike>, _) = match (item, rest[0].parse::<usize>()) {
+                (Item::ArrayOfTables(list), Ok(index)) => (list.get_mut(index).map(|table| table as _), &rest[1..]),
+                (Item::Value(Value::Array(list)), Ok(index)) => {
+                    let entry = list.get_mut(index).and_then(Value::as_inline_table_mut);
+                    (entry.map(|table| table as _), &rest[1..])
                 }
-                (Item::Value(Value::Array(list)), Some(index)) => {
-                    let inner = list.get_mut(index).and_then(Value::as_inline_table_mut);
-                    inner.map(|inner| put(inner, &rest[1..], value));
-                }
-                (item, _) => drop(item.as_table_like_mut().map(|inner| put(inner, rest, value))),
+                (item, _) => (item.as_table_like_mut(), rest),
+            };
+            // Reading the config reports a key that leads through anything else than tables and lists of tables.
+            if let Some(inner) = inner {
+                put(inner, rest, value);
             }
         }
         None if rest.is_empty() => drop(table.insert(name, Item::Value(value))),

@@ -57,8 +57,9 @@ const stage = (() => {
     const grow = (low, high, least, end) => {
       const more = Math.max(0, (least - (high - low)) / 2);
       low -= more; high += more;
-      const shift = low < 0 ? -low : Math.min(0, end - high);
-      return [Math.max(0, low + shift), Math.min(end, high + shift)];
+      // A margin beyond the walls, so that agents at a wall are drawn whole.
+      const shift = low < -1 ? -1 - low : Math.min(0, end + 1 - high);
+      return [Math.max(-1, low + shift), Math.min(end + 1, high + shift)];
     };
     [left, right] = grow(left, right, (above - below) / 2, width);
     [below, above] = grow(below, above, (right - left) / 2, height);
@@ -122,7 +123,7 @@ const stage = (() => {
     return observers ? `, only ${observers.map(own => data.classes[own].name).join(" and ")}` : "";
   }
 
-  const whole = data => [0, 0, ...data.map];
+  const whole = ({ map: [width, height] }) => [-1, -1, width + 1, height + 1];
 
   // Maps positions in a part of the map to positions on a canvas.
   function place_on(canvas, [left, below, right, above]) {
