@@ -238,6 +238,10 @@ def check_map_in_view(tab, page):
         tab.window(width, height, dark=False)
         tab.load(page)
         look("the opening", width)
+        # The POIs that go dark without a leader are in view, too, and so is who is missing.
+        tab.evaluate("scrollTo(0, 100000); " + press('#credits button[data-credit="true 3"]'))
+        look("without a leader", width)
+        assert tab.text("#views p").endswith(", without leader 3 and its followers"), tab.text("#views p")
         for scroll in [0, 100000]:
             for mode in ["arrange", "drive", "watch"]:
                 tab.evaluate(f"scrollTo(0, {scroll}); {press(f'[data-mode={mode}]')}; 0")
@@ -282,6 +286,18 @@ def check_consistency(tab, page, downloads):
     # What was said about a file is gone with the next experiment.
     tab.evaluate("document.querySelector('[data-exhibit=blind]').click()")
     assert tab.text("#message") == "", tab.text("#message")
+    # Controls that would do nothing are disabled, or say why.
+    tab.load(page, layout="chaotic")
+    dead = "['replay', 'trial', 'pause', 'stop', 'scrub', 'step', 'undo']"
+    dead += ".filter(id => !document.getElementById(id).disabled)"
+    assert tab.evaluate(dead) == [], tab.evaluate(dead)
+    tab.click("#gif")
+    assert tab.text("#message").startswith("There is no film yet"), tab.text("#message")
+    tab.click("[data-mode=arrange]")
+    assert tab.evaluate("document.querySelector('#remove').disabled")
+    tab.evaluate("page.state.views[0].canvas.focus()")
+    tab.press("]", "BracketRight")
+    assert not tab.evaluate("document.querySelector('#remove').disabled")
     # A leader that is removed is not drawn, even if it was the last one, so that the config has a problem.
     tab.load(page)
     tab.drop("one.toml", base64(b"[world]\nleaders = [[5, 5]]\npois = [[5, 12]]\ncoupling = 1\n"))
@@ -305,6 +321,114 @@ def check_consistency(tab, page, downloads):
     assert tab.evaluate("document.querySelector('#trouble').hidden")
     assert not list(tab.complaints())
     print("the page says nothing about something else than it shows")
+
+
+def check_classes(tab, page, native):
+    """Tests configs in full: they train, and their classes, radii and values are drawn, rearranged and steered."""
+    view, episode = "page.state.views[0]", "page.state.views[0].data.episodes[0]"
+    choose = f"{view}.chosen = {{}}; dispatchEvent(new Event('resize')); 0".format
+    texts = "element => [element.textContent.trim(), element.querySelector('polygon').outerHTML]"
+    for name, classes, unit in [
+        ("rovers", ["4 rover", "2 drone"], "share of the POIs' value"),
+        ("herd", ["3 dog", "6 sheep"], "POIs"),
+    ]:
+        tab.load(page)
+        config = CONFIGS / f"{name}.toml"
+        tab.drop(config.name, base64(config.read_bytes()))
+        tab.wait("page.state.valid && page.state.start.classes?.length === 2")
+        # Settings that classes replace are hidden.
+        shown = "['paradigm', 'coupling'].map(id => document.querySelector('#' + id).closest('label').hidden)"
+        assert tab.evaluate(shown) == [True, True]
+        # Each class has its own mark, and each POI its own radius.
+        (first, mark), (second, other) = tab.evaluate(f"[...document.querySelectorAll('.marks span')].map({texts})")
+        assert [first, second] == classes and mark != other, (first, mark, second, other)
+        assert ", ".join(classes) in tab.text("#views p"), tab.text("#views p")
+        for key, value in {"generations": 3, "trials": 2, "population": 12}.items():
+            tab.set(f"#{key}", str(value))
+            tab.wait(f"page.state.config.learning.{key} === {value}")
+        tab.set("#pace", "full")
+        flags = ("--generations", "3", "--trials", "2", "--population", "12")
+        ((label, digest),) = tab.train().items()
+        assert label == " and ".join(own.split()[1] for own in classes), label
+        assert digest == native(f"classes-{name}", config, *flags), name
+        tab.wait(f"{view}.data && !{view}.playing")
+        assert f"{unit} observed by the best team" in tab.text("#legend"), tab.text("#legend")
+        tab.assert_no_errors()
+        # The others do what they learned, whatever the arms are called.
+        tab.click("[data-mode=drive]")
+        tab.click("#again")
+        tab.wait("document.querySelector('#driven').textContent.includes('what they learned (')")
+        tab.assert_no_errors()
+    # Radii in the start view are those of the config. The largest is not that of all.
+    tab.load(page)
+    tab.drop("rovers.toml", base64((CONFIGS / "rovers.toml").read_bytes()))
+    tab.wait(f"page.state.start.classes?.length === 2 && {view}.data.pois.length === 8")
+    assert tab.evaluate(f"{view}.data.radii") == [3, 3, 3, 4, 4, 3, 3, 5]
+    # A drone moves freely, so that keys and pointer set its velocity. A rover has to turn first.
+    tab.click("[data-mode=drive]")
+    for leader, sideways in [(4, True), (0, False)]:
+        tab.set("#leader", str(leader))
+        assert tab.text(f"#leader option:nth-child({leader + 1})") == ("drone 4" if sideways else "rover 0")
+        tab.click("#again")
+        tab.evaluate(f"{view}.canvas.dispatchEvent(new KeyboardEvent('keydown', {{ key: 'ArrowRight' }})); 0")
+        tab.wait(f"{view}.place >= 3")
+        tab.evaluate(f"{view}.canvas.dispatchEvent(new KeyboardEvent('keyup', {{ key: 'ArrowRight' }})); 0")
+        at = f"{episode}.positions.slice({{0}} * 12 + {2 * leader}, {{0}} * 12 + {2 * leader} + 2)"
+        (x0, y0), (x1, y1) = (list(tab.evaluate(f"[...{at.format(step)}]")) for step in [0, 3])
+        assert (x1 - x0 > 2 and abs(y1 - y0) < 1e-6) if sideways else y1 - y0 > 0.1, (leader, x0, y0, x1, y1)
+    tab.set("#leader", "4")
+    tab.click("#again")
+    tab.mouse("mouseMoved", *tab.place("pois", 6))
+    tab.wait(f"{episode}.observed[6] !== null", 60)
+    tab.assert_no_errors()
+    # Classes are rearranged in their tables, and comments stay.
+    tab.click("[data-mode=arrange]")
+    comments = tab.evaluate("page.state.text").count("#")
+    tab.evaluate(f"{view}.canvas.focus(); " + choose(["leaders", 5]))
+    tab.press("ArrowRight", "ArrowRight")
+    tab.wait("page.state.toml.includes('at = [[24.0, 25.0], [27.0, 25.0]]')")
+    tab.click('[data-add="agents.1"]')
+    tab.wait("page.state.start.classes[1].count === 3")
+    tab.click('[data-add="pois.1"]')
+    tab.wait("page.state.start.groups[1].count === 3 && page.state.start.radii.length === 9")
+    tab.evaluate(choose(["pois", 0]))
+    tab.click("#remove")
+    tab.wait("page.state.start.groups[0].count === 2")
+    assert tab.evaluate("page.state.valid && page.state.text").count("#") == comments
+    tab.assert_no_errors()
+    # A link has them.
+    text = tab.evaluate("page.state.text")
+    tab.wait("location.hash.includes('config=')")
+    tab.open(tab.evaluate("location.href"))
+    tab.wait(READY)
+    assert tab.evaluate("page.state.text") == text
+    tab.assert_no_errors()
+    # A group's lists of a value per POI keep their lengths. So do those of the short form.
+    tab.drop("herd.toml", base64((CONFIGS / "herd.toml").read_bytes()))
+    tab.wait("page.state.start.groups && page.state.start.groups[0].name === 'gate'")
+    tab.click("[data-mode=arrange]")
+    tab.click('[data-add="pois.0"]')
+    tab.wait("page.state.valid && page.state.start.coupling.join() === '2,4,6,6,2,4,6'")
+    tab.evaluate("document.querySelector('[data-exhibit=relay]').click(); 0")
+    tab.wait("page.state.training && page.state.training.reached >= 0")
+    tab.click("[data-mode=arrange]")
+    tab.evaluate(choose(["pois", 1]))
+    tab.click("#remove")
+    tab.wait("page.state.valid && page.state.config.world.windows.length === 2")
+    tab.assert_no_errors()
+    # The value of the POIs that are lost is the credit.
+    tab.evaluate("document.querySelector('#guide-end').click(); 0")
+    tab.load(page, on="cpu", pace="full")
+    tab.evaluate("document.querySelector('[data-exhibit=rovers]').click(); 0")
+    tab.wait(DONE, 200)
+    tab.wait(f"page.state.views.every(view => view.data && view.data.episodes[0].generation === 100)")
+    credits = tab.evaluate(f"{episode}.d")
+    for leader, d in enumerate(credits):
+        tab.evaluate(f"document.querySelector('#credits [data-credit=\"false {leader}\"]').click(); 0")
+        assert tab.text("#lost").endswith(f" {round(d, 3):g}."), (tab.text("#lost"), d)
+    assert max(credits) > 0 and tab.text("#lost").startswith("Without drone 5"), tab.text("#lost")
+    tab.assert_no_errors()
+    print("configs in full train, and their classes are drawn, rearranged and steered")
 
 
 def check_history(tab, page):
@@ -899,7 +1023,7 @@ def check_first_visit(tab, page, call, downloads):
     assert f"{lost} of 4 POIs are lost" in tab.text("#guide-says"), tab.text("#guide-says")
     assert "dark" in tab.text("#lost") and f"{lost} of 4" in tab.text("#lost"), tab.text("#lost")
     assert tab.evaluate("document.activeElement.id") == "guide-next", "the focus is lost after a prediction"
-    assert tab.text("#guide-says").startswith("You said: one. "), tab.text("#guide-says")
+    assert tab.text("#guide-says").startswith("You said: one. That is right. "), tab.text("#guide-says")
     # Then it trains both paradigms, and shows the baselines. Here, constant actions observe nothing. It does
     # not say why before the result is there.
     tab.click("#guide-next")
@@ -915,6 +1039,7 @@ def check_first_visit(tab, page, call, downloads):
     tab.wait("document.querySelector('#guide-says').textContent.includes('Training is finished.')")
     guide = tab.text("#guide-says")
     assert f"{sum(best[0]):.2f} of 4 (leader-follower), 0.00 of 4 (all-leaders)" in guide, guide
+    assert guide.startswith("You said: leader-follower. That is right. "), guide
     assert "Six independent learners almost never coincide" in guide, guide
     assert min(best[0]) >= 0.75 and max(best[1]) == 0, best
     assert not tab.text("#needless")
@@ -928,14 +1053,17 @@ def check_first_visit(tab, page, call, downloads):
     tab.wait("page.state.training.arms.every(arm => arm.constant === 0)", 60)
     sums = "arm => arm.trials.reduce((sum, trial) => sum + trial.at(-1).best, 0)"
     best = tab.evaluate(f"page.state.training.arms.map({sums})")
-    assert best[0] < best[1] < best[2], best
+    assert best[0] < 3 <= best[1] < best[2], best
     tab.wait(f"document.querySelector('#guide-says').textContent.includes('{best[2]:.2f} of 4 (population 500)')")
+    assert tab.text("#guide-says").startswith("You said: 20 are enough. It is: 100. "), tab.text("#guide-says")
     assert not tab.text("#needless")
     tab.assert_no_errors()
     # The whole population of three generations is shown, as 50 faint teams each.
     tab.click("#guide-next")
     tab.click(predict)
     tab.wait("page.state.views.length === 3 && page.state.views.every(view => view.ghosts.length === 50)", 100)
+    # They are drawn once, so that the best team still moves. Drawing them for every picture took seconds.
+    tab.wait("page.state.views.every(view => view.place >= 25)", 20)
     titles = tab.evaluate("page.state.views.map(view => view.title.textContent)")
     assert titles == ["Generation 0", "Generation 15", "Generation 60"], titles
     spread = (
@@ -949,7 +1077,7 @@ def check_first_visit(tab, page, call, downloads):
     # The surprise: with one population per group, teams without followers learn, too.
     tab.click("#guide-next")
     tab.click(predict)
-    tab.wait("page.state.training && page.state.training.arms[0].label === 'sharing none' && " + DONE, 400)
+    tab.wait("page.state.training && page.state.training.arms[0].label === 'a population per agent' && " + DONE, 400)
     none, group, _ = tab.evaluate(f"page.state.training.arms.map({sums})")
     assert none == 0 and group > 2, (none, group)
     assert "number of populations" in tab.text("#guide-says"), tab.text("#guide-says")
@@ -961,7 +1089,7 @@ def check_first_visit(tab, page, call, downloads):
 
     # Every experiment of the gallery opens with its arms.
     names = tab.evaluate("[...document.querySelectorAll('[data-exhibit]')].map(button => button.dataset.exhibit)")
-    assert len(names) == 7, names
+    assert len(names) == 9, names
     for name in names:
         tab.click(f"[data-exhibit={name}]")
         training = "page.state.training"
@@ -983,7 +1111,7 @@ def check_first_visit(tab, page, call, downloads):
     # The pointer on the chart shows the values of a generation.
     x, y = tab.evaluate(
         "(() => { const box = document.querySelector('#curves').getBoundingClientRect();"
-        " return [box.left + 30 + (box.width - 44) / 3, box.top + 60]; })()"
+        " return [box.left + 36 + (box.width - 50) / 3, box.top + 60]; })()"
     )
     mean = "page.state.training.arms[0].trials.reduce((sum, trial) => sum + trial[{}].best, 0) / 2 * 4".format
     for at, move in [(2, [x, y]), (6, [x, y - 100])]:
@@ -1369,6 +1497,7 @@ def main():
         check_slow_network(tab, page)
         check_map_in_view(tab, page)
         check_history(tab, page)
+        check_classes(tab, page, native)
         check_consistency(tab, page, downloads)
         check_links_and_devices(tab, page)
         check_first_visit(tab, page, call, downloads)

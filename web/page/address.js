@@ -38,7 +38,7 @@ async function words_of({ text, compared }, config, layout) {
     for (const id of KEY_IDS) if (id !== "coupling") words.set(id, $(id).value);
   }
   const both = compared && compared.key === "learning.paradigm";
-  words.set("learners", both ? "both" : config.learning.paradigm);
+  if (config.learning.paradigm) words.set("learners", both ? "both" : config.learning.paradigm);
   if (compared && !both) words.set("compare", write(compared));
   if ($("on").value !== "auto") words.set("on", $("on").value);
   if ($("pace").value !== "watch") words.set("pace", $("pace").value);
@@ -82,7 +82,7 @@ export async function recall() {
     await take(text);
   }
   const version = words.get("version");
-  $("version").textContent = version !== null && version !== state.version ? `This link is from version ${version}, and this page is version ${state.version}: results may differ.` : "";
+  render({ note: version !== null && version !== state.version ? `This link is from version ${version}, and this page is version ${state.version}: results may differ.` : "" });
 }
 
 /** Returns whether several opened runs are on show. No link holds them. */

@@ -1,9 +1,9 @@
 // Rearranging the map by pointer and keys.
 import { configs } from "./config.js";
-import { $, count, number, write_text } from "./dom.js";
+import { $, count, make, number, write_text } from "./dom.js";
 import { change } from "./experiment.js";
 import { start_scene } from "./scene.js";
-import { render, state } from "./state.js";
+import { part, render, state } from "./state.js";
 import { aim, draw, only_view, show } from "./views.js";
 
 /** The view of the start. @type {View | null} */
@@ -20,20 +20,50 @@ export function show_start() {
   show(start_view, start_scene(config), false);
 }
 
+/** @returns {[string, string]} */
 function describe_start() {
-  const { world } = state.config;
-  if (!start_view) return;
-  write_text($("chosen"), start_view.chosen ? `Chosen: ${name_chosen(start_view.chosen)}` : "");
-  start_view.status.textContent = `${count(world.leaders.length, "leader")}, ${count(world.followers.length, "follower")}, ${count(world.pois.length, "POI")} · ${world.steps} steps`;
-  start_view.canvas.ariaLabel = `Map of the start: ${start_view.status.textContent}${start_view.chosen ? `; chosen: ${name_chosen(start_view.chosen)}` : ""}`;
+  const { world } = state.config, chosen = start_view && start_view.chosen && name_chosen(start_view.chosen);
+  const who = groups().filter(({ list, from, end }) => list !== "pois" && end > from).map(({ name, table, from, end }) => table === "world" ? count(end - from, name) : `${end - from} ${name}`);
+  $("remove").disabled = !chosen;
+  write_text($("chosen"), chosen ? `Chosen: ${chosen}` : "");
+  const status = `${who.join(", ")}, ${count(world.pois.length, "POI")} · ${world.steps} steps`;
+  return [status, `Map of the start: ${status}${chosen ? `; chosen: ${chosen}` : ""}`];
 }
 
-const KINDS = { leaders: "leader", followers: "follower", pois: "POI" };
-const name_chosen = (/** @type {Chosen} */ [list, index]) => `${KINDS[list]} ${index} at ${state.config.world[list][index].map(number).join(", ")}`;
+/**
+ * Returns what lies on the map: leaders, followers and POIs, or classes of agents and groups of POIs. `table` is the config's table with
+ * their `places` as its key `key`. They are entries `from` to `end` of a list of the world.
+ */
+function groups() {
+  const { world, agents = [], pois = [] } = state.config, end = { leaders: 0, followers: 0, pois: 0 };
+  const short = (/** @type {List} */ list, /** @type {string} */ name) => ({ list, name, table: "world", key: /** @type {string} */ (list), places: world[list], own: /** @type {Group | Config["world"]} */ (world) });
+  const full = (/** @type {"agents" | "pois"} */ table, /** @type {Group} */ own, /** @type {number} */ index) => ({
+    list: /** @type {List} */ (table === "pois" ? "pois" : own.control === "policy" ? "leaders" : "followers"), name: table === "pois" ? `POI (${own.name})` : own.name,
+    table: `${table}.${index}`, key: "at", places: own.at, own: /** @type {Group | Config["world"]} */ (own),
+  });
+  const all = [
+    ...agents.length ? agents.map((own, index) => full("agents", own, index)) : [short("leaders", "leader"), short("followers", "follower")],
+    ...pois.length ? pois.map((own, index) => full("pois", own, index)) : [short("pois", "POI")],
+  ];
+  return all.map(group => ({ ...group, from: end[group.list], end: end[group.list] += group.places.length }));
+}
+/** @typedef {ReturnType<typeof groups>[0]} Placed */
 
-const LISTS = /** @type {List[]} */ (["leaders", "followers", "pois"]);
-/** Returns everything on the map: its list, its index and its place. @type {(config: Config) => [List, number, Place][]} */
-const items = ({ world }) => LISTS.flatMap(list => world[list].map((place, index) => /** @type {[List, number, Place]} */ ([list, index, place])));
+/** Returns the group of what is chosen. @param {Chosen} chosen */
+const group_of = ([list, index]) => /** @type {Placed} */ (groups().find(group => group.list === list && index < group.end));
+const name_chosen = (/** @type {Chosen} */ chosen) => `${group_of(chosen).name} ${chosen[1]} at ${state.config.world[chosen[0]][chosen[1]].map(number).join(", ")}`;
+
+/** Returns everything on the map: its list, its index and its place. @returns {[List, number, Place][]} */
+const items = () => groups().flatMap(({ list, from, places }) => places.map((place, index) => /** @type {[List, number, Place]} */ ([list, from + index, place])));
+
+part(() => [groups().map(({ name }) => name).join()], () => {
+  $("adds").replaceChildren(...groups().map(({ name, table, key }) => {
+    const button = make("button", `Add a ${name}`, null, { type: "button" });
+    button.dataset.add = key === "at" ? table : key;
+    button.addEventListener("click", () => add(table, key));
+    return button;
+  }));
+});
 
 /** @param {View} view @param {Chosen | null} chosen */
 function choose(view, chosen) {
@@ -41,8 +71,18 @@ function choose(view, chosen) {
   draw(view);
 }
 
-/** Shows a list of the world before the module has resolved it. @param {List} list @param {Place[]} places */
-const put = (list, places) => render({ config: { ...state.config, world: { ...state.config.world, [list]: places } } });
+/** Shows other places of a group before the module has resolved them. @param {Placed} group @param {Place[]} places */
+function put({ list, table, from, end, own }, places) {
+  const { config } = state, { world } = config, [name, index] = table.split(".");
+  const full = name === "world" ? {} : { [name]: config[/** @type {"agents" | "pois"} */ (name)]?.with(Number(index), { .../** @type {Group} */ (own), at: places }) };
+  render({ config: { ...config, ...full, world: { ...world, [list]: world[list].toSpliced(from, end - from, ...places) } } });
+}
+
+/** Moves what is chosen. @param {Chosen} chosen @param {Place} place */
+function move([list, index], place) {
+  const group = group_of([list, index]);
+  put(group, group.places.with(index - group.from, place));
+}
 
 // Positions are rounded to a tenth, and stay on the map.
 const tenth = (/** @type {number} */ value, /** @type {number} */ most) => Math.round(Math.max(0, Math.min(most, value)) * 10) / 10;
@@ -66,7 +106,7 @@ function hands(view) {
     const { scale } = stage.place_on(view.canvas, view.crop), at = place(event);
     // Agents are drawn above POIs, so they take precedence.
     const away = (/** @type {[List, number, Place]} */ [list, , [x, y]]) => Math.hypot(x - at[0], y - at[1]) + (list === "pois" ? 1 : 0);
-    const near = items(state.config).sort((a, b) => away(a) - away(b))[0];
+    const near = items().sort((a, b) => away(a) - away(b))[0];
     if (!near || away(near) > Math.max(18 / scale, state.config.world.observation_radius * 0.6)) return choose(view, null);
     held = [near[0], near[1]];
     choose(view, held);
@@ -75,16 +115,16 @@ function hands(view) {
   });
   view.canvas.addEventListener("pointermove", event => {
     if (!held) return;
-    put(held[0], state.config.world[held[0]].with(held[1], place(event)));
+    move(held, place(event));
   });
   const release = () => {
-    if (held) moved(held[0]);
+    if (held) moved(group_of(held));
     held = null;
   };
   view.canvas.addEventListener("pointerup", release);
   view.canvas.addEventListener("pointercancel", release);
   view.canvas.addEventListener("keydown", event => {
-    const all = items(state.config), { chosen } = view;
+    const all = items(), { chosen } = view;
     const index = chosen ? all.findIndex(([list, at]) => list === chosen[0] && at === chosen[1]) : -1;
     const by = ARROWS[event.key];
     if (event.key === "]" || event.key === "[") {
@@ -93,8 +133,8 @@ function hands(view) {
     } else if (by && view.chosen) {
       const [list, at] = view.chosen, [width, height] = state.config.world.map, size = event.shiftKey ? 0.1 : 1;
       const [x, y] = state.config.world[list][at];
-      put(list, state.config.world[list].with(at, [tenth(x + by[0] * size, width), tenth(y + by[1] * size, height)]));
-      moved(list);
+      move(view.chosen, [tenth(x + by[0] * size, width), tenth(y + by[1] * size, height)]);
+      moved(group_of(view.chosen));
     } else if (event.key === "Delete" && view.chosen) remove();
     else return;
     event.preventDefault();
@@ -102,16 +142,18 @@ function hands(view) {
   });
 }
 
-/** @param {List} list */
-function moved(list) {
+/** Writes the places of a group into the config. @param {Placed} group @param {(list: unknown[]) => unknown[]} [fit] changes its lists of a value per place */
+function moved({ list, table, key, places, own }, fit) {
   state.file = null;
-  return change([[`world.${list}`, configs.positions(state.config.world[list])]]);
+  const each = fit ? [list === "pois" ? "coupling" : table === "world" ? "" : "heading", list === "pois" ? "windows" : ""] : [];
+  const values = Object.entries(own).filter(([key, value]) => each.includes(key) && Array.isArray(value) && value.length > 1);
+  return change([[`${table}.${key}`, configs.positions(places)], ...values.map(([key, value]) => /** @type {[string, string]} */ ([`${table}.${key}`, JSON.stringify(fit?.(value))]))]);
 }
 
-/** Adds an agent or a POI. @param {List} list */
-export function add(list) {
+/** Adds an agent or a POI to a group. @param {string} table @param {string} key */
+function add(table, key) {
   const { world } = state.config, [width, height] = world.map, [first] = state.views;
-  const taken = items(state.config).map(([, , place]) => place);
+  const taken = items().map(([, , place]) => place);
   // Search for a free place, on a spiral from the middle of the map.
   /** @type {Place} */
   let place = [width / 2, height / 2];
@@ -119,16 +161,18 @@ export function add(list) {
     const away = 1.5 * Math.sqrt(ring), angle = 2.4 * ring;
     place = [tenth(width / 2 + away * Math.cos(angle), width), tenth(height / 2 + away * Math.sin(angle), height)];
   }
-  put(list, [...world[list], place]);
-  choose(first, [list, world[list].length]);
-  moved(list);
+  const find = () => /** @type {Placed} */ (groups().find(group => group.table === table && group.key === key)), group = find();
+  put(group, [...group.places, place]);
+  choose(first, [group.list, group.end]);
+  moved(find(), list => [...list, list.at(-1)]);
 }
 
 export function remove() {
   const [first] = state.views;
   if (!first || !first.chosen) return;
-  const [list, index] = first.chosen;
+  const group = group_of(first.chosen), index = first.chosen[1] - group.from;
   first.chosen = null;
-  put(list, state.config.world[list].toSpliced(index, 1));
-  moved(list);
+  put(group, group.places.toSpliced(index, 1));
+  const find = /** @type {Placed} */ (groups().find(({ table, key }) => table === group.table && key === group.key));
+  moved(find, list => list.toSpliced(index, 1));
 }

@@ -26,14 +26,14 @@ export const chart = (() => {
     const draw = pen_of(canvas);
     draw.setTransform(dots, 0, 0, dots, 0, 0);
     draw.clearRect(0, 0, wide, tall);
-    const [left, right, above, below] = [30, 14, 12, 36];
+    const [left, right, above, below] = [36, 14, 12, 36];
     const X = (/** @type {number} */ generation) => left + (wide - left - right) * (last > 0 ? generation / last : 0);
     const Y = (/** @type {number} */ value) => tall - below - (tall - above - below) * (pois > 0 ? value / pois : 0);
     draw.font = "12px system-ui, sans-serif";
     draw.lineWidth = 1;
     draw.textBaseline = "middle";
     draw.textAlign = "right";
-    const step = Math.max(1, Math.ceil(pois / 5));
+    const step = pois > 1 ? Math.ceil(pois / 5) : 0.25;
     for (let value = 0; value <= pois; value += step) {
       draw.strokeStyle = color("--line");
       draw.beginPath(); draw.moveTo(left, Y(value)); draw.lineTo(wide - right, Y(value)); draw.stroke();

@@ -50,11 +50,17 @@ export function read(word) {
 /** Returns a value as TOML: a number as it is, and a word in quotes. @param {string} value */
 export const toml = value => /^-?(\d+(\.\d+)?|inf)$/.test(value) ? value : `"${value}"`;
 
+/** Names of arms that say more than their values. @type {Record<string, Record<string, string>>} */
+const SAYS = { "learning.sharing": { none: "a population per agent", group: "one per group", all: "one for all" } };
+
 /** Names an arm. @param {Comparison} compared @param {string} value */
 export function label({ key, values }, value) {
   if (key === "learning.paradigm" || key === "learning.fitness" && values.length > 1) return value;
-  return `${key.split(".")[1].replaceAll("_", " ")} ${value}`;
+  return SAYS[key]?.[value] ?? `${key.split(".")[1].replaceAll("_", " ")} ${value}`;
 }
+
+/** Names the team of a config: by its paradigm, or by its classes. @param {Config} config */
+export const team = ({ learning, agents = [] }) => learning.paradigm ?? agents.map(({ name }) => name).join(" and ");
 
 /**
  * Returns the style of each arm: the index of its colour and dashes. Paradigms and fitnesses have their own. Other arms have theirs by the

@@ -1,7 +1,8 @@
 // Credit of each leader, and the episode without a leader: the POIs that go dark are its credit.
 import { $, all, count, make, number } from "./dom.js";
+import { name_of_leader } from "./senses.js";
 import { part, render, shown, state } from "./state.js";
-import { dark, draw, select } from "./views.js";
+import { dark, draw, reveal, select } from "./views.js";
 
 // Most leaders in the table.
 const SHOWN = 32;
@@ -60,8 +61,9 @@ function table(view) {
 
 /** Makes the button that shows what a leader senses. @param {Shown} view @param {number} leader */
 function sense_button(view, leader) {
-  const colors = stage.palette(view.data), button = make("button", String(leader), null, { type: "button", title: "Show what it senses" });
-  button.setAttribute("aria-label", `Leader ${leader}: show what it senses`);
+  const name = name_of_leader(view.data, leader);
+  const colors = stage.palette(view.data), button = make("button", view.data.classes ? name : String(leader), null, { type: "button", title: "Show what it senses" });
+  button.setAttribute("aria-label", `${name}: show what it senses`);
   button.setAttribute("aria-pressed", String(view.selected === leader));
   button.dataset.credit = `sense ${leader}`;
   button.style.borderBottom = `4px solid ${colors[leader % colors.length]}`;
@@ -69,11 +71,11 @@ function sense_button(view, leader) {
   return button;
 }
 
-/** Makes the button that removes a leader, or puts it back. @param {View} view @param {Removed} removal */
+/** Makes the button that removes a leader, or puts it back. @param {Shown} view @param {Removed} removal */
 function remove_button(view, { leader, group }) {
   const is = view.removed && view.removed.leader === leader && view.removed.group === group;
   const button = make("button", is ? "Put back" : "Remove", null, { type: "button" });
-  button.setAttribute("aria-label", `${is ? "Put back" : "Remove"} leader ${leader}${group ? " and its followers" : ""}`);
+  button.setAttribute("aria-label", `${is ? "Put back" : "Remove"} ${name_of_leader(view.data, leader)}${group ? " and its followers" : ""}`);
   button.setAttribute("aria-pressed", String(Boolean(is)));
   button.dataset.credit = `${group} ${leader}`;
   button.addEventListener("click", () => remove_leader(view, is ? null : { leader, group }));
@@ -85,13 +87,16 @@ export function remove_leader(view, removed) {
   view.removed = removed;
   draw(view);
   render();
+  reveal();
 }
 
 /** Says what the removal costs. @param {Shown} view */
 function lost(view) {
   if (!view.removed) return "Remove a leader: the POIs that go dark are its credit. D removes the leader alone, Df the leader and its followers.";
-  const { leader, group } = view.removed, gone = dark(view.data, view.removed), pois = view.data.pois.length;
-  const who = `Without leader ${leader}${group ? " and its followers" : ""}`;
+  const { leader, group } = view.removed, { data } = view, gone = dark(data, view.removed), pois = data.pois.length;
+  const who = `Without ${name_of_leader(data, leader)}${group ? " and its followers" : ""}`;
+  const worth = (/** @type {number[]} */ values) => values.reduce((sum, value) => sum + value, 0), all = data.values ? worth(data.values) : pois;
+  const lost = data.values ? worth(data.values.filter((_, poi) => gone.includes(poi))) : gone.length;
   const which = gone.length ? `POI${gone.length > 1 ? "s" : ""} ${gone.join(", ")} ${gone.length > 1 ? "go" : "goes"} dark` : "no POI goes dark";
-  return `${who}, ${which}: its ${group ? view.data.fitness === "Dt" ? "Dt" : "Df" : "D"} is ${gone.length} of ${pois}, ${number(gone.length / pois)}.`;
+  return `${who}, ${which}: its ${group ? data.fitness === "Dt" ? "Dt" : "Df" : "D"} is ${lost} of ${data.values ? `the POIs' value ${all}` : all}, ${number(lost / all)}.`;
 }

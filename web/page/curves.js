@@ -26,7 +26,7 @@ export function curves() {
   const cursor = !training ? null : over ?? (follow ? null : generation);
   drawn_chart = chart.paint($("curves"), arms, every, last, pois, cursor);
   $("legend").replaceChildren();
-  const many = training && training.pois === null ? "share of POIs" : "POIs", own = training ? training.arms : [];
+  const many = training ? training.unit : "POIs", own = training ? training.arms : [];
   const reached = Math.min(...own.map(({ trials }) => Math.min(...trials.map(trial => trial.length)) - 1), Infinity), at = Math.min(cursor ?? reached, reached);
   /** @param {string} tone @param {number[]} dashes @param {string} text */
   const item = (tone, dashes, text) => {
@@ -61,5 +61,5 @@ function needless(training) {
   const alike = training.arms.flatMap(arm => arm.constant !== null && arm.constant > 0 && arm.constant >= final(arm) - 1e-9 ? [{ arm, constant: arm.constant }] : []);
   if (!alike.length) return "";
   const all = training.pois ?? 1, many = (/** @type {number} */ g) => (g * all).toFixed(2);
-  return `No learning is needed here. ${alike.map(({ arm, constant }) => `${arm.label} observes ${many(final(arm))} of ${all} POIs, and the best constant action ${many(constant)}`).join("; ")}. In "Two groups must meet", a constant action observes nothing.`;
+  return `No learning is needed here. ${alike.map(({ arm, constant }) => `${arm.label} observes ${many(final(arm))} of ${all}${training.pois === null ? "" : " POIs"}, and the best constant action ${many(constant)}`).join("; ")}. In "Two groups must meet", a constant action observes nothing.`;
 }

@@ -3,15 +3,16 @@ import { $, count, failure, make, number } from "./dom.js";
 import { edited } from "./experiment.js";
 import { clerk } from "./pool.js";
 import { reach, start_scene } from "./scene.js";
+import { class_of, name_of_leader } from "./senses.js";
 import { part, state, trouble } from "./state.js";
 import { draw, only_view, show } from "./views.js";
 
 /** What steers. `turn` identifies the drive in progress. @type {{ on: boolean, timer: number, pointer: Place | null, keys: Set<string>, turn: object | null }} */
 const drive = { on: false, timer: 0, pointer: null, keys: new Set(), turn: null };
 
-part(() => [state.config.world.leaders.length], () => {
+part(() => [state.config.world.leaders.length, state.start], () => {
   const many = state.config.world.leaders.length, chosen = $("leader").value;
-  $("leader").replaceChildren(...Array.from({ length: many }, (_, leader) => make("option", String(leader))));
+  $("leader").replaceChildren(...Array.from({ length: many }, (_, leader) => make("option", state.start.classes ? name_of_leader(state.start, leader) : String(leader), null, { value: String(leader) })));
   if (Number(chosen) < many && chosen !== "") $("leader").value = chosen;
 });
 
@@ -21,10 +22,10 @@ export function drive_view() {
   only.canvas.classList.add("steer");
   only.canvas.tabIndex = 0;
   only.canvas.setAttribute("role", "application");
-  only.describe = (step, observed, text) => {
-    only.status.textContent = `step ${step} of ${state.config.world.steps} · ${observed} of ${state.config.world.pois.length} POIs`;
-    only.canvas.ariaLabel = `You steer leader ${$("leader").value}: step ${step}, ${text}`;
-  };
+  only.describe = (step, observed, text) => [
+    `step ${step} of ${state.config.world.steps} · ${observed} of ${state.config.world.pois.length} POIs`,
+    `You steer ${name_of_leader(state.start, Number($("leader").value))}: step ${step}, ${text}`,
+  ];
   show(only, start_scene(state.config), false);
   only.chosen = ["leaders", Number($("leader").value) || 0];
   draw(only);
@@ -48,20 +49,23 @@ export function drive_view() {
 }
 
 /**
- * Returns the wanted turn, in half turns to the left, and speed, each in -1..1. Returns null without input.
+ * Returns a leader's two outputs, each in -1..1: the wanted turn, in half turns to the left, and speed, or if it moves freely, its speed
+ * along x and y. Returns null without input.
  * @param {number[]} positions @param {number[]} headings @param {number} leader
  */
 function wish(positions, headings, leader) {
+  const { free } = class_of(state.start, leader);
   const [x, y] = positions.slice(2 * leader, 2 * leader + 2), [cos, sin] = headings.slice(2 * leader, 2 * leader + 2);
   if (drive.pointer) {
     const [dx, dy] = [drive.pointer[0] - x, drive.pointer[1] - y], away = Math.hypot(dx, dy);
+    if (free) return [dx, dy].map(part => part / Math.max(2, away));
     if (away < 0.3) return [0, -1];
     const angle = Math.atan2(cos * dy - sin * dx, cos * dx + sin * dy);
     return [Math.max(-1, Math.min(1, angle / Math.PI)), Math.max(-1, Math.min(1, away / 2 - 1))];
   }
   if (!drive.keys.size) return null;
-  const turn = (drive.keys.has("ArrowLeft") ? 0.4 : 0) - (drive.keys.has("ArrowRight") ? 0.4 : 0);
-  return [turn, drive.keys.has("ArrowUp") ? 1 : drive.keys.has("ArrowDown") ? -1 : 0.2];
+  const [left, right, up, down] = ["ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown"].map(key => Number(drive.keys.has(key)));
+  return free ? [right - left, up - down] : [0.4 * (left - right), up || (down ? -1 : 0.2)];
 }
 
 export async function drive_on() {
@@ -71,13 +75,14 @@ export async function drive_on() {
   only.chosen = null;
   drive.on = true;
   $("again").textContent = "Start over";
-  const toml = await edited(state.toml ?? "", [["learning.paradigm", '"leader-follower"']]);
-  const { each, weights } = state.policies || { each: 0 };
+  // Classes already say which agents learn.
+  const toml = state.start.classes ? state.toml : await edited(state.toml ?? "", [["learning.paradigm", '"leader-follower"']]);
+  const { each, weights, of } = state.policies || { each: 0 };
   /** @type {Driven} */
   let now;
   try {
     now = (await clerk.ask({ ask: "drive", text: toml, leader, policies: each }, weights)).words;
-    $("driven").textContent = now.learned ? "The other leaders do what they learned." : state.policies ? "The other leaders go straight ahead: what was learned is not for these teams." : "The other leaders go straight ahead: train first, and they do what they learned.";
+    $("driven").textContent = now.learned ? `The other leaders do what they learned${of ? ` (${of})` : ""}.` : `The other leaders have a policy of zeros: ${state.policies ? "what was learned is not for this team" : "train first, and they do what they learned"}.`;
   } catch (thrown) {
     drive_off();
     return trouble("run", failure(thrown).message);
@@ -111,7 +116,7 @@ export async function drive_on() {
     if (now.scores) {
       drive_off();
       const { g, d, df } = now.scores, pois = state.config.world.pois.length;
-      $("driven").textContent = `The team observed ${Math.round(g * pois)} of ${count(pois, "POI")} (G = ${number(g)}). Yours: D = ${number(d[leader])}, Df = ${number(df[leader])}.`;
+      $("driven").textContent = `The team observed ${now.observed.filter(at => at !== null).length} of ${count(pois, "POI")} (G = ${number(g)}). Yours: D = ${number(d[leader])}, Df = ${number(df[leader])}.`;
       return;
     }
     drive.timer = setTimeout(step, Math.max(0, pace - (performance.now() - from)));

@@ -103,7 +103,12 @@ export async function entered() {
   await changing;
 }
 
-// Sets the controls to the values of the config.
+// Returns whether the experiment has paradigms. Without followers there is only one, and classes replace them.
+const has_paradigms = () => state.config.learning.paradigm !== undefined && state.config.world.followers.length > 0;
+/** Returns what the arms differ in, or null for a single arm. */
+export const effective = () => state.compared && (state.compared.key !== "learning.paradigm" || has_paradigms()) ? state.compared : null;
+
+// Sets the controls to the values of the config. Settings that it does not have are hidden.
 export function fill() {
   const { learning, world } = state.config;
   for (const id of /** @type {const} */ (["seed", "generations", "trials", "population"])) $(id).value = String(learning[id]);
@@ -111,11 +116,16 @@ export function fill() {
   const each = typeof world.coupling !== "number";
   $("coupling").value = each ? "" : String(world.coupling);
   $("coupling").placeholder = each ? "each" : "";
-  const choice = choice_of(state.compared, learning.population), own = option($("compare"), "own");
+  const compared = effective(), choice = choice_of(compared, learning.population), own = option($("compare"), "own");
   own.hidden = choice !== "own";
-  own.textContent = state.compared && choice === "own" ? `${state.compared.key.split(".")[1].replaceAll("_", " ")} ${state.compared.values.join(", ")}` : "";
+  own.textContent = compared && choice === "own" ? `${compared.key.split(".")[1].replaceAll("_", " ")} ${compared.values.join(", ")}` : "";
+  option($("compare"), "paradigm").hidden = !has_paradigms();
   $("compare").value = choice;
-  $("paradigm").value = learning.paradigm;
+  if (learning.paradigm) $("paradigm").value = learning.paradigm;
+  for (const [id, has] of /** @type {const} */ ([["paradigm", has_paradigms()], ["coupling", !state.config.pois?.length]])) {
+    const label = $(id).closest("label");
+    if (label) label.hidden = !has;
+  }
   const layout = configs.LAYOUTS.find(name => same_world(name));
   option($("layout"), "own").hidden = Boolean(layout);
   $("layout").value = layout || "own";
@@ -180,7 +190,7 @@ export function command({ learning }, given = []) {
   const layout = $("layout").value, flagged = ["fitness", "seed", "generations", "trials", "population"];
   const written = (/** @type {Changes[0]} */ [key, value]) => flagged.includes(key.split(".")[1]) ? ` --${key.split(".")[1]} ${value}` : ` --set ${key}=${value}`;
   const extra = given.filter(([key]) => layout === "own" || !flagged.includes(key.split(".")[1])).map(written).join("");
-  if (layout === "own") return `flotilla train ${slug(name_of())}.toml --paradigm ${learning.paradigm}${extra}`;
+  if (layout === "own") return `flotilla train ${slug(name_of())}.toml${learning.paradigm ? ` --paradigm ${learning.paradigm}` : ""}${extra}`;
   const flags = /** @type {const} */ (["paradigm", "fitness", "seed"]).map(key => `--${key} ${learning[key]}`);
   const base = state.layouts[layout].learning;
   for (const key of /** @type {const} */ (["generations", "trials", "population"])) if (base[key] !== learning[key]) flags.push(`--${key} ${learning[key]}`);

@@ -70,7 +70,8 @@ const pause_of = (/** @type {number} */ many) => {
 let busy = false;
 /** @param {() => Promise<void>} act */
 async function one_at_a_time(act) {
-  if (busy || !moving().length) return;
+  if (busy) return;
+  if (!moving().length) return report("There is no film yet: nothing on the map moves. Train first.");
   busy = true;
   try { await act(); } catch (thrown) { trouble("file", `The film could not be made: ${failure(thrown).message}`); } finally { busy = false; }
 }

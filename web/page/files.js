@@ -1,4 +1,5 @@
 // Files that are dropped or opened.
+import { team } from "./compare.js";
 import { count, failure } from "./dom.js";
 import { keep, take } from "./experiment.js";
 import { renew_failed, settle } from "./machine.js";
@@ -43,7 +44,7 @@ async function take_runs(read, reading) {
   for (const { file, bytes } of read) {
     reading(file);
     const { words, bytes: numbers } = await state.players[0].ask({ ask: "read", text: null }, bytes, {}, [bytes.buffer]);
-    found.push({ name: file.name, label: words.config.learning.paradigm, words, bytes: numbers });
+    found.push({ name: file.name, label: team(words.config), words, bytes: numbers });
   }
   if (found.length > 1) {
     const { words } = await clerk.ask({ ask: "labels", texts: found.map(({ words }) => words.toml), names: found.map(({ name }) => name) });

@@ -1,4 +1,4 @@
-// Experiments to start from. Each has a config in web/gallery and what it compares.
+// Experiments to start from. Each has a config in web/gallery or configs, and what it compares.
 import { $, make } from "./dom.js";
 import { edited, keep, take } from "./experiment.js";
 import { render, state } from "./state.js";
@@ -37,6 +37,14 @@ const GALLERY = [
   {
     name: "places", title: "POIs that move", compare: { key: "learning.paradigm", values: ["leader-follower", "all-leaders"] },
     says: "POIs are elsewhere in every generation. No way can be learned by heart, and teams of both kinds learn to sense.",
+  },
+  {
+    name: "swarm", title: "A swarm", compare: { key: "learning.fitness", values: ["G", "D", "Df"] },
+    says: "Two leaders with twelve followers each. D, which removes a leader alone, is nearly always 0 with that many. Df removes its followers, too.",
+  },
+  {
+    name: "rovers", title: "Rovers and drones", compare: { key: "learning.fitness", values: ["G", "D"] },
+    says: "Two classes learn: slow rovers, and fast drones without a heading. Some POIs count rovers, some drones, one both, and their values differ.",
   },
 ];
 

@@ -21,14 +21,18 @@ interface Config {
   world: Record<List, Place[]> & Rule & { map: Place, coupling: number | number[], observation_radius: number, steps: number, dt: number };
   motion: { max_speed: number };
   follow: { attraction_radius: number };
+  agents?: Group[];
+  pois?: Group[];
   learning: {
-    paradigm: Kind, fitness: string, seed: string, generations: number, trials: number, population: number, partners?: number, hall_of_fame?: number,
+    paradigm?: Kind, fitness: string, seed: string, generations: number, trials: number, population: number, partners?: number, hall_of_fame?: number,
     episodes_per_team: number, test_episodes: number,
   };
 }
 /** Which agents count at POIs, when, and after which others. */
 interface Rule { observers: "all" | "leaders" | "followers", windows: Place[], after: number[][] }
-interface Start { owner: number[], coupling: number[], headings: number[] }
+/** An entry of `[[agents]]` or `[[pois]]`. The lists have a value for each place, or one for all. */
+interface Group { name: string, at: Place[], motion: { max_speed: number }, control?: string, coupling?: number | number[], windows?: Place[], heading?: number | number[] }
+interface Start extends Parts { owner: number[], coupling: number[], headings: number[] }
 interface Described { toml: string, config: Config, pois: number | null, parameters: number, start: Start }
 interface Palettes { light: string[], dark: string[] }
 
@@ -42,10 +46,12 @@ interface Episode extends Seen {
 }
 /** A channel of a class's senses, and a class of agents. Those that learn come first. */
 interface Channel { of: string | string[], sectors: number, frame: "heading" | "map" }
-interface AgentClass { count: number, free: boolean, senses: Channel[] }
-interface Scene extends Rule {
+interface AgentClass { name: string, count: number, free: boolean, senses: Channel[] }
+/** What only full configs have: classes of agents, groups of POIs, and the radius and value of each POI if they differ. */
+interface Parts { classes?: AgentClass[], groups?: { name: string, count: number }[], radii?: number[], values?: number[] }
+interface Scene extends Rule, Parts {
   map: Place, pois: Place[], observation_radius: number, attraction_radius: number, dt: number, steps: number, exact: boolean,
-  colors: Palettes, fitness?: string, episodes: Episode[], radii?: number[], values?: number[], classes?: AgentClass[],
+  colors: Palettes, fitness?: string, episodes: Episode[],
 }
 /** A scene as it is sent: arrays are base64 until `stage.unpack`. */
 interface Packed { colors: Palettes, episodes: { generation: number, best_g: number }[] }
@@ -68,15 +74,17 @@ declare const stage: {
   paint(data: Scene, episode: Episode, canvas: HTMLCanvasElement, place: number, look: Look): { step: number, positions: Place[] },
   say(episode: Episode, step: number): [number, string],
   poi_at(data: Scene, canvas: HTMLCanvasElement, crop: Crop, x: number, y: number): number | null,
+  legend(data: Scene): HTMLElement[],
   later(data: Scene, episode: Episode, place: number, seconds: number): number,
 };
 
-/** One canvas: its arm, its episode, and the place in it. `describe` writes the text of a view that shows no training. */
+/** One canvas: its arm, its episode, and the place in it. `describe` returns the line below the title of a view that shows no training, and its
+ * description for screen readers. */
 interface View {
-  label: string, card: HTMLElement, title: HTMLElement, status: HTMLElement, sensed: HTMLElement, canvas: HTMLCanvasElement,
+  label: string, card: HTMLElement, title: HTMLElement, status: HTMLElement, marks: HTMLElement, sensed: HTMLElement, canvas: HTMLCanvasElement,
   data: Scene | null, place: number, playing: boolean, ended: number | null, over: number | null, wanted: number | null, asking: boolean,
-  crop: Crop, chosen: Chosen | null, removed: Removed | null, selected: number | null, drawn: Place[], ghosts: Scene[],
-  describe: ((step: number, observed: number, text: string) => void) | null,
+  crop: Crop, chosen: Chosen | null, removed: Removed | null, selected: number | null, drawn: Place[], ghosts: Scene[], haunted: { look: string, picture: HTMLCanvasElement } | null,
+  describe: ((step: number, observed: number, text: string) => [string, string]) | null,
 }
 /**
  * Episodes that belong to no training. `status` writes the line below a title, `label` names the episode for screen readers, and `ghosts` are
@@ -91,13 +99,13 @@ type Shown = View & { data: Scene };
  * generation under the pointer. `training` has the results on
  * show, and without one `exhibit` the episode. `valid` tells whether the text is a valid config, `problems` why not, and `config`, `toml`, `pois`
  * and `start` are those of the last valid text. `linked` tells whether the address holds it. `past` has earlier texts, for undo. `chosen` is
- * the latest experiment of the gallery, and `guide` the step of the guided start, and what the visitor predicted. `layouts` has the config of each layout. `settled` is the choice that `machine` was opened for.
+ * the latest experiment of the gallery, `note` is about the version of the opened link, and `guide` the step of the guided start, and what the visitor predicted. `layouts` has the config of each layout. `settled` is the choice that `machine` was opened for.
  */
 interface State extends Past {
   valid: boolean, config: Config, toml: string | null, pois: number | null, start: Start, past: Past[], problems: Problem[], linked: boolean,
   mode: "watch" | "arrange" | "drive", training: Training | null, exhibit: Exhibit | null, follow: boolean, generation: number, over: number | null, trial: number,
-  views: View[], chosen: Picked | null, guide: { step: number, said: string | null } | null, troubles: Record<string, string>, message: string, gpu: Gpu, machine: Machine, settled: string | null,
-  players: Player[], policies: { each: number, weights: Bytes } | null, layouts: Record<string, Config>, version: string,
+  views: View[], chosen: Picked | null, guide: { step: number, said: string | null } | null, troubles: Record<string, string>, message: string, note: string, gpu: Gpu, machine: Machine, settled: string | null,
+  players: Player[], policies: { each: number, weights: Bytes, of?: string } | null, layouts: Record<string, Config>, version: string,
 }
 interface Past { text: string, file: string | null, compared: Comparison | null }
 /** An experiment of the gallery, and what it set. */
@@ -165,7 +173,7 @@ type Elements =
   & Record<"train" | "stop" | "pause" | "replay" | "undo" | "again" | "remove" | "verify" | "share" | "open" | "save", HTMLButtonElement>
   & Record<"png" | "gif" | "webm" | "csv" | "guide-next" | "guide-end", HTMLButtonElement>
   & Record<"text", HTMLTextAreaElement> & Record<"curves", HTMLCanvasElement> & Record<"config" | "more", HTMLDetailsElement>
-  & Record<"setup" | "guide" | "guide-step" | "guide-says" | "guide-choices" | "bar" | "arrange" | "drive" | "modes" | "views" | "plain-label", HTMLElement>
+  & Record<"setup" | "guide" | "guide-step" | "guide-says" | "guide-choices" | "bar" | "arrange" | "adds" | "drive" | "modes" | "views" | "plain-label", HTMLElement>
   & Record<"credit" | "play" | "team" | "credits" | "lost" | "compared" | "compared-says" | "means" | "pairs" | "tests" | "gallery" | "digests", HTMLElement>
   & Record<"trouble" | "stale" | "announced" | "machine" | "version" | "legend" | "needless" | "problems" | "lines" | "marks", HTMLElement>
   & Record<"chosen" | "driven" | "generation" | "message" | "verified", HTMLElement>

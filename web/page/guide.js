@@ -15,41 +15,45 @@ const dearest = (() => {
 })();
 
 /**
- * A step: `of` names what `watch` shows, an exhibit or an experiment of the gallery, once `ready` has made it.
- * @type {{ of: string, asks: string, choices: string[], ready?: () => Promise<unknown>, watch: () => unknown, why: string }[]}
+ * A step: `of` names what `watch` shows, an exhibit or an experiment of the gallery, once `ready` has made it. `right` is the index of the
+ * choice that comes true.
+ * @type {{ of: string, asks: string, choices: string[], right: number, ready?: () => Promise<unknown>, watch: () => unknown, why: string }[]}
  */
 const STEPS = [
   {
     of: "opening", watch: () => show_opening({ leader: dearest.leader, group: true }),
     asks: `This team was trained: its four leaders (filled arrows) learned where to go, and eight followers (hollow arrows) follow them. A point of interest (POI, a circle) is observed once six agents are inside it at the same time, so groups have to meet. How many of the four POIs are left without leader ${dearest.leader} and its followers?`,
-    choices: ["One", "Two", "Three"],
+    choices: ["One", "Two", "Three"], right: dearest.pois - dearest.lost - 1,
     why: `Leader ${dearest.leader} and its followers (pale) no longer count, and ${dearest.lost} of ${dearest.pois} POIs are lost (dark). This loss, ${dearest.lost / dearest.pois}, is the leader's Df. The Df of the four leaders are ${dearest.df.map(number).join(", ")}: one score of the team, but different credits. Training with Df keeps the leaders without which the team would lose most.`,
   },
   {
     of: "two_groups", watch: () => exhibit("two_groups", { trains: true }),
     asks: "Now two kinds of team start from nothing: leaders with followers, and teams in which all twelve agents learn. Which observe more POIs?",
-    choices: ["Leader-follower", "All-leaders", "Both alike"],
+    choices: ["Leader-follower", "All-leaders", "Both alike"], right: 0,
     why: "Six independent learners almost never coincide. If each is at a POI in 3 of 10 episodes, all six are there in 7 of 10 000. All teams then score 0, and there is nothing to select. Two leaders that bring their followers coincide in 9 of 100.",
   },
   {
     of: "population", watch: () => exhibit("population", { trains: true }),
-    asks: "The same task, with followers. Each leader's policy is selected from a population of policies. How many does it take?",
-    choices: ["20 are enough", "100", "500"],
+    asks: "The same task, with followers. Each leader's policy is selected from a population of policies. How many does it take until the best teams observe three of the four POIs?",
+    choices: ["20 are enough", "100", "500"], right: 1,
     why: "The first policies are random. Among few, hardly any two leaders meet. Among many, some do, and selection copies them.",
   },
   {
     of: "evolution", ready: evolution, watch: async () => show_exhibit(await evolution()),
     asks: "Selection changes whole populations. The 50 policies of each leader start at random. Where do they go after 60 generations?",
-    choices: ["Everywhere", "Nearly all the same way"],
+    choices: ["Everywhere", "Most the same way"], right: 1,
     why: "Each faint line is the way of one policy, in the colour of its leader. At first they go everywhere. Selection keeps the few that meet, and their changed copies soon fill the population.",
   },
   {
     of: "groups", watch: () => exhibit("groups", { trains: true }),
     asks: "Do followers make the difference? Take them away, and let the three agents of a group share one population instead. What do such teams observe?",
-    choices: ["Nothing", "Less than half", "Most POIs"],
+    choices: ["Nothing", "Less than half", "Most POIs"], right: 2,
     why: "Most of the difference was the number of populations, not the followers. In 30 trials of the paper's first layout, champions without followers reach G = 0.18 with a population per agent and 0.77 with one per group. With followers they reach 0.91. But somebody has to say who belongs to a group. Followers find their leader themselves.",
   },
 ];
+
+/** Returns a choice within a sentence. @param {string} choice */
+const small = choice => choice[0].toLowerCase() + choice.slice(1);
 
 /** Shows an exhibit instead of a training. @param {Exhibit} exhibit */
 function show_exhibit(exhibit) {
@@ -75,11 +79,11 @@ part(() => [state.guide, state.mode, state.exhibit, state.text, state.compared, 
   $("guide").hidden = guide === null;
   $(guide === null ? "guide" : "credit").after($("setup"));
   if (!guide) return;
-  const { step, said } = guide, { asks, choices, why } = STEPS[step], here = is_shown(about(guide).of), last = step === STEPS.length - 1;
+  const { step, said } = guide, { asks, choices, right, why } = STEPS[step], here = is_shown(about(guide).of), last = step === STEPS.length - 1;
   const watches = said !== null && training && training.state !== "done", result = training ? $("announced").textContent : "";
   $("guide-step").textContent = `${step + 1} of ${STEPS.length}`;
   $("guide-says").textContent = !here ? "What is on show is not part of the guide."
-    : said === null ? asks : `You said: ${said.toLowerCase()}. ${watches ? "Watch the map and the chart." : `${result ? `${result} ` : ""}${why}`}`;
+    : said === null ? asks : `You said: ${small(said)}. ${watches ? "Watch the map and the chart." : `${said === choices[right] ? "That is right." : `It is: ${small(choices[right])}.`} ${result ? `${result} ` : ""}${why}`}`;
   const asked = here && said === null;
   $("guide-choices").replaceChildren(...(asked ? choices : []).map(choice => {
     const button = make("button", choice, null, { type: "button" });

@@ -1,6 +1,6 @@
 // The page's event listeners and its start.
 import { autoplay, link, recall, remember, shows_runs } from "./address.js";
-import { add, remove } from "./arrange.js";
+import { remove } from "./arrange.js";
 import { comparison } from "./compare.js";
 import { configs } from "./config.js";
 import { curves, drawn_chart } from "./curves.js";
@@ -46,7 +46,6 @@ function listen() {
   // A training in progress keeps its backend. The next one uses the new choice.
   $("on").addEventListener("change", () => { if (!state.training || state.training.state === "done" || state.training.state === "stopped") settle().catch(thrown => trouble("run", failure(thrown).message)); });
   for (const button of all("[data-mode]")) button.addEventListener("click", () => mode(/** @type {typeof state.mode} */ (button.dataset.mode)));
-  for (const button of all("[data-add]")) button.addEventListener("click", () => add(/** @type {List} */ (button.dataset.add)));
   $("remove").addEventListener("click", remove);
   $("again").addEventListener("click", drive_on);
   $("leader").addEventListener("change", () => { if (state.mode === "drive") { drive_off(); drive_view(); } });

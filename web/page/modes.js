@@ -1,6 +1,6 @@
 // What to do with the map: watch, rearrange, or take a leader.
 import { show_start } from "./arrange.js";
-import { $, all, write_text } from "./dom.js";
+import { $, all } from "./dom.js";
 import { drive_off, drive_view } from "./drive.js";
 import { join } from "./scene.js";
 import { part, render, state } from "./state.js";
@@ -27,10 +27,7 @@ part(() => [state.mode, subject()], () => {
     const crop = exhibit.scenes.map(({ data }) => stage.busy(data)).reduce(join);
     for (const { title, data, status, label, ghosts = [] } of exhibit.scenes) {
       const view = add_view(title, crop);
-      view.describe = (step, observed, text) => {
-        write_text(view.status, status(step, observed));
-        view.canvas.ariaLabel = `${label}, step ${step}: ${text}`;
-      };
+      view.describe = (step, observed, text) => [status(step, observed), `${label}, step ${step}: ${text}`];
       view.ghosts = ghosts;
       show(view, data);
     }
@@ -42,8 +39,10 @@ export function mode(mode) {
   if (state.mode === mode) return;
   const { training } = state;
   if (mode !== "watch" && training) training.paused = true;
-  const led = mode === "drive" && training && training.arms.find(arm => arm.label === "leader-follower" && arm.ended.length);
-  if (led) state.policies = { each: 1, weights: led.ended[Math.min(state.trial, led.ended.length - 1)] };
+  // A leader is taken in a leader-follower team: that of the present settings, if it is trained.
+  const teams = mode === "drive" && training ? training.arms.filter(({ config, ended }) => ended.length && config.learning.paradigm !== "all-leaders") : [];
+  const led = teams.find(({ toml }) => toml === state.toml) ?? teams[0];
+  if (led) state.policies = { each: 1, weights: led.ended[Math.min(state.trial, led.ended.length - 1)], of: led.label };
   if (led && led.toml !== state.toml && led.config.world.leaders.length !== state.config.world.leaders.length) state.policies = null;
   render({ mode });
   reveal();

@@ -3,8 +3,9 @@ import { opening, state } from "./state.js";
 
 // Returns the part of the map that contains all POIs and every place that agents can reach in an episode.
 /** @param {Config} config @returns {Crop} */
-export function reach({ world, motion }) {
-  const far = world.steps * world.dt * motion.max_speed + 2, [width, height] = world.map;
+export function reach({ world, motion, agents = [] }) {
+  const fastest = Math.max(...(agents.length ? agents : [{ motion }]).map(({ motion }) => motion.max_speed));
+  const far = world.steps * world.dt * fastest + 2, [width, height] = world.map;
   const starts = [...world.leaders, ...world.followers].map(place => [...place, far]);
   const all = [...starts, ...world.pois.map(place => [...place, world.observation_radius + 1])];
   const side = (/** @type {number} */ axis, /** @type {number} */ sign) => all.map(place => place[axis] + sign * place[2]);
@@ -24,13 +25,13 @@ export const join = (one, other) => [Math.min(one[0], other[0]), Math.min(one[1]
  * @param {Config} config @returns {Scene}
  */
 export function start_scene(config) {
-  const { world, follow } = config, agents = [...world.leaders, ...world.followers], { coupling, headings } = state.start;
+  const { world, follow } = config, agents = [...world.leaders, ...world.followers], { coupling, headings, owner: owners, ...parts } = state.start;
   // After an addition or a removal, the owners are those of the former agents until the module has resolved it.
-  const owner = agents.map((_, agent) => state.start.owner[agent] < world.leaders.length ? state.start.owner[agent] : -1);
+  const owner = agents.map((_, agent) => owners[agent] < world.leaders.length ? owners[agent] : -1);
   return {
     map: world.map, pois: world.pois, observation_radius: world.observation_radius, attraction_radius: follow.attraction_radius,
     dt: world.dt, steps: world.steps, exact: true, colors: opening.data.colors,
-    observers: world.observers, windows: world.windows, after: world.after,
+    observers: world.observers, windows: world.windows, after: world.after, ...parts,
     episodes: [{
       leaders: world.leaders.length, agents: agents.length, coupling, shown: [0], g: 0, generation: 0, trial: 0, owner,
       observed: world.pois.map(() => null), near: new Uint16Array(world.pois.length), led: new Uint32Array(0),

@@ -3,7 +3,7 @@
 /** Names of the quadrants, in the order of a policy's inputs. */
 const QUADRANTS = ["back right", "front right", "front left", "back left"];
 /** What leaders sense if the config has no `[[agents]]`. @type {AgentClass} */
-const QUADRANTS_ONLY = { count: 1, free: false, senses: ["pois", "agents"].map(of => ({ of, sectors: 4, frame: "heading" })) };
+const QUADRANTS_ONLY = { name: "leader", count: 1, free: false, senses: ["pois", "agents"].map(of => ({ of, sectors: 4, frame: "heading" })) };
 
 /**
  * Returns the angles at which a sector starts and ends, counterclockwise: from the heading, or from the x axis of the map.
@@ -18,6 +18,9 @@ export function class_of({ classes = [] }, leader) {
   let left = leader;
   return classes.find(({ count }) => (left -= count) < 0) ?? QUADRANTS_ONLY;
 }
+
+/** Names a leader by its class. @param {Pick<Scene, "classes">} data @param {number} leader */
+export const name_of_leader = (data, leader) => `${class_of(data, leader).name} ${leader}`;
 
 /**
  * Returns what a leader senses and answers at a frame, from `[frames][leaders][inputs, 2 outputs]`. At the start it has not yet sensed

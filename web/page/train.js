@@ -1,8 +1,8 @@
 // Starts, shows and ends trainings.
 import { constants, randoms } from "./baselines.js";
-import { label, slug, toml } from "./compare.js";
+import { label, slug, team, toml } from "./compare.js";
 import { $, failure, make, write_text } from "./dom.js";
-import { command, entered, name_of } from "./experiment.js";
+import { command, effective, entered, name_of } from "./experiment.js";
 import { intervals } from "./intervals.js";
 import { renew, settle } from "./machine.js";
 import { mode } from "./modes.js";
@@ -29,12 +29,12 @@ export async function train() {
     if (!state.valid) return;
     await settle();
     const compared = effective();
-    const arms = await Promise.all(compared.values.map(async value => {
-      const { key } = compared, changes = [[key, toml(value)]];
+    const arms = await Promise.all((compared ? compared.values : [""]).map(async value => {
+      const changes = compared ? [[compared.key, toml(value)]] : [];
       const { words } = await clerk.ask({ ask: "resolve", text: state.text, name: "config.toml", changes });
       return {
-        bytes: words.bytes, label: label(compared, value), toml: words.toml, config: words.config, pois: words.pois, parameters: words.parameters,
-        command: command(words.config, key === "learning.paradigm" ? [] : [[key, value]]), name: slug(name_of()), constant: null, random: [],
+        bytes: words.bytes, label: compared ? label(compared, value) : team(words.config), toml: words.toml, config: words.config, pois: words.pois, parameters: words.parameters,
+        command: command(words.config, !compared || compared.key === "learning.paradigm" ? [] : [[compared.key, value]]), name: slug(name_of()), constant: null, random: [],
       };
     }));
     const bytes = arms.reduce((sum, arm) => sum + arm.bytes, 0);
@@ -95,7 +95,8 @@ function found_by(training) {
     const last = arm.trials.map(trial => trial[trial.length - 1].best), mean = last.reduce((sum, best) => sum + best, 0) / last.length;
     return `${(mean * (arm.pois ?? 1)).toFixed(2)} of ${arm.pois ?? 1} (${arm.label})`;
   });
-  return `${training.pois === null ? "Share of POIs" : "POIs"} that the best team observes, on average over trials: ${found.join(", ")}.`;
+  const { unit } = training;
+  return `${unit[0].toUpperCase()}${unit.slice(1)} that the best team observes, on average over trials: ${found.join(", ")}.`;
 }
 
 part(() => [state.training, state.training && state.training.state], () => {
@@ -103,13 +104,6 @@ part(() => [state.training, state.training && state.training.state], () => {
   if (training && training.state === "done") $("announced").textContent = `Training is finished. ${found_by(training)}`;
   else $("announced").textContent = training && training.state === "stopped" ? `Stopped after generation ${Math.max(0, training.reached)}.` : "";
 });
-
-// Returns what the arms differ in. Without followers, there is only one paradigm. One value makes one arm.
-function effective() {
-  const { compared, config } = state;
-  if (compared && (compared.key !== "learning.paradigm" || config.world.followers.length)) return compared;
-  return { key: "learning.paradigm", values: [config.learning.paradigm] };
-}
 
 // Stops a training. The generations played so far can still be watched.
 export function stop() {
@@ -123,7 +117,7 @@ export function stop() {
 export function forget() {
   if (state.training) state.training.stop();
   leave();
-  render({ training: null, exhibit: null, policies: null, generation: 0, trial: 0, troubles: {}, message: "" });
+  render({ training: null, exhibit: null, policies: null, generation: 0, trial: 0, troubles: {}, message: "", note: "" });
 }
 
 part(() => [state.training, state.training && state.training.state === "done"], () => {

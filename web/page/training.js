@@ -41,6 +41,8 @@ export class Training {
   }
   // Returns the number of POIs if it is the same in all arms and stages, otherwise null.
   get pois() { return this.arms.every(arm => arm.pois === this.arms[0].pois) ? this.arms[0].pois : null; }
+  // Returns what is shown of a team: how many POIs it observes, or G if that does not count POIs.
+  get unit() { return this.pois !== null ? "POIs" : this.arms.some(({ config }) => config.pois?.length) ? "share of the POIs' value" : "share of POIs"; }
   get rate() { return this.teams / Math.max(1e-9, Math.max(0, ...this.busy)); }
 
   /** Divides the trials among players, and starts the training. @param {Player[]} players */

@@ -2,7 +2,7 @@
 import { chart } from "./chart.js";
 import { $, failure, make, make_key, pen_of, still, write_text } from "./dom.js";
 import { join, start_scene } from "./scene.js";
-import { angles, moment, words } from "./senses.js";
+import { angles, moment, name_of_leader, words } from "./senses.js";
 import { NAMES, TONES, part, render, shown, state, trouble } from "./state.js";
 import { last_of } from "./training.js";
 
@@ -15,11 +15,11 @@ export function add_view(label, crop, style = null) {
   title.append(name, make("small", more.join("")));
   const status = make("p", "", card, { role: "status", ariaLive: "off" });
   const canvas = make("canvas", "", card, { role: "img" });
-  const sensed = make("p", "", card, { className: "sensed", hidden: true });
+  const marks = make("p", "", card, { className: "marks", hidden: true }), sensed = make("p", "", card, { className: "sensed", hidden: true });
   /** @type {View} */
   const view = {
-    label, card, title, status, canvas, sensed, crop, data: null, place: 0, playing: false, ended: null, over: null, wanted: null,
-    asking: false, chosen: null, removed: null, selected: null, drawn: [], ghosts: [], describe: null,
+    label, card, title, status, canvas, marks, sensed, crop, data: null, place: 0, playing: false, ended: null, over: null, wanted: null,
+    asking: false, chosen: null, removed: null, selected: null, drawn: [], ghosts: [], haunted: null, describe: null,
   };
   canvas.addEventListener("pointermove", event => pointed(view, event));
   canvas.addEventListener("click", event => picked(view, event));
@@ -31,7 +31,12 @@ export function add_view(label, crop, style = null) {
 
 /** Sets the part of the map that a view shows, extended to the shape of its canvas: width divided by height. @param {View} view @param {Crop} crop */
 export function aim(view, [left, below, right, above], shape = (right - left) / (above - below)) {
-  const wide = Math.max(right - left, (above - below) * shape), tall = wide / shape, x = (left + right) / 2, y = (below + above) / 2;
+  const wide = Math.max(right - left, (above - below) * shape), tall = wide / shape;
+  // The middle moves so that no more than a margin beyond the walls is shown, unless the map is smaller than the canvas.
+  const [x, y] = [[left, right, wide], [below, above, tall]].map(([low, high, size], axis) => {
+    const most = state.config.world.map[axis] + 1.5 - size / 2, least = size / 2 - 1.5, middle = (low + high) / 2;
+    return most < least ? middle : Math.max(least, Math.min(most, middle));
+  });
   view.crop = [x - wide / 2, y - tall / 2, x + wide / 2, y + tall / 2];
   view.canvas.style.setProperty("--wide", String(shape));
 }
@@ -75,11 +80,13 @@ export function draw(view) {
   haunt(view);
   if (view === state.views[0]) steps(data, view.place);
   const [observed, text] = stage.say(episode, step);
-  if (view.describe) view.describe(step, observed, text);
-  else {
-    write_text(view.status, `generation ${episode.generation}, trial ${episode.trial} · ${observed} of ${data.pois.length} POIs by step ${step}`);
-    view.canvas.ariaLabel = `${NAMES[view.label] || view.label}: the best team of generation ${episode.generation}, step ${step}: ${text}`;
-  }
+  const [status, label] = view.describe ? view.describe(step, observed, text) : [
+    `generation ${episode.generation}, trial ${episode.trial} · ${observed} of ${data.pois.length} POIs by step ${step}`,
+    `${NAMES[view.label] || view.label}: the best team of generation ${episode.generation}, step ${step}: ${text}`,
+  ];
+  const missing = gone && removed ? `, without ${name_of_leader(data, removed.leader)}${removed.group ? " and its followers" : ""}` : "";
+  write_text(view.status, status + missing);
+  view.canvas.ariaLabel = label + missing;
   if (view.chosen) ring(view, view.chosen);
   senses(view, data);
   if (view === state.views[0]) playing();
@@ -94,10 +101,22 @@ export function dark(data, removed) {
   return gone ? episode.observed.flatMap((at, poi) => at !== null && gone.observed[poi] === null ? [poi] : []) : [];
 }
 
-/** Draws the ways of the leaders of other teams as faint lines. @param {View} view */
-function haunt({ canvas, crop, ghosts }) {
-  const { X, Y } = stage.place_on(canvas, crop), pen = pen_of(canvas);
-  pen.lineWidth = 1;
+/** Draws the ways of the leaders of other teams as faint lines, once for each look of the view. @param {View} view */
+function haunt(view) {
+  const { canvas, ghosts, crop } = view, look = [canvas.width, canvas.height, stage.night.matches, ...crop].join();
+  if (!ghosts.length) return;
+  if (!view.haunted || view.haunted.look !== look) view.haunted = { look, picture: ways(canvas, crop, ghosts) };
+  const pen = pen_of(canvas);
+  pen.save();
+  pen.resetTransform();
+  pen.drawImage(view.haunted.picture, 0, 0);
+  pen.restore();
+}
+
+/** Returns a picture of the ways of leaders, of a canvas's size. @param {HTMLCanvasElement} canvas @param {Crop} crop @param {Scene[]} ghosts */
+function ways(canvas, crop, ghosts) {
+  const { X, Y } = stage.place_on(canvas, crop), picture = make("canvas", "", null, { width: canvas.width, height: canvas.height }), pen = pen_of(picture);
+  pen.setTransform(pen_of(canvas).getTransform());
   pen.globalAlpha = 0.2;
   for (const ghost of ghosts) {
     const [episode] = ghost.episodes, colors = stage.palette(ghost);
@@ -111,7 +130,7 @@ function haunt({ canvas, crop, ghosts }) {
       pen.stroke();
     }
   }
-  pen.globalAlpha = 1;
+  return picture;
 }
 
 /** Draws a ring around what is chosen in a view. @param {View} view @param {Chosen} chosen */
@@ -130,8 +149,8 @@ function senses(view, data) {
   view.sensed.hidden = leader === null || !episode.senses;
   if (leader === null || !episode.senses) return;
   const frame = Math.min(Math.floor(view.place), episode.shown.length - 1);
-  const now = moment(data, episode, frame, leader), { X, Y } = stage.place_on(view.canvas, view.crop);
-  view.sensed.textContent = frame === 0 ? `Leader ${leader} has not sensed anything yet.` : `Leader ${leader} ${words(now)}`;
+  const now = moment(data, episode, frame, leader), name = name_of_leader(data, leader), { X, Y } = stage.place_on(view.canvas, view.crop);
+  view.sensed.textContent = `${name[0].toUpperCase()}${name.slice(1)} ${frame === 0 ? "has not sensed anything yet." : words(now)}`;
   if (frame === 0) return;
   const [x, y, cos, sin] = stage.moment(data, episode, frame - 1, leader), ahead = Math.atan2(sin, cos);
   const pen = pen_of(view.canvas), style = getComputedStyle(document.documentElement);
@@ -185,6 +204,8 @@ export function show(view, data, moves = true) {
   }
   // A removed leader stays removed while the episode is the same.
   if (data !== view.data) view.removed = null;
+  view.marks.replaceChildren(...stage.legend(data));
+  view.marks.hidden = !data.classes;
   if (view.selected && view.selected >= data.episodes[0].leaders) view.selected = null;
   Object.assign(view, { data, place: plays ? 0 : last, playing: plays, ended: plays ? null : performance.now() });
   draw(view);
@@ -218,6 +239,7 @@ export function step_to(place) {
 
 // Sets the button of the player.
 function playing() {
+  $("replay").disabled = !moving().length && !state.training && !state.exhibit;
   write_text($("replay"), state.views.some(view => view.playing) ? "Pause the episode" : "Play");
 }
 
@@ -328,6 +350,7 @@ part(() => [state.training], () => {
   $("loop").checked = !training && !still.matches;
   // Trials that all arms have.
   const trials = training ? Math.min(...training.arms.map(arm => arm.trials.length)) : 0;
+  $("trial").disabled = !trials;
   $("trial").replaceChildren(...Array.from({ length: trials }, (_, trial) => make("option", String(trial))));
   $("scrub").max = String(training ? training.last : 100);
 });

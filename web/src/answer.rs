@@ -4,6 +4,7 @@ use std::fmt::Display;
 
 use flotilla::config::{Config, ConfigError, Problem, ValidConfig};
 use flotilla::model::start;
+use flotilla_app::report::replay;
 use serde_json::{Value, json};
 
 /// JSON and little-endian numbers.
@@ -41,8 +42,8 @@ pub fn floats(bytes: &[u8]) -> Vec<f32> {
     bytemuck::pod_collect_to_vec(&bytes[..bytes.len() / 4 * 4])
 }
 
-/// Returns a config as TOML and as JSON, with its number of POIs (null if stages differ), parameters per policy, and
-/// start.
+/// Returns a config as TOML and as JSON, with its number of POIs (null if stages or the values of POIs differ, because G
+/// does not count POIs then), parameters per policy, and start.
 pub fn described(config: &ValidConfig) -> Value {
     let (toml, pois, parameters) = (config.to_toml(), config.pois(), config.parameters());
     let mut words = json!({ "toml": toml, "config": **config, "pois": pois, "parameters": parameters });
@@ -54,10 +55,14 @@ pub fn described(config: &ValidConfig) -> Value {
         words["config"]["follow"] = json!({ "attraction_radius": config.influence_radius() });
     }
     words["start"] = start_of(config);
+    if !words["start"]["values"].is_null() {
+        words["pois"] = Value::Null;
+    }
     words
 }
 
-/// Returns each POI's coupling, each agent's heading, and the leader that each agent would follow first (-1 for none).
+/// Returns each POI's coupling, each agent's heading, the leader that each agent would follow first (-1 for none), and
+/// what only full configs have.
 fn start_of(config: &Config) -> Value {
     let (world, radius) = (config.drawn(), config.influence_radius());
     let first = |follower: &[f64; 2]| {
@@ -66,5 +71,10 @@ fn start_of(config: &Config) -> Value {
         if dx.hypot(dy) <= radius { leader as i64 } else { -1 }
     };
     let owner: Vec<i64> = (0..world.leaders.len() as i64).chain(world.followers.iter().map(first)).collect();
-    json!({ "owner": owner, "coupling": world.coupling.of_each(world.pois.len()), "headings": world.headings() })
+    let coupling = world.coupling.of_each(world.pois.len());
+    let mut start = json!({ "owner": owner, "coupling": coupling, "headings": world.headings() });
+    for (key, value) in replay::parts(config) {
+        start[key] = value;
+    }
+    start
 }

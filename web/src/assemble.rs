@@ -32,8 +32,11 @@ mod page {
     use miniz_oxide::deflate::compress_to_vec_zlib;
     use wasm_bindgen_cli_support::Bindgen;
 
-    /// Experiments of the gallery.
-    const GALLERY: [&str; 5] = ["two_groups", "blind", "eight_followers", "relay", "places"];
+    /// Experiments of the gallery, by folder.
+    const GALLERY: [(&str, &[&str]); 2] = [
+        ("gallery", &["two_groups", "blind", "eight_followers", "relay", "places", "swarm"]),
+        ("../configs", &["rovers"]),
+    ];
     const LAYOUTS: [&str; 3] = ["generally_forward", "strictly_forward", "chaotic"];
 
     fn source(name: &str) -> Result<String, Box<dyn Error>> {
@@ -105,8 +108,10 @@ mod page {
         for layout in LAYOUTS {
             texts.push((format!("layout-{layout}"), source(&format!("../configs/{layout}.toml"))?));
         }
-        for name in GALLERY {
-            texts.push((format!("gallery-{name}"), source(&format!("gallery/{name}.toml"))?));
+        for (folder, names) in GALLERY {
+            for name in names {
+                texts.push((format!("gallery-{name}"), source(&format!("{folder}/{name}.toml"))?));
+            }
         }
         texts.push(("opening".into(), source("page/opening.json")?));
         let mut script = Script { text: source("../app/src/report/stage.js")?, ..Script::default() };

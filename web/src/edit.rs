@@ -4,7 +4,8 @@ use toml_edit::{DocumentMut, Item, Table, TableLike, TomlError, Value};
 
 /// Returns the text with each key, such as `learning.seed`, set to a value written as TOML.
 ///
-/// Keys may be in a table, an inline table, dotted or quoted. A value that is not TOML is written as a string, so that
+/// Keys may be in a table, an inline table, dotted or quoted. An entry of a list of tables has its index, as in
+/// `agents.0.at`. A value that is not TOML is written as a string, so that
 /// reading the config reports it at its line.
 ///
 /// # Errors
@@ -29,11 +30,20 @@ fn put(table: &mut dyn TableLike, names: &[&str], mut value: Value) {
             }
             *item = Item::Value(value);
         }
-        Some(item) => match item.as_table_like_mut() {
-            Some(inner) => put(inner, rest, value),
-            // Reading the config reports that this is no table.
-            None => (),
-        },
+        Some(item) => {
+            let (inner, rest): (Option<&mut dyn TableLike>, _) = match (item, rest[0].parse::<usize>()) {
+                (Item::ArrayOfTables(list), Ok(index)) => (list.get_mut(index).map(|table| table as _), &rest[1..]),
+                (Item::Value(Value::Array(list)), Ok(index)) => {
+                    let entry = list.get_mut(index).and_then(Value::as_inline_table_mut);
+                    (entry.map(|table| table as _), &rest[1..])
+                }
+                (item, _) => (item.as_table_like_mut(), rest),
+            };
+            // Reading the config reports a key that leads through anything else than tables and lists of tables.
+            if let Some(inner) = inner {
+                put(inner, rest, value);
+            }
+        }
         None if rest.is_empty() => drop(table.insert(name, Item::Value(value))),
         None => {
             let mut inner = Table::new();

@@ -3,6 +3,10 @@ const stage = (() => {
   "use strict";
   // Dashes distinguish groups once all colours are used; beyond that, only the leaders' numbers do.
   const DASHES = [[], [5, 3], [1.5, 2]];
+  // Outlines of agents as [ahead, aside]: of classes with a heading, and of those that move freely.
+  const around = (corners, first) => Array.from({ length: corners }, (_, corner) => [0, 1].map(axis => 0.9 * Math.cos((first + corner) / corners * 2 * Math.PI - axis * Math.PI / 2)));
+  const HEADED = [[[1.1, 0], [-0.8, 0.75], [-0.4, 0], [-0.8, -0.75]], [[1.1, 0], [-0.8, 0.6], [-0.8, -0.6]], [[1.1, 0], [0.2, 0.7], [-0.9, 0.45], [-0.9, -0.45], [0.2, -0.7]]];
+  const FREE = [around(24, 0), around(4, 0.5), around(4, 0)];
   const night = matchMedia("(prefers-color-scheme: dark)");
   const bytes = text => Uint8Array.from(atob(text), c => c.charCodeAt(0)).buffer;
   const turn = Array.from({ length: 256 }, (_, index) => index / 256 * 2 * Math.PI);
@@ -53,8 +57,9 @@ const stage = (() => {
     const grow = (low, high, least, end) => {
       const more = Math.max(0, (least - (high - low)) / 2);
       low -= more; high += more;
-      const shift = low < 0 ? -low : Math.min(0, end - high);
-      return [Math.max(0, low + shift), Math.min(end, high + shift)];
+      // A margin beyond the walls, so that agents at a wall are drawn whole.
+      const shift = low < -1 ? -1 - low : Math.min(0, end + 1 - high);
+      return [Math.max(-1, low + shift), Math.min(end + 1, high + shift)];
     };
     [left, right] = grow(left, right, (above - below) / 2, width);
     [below, above] = grow(below, above, (right - left) / 2, height);
@@ -83,11 +88,42 @@ const stage = (() => {
     const window = data.windows[poi], others = data.after[poi] || [];
     return (data.values ? `, value ${data.values[poi]}` : "") + (window ? `, steps ${window[0]} to ${window[1]}` : "") + (others.length ? `, after ${others.join(" and ")}` : "");
   }
-  const radius = (data, poi) => data.radii ? data.radii[poi] : data.observation_radius;
+  const radius = (data, poi) => (data.radii && data.radii[poi]) ?? data.observation_radius;
+  // of_each returns the index of the class of each agent, or of the group of each POI.
+  const of_each = (parts = []) => parts.flatMap(({ count }, index) => Array(count).fill(index));
+  // outline returns the outline of a class. Without classes, it is that of the first class with a heading.
+  function outline({ classes = [] }, index = 0) {
+    const free = Boolean(classes[index] && classes[index].free), alike = free ? FREE : HEADED;
+    return alike[classes.slice(0, index).filter(other => other.free === free).length % alike.length];
+  }
+  // Returns, for each class, an element with its mark, number and name.
+  function legend(data) {
+    let first = 0;
+    return (data.classes || []).map(({ count, name }, index) => {
+      const item = document.createElement("span"), filled = first < data.episodes[0].leaders;
+      first += count;
+      const points = outline(data, index).map(([ahead, aside]) => `${7 * aside},${-7 * ahead}`).join(" ");
+      item.innerHTML = `<svg viewBox="-9 -9 18 18" width="16" height="16"><polygon points="${points}" fill="${filled ? "currentColor" : "none"}" stroke="currentColor" stroke-width="1.5"/></svg> `;
+      item.append(`${count} ${name}`);
+      return item;
+    });
+  }
+  // Returns the classes that count at a POI, or null if all do.
+  function observers_of({ classes = [], groups = [] }, poi) {
+    const group = groups[of_each(groups)[poi]];
+    return group && group.observers.length < classes.length ? group.observers : null;
+  }
+  // counts_at_pois reports whether an agent counts at POIs. With classes, these show it.
   const counts_at_pois = (data, episode, agent) =>
-    data.observers === "all" || (data.observers === "leaders") === (agent < episode.leaders);
+    data.classes || data.observers === "all" || (data.observers === "leaders") === (agent < episode.leaders);
 
-  const whole = data => [0, 0, ...data.map];
+  // who names the classes that count at a POI, if not all do.
+  function who(data, poi) {
+    const observers = observers_of(data, poi);
+    return observers ? `, only ${observers.map(own => data.classes[own].name).join(" and ")}` : "";
+  }
+
+  const whole = ({ map: [width, height] }) => [-1, -1, width + 1, height + 1];
 
   // Maps positions in a part of the map to positions on a canvas.
   function place_on(canvas, [left, below, right, above]) {
@@ -187,7 +223,20 @@ const stage = (() => {
         const full = Math.min(near[poi] / needed, 1) * 2 * Math.PI;
         draw.beginPath(); draw.arc(X(x), Y(y), ring, -Math.PI / 2, full - Math.PI / 2); draw.stroke();
       }
-      return [`${near[poi]}/${needed}${done ? " ✓" : dark ? " ✗ dark" : ""}`, X(x), Y(y) - ring - 6];
+      // Marks below the ring show which classes count, if not all do.
+      const observers = observers_of(data, poi) || [], small = Math.max(3, 0.45 * ring);
+      observers.forEach((own, index) => {
+        const middle = X(x) + 3 * small * (index - (observers.length - 1) / 2), base = Y(y) + ring + 2.4 * small;
+        draw.beginPath();
+        for (const [ahead, aside] of outline(data, own)) draw.lineTo(middle + small * aside, base - small * ahead);
+        draw.closePath();
+        draw.fillStyle = color("--poi");
+        draw.fill();
+      });
+      // The counts of POIs at the same place are above each other.
+      const same = data.pois.flatMap(([left, low], other) => left === x && low === y ? [other] : []);
+      const base = Math.max(Y(y) - ring - 6, 15 * same.length - 3) - 15 * same.indexOf(poi);
+      return [`${near[poi]}/${needed}${done ? " ✓" : dark ? " ✗ dark" : ""}`, X(x), base];
     });
 
     const many = episode.agents > 100;
@@ -213,10 +262,11 @@ const stage = (() => {
     }
 
     const now = Array.from({ length: episode.agents }, (_, agent) => between(data, episode, place, agent));
-    const followers = episode.agents > episode.leaders;
+    const followers = episode.agents > episode.leaders, classes = of_each(data.classes);
     for (let leader = 0; leader < episode.leaders && followers && look.radii; leader++) {
+      const own = data.classes && data.classes[classes[leader]];
       if (gone(leader)) continue;
-      circle(now[leader][0], now[leader][1], data.attraction_radius);
+      circle(now[leader][0], now[leader][1], own ? own.influence : data.attraction_radius);
       draw.strokeStyle = group(leader);
       draw.globalAlpha = many ? 0.3 : 0.7;
       draw.lineWidth = 1;
@@ -243,11 +293,12 @@ const stage = (() => {
     // Leaders are drawn last, on top of followers.
     const size = Math.max(many ? 2.5 : 5, Math.min(9, 0.8 * scale));
     for (let agent = episode.agents - 1; agent >= 0; agent--) {
-      const [x, y, ahead, aside] = now[agent], leads = agent < episode.leaders;
-      const long = Math.hypot(ahead, aside) || 1, cos = ahead / long, sin = aside / long;
+      const [x, y, ahead, aside] = now[agent], leads = agent < episode.leaders, own = classes[agent];
+      const free = own !== undefined && data.classes[own].free, long = Math.hypot(ahead, aside) || 1;
+      const [cos, sin] = free ? [0, 1] : [ahead / long, aside / long];
       const point = (a, b) => [X(x) + (leads ? 1.35 : 1) * size * (a * cos - b * sin), Y(y) - (leads ? 1.35 : 1) * size * (a * sin + b * cos)];
       draw.beginPath();
-      for (const [a, b] of [[1.1, 0], [-0.8, 0.75], [-0.4, 0], [-0.8, -0.75]]) draw.lineTo(...point(a, b));
+      for (const [a, b] of outline(data, own)) draw.lineTo(...point(a, b));
       draw.closePath();
       draw.fillStyle = leads ? group(agent) : color("--card");
       draw.strokeStyle = leads ? color("--ink") : group(agent);
@@ -268,15 +319,16 @@ const stage = (() => {
     // Labels come last: all counts if they fit, and that of the POI under the pointer; then the leaders' numbers.
     draw.font = "600 12px system-ui, sans-serif";
     const told = counts.map(([text], poi) => when(data, poi) ? `${poi}: ${text}${when(data, poi)}` : text);
-    const areas = counts.map(([, x, y], poi) => {
-      const text = told[poi], half = draw.measureText(text).width / 2;
-      return [x - half - 2, y - 11, x + half + 2, y + 3];
+    const areas = counts.map((count, poi) => {
+      const [, x, y] = count, half = draw.measureText(told[poi]).width / 2;
+      count[1] = Math.max(half, Math.min(wide - half, x));
+      return [count[1] - half - 2, y - 11, count[1] + half + 2, y + 3];
     });
     const clear = areas.every((area, index) => areas.slice(0, index).every(other => !overlap(area, other)));
     if (clear) counts.forEach(([, x, y], poi) => { if (poi !== look.over) label(told[poi], x, y); });
     if (look.over !== null) {
       const [text, x, y] = counts[look.over];
-      const words = `POI ${look.over}: ${text}${when(data, look.over)}`, half = Math.max(40, draw.measureText(words).width / 2 + 4);
+      const words = `POI ${look.over}: ${text}${when(data, look.over)}${who(data, look.over)}`, half = Math.max(40, draw.measureText(words).width / 2 + 4);
       label(words, Math.max(half, Math.min(wide - half, x)), Math.max(12, y));
     }
     // A leader's number is placed at the first corner of its arrow where it hides no other label, and omitted if there is none.
@@ -324,5 +376,5 @@ const stage = (() => {
     return place;
   }
 
-  return { night, bytes, moment, unpack, busy, whole, place_on, palette, paint, say, poi_at, later };
+  return { night, bytes, moment, unpack, busy, whole, place_on, palette, paint, say, poi_at, later, legend };
 })();

@@ -29,7 +29,7 @@ mod page;
 
 pub use film::{FPS, Frames};
 pub use film::{Film, animate, gif, still};
-pub use page::{data, detailed, page};
+pub use page::{data, detailed, page, parts};
 
 /// The reason why an episode cannot be replayed.
 #[derive(Debug, thiserror::Error)]

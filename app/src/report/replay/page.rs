@@ -6,9 +6,9 @@ use serde_json::json;
 
 use super::{Counterfactual, Replayed, near};
 use crate::record::folder::OWN_FITNESS;
-use crate::report::map::{self, GROUPS, GROUPS_DARK};
+use crate::report::map::{GROUPS, GROUPS_DARK};
 use crate::report::scene::hex;
-use flotilla::config::{AgentClass, Config, Mobility};
+use flotilla::config::{AgentClass, Config, Mobility, PoiGroup};
 use flotilla::credit::{self, Strided};
 use flotilla::world::OUTPUTS;
 
@@ -74,9 +74,6 @@ pub fn detailed(name: &str, config: &Config, played: &[Replayed]) -> serde_json:
 }
 
 /// Returns the data that a page needs to play episodes of one run.
-///
-/// Only configs with `[[agents]]` have `classes`, those that learn first: with their `name`, the `count` of their agents,
-/// whether they move `free`, and the channels of their `senses`. Only those whose POIs differ have their `radii` or `values`.
 pub fn data(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Value {
     let count = played.len().max(1);
     let size = |per_agent: usize, played: &Replayed| {
@@ -116,26 +113,47 @@ pub fn data(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Val
         "colors": colors(),
         "episodes": episodes,
     });
-    if !config.agents.is_empty() {
-        let class = |class: &AgentClass| {
-            let free = matches!(class.motion, Mobility::Free { .. });
-            json!({ "name": class.name, "count": class.size(), "free": free, "senses": class.senses })
-        };
-        data["classes"] = config.agents.iter().map(class).collect();
-    }
-    if let Some(Replayed { world, .. }) = played.first() {
-        let radii: Vec<f64> = (0..world.pois.len()).map(|poi| map::radius_of(world, poi)).collect();
-        if radii.windows(2).any(|pair| pair[0] != pair[1]) {
-            data["radii"] = json!(radii);
-        }
-        if map::values_differ(world) {
-            data["values"] = json!(world.values);
-        }
+    for (key, value) in parts(config) {
+        data[key] = value;
     }
     if played.iter().any(|played| played.given) {
         data["given"] = true.into();
     }
     data
+}
+
+/// Returns what only pages of full configs have.
+///
+/// With `[[agents]]`, they have `classes`, those that learn first: their `name`, the `count` of their agents, whether they
+/// move `free`, the distance up to which they `influence` others, and the channels of their `senses`. The `groups` of POIs
+/// have their `name`, the `count` of their POIs, and the indices of the classes that are `observers`. Only if POIs differ
+/// in their radius or value, there are `radii` or `values`.
+pub fn parts(config: &Config) -> Vec<(&'static str, serde_json::Value)> {
+    let (all, mut parts) = (config.classes(), Vec::new());
+    let count = all.agents.len();
+    if !config.agents.is_empty() {
+        let class = |(index, class): (usize, &AgentClass)| {
+            let free = matches!(class.motion, Mobility::Free { .. });
+            let influence = (0..count).filter_map(|led| all.influence_radius(index, led)).fold(0.0, f64::max);
+            let AgentClass { name, senses, .. } = class;
+            json!({ "name": name, "count": class.size(), "free": free, "influence": influence, "senses": senses })
+        };
+        parts.push(("classes", config.agents.iter().enumerate().map(class).collect()));
+    }
+    if !config.agents.is_empty() || !config.pois.is_empty() {
+        let group = |(index, group): (usize, &PoiGroup)| {
+            let observers: Vec<usize> = (0..count).filter(|&class| all.observes(class, index)).collect();
+            json!({ "name": group.name, "count": group.size(), "observers": observers })
+        };
+        parts.push(("groups", all.pois.iter().enumerate().map(group).collect()));
+        let of_each = |value: fn(&PoiGroup) -> f64| {
+            let values = all.pois.iter().flat_map(|group| vec![value(group); group.size()]).collect::<Vec<_>>();
+            values.windows(2).any(|pair| pair[0] != pair[1]).then(|| json!(values))
+        };
+        parts.extend(of_each(|group| group.radius).map(|radii| ("radii", radii)));
+        parts.extend(of_each(|group| group.value).map(|values| ("values", values)));
+    }
+    parts
 }
 
 /// Returns the colours of leaders and their followers for light and dark backgrounds.
