@@ -7,7 +7,7 @@ use std::time::Duration;
 use glam::Vec2;
 
 use crate::backend::{Backend, BackendError, Group, Moment};
-use crate::config::Fitness;
+use crate::config::{Config, Fitness};
 use crate::evolve::{self, Key, Purpose};
 use crate::host::Instant;
 use crate::statistics::{self, Average, Estimate};
@@ -20,9 +20,9 @@ pub const SCORES: &[Fitness] = &[Fitness::D, Fitness::Df, Fitness::Dpp];
 /// [`SCORES`] and Dt, which needs a record of who was seen at every step.
 pub const SCORES_AND_DT: &[Fitness] = &[Fitness::D, Fitness::Df, Fitness::Dpp, Fitness::Dt];
 
-/// Returns the fitnesses that an evaluation computes: Dt only if it is the given fitness.
-pub fn scores_beside(fitness: Fitness) -> &'static [Fitness] {
-    if fitness == Fitness::Dt { SCORES_AND_DT } else { SCORES }
+/// Returns the fitnesses that teams of a config are scored by: Dt only if it is the fitness of any class.
+pub fn scores_beside(config: &Config) -> &'static [Fitness] {
+    if config.fitnesses().contains(&Fitness::Dt) { SCORES_AND_DT } else { SCORES }
 }
 
 /// Maximum number of episodes per evaluation.

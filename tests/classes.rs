@@ -403,7 +403,7 @@ fn every_problem_names_key_line_found_and_allowed() {
         (
             "after = \"a\"",
             "foo = 3",
-            "25: pois[1].foo: unknown key, allowed after, at, count, coupling, in, name, observers, radius, value, windows",
+            "25: pois[1].foo: unknown key, allowed after, at, count, coupling, in, name, observers, radius, score, value, when, windows",
         ),
         ("name = \"b\"", "name = \"a\"", "22: pois[1].name: found \"a\" again, allowed another name"),
         (

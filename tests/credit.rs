@@ -632,7 +632,7 @@ fn paths_and_sets_give_equal_scores() {
         config.world.after.clear();
         config.pois.iter_mut().for_each(|group| group.after.clear());
         let world = World::new(&config.validate().unwrap());
-        if world.paths.is_some() {
+        if world.paths.is_some() || config.pois.iter().any(|group| group.region.is_some()) {
             continue;
         }
         let (expected, positions) = paths_of(&world, seed);
@@ -667,7 +667,9 @@ fn worth_of_path(world: &World, paths: &PathRule, positions: &[f32], times: impl
                 near.extend(vec![d2; if d2 <= world.radii2[poi] { times(moment, agent) } else { 0 }]);
             }
             near.sort_by(f32::total_cmp);
-            let is_open = world.rule.window(poi).is_none_or(|[first, last]| (first..=last).contains(&(moment as u32)));
+            let all = [1, steps as u32];
+            let is_open = |window: [u32; 2]| window == all || (window[0]..=window[1]).contains(&(moment as u32));
+            let is_open = world.rule.window(poi).is_none_or(is_open);
             let coupling = world.coupling[poi] as usize;
             match score {
                 _ if !is_open || near.len() < coupling => 0,

@@ -162,6 +162,7 @@ fn pictures_and_pages_show_classes_radii_and_values() {
     place.good("train herd.toml --out run");
     place.good("replay run --out page.html");
     let page = place.read("page.html");
-    assert!(page.contains("\"classes\":[{\"count\":2,\"free\":false,\"name\":\"rover\",\"senses\":[{"));
+    assert!(page.contains("\"classes\":[{\"count\":2,\"free\":false,\"influence\":"));
+    assert!(page.contains("\"name\":\"rover\",\"senses\":[{"));
     assert!(page.contains("\"radii\":[5.0,5.0,3.0]") && page.contains("\"values\":[2.0,2.0,0.5]"));
 }

@@ -406,7 +406,7 @@ x.toml:13: motion.max_sped: unknown key, did you mean `motion.max_speed`?
 x.toml:21: policy.hidden[0]: found 65, allowed 1 to 64
 x.toml:24: learning.trials: found 0, allowed 1 to 4096
 x.toml:25: learning.foo: unknown key; [learning] has elites, episodes_per_team, fitness, generations, groups, hall_of_fame, initial, \
-         initial_scale, led_by, led_within, leniency, method, mutation, mutation_probability, mutation_sigma, paradigm, parents, partners, poi_jitter, population, search_sigma, search_step, seed, sharing, start_jitter, team_elites, team_g_elites, teams, temperature, test_episodes, trials
+         initial_scale, leniency, method, mutation, mutation_probability, mutation_sigma, paradigm, parents, partners, poi_jitter, population, search_sigma, search_step, seed, sharing, start_jitter, team_elites, team_g_elites, teams, temperature, test_episodes, trials
 --population: found 1, allowed 2 to 1048576"
     );
 }

@@ -19,6 +19,7 @@
 //! `FLOTILLA_PAGE=first-run` selects the pages with this in their names.
 
 use crate::support;
+use std::collections::BTreeMap;
 use std::fs;
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -443,4 +444,52 @@ fn every_relative_link_has_a_target() {
     fs::write(&page, "# One `two`: three\n[a](#one-two-three) [b](#four) [c](page.md#x) [d](none.md) [e](https://f.g)")
         .unwrap();
     assert_eq!(broken_links(&page).len(), 3, "{:?}", broken_links(&page));
+}
+
+/// Every cell of the table on rovers and UAVs is in the published files, and no pair of credits differs.
+#[test]
+fn the_page_on_rovers_and_uavs_agrees_with_its_files() {
+    let folder = crate::support::root("docs/results");
+    let page = fs::read_to_string(folder.join("influence.md")).unwrap();
+    let read = |name: String| {
+        let text = fs::read_to_string(folder.join("influence").join(name)).unwrap();
+        let mut reader = csv::Reader::from_reader(text.as_bytes());
+        let rows: Vec<BTreeMap<String, String>> = reader.deserialize().map(Result::unwrap).collect();
+        rows
+    };
+    let layouts = ["rover_uav", "3_rovers_1_uav", "3_rovers_3_uavs", "4_rovers_4_uavs"];
+    let tables: Vec<_> = layouts.iter().map(|layout| read(format!("{layout}.csv"))).collect();
+    let rule = |rule: &'static str| ("Dt", rule);
+    let credits = [
+        ("G", "alone"),
+        ("D", "alone"),
+        ("Df", "alone"),
+        rule("any-seen"),
+        rule("first"),
+        rule("alone"),
+        rule("anyone"),
+    ];
+    for (fitness, led_by) in credits {
+        let cells = tables.iter().map(|rows| {
+            let is = |row: &&BTreeMap<String, String>| {
+                row["learning.fitness"] == fitness && row["credit.led_by"] == led_by && row["trials"] == "30"
+            };
+            let row = rows.iter().find(is).unwrap_or_else(|| panic!("{fitness}, {led_by}"));
+            let [g, low, high] =
+                ["champion_g", "champion_g_low", "champion_g_high"].map(|key| row[key].parse::<f64>().unwrap());
+            format!("{g:.2} [{low:.2}, {high:.2}]")
+        });
+        let name = if fitness == "Dt" { format!("Dt, `{led_by}`") } else { fitness.into() };
+        let line = format!("| {name} | {} |", cells.collect::<Vec<_>>().join(" | "));
+        assert!(page.contains(&line), "{line}");
+    }
+    let (mut pairs, mut uncorrected) = (0, 0);
+    for layout in layouts {
+        for row in read(format!("{layout}_pairs.csv")) {
+            assert!(row["p_holm"].parse::<f64>().unwrap() >= 0.05, "{layout}: {row:?}");
+            uncorrected += usize::from(row["p"].parse::<f64>().unwrap() < 0.05);
+            pairs += 1;
+        }
+    }
+    assert_eq!((pairs, uncorrected), (84, 1));
 }

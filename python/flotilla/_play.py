@@ -145,7 +145,8 @@ def score(config: Config, positions: ArrayLike) -> Scores:
             `[teams, steps + 1, agents, 2]`; classes follow each other in the order of the config.
 
     Raises:
-        ValueError: the positions have another shape, or hold a NaN or an infinity; or POIs come after others.
+        ValueError: the positions have another shape, or hold a NaN or an infinity; or POIs come after others, or are drawn
+            from regions.
 
     Example:
         >>> config = flotilla.Config.paper()
@@ -427,16 +428,18 @@ def collect(
     _, pois, steps = config._native.sizes
     values = np.array(config._native.worth)
     at = np.empty((total, pois), np.uint32)
-    if reward == "G":
+    by_step = reward == "G" and not config._native.needs_paths
+    if by_step:
         arrays["observed_at"] = at
     worth, d, df, dpp, dt = _record(scored, array, starts, (starts[1], deviations), arrays)
     rewards = np.zeros((total, steps, config.num_learners), np.float32)
-    if reward == "G":
+    if by_step:
         team, poi = np.nonzero(at)
         gains = np.bincount(team * steps + at[team, poi] - 1, values[poi], total * steps)
         rewards[...] = gains.reshape(total, steps, 1).astype(np.float32) / np.float32(values.sum())
     else:
-        rewards[:, -1] = {"D": d, "Df": df, "D++": dpp, "Dt": dt}[reward]
+        g = np.repeat((worth / values.sum())[:, None], config.num_learners, axis=1)
+        rewards[:, -1] = {"G": g, "D": d, "Df": df, "D++": dpp, "Dt": dt}[reward]
     masks = np.ones((total, steps), np.bool_)
     masks[:, -1] = False
     return Collected(arrays["inputs"], arrays["actions"], arrays["outputs"], rewards, masks, worth / values.sum())

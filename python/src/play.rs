@@ -213,7 +213,7 @@ pub fn record<'py>(
         write_distances(&world, positions, &places, of_pois, of_agents);
         PyResult::Ok(scores)
     })?;
-    let (leaders, fitnesses) = (world.leaders(), evaluate::scores_beside(config.0.learning.fitness));
+    let (leaders, fitnesses) = (world.leaders(), evaluate::scores_beside(&config.0));
     let rows = |index: usize| {
         let teams = scores.iter().flat_map(|episode| episode.scores.chunks_exact(fitnesses.len() * leaders));
         let rows: Vec<f32> = teams.flat_map(|scores| &scores[index * leaders..][..leaders]).copied().collect();

@@ -71,6 +71,7 @@ pub fn held_bytes([populations, slots, parameters]: [usize; 3]) -> u64 {
 ///
 /// # Errors
 /// There are too few or too many weights, or a size is 0.
+#[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "only GPUs hold populations"))]
 pub(super) fn check_sizes(weights: usize, sizes: [usize; 3]) -> Result<(), BackendError> {
     let expected = sizes.into_iter().try_fold(1, usize::checked_mul);
     if weights > 0 && expected == Some(weights) {

@@ -165,7 +165,8 @@ pub(super) fn play_segments(world: &World, teams: &[(&[f32], &[Vec<Vec2>])]) -> 
     let failed = |error: crate::stepping::StepError| BackendError::InvalidInput(error.to_string());
     let mut observed = vec![0; teams.len()];
     let Some((_, starts)) = teams.first() else { return Ok(observed) };
-    let mut stepper = Stepper::new(world.clone(), teams.len(), Recording::None).map_err(failed)?;
+    let recording = if world.paths.is_some() { Recording::Sets } else { Recording::None };
+    let mut stepper = Stepper::new(world.clone(), teams.len(), recording).map_err(failed)?;
     let (steps, mut actions) = (world.steps(), Vec::new());
     // The largest turn per step of each leader, as a fraction of a half turn.
     let most = |leader: usize| world.class_of(leader).constants.motion.max_turn / std::f32::consts::PI;
@@ -185,6 +186,12 @@ pub(super) fn play_segments(world: &World, teams: &[(&[f32], &[Vec<Vec2>])]) -> 
                 actions.extend([turn.signum() * (turn.abs() - turned).max(0.0), speed]);
             }
             stepper.step(&actions).map_err(failed)?;
+        }
+        if world.paths.is_some() {
+            for (team, total) in observed.iter_mut().enumerate() {
+                *total += u64::from(stepper.scores(team).map_err(failed)?.observed);
+            }
+            continue;
         }
         let all = stepper.observed().chunks_exact(world.pois.len());
         for (total, pois) in observed.iter_mut().zip(all) {

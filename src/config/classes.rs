@@ -178,7 +178,7 @@ impl Config {
 
     /// Returns the fitness of each learner, `[learners]`.
     pub fn fitness_of_each(&self) -> Vec<Fitness> {
-        let of_class = |class: &AgentClass| vec![class.fitness.unwrap_or(self.learning.fitness); class.at.len()];
+        let of_class = |class: &AgentClass| vec![class.fitness.unwrap_or(self.learning.fitness); class.size()];
         match &self.agents[..] {
             [] => vec![self.learning.fitness; self.learners()],
             classes => classes.iter().filter(|class| class.learns()).flat_map(of_class).collect(),

@@ -366,7 +366,7 @@ impl Config {
             Paradigm::AllLeaders => world.leaders.len() + world.followers.len(),
         };
         let agent_count = match has_agents {
-            true => agents.iter().map(|class| class.at.len()).sum(),
+            true => agents.iter().map(AgentClass::size).sum(),
             false => world.leaders.len() + world.followers.len(),
         };
         let config = Config {

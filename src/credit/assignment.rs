@@ -84,10 +84,11 @@ pub(super) fn lead(sights: &Strided<'_>, followers: usize, leaders: usize, rule:
             match by {
                 LedBy::AnySeen => counted.for_each(|(leader, _)| lead(leader)),
                 LedBy::First => counted.next().into_iter().for_each(|(leader, _)| lead(leader)),
-                LedBy::Alone => match (counted.next(), counted.next()) {
-                    (Some((leader, _)), None) => lead(leader),
-                    _ => {}
-                },
+                LedBy::Alone => {
+                    if let (Some((leader, _)), None) = (counted.next(), counted.next()) {
+                        lead(leader);
+                    }
+                }
                 LedBy::Anyone if counted.next().is_some() => (0..leaders).for_each(lead),
                 LedBy::Anyone => {}
                 LedBy::MostSeen => {

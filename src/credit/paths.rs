@@ -24,7 +24,8 @@ pub(super) struct PathCredit {
     led: Vec<u32>,
     /// The number of moments at which each agent was influenced by each learner, `[agents][leaders]`.
     counts: Vec<u32>,
-    /// The agents that are taken out for each learner, `[leaders][words][width]`, and at any moment, `[leaders][words]`.
+    /// The agents that are taken out for each learner, `[leaders][words][width]`, and at any moment, `[leaders][words]`. The
+    /// first is empty if they are the same at all moments.
     taken: Vec<u32>,
     ever_taken: Vec<u32>,
     /// Agents that are ever near the POI and count there, and at each moment their squared distance, infinite unless it
@@ -167,12 +168,13 @@ impl PathCredit {
                 }
             }
         }
-        let width = self.width;
-        self.taken.resize(leaders * words * width, 0);
-        for (row, &agents) in self.taken.chunks_exact_mut(width).zip(&self.ever_taken) {
-            row.fill(agents);
-        }
+        self.taken.clear();
         if fitness == Fitness::Dt {
+            let width = self.width;
+            self.taken.resize(leaders * words * width, 0);
+            for (row, &agents) in self.taken.chunks_exact_mut(width).zip(&self.ever_taken) {
+                row.fill(agents);
+            }
             lead(&Strided::contiguous(&self.sights), agents, leaders, world.led, &mut self.led);
             let size = world.leader_words();
             for (place, &word) in self.led.iter().enumerate() {
@@ -230,8 +232,9 @@ impl PathCredit {
     #[inline(always)]
     fn find_observers<S: Simd>(&mut self, simd: S, world: &World, rule: &PathRule, poi: usize, at: Vec2) {
         let (agents, width) = (world.agents(), self.width);
-        let [first, last] =
-            world.rule.window(poi).map_or([0, world.steps()], |window| window.map(|step| step as usize));
+        // A window of all steps includes the start, if that counts. POIs without one have it if others have windows.
+        let window = world.rule.window(poi).filter(|&window| window != [1, world.constants.steps]);
+        let [first, last] = window.map_or([0, world.steps()], |window| window.map(|step| step as usize));
         let first = first.max(usize::from(!rule.start_counts));
         self.observers.clear();
         self.near.clear();
@@ -312,6 +315,10 @@ impl PathCredit {
         match change {
             Change::Without(leader) => {
                 let row = leader * world.constants.words as usize + agent / 32;
+                if self.taken.is_empty() {
+                    let is_taken = self.ever_taken[row] >> (agent % 32) & 1 != 0;
+                    return (if is_taken { splat(simd, f32::INFINITY) } else { near }, 1);
+                }
                 let taken = S::u32s::from_slice(simd, &self.taken[row * self.width + first..][..S::f32s::LEN]);
                 let stays = (taken & S::u32s::splat(simd, 1 << (agent % 32))).simd_eq(0);
                 (select::<S>(splat(simd, f32::INFINITY), near, stays), 1)

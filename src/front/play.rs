@@ -26,7 +26,7 @@ pub struct Played {
     pub df: Vec<f32>,
     /// D++, `[teams][leaders]`.
     pub dpp: Vec<f32>,
-    /// Dt, `[teams][leaders]`. Empty unless Dt is the config's fitness, because Dt needs a record of who was seen at
+    /// Dt, `[teams][leaders]`. Empty unless Dt is the fitness of any class, because Dt needs a record of who was seen at
     /// every step.
     pub dt: Vec<f32>,
 }
@@ -64,13 +64,8 @@ pub fn play_until(
     each: &mut dyn FnMut(evaluate::Batch<'_>) -> ControlFlow<()>,
 ) -> Result<Evaluation, Failure> {
     let checked = CheckedTeams::new(config, teams, weights, starts)?;
-    let group = Group { fitnesses: scores_of(config), ..checked.group(&checked.world.starts) };
+    let group = Group { fitnesses: evaluate::scores_beside(config), ..checked.group(&checked.world.starts) };
     Ok(evaluate::evaluate(backend, &group, starts, each)?)
-}
-
-/// Returns the fitnesses that teams of a config are scored by: Dt only if it is the config's fitness.
-fn scores_of(config: &Config) -> &'static [Fitness] {
-    evaluate::scores_beside(config.learning.fitness)
 }
 
 impl From<&Evaluation> for Played {
@@ -101,7 +96,7 @@ pub fn with_team<R>(
 ) -> Result<R, Failure> {
     let checked = CheckedTeams::new(config, 1, weights, starts)?;
     let starts = starts.of(0, &checked.world);
-    Ok(look(&Group { fitnesses: scores_of(config), ..checked.group(&starts) }))
+    Ok(look(&Group { fitnesses: evaluate::scores_beside(config), ..checked.group(&starts) }))
 }
 
 /// Noise on the actions of leaders: its seed, and the standard deviation of each leader's turn and speed, `[leaders]`.
@@ -134,7 +129,7 @@ pub fn record(
         return Err(Failure::NoEpisode { episode: episodes.end, episodes: starts.episodes() });
     }
     let checked = CheckedTeams::new(config, teams, weights, starts)?;
-    checked.record(starts, episodes, scores_of(config), noise, arrays)
+    checked.record(starts, episodes, evaluate::scores_beside(config), noise, arrays)
 }
 
 /// The states, inputs, outputs and observations of every step of one episode.
@@ -195,16 +190,16 @@ pub fn trace(
 }
 
 /// Creates teams that are stepped by given actions, all at the world's start. With `recording`, the teams can be
-/// scored, including Dt if that is the config's fitness.
+/// scored, including Dt if that is the fitness of any class.
 ///
 /// # Errors
 /// The config is invalid, the number of teams is not allowed, or memory is insufficient.
 pub fn stepper(config: &Config, teams: usize, recording: bool) -> Result<Stepper, Failure> {
     let world = World::new(&config.validate()?);
-    let recording = match (recording, config.learning.fitness) {
-        (false, _) => Recording::None,
-        (true, Fitness::Dt) => Recording::SetsAndSights,
-        (true, _) => Recording::Sets,
+    let recording = match recording {
+        false => Recording::None,
+        true if config.fitnesses().contains(&Fitness::Dt) => Recording::SetsAndSights,
+        true => Recording::Sets,
     };
     Ok(Stepper::new(world, teams, recording)?)
 }

@@ -28,10 +28,11 @@ pub struct Scored {
 }
 
 /// Scores paths of teams of a config's world: positions at the start and after each step in units,
-/// `[teams][steps + 1][agents][2]`. They need not be on the map, and nothing is simulated.
+/// `[teams][steps + 1][agents][2]`. They need not be on the map, and nothing is simulated. Stages do not matter.
 ///
 /// # Errors
-/// The config is invalid, has POIs that come after others or are drawn from regions, the number of positions is wrong, or one is not finite.
+/// The config is invalid, POIs come after others or are drawn from regions, the number of positions is wrong, or one is not
+/// finite.
 pub fn score(config: &Config, positions: &[f32]) -> Result<Scored, Failure> {
     let valid = config.validate()?;
     let world = World::scored_by_paths(&valid);
@@ -53,7 +54,7 @@ pub fn score(config: &Config, positions: &[f32]) -> Result<Scored, Failure> {
         let value = positions[index];
         return Err(Failure::Paths(format!("agent {agent} of team {team} is at {value} after step {moment}")));
     }
-    let (leaders, of_each) = (world.leaders(), config.fitness_of_each());
+    let of_each = config.fitness_of_each();
     let teams: Vec<_> = positions
         .par_chunks_exact(size)
         .map_init(Credit::default, |credit, positions| {
@@ -65,15 +66,15 @@ pub fn score(config: &Config, positions: &[f32]) -> Result<Scored, Failure> {
     let mut scored = Scored::default();
     for scores in teams {
         scored.value.push(f64::from(scores.observed) / f64::from(total) * values);
-        for leader in 0..leaders {
-            let own = match of_each[leader] {
+        for (leader, &fitness) in of_each.iter().enumerate() {
+            let own = match fitness {
                 Fitness::G => scores.g,
                 Fitness::D => scores.d[leader],
                 Fitness::Df => scores.df[leader],
                 Fitness::Dpp => scores.dpp[leader],
                 Fitness::Dt => scores.dt[leader],
             };
-            let added = if config.credit.add_g && of_each[leader] != Fitness::G { scores.g } else { 0.0 };
+            let added = if config.credit.add_g && fitness != Fitness::G { scores.g } else { 0.0 };
             scored.fitness.push(own + added);
         }
         scored.g.push(scores.g);

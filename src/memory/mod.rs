@@ -6,7 +6,7 @@
 //! see [`copies_checkpoint`]. A sweep limits its batches to half of the available memory.
 
 use crate::backend::{self, BATCH_BYTES, PACKED_FROM, cpu};
-use crate::config::{Config, Method, StageConfig, ValidConfig};
+use crate::config::{Config, Fitness, Method, StageConfig, ValidConfig};
 use crate::world::World;
 
 #[cfg(any(test, not(any(target_os = "macos", windows))))]
@@ -45,7 +45,11 @@ struct StageBytes {
 impl StageBytes {
     fn of(config: &StageConfig) -> StageBytes {
         let (world, learning) = (World::new(config), &config.learning);
-        let (sizes, fitness) = ([learning.trials, config.populations(), learning.population], learning.fitness);
+        let sizes = [learning.trials, config.populations(), learning.population];
+        let fitnesses = config.fitnesses();
+        let largest = |bytes: fn(&World, Fitness) -> u64| {
+            fitnesses.iter().map(|&fitness| bytes(&world, fitness)).fold(0, u64::max)
+        };
         let [trials, populations, policies] = sizes.map(|size| size as u64);
         let [leaders, teams, episodes] = [config.learners(), config.max_teams(), learning.episodes_per_team];
         let [leaders, teams, episodes] = [leaders, teams, episodes].map(|size| size as u64);
@@ -62,17 +66,13 @@ impl StageBytes {
             + if is_summed { 2 * populations * policies } else { 0 }
             + (episodes + tests) * EPISODE_WORDS;
         let played = trials * (episodes * teams).max(tests);
-        let of_team = [
-            backend::weight_bytes(&world),
-            backend::record_bytes(&world, fitness),
-            backend::state_bytes(&world, fitness),
-        ];
+        let of_team = [backend::weight_bytes(&world), largest(backend::record_bytes), largest(backend::state_bytes)];
         StageBytes {
             training: 4 * trials * words_of_trial + schedules,
             schedules,
             starts,
             queue: played.div_ceil(cpu::lanes()) * 16,
-            block: cpu::block_bytes(&world, fitness),
+            block: largest(cpu::block_bytes),
             on_gpu: of_team.map(|bytes| played.saturating_mul(bytes)),
         }
     }

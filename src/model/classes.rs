@@ -231,7 +231,7 @@ table! {
         /// what it counts for at a step with enough observers within its radius: 1 if observed; if closeness, the product
         /// of 1/max(d, 1) over the distances d of as many of the nearest as it needs
         score: Score = "",
-        /// which step counts: the best if ever, the last if end, or all if mean
+        /// which step counts: the best if ever, the last if end, or all if mean; steps outside its window count 0
         when: When = "",
         /// groups whose POIs must all have been observed at earlier steps
         #[serde(skip_serializing_if = "Vec::is_empty", serialize_with = "one_or_list")]

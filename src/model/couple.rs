@@ -8,7 +8,6 @@ use crate::kernels::math::within;
 use crate::reader::{Reader, between};
 
 /// The shader of this part.
-#[cfg(feature = "gpu")]
 pub(crate) const WGSL: &str = include_str!("../../shaders/couple.wgsl");
 
 /// Reads the observation radius.

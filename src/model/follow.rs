@@ -18,7 +18,6 @@ use crate::kernels::{
 use crate::reader::{Reader, between, section};
 
 /// The shader of this part.
-#[cfg(feature = "gpu")]
 pub(crate) const WGSL: &str = include_str!("../../shaders/follow.wgsl");
 
 /// Maximum gain of a force.

@@ -125,6 +125,7 @@ impl<S: Simd> Lanes<S> {
 }
 
 /// Returns the WGSL of the structs and constants that the parts' shaders use.
+#[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "only GPUs have shaders"))]
 pub(crate) fn declarations() -> String {
     let constants = gpu_constants!(BEHAVIOURS, TINY, GRID, INVERSE_GRID, MAX_RANGES);
     let structs = [
@@ -141,5 +142,5 @@ pub(crate) fn declarations() -> String {
 }
 
 /// The parts' shaders.
-#[cfg(feature = "gpu")]
+#[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "only GPUs have shaders"))]
 pub(crate) const WGSL: [&str; 5] = [sense::WGSL, policy::WGSL, follow::WGSL, motion::WGSL, couple::WGSL];

@@ -14,7 +14,6 @@ use crate::kernels::{
 use crate::reader::{Allowed, Reader, between, section};
 
 /// The shader of this part.
-#[cfg(feature = "gpu")]
 pub(crate) const WGSL: &str = include_str!("../../shaders/motion.wgsl");
 
 section! {

@@ -10,7 +10,6 @@ use crate::kernels::{math, select, splat};
 use crate::reader::{Reader, between, section};
 
 /// The shader of this part.
-#[cfg(feature = "gpu")]
 pub(crate) const WGSL: &str = include_str!("../../shaders/policy.wgsl");
 
 /// Actions of a leader: a wanted turn and a wanted speed.

@@ -17,7 +17,6 @@ use crate::kernels::{
 use crate::reader::{Reader, between, section};
 
 /// The shader of this part.
-#[cfg(feature = "gpu")]
 pub(crate) const WGSL: &str = include_str!("../../shaders/sense.wgsl");
 // The shader has a case for each, and takes the last for the other one.
 const _: () = assert!(Measure::ALL.len() == 6, "add the new measure to shaders/sense.wgsl, too, and raise this number");

@@ -179,7 +179,7 @@ impl TrialState {
 /// Returns G of the last team of some episodes. `total` is what all POIs are worth.
 fn last_g(episodes: &[GroupScores], total: u32) -> f64 {
     let observed = |episode: &GroupScores| u64::from(episode.observed.last().copied().unwrap_or(0));
-    episodes.iter().map(observed).sum::<u64>() as f64 / (total as usize * episodes.len()) as f64
+    episodes.iter().map(observed).sum::<u64>() as f64 / (f64::from(total) * episodes.len() as f64)
 }
 
 /// Returns what the POIs that a team observed in some episodes are worth.
@@ -215,7 +215,7 @@ fn team_g(episodes: &[GroupScores], worth: u32, teams: usize) -> [f64; 2] {
     let chunks: Vec<_> =
         (0..teams.div_ceil(TEAMS_TOGETHER)).into_par_iter().map(|index| chunk(index * TEAMS_TOGETHER)).collect();
     let (best, total) = chunks.into_iter().fold((0, 0), fold);
-    let whole = (worth as usize * episodes.len()) as f64;
+    let whole = f64::from(worth) * episodes.len() as f64;
     [best as f64 / whole, total as f64 / (whole * teams as f64)]
 }
 

@@ -220,7 +220,7 @@ pub fn play(config: &Config, policies: usize, mut weights: Vec<f32>) -> Result<V
         populations: &populations,
         weights: weights[..].into(),
         teams: &vec![0; world.leaders()],
-        fitnesses: std::slice::from_ref(&config.learning.fitness),
+        fitnesses: flotilla::evaluate::scores_beside(config),
     };
     let played = replay::one(&group, &mut Cpu::default()).map_err(refuse)?;
     let generation = config.learning.generations;

@@ -164,8 +164,9 @@ impl Training {
         // Under Dt, what Dt needs is recorded, and every other credit, too.
         let mut timed = Config::clone(config);
         timed.learning.fitness = Fitness::Dt;
+        timed.agents.iter_mut().for_each(|class| class.fitness = None);
         let mut played = replay::best(&timed, &mut trainer, trial, &mut cpu).map_err(refuse)?;
-        if config.learning.fitness != Fitness::Dt {
+        if !config.fitnesses().contains(&Fitness::Dt) {
             // Then followers are drawn with the leader that they saw most.
             played.led.clear();
         }

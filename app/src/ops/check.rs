@@ -115,7 +115,8 @@ impl Cost {
             let travelled =
                 classes.agents.iter().flat_map(|class| reach::travel(config, class, config.world.steps).pop());
             travel = travelled.fold(travel, f64::max);
-            record_bytes = record_bytes.max(backend::record_bytes(&world, learning.fitness));
+            let bytes = config.fitnesses().into_iter().map(|fitness| backend::record_bytes(&world, fitness));
+            record_bytes = bytes.fold(record_bytes, u64::max);
         }
         let plan = Peaks::of([config], parallel::current_num_threads());
         Cost {

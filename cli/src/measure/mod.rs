@@ -248,6 +248,7 @@ fn rollout(
     // If generations play from the device's memory, so do these rollouts.
     let held = backend.hold(weights, [config.populations(), policies, world.parameters()])?;
     let played = held.as_deref().map_or(weights.into(), Weights::OnDevice);
+    let fitnesses = config.fitnesses();
     let group = Group {
         world,
         starts: &world.starts,
@@ -255,7 +256,7 @@ fn rollout(
         policies,
         populations: &world.populations,
         teams: &teams,
-        fitnesses: std::slice::from_ref(&config.learning.fitness),
+        fitnesses: &fitnesses,
     };
     let mut observed = 0;
     let play = || {

@@ -259,5 +259,13 @@ pub(crate) fn block_bytes(world: &World, fitness: Fitness) -> u64 {
     let paths = if world.paths.is_some() { world.path_words() } else { 0 };
     let record = world.set_words() + followers * leaders + sight_words(world, fitness == Fitness::Dt) + paths;
     let words = 8 * agents + leaders * world.constants.policy.words() + 3 * followers + record;
-    words as u64 * lanes() * 4 + (8 * world.parameters() + agents * agents.div_ceil(64) * 8) as u64
+    // Scores from paths copy these, and under Dt find who leads whom at each moment.
+    let moments = world.steps() + 1 + lanes() as usize;
+    let led = 2 * agents * leaders.div_ceil(32) + leaders * world.constants.words as usize;
+    let scratch = match (paths, fitness) {
+        (0, _) => 0,
+        (_, Fitness::Dt) => moments * (3 * agents + led),
+        _ => moments * 3 * agents,
+    };
+    words as u64 * lanes() * 4 + (8 * world.parameters() + agents * agents.div_ceil(64) * 8 + 4 * scratch) as u64
 }

@@ -416,7 +416,7 @@ impl<'a> Episodes<'a> {
             policies: learning.slots(),
             populations: &self.world.populations,
             teams,
-            fitnesses: std::slice::from_ref(&learning.fitness),
+            fitnesses: flotilla::evaluate::scores_beside(self.config),
         }
     }
 
@@ -424,12 +424,12 @@ impl<'a> Episodes<'a> {
     fn play(&self, backend: &mut dyn Backend) -> Result<Vec<f64>, BackendError> {
         let groups: Vec<_> =
             (0..self.starts.len()).map(|episode| Group { fitnesses: &[], ..self.group(episode, self.teams) }).collect();
-        let mut observed = vec![0; self.teams.len() / self.world.leaders()];
+        let mut observed = vec![0u64; self.teams.len() / self.world.leaders()];
         for scores in backend.play(&groups)? {
-            observed.iter_mut().zip(scores.observed).for_each(|(sum, observed)| *sum += observed);
+            observed.iter_mut().zip(scores.observed).for_each(|(sum, observed)| *sum += u64::from(observed));
         }
-        let whole = (self.world.total_worth as usize * groups.len()) as f64;
-        Ok(observed.into_iter().map(|observed| f64::from(observed) / whole).collect())
+        let whole = f64::from(self.world.total_worth) * groups.len() as f64;
+        Ok(observed.into_iter().map(|observed| observed as f64 / whole).collect())
     }
 
     /// Plays a team's first episode again and traces it.

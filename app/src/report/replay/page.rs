@@ -8,7 +8,7 @@ use super::{Counterfactual, Replayed, near};
 use crate::record::folder::OWN_FITNESS;
 use crate::report::map::{GROUPS, GROUPS_DARK};
 use crate::report::scene::hex;
-use flotilla::config::{AgentClass, Config, Mobility, PoiGroup};
+use flotilla::config::{AgentClass, Config, Fitness, Mobility, PoiGroup};
 use flotilla::credit::{self, Strided};
 use flotilla::world::OUTPUTS;
 
@@ -99,7 +99,7 @@ pub fn data(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Val
     let mut data = json!({
         "run": format!("{name}{unverified}"),
         "paradigm": config.learning.paradigm,
-        "fitness": if own_fitness { OWN_FITNESS.into() } else { config.learning.fitness.to_string() },
+        "fitness": if own_fitness { OWN_FITNESS.into() } else { words(&config.fitnesses()) },
         "map": world.map,
         "pois": pois,
         "observation_radius": world.observation_radius,
@@ -154,6 +154,11 @@ pub fn parts(config: &Config) -> Vec<(&'static str, serde_json::Value)> {
         parts.extend(of_each(|group| group.value).map(|values| ("values", values)));
     }
     parts
+}
+
+/// Names fitnesses.
+fn words(fitnesses: &[Fitness]) -> String {
+    fitnesses.iter().map(Fitness::to_string).collect::<Vec<_>>().join(" and ")
 }
 
 /// Returns the colours of leaders and their followers for light and dark backgrounds.
