@@ -27,7 +27,7 @@ ORDER = [
     ("Training", ["train", "Run", "Generation", "Error", "loggers"]),
     ("Your own fitness", ["Coevolution", "Proposal", "Played"]),
     ("Looking", ["Replay", "Episode", "Figure", "plot", "compare", "Comparison"]),
-    ("Evaluating", ["rollout", "Rollout", "Trace", "replay", "forward", "collect", "Collected", "to_onnx"]),
+    ("Evaluating", ["rollout", "Rollout", "Trace", "score", "Scores", "replay", "forward", "collect", "Collected", "to_onnx"]),
     ("Environments", ["VectorEnv", "team_env", "parallel_env"]),
     ("Many runs", ["sweep", "Sweep", "Point", "paper"]),
     ("The machine", ["devices", "verify"]),

@@ -70,6 +70,8 @@ FUNCTIONS = {
         else None
     ),
     "rollout backend": lambda *a: flotilla.rollout(SMALL, RUN.policies[0], backend=a[0]),
+    "score": lambda *a: flotilla.score(SMALL, a[0]),
+    "score anything": lambda *a: flotilla.score(*a[:2]),
     "forward": lambda *a: flotilla.forward(*a[:3]),
     "collect": lambda *a: flotilla.collect(SMALL, RUN.policies[0], a[0], a[1], jitter=a[2]),
     "collect anything": lambda *a: flotilla.collect(*a[:4]),

@@ -102,7 +102,7 @@ def test_curves_are_drawn(config):
     assert flotilla.plot("kept").svg() == flotilla.plot(runs[1]).svg() == flotilla.plot([Path("kept")]).svg()
     assert "G of the champion" in flotilla.plot(runs, measure="champion").svg() != flotilla.plot(runs, measure="best").svg()
     assert runs[0].plot("mean").svg() != runs[0].plot("best").svg()
-    with pytest.raises(ValueError, match='measure "worst": allowed champion, best or mean'):
+    with pytest.raises(ValueError, match='measure "worst": allowed champion, best, mean or test'):
         flotilla.plot(runs, measure="worst")
     flotilla.plot(runs).save("curves.png", width=400)
     assert os.path.getsize("curves.png") > 1000
