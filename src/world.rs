@@ -54,7 +54,7 @@ pub struct WorldParts {
     pub rule: Rule,
     /// The rule by which leaders lead followers, for Dt.
     pub led: Led,
-    /// What scores need if they are computed from paths.
+    /// The rule of scores that are computed from paths; `None` if they are computed from sets.
     pub paths: Option<PathRule>,
     /// The population that each leader chooses its policy from, `[leaders]`.
     pub populations: Vec<u32>,
@@ -63,7 +63,7 @@ pub struct WorldParts {
 /// The rule by which scores are computed from [paths](crate::credit::Paths).
 #[derive(Clone, Debug, PartialEq)]
 pub struct PathRule {
-    /// What each POI counts for, and when, `[pois]`.
+    /// The score of each POI and the step whose score counts, `[pois]`.
     pub scores: Vec<(Score, When)>,
     /// Whether the start counts as a step.
     pub start_counts: bool,

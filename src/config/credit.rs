@@ -7,9 +7,8 @@ use crate::reader::{Reader, between, section};
 section! {
     /// `[credit]`: whom D, Df and Dt take out. `led_within` and `led_by` are a world's [`Led`](crate::world::Led).
     CreditConfig = "credit" {
-        /// for Dt: whom a learner leads at a step, of the agents that it influenced within led_within; an agent is led by
-        /// the learner that influenced it at the most steps, or by every one that did, or by the first of these by its
-        /// number, or by one that was alone, or, if anyone influenced it, by all learners
+        /// for Dt: the learners that lead an agent at a step, of those that influenced it within led_within: the one that
+        /// did at most steps, every one, the first by its number, the only one, or, if anyone did, all learners
         led_by: LedBy = "", "4.2, 5",
         /// for Dt: number of last steps, the present one included, that decide who leads an agent; 0 means all steps so
         /// far; 0 by default with led_by = "most-seen", else 1

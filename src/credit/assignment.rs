@@ -18,14 +18,8 @@ pub fn assign(seen: &Seen<'_>, world: &World, owner: &mut Vec<u32>) {
     let followers = 0..world.followers();
     match seen {
         Seen::Counts(seen) => owner.extend(followers.map(|follower| {
-            let (mut most, mut best) = (0, UNASSIGNED);
-            for leader in 0..leaders {
-                let steps = seen.get(follower * leaders as usize + leader as usize);
-                if steps > most {
-                    (most, best) = (steps, leader);
-                }
-            }
-            best
+            let steps = (0..leaders as usize).map(|leader| seen.get(follower * leaders as usize + leader));
+            first_most(steps).map_or(UNASSIGNED, |leader| leader as u32)
         })),
         Seen::Owners(owners) => {
             let bits = owner_bits(leaders);
@@ -37,6 +31,12 @@ pub fn assign(seen: &Seen<'_>, world: &World, owner: &mut Vec<u32>) {
             }));
         }
     }
+}
+
+/// Returns the index of the largest number, the first of equal ones. `None` if all are 0.
+pub(super) fn first_most(numbers: impl Iterator<Item = u32>) -> Option<usize> {
+    let larger = |(most, first), (index, number)| if number > most { (number, Some(index)) } else { (most, first) };
+    numbers.enumerate().fold((0, None), larger).1
 }
 
 /// Writes the agents that belong to each leader, one bit per agent, `[leaders][words]`.
@@ -91,12 +91,7 @@ pub(super) fn lead(sights: &Strided<'_>, followers: usize, leaders: usize, rule:
                 }
                 LedBy::Anyone if counted.next().is_some() => (0..leaders).for_each(lead),
                 LedBy::Anyone => {}
-                LedBy::MostSeen => {
-                    let first = counted.next();
-                    let most =
-                        first.map(|first| counted.fold(first, |most, next| if next.1 > most.1 { next } else { most }));
-                    most.into_iter().for_each(|(leader, _)| lead(leader));
-                }
+                LedBy::MostSeen => first_most(counts.iter().copied()).into_iter().for_each(lead),
             }
         }
     }

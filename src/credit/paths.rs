@@ -3,7 +3,7 @@
 use fearless_simd::{Level, Simd, dispatch, prelude::*};
 use glam::Vec2;
 
-use super::assignment::lead;
+use super::assignment::{first_most, lead};
 use super::{Paths, Strided, each_bit, share, stepping_stone};
 use crate::config::{Fitness, Score, When};
 use crate::kernels::math::within;
@@ -34,7 +34,7 @@ pub(super) struct PathCredit {
     near: Vec<f32>,
     /// The squared distances of the nearest observers, `[coupling][lanes]`.
     nearest: Vec<f32>,
-    /// What each learner would lose, `[leaders]`, and gain by so many copies, `[leaders][copies]`.
+    /// The worth that each learner would lose, `[leaders]`, and gain by so many copies, `[leaders][copies]`.
     lost: Vec<u32>,
     gains: Vec<u32>,
 }
@@ -162,8 +162,7 @@ impl PathCredit {
         }
         if fitness == Fitness::Df {
             for (agent, counts) in self.counts.chunks_exact(leaders).enumerate() {
-                let most = counts.iter().copied().max().filter(|&most| most > 0);
-                if let Some(leader) = most.and_then(|most| counts.iter().position(|&count| count == most)) {
+                if let Some(leader) = first_most(counts.iter().copied()) {
                     self.ever_taken[leader * words + agent / 32] |= 1 << (agent % 32);
                 }
             }
@@ -282,7 +281,9 @@ impl PathCredit {
             false => 0,
         };
         let (mut best, mut sum, steps) = (splat(simd, f32::INFINITY), 0_u64, world.steps());
-        for first in (0..self.width).step_by(S::f32s::LEN) {
+        // The last vector has the last moment.
+        let from = if when == When::End { self.width - S::f32s::LEN } else { 0 };
+        for first in (from..self.width).step_by(S::f32s::LEN) {
             let squared = match (score, coupling) {
                 (Score::Observed, _) => self.observed::<S>(simd, world, coupling as u32, first, change),
                 (Score::Closeness, 1) => self.closest::<S>(simd, world, first, change),
@@ -290,14 +291,8 @@ impl PathCredit {
             };
             match when {
                 When::Ever => best = smaller::<S>(squared, best),
-                When::End if first + S::f32s::LEN > steps => best = splat(simd, squared.as_slice()[steps - first]),
-                When::End => {}
+                When::End => best = splat(simd, squared.as_slice()[steps - first]),
                 When::Mean => sum += squared.as_slice().iter().map(|&squared| u64::from(value(squared))).sum::<u64>(),
-            }
-            if let When::End = when
-                && first + S::f32s::LEN > steps
-            {
-                break;
             }
         }
         if when == When::Mean {

@@ -22,8 +22,7 @@ pub struct Scored {
     pub dpp: Vec<f32>,
     /// Dt, `[teams][learners]`.
     pub dt: Vec<f32>,
-    /// What each learner's policies would be selected by: one of these, with G if `credit.add_g` is set,
-    /// `[teams][learners]`.
+    /// The fitness of each learner: one of these, added to G if `credit.add_g` is set, `[teams][learners]`.
     pub fitness: Vec<f32>,
 }
 

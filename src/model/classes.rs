@@ -240,7 +240,7 @@ table! {
 }
 
 config_enum! {
-    /// What a POI counts for at a step with enough observers within its radius.
+    /// The number that a POI counts for at a step with enough observers within its radius.
     Score {
         /// 1.
         Observed = "observed",
