@@ -7,7 +7,9 @@ use std::fmt::{self, Display};
 
 use glam::DVec2;
 
-use crate::config::{AgentClass, Classes, Config, Control, MAX_STEPS, Mobility, Region, StageConfig, WorldConfig};
+use crate::config::{
+    AgentClass, Classes, Config, Control, MAX_STEPS, Mobility, PoiGroup, Region, StageConfig, WorldConfig,
+};
 use crate::model::rule::{NEVER, Rule};
 use crate::world::{GRID, on_grid};
 
@@ -112,8 +114,8 @@ pub fn travel(config: &Config, class: &AgentClass, steps: usize) -> Vec<f64> {
 struct Distances {
     /// The maximum distance that an agent of each class travels, `[classes][steps + 1]`.
     travel: Vec<Vec<f64>>,
-    /// The class of each observer and its start distance less jitter in units, `[pois]`.
-    observers: Vec<Vec<(usize, f64)>>,
+    /// The class of observers, their start distance less jitter in units, and how many start there, `[pois]`.
+    observers: Vec<Vec<(usize, f64, usize)>>,
     /// The number of observers that each POI needs, `[pois]`.
     couplings: Vec<u32>,
     /// The observation radius of each POI in units, `[pois]`.
@@ -124,30 +126,33 @@ impl Distances {
     fn new(config: &StageConfig, classes: &Classes, steps: usize) -> Distances {
         // Jitter moves agent and POI, each by up to this much per axis. Regions are replaced by their middles.
         let jitter = 2f64.sqrt() * (config.learning.start_jitter + config.learning.poi_jitter);
-        let middles = |mut places: Vec<[f64; 2]>, regions: Vec<(usize, Region)>| {
-            let mut reach = vec![0.0; places.len()];
-            for (index, region) in regions {
-                (places[index], reach[index]) = region.extent();
-            }
-            (places, reach)
-        };
-        let (starts, start_reach) = middles(classes.starts(), classes.start_regions());
-        let (places, poi_reach) = middles(classes.places(), classes.poi_regions());
         let map = DVec2::from(config.world.map).as_vec2();
-        let on_grid = |places: Vec<[f64; 2]>| -> Vec<DVec2> {
-            places.into_iter().map(|at| on_grid(DVec2::from(at).as_vec2(), map).as_dvec2()).collect()
+        let on_grid = |at: [f64; 2]| on_grid(DVec2::from(at).as_vec2(), map).as_dvec2();
+        let middles = |at: &[[f64; 2]], size: usize, region: Option<Region>| -> Vec<(DVec2, f64, usize)> {
+            match region.map(Region::extent) {
+                Some((middle, reach)) => vec![(on_grid(middle), reach, size)],
+                None => at.iter().map(|&at| (on_grid(at), 0.0, 1)).collect(),
+            }
         };
-        let (starts, of_class) = (on_grid(starts), classes.class_of_each());
+        let starts: Vec<_> =
+            classes.agents.iter().map(|class| middles(&class.at, class.size(), class.region)).collect();
+        let places = |group: &PoiGroup| middles(&group.at, group.size(), group.region);
+        let places = classes.pois.iter().map(places).enumerate().flat_map(|(group, places)| {
+            places.into_iter().flat_map(move |(place, reach, size)| vec![(group, place, reach); size])
+        });
         let groups = classes.group_of_each();
-        let observers = |((place, &group), &poi_reach): ((DVec2, &usize), &f64)| {
-            let counted = starts.iter().zip(&of_class).zip(&start_reach);
-            let counted = counted.filter(|((_, class), _)| classes.observes(**class, group));
-            let left = |start: &DVec2, reach: f64| (start.distance(place) - jitter - poi_reach - reach).max(0.0);
-            counted.map(|((start, &class), &reach)| (class, left(start, reach))).collect()
+        let observers = |(group, place, poi_reach): (usize, DVec2, f64)| {
+            let left = |start: DVec2, reach: f64| (start.distance(place) - jitter - poi_reach - reach).max(0.0);
+            let counted = starts.iter().enumerate().filter(|(class, _)| classes.observes(*class, group));
+            let of_class = |(class, starts)| {
+                let starts: &Vec<(DVec2, f64, usize)> = starts;
+                starts.iter().map(move |&(start, reach, size)| (class, left(start, reach), size))
+            };
+            counted.flat_map(of_class).collect()
         };
         Distances {
             travel: classes.agents.iter().map(|class| travel(config, class, steps)).collect(),
-            observers: on_grid(places).into_iter().zip(&groups).zip(&poi_reach).map(observers).collect(),
+            observers: places.map(observers).collect(),
             couplings: classes.couplings(),
             radii: groups.iter().map(|&group| classes.pois[group].radius).collect(),
         }
@@ -156,10 +161,14 @@ impl Distances {
     /// Returns class and distance of the last observer that a POI needs at a step, if they come as near as they can.
     fn last(&self, poi: usize, step: usize) -> (usize, f64) {
         let mut observers = self.observers[poi].clone();
-        let left = |&(class, distance): &(usize, f64)| distance - self.travel[class][step];
+        let left = |&(class, distance, _): &(usize, f64, usize)| distance - self.travel[class][step];
         observers.sort_by(|a, b| left(a).total_cmp(&left(b)));
-        let last = (self.couplings[poi] as usize).saturating_sub(1);
-        observers.get(last).copied().unwrap_or((0, f64::INFINITY))
+        let mut needed = self.couplings[poi] as usize;
+        let is_last = |&&(_, _, size): &&(usize, f64, usize)| {
+            needed = needed.saturating_sub(size);
+            needed == 0
+        };
+        observers.iter().find(is_last).map_or((0, f64::INFINITY), |&(class, distance, _)| (class, distance))
     }
 
     /// Returns the first step at which enough observers can be within a POI's radius, times this factor.

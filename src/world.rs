@@ -34,12 +34,12 @@ pub struct WorldParts {
     pub starts: Vec<Vec2>,
     /// Initial headings, unit vectors, `[agents]`.
     pub headings: Vec<Vec2>,
-    /// The agents that start in regions. Their starts here are examples.
-    pub start_regions: Vec<(usize, Region)>,
+    /// The agents that start in each region. Their starts here are examples.
+    pub start_regions: Vec<(Range<usize>, Region)>,
     /// POI positions in units, on the kernels' grid, `[pois]`.
     pub pois: Vec<Vec2>,
-    /// The POIs in regions. Their positions here are examples.
-    pub poi_regions: Vec<(usize, Region)>,
+    /// The POIs in each region. Their positions here are examples.
+    pub poi_regions: Vec<(Range<usize>, Region)>,
     /// The squared observation radius of each POI, `[pois]`.
     pub radii2: Vec<f32>,
     /// The value of each POI, `[pois]`.

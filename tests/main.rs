@@ -23,6 +23,7 @@ mod support {
     pub use crate::helpers::*;
 }
 mod structure;
+mod swarm;
 // Release builds have no faults to inject.
 #[cfg(all(debug_assertions, feature = "gpu"))]
 mod watchdog;

@@ -41,7 +41,7 @@ pub struct Args {
     /// Agents per team, one or several: leaders and followers in the config's ratio, laid out in groups as by
     /// `flotilla sweep` [default: the config's]
     #[arg(long, value_name = "N,…", value_delimiter = ',',
-        value_parser = between(1..=config::MAX_AGENTS as u32))]
+        value_parser = between(1..=config::MAX_LEARNERS as u32))]
     agents: Vec<u32>,
     /// Train for this many generations first. Trained teams observe more POIs, so that scoring them takes longer
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = between(0..=1000u32))]

@@ -5,7 +5,7 @@ use std::fmt::Write;
 
 use glam::DVec2;
 
-use flotilla::config::{Config, ConfigError, MAX_AGENTS, MAX_POIS};
+use flotilla::config::{Config, ConfigError, MAX_LEARNERS, MAX_POIS};
 use flotilla::reach;
 use flotilla_app::report::map::counted;
 
@@ -56,8 +56,8 @@ impl StartLayout {
             _ if self.pois == 0 || self.pois > MAX_POIS => {
                 Some(format!("--pois {}: allowed 1 to {MAX_POIS}", self.pois))
             }
-            _ if agents > MAX_AGENTS => Some(format!(
-                "--groups {} --followers {}: these are {agents} agents, allowed 1 to {MAX_AGENTS}",
+            _ if agents > MAX_LEARNERS => Some(format!(
+                "--groups {} --followers {}: these are {agents} agents, allowed 1 to {MAX_LEARNERS}",
                 self.groups, self.followers
             )),
             _ if self.coupling == 0 || self.coupling > agents => {

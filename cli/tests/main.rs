@@ -43,6 +43,7 @@ mod rules;
 mod searchers;
 mod stages;
 mod stories;
+mod swarm;
 mod sweep;
 mod tasks;
 mod train;

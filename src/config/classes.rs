@@ -34,6 +34,19 @@ pub(super) const REPLACED_BY_POIS: &[&str] =
 /// Inputs of the leaders of the short form: POIs and agents in four quadrants each.
 const SHORT_INPUTS: usize = 8;
 
+/// Maximum number of agents of a team that do not learn in pictures.
+const MOST_DRAWN: usize = 2000;
+
+/// Returns the agents that pictures draw: those that learn, and of the others every n-th if there are very many.
+pub fn drawn_agents(learners: usize, agents: usize) -> Vec<usize> {
+    (0..learners).chain((learners..agents).step_by(drawn_every(learners, agents))).collect()
+}
+
+/// Returns n if pictures draw every n-th agent that does not learn.
+pub fn drawn_every(learners: usize, agents: usize) -> usize {
+    (agents - learners).div_ceil(MOST_DRAWN).max(1)
+}
+
 impl Config {
     /// Returns the number of agents in a team.
     pub fn agent_count(&self) -> usize {
@@ -58,15 +71,17 @@ impl Config {
     }
 
     /// Returns the world in short as pictures draw it. Agents that learn are leaders, others are followers, and all POIs
-    /// have the largest radius of any.
+    /// have the largest radius of any. Of the followers of large teams some are drawn, see [`drawn_agents`].
     pub fn drawn(&self) -> WorldConfig {
         let mut world = self.world.clone();
         let classes = self.classes();
         if !self.agents.is_empty() {
             // Classes that learn come first.
-            world.leaders = classes.starts();
-            world.followers = world.leaders.split_off(self.learners());
-            world.heading = Heading::Each(classes.headings());
+            let (starts, headings, learners) = (classes.starts(), classes.headings(), self.learners());
+            let drawn = drawn_agents(learners, starts.len());
+            world.heading = Heading::Each(drawn.iter().map(|&agent| headings[agent]).collect());
+            world.leaders = drawn.into_iter().map(|agent| starts[agent]).collect();
+            world.followers = world.leaders.split_off(learners);
         }
         if !self.pois.is_empty() {
             world.pois = classes.places();

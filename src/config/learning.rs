@@ -1,6 +1,6 @@
 //! The sections `[learning]` and `[checkpoint]`: their data and keys.
 
-use super::MAX_AGENTS;
+use super::MAX_LEARNERS;
 use crate::config_enum::config_enum;
 use crate::model::classes::Fitness;
 use crate::model::{LEAST, LONGEST};
@@ -351,7 +351,7 @@ fn groups(r: &mut Reader<'_>, sharing: Sharing, learners: usize) -> Vec<Vec<usiz
             .collect()
     };
     // Without valid leaders the number of learners is unknown, which is reported already.
-    let places = if learners == 0 { MAX_AGENTS } else { learners };
+    let places = if learners == 0 { MAX_LEARNERS } else { learners };
     let each_in_one = |groups: &[Vec<usize>]| if learners == 0 { vec![] } else { each_in_one(groups) };
     let learner = between(0, places - 1).because("the last learner");
     let groups = Learning::groups(r).lists("groups of learners", ("wanted", None), 1..=places, learner, each_in_one);

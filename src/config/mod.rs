@@ -31,6 +31,7 @@ pub use crate::model::sense::{Density, Sense};
 pub use crate::model::start::Heading;
 pub use crate::reader::{Definition, Override, Problem};
 
+pub use classes::{drawn_agents, drawn_every};
 pub use credit::{CreditConfig, LedBy};
 pub use learning::{
     CheckpointConfig, Elites, Initial, Learning, Leniency, MAX_EPISODES, MAX_GENERATIONS, MAX_HALL_OF_FAME,
@@ -42,7 +43,8 @@ pub use populations::{one_population, own_populations, population_count};
 pub use stages::MAX_STAGES;
 pub use stages::{GENERATIONS, STAGES, Stage};
 pub use valid::{StageConfig, ValidConfig};
-pub use world::{MAX_AGENTS, MAX_POIS, MAX_STEPS, WorldConfig};
+use world::MAX_RECORD_BYTES;
+pub use world::{MAX_AGENTS, MAX_LEARNERS, MAX_POIS, MAX_STEPS, WorldConfig};
 
 mod classes;
 mod credit;
@@ -265,6 +267,17 @@ impl Config {
         }
     }
 
+    /// Returns the bytes of everything that any fitness may need of one team's episode: the agents at each POI, the leaders
+    /// that followers saw, and positions if [scores need these](Config::needs_paths).
+    fn record_bytes(&self) -> u64 {
+        let numbers = [self.agent_count(), self.learners(), self.poi_count(), self.world.steps];
+        let [agents, learners, pois, steps] = numbers.map(|number| number as u64);
+        let followers = agents.saturating_sub(learners);
+        let sights = followers * learners.div_ceil(32);
+        let paths = if self.needs_paths().is_some() { 2 * agents } else { 0 };
+        4 * (steps * (pois * agents.div_ceil(32) + sights) + followers * learners + (steps + 1) * paths)
+    }
+
     /// Returns the number of populations in a trial.
     pub fn populations(&self) -> usize {
         population_count(&self.population_of_each())
@@ -382,6 +395,19 @@ impl Config {
             pois,
             stages: vec![],
         };
+        if learners > MAX_LEARNERS {
+            r.report_key(AGENTS, format!("found {learners} agents that learn, allowed up to {MAX_LEARNERS}"));
+        }
+        let record = config.record_bytes();
+        if r.error_count() == 0 && record > MAX_RECORD_BYTES {
+            let [found, most] = [record, MAX_RECORD_BYTES].map(|bytes| bytes.div_ceil(1 << 20));
+            let text = format!(
+                "found {}, with which the record of an episode takes {found} MiB, allowed {most} MiB: it grows with \
+                 steps × agents × learners and with steps × agents × POIs",
+                config.world.steps
+            );
+            r.report_key("world.steps", text);
+        }
         let needs_quadrants = config.agents.iter().find(|class| class.learns() && !class.senses_quadrants());
         if let (Actions::Behaviours, Some(class)) = (config.policy.actions, needs_quadrants) {
             let message = format!(

@@ -1,6 +1,6 @@
 //! Maps from the leaders of a team to the populations that their policies come from, `[leaders]`.
 
-use super::MAX_AGENTS;
+use super::MAX_LEARNERS;
 
 /// Returns the number of populations that leaders choose from.
 pub fn population_count(populations: &[u32]) -> usize {
@@ -10,12 +10,12 @@ pub fn population_count(populations: &[u32]) -> usize {
 /// Returns the populations of leaders that each have one of their own.
 ///
 /// # Panics
-/// There are more than [`MAX_AGENTS`] leaders.
+/// There are more than [`MAX_LEARNERS`] leaders.
 pub fn own_populations(leaders: usize) -> &'static [u32] {
-    static OWN: [u32; MAX_AGENTS] = {
-        let mut own = [0; MAX_AGENTS];
+    static OWN: [u32; MAX_LEARNERS] = {
+        let mut own = [0; MAX_LEARNERS];
         let mut leader = 0;
-        while leader < MAX_AGENTS {
+        while leader < MAX_LEARNERS {
             own[leader] = leader as u32;
             leader += 1;
         }
@@ -27,8 +27,8 @@ pub fn own_populations(leaders: usize) -> &'static [u32] {
 /// Returns the populations of leaders that all share one.
 ///
 /// # Panics
-/// There are more than [`MAX_AGENTS`] leaders.
+/// There are more than [`MAX_LEARNERS`] leaders.
 pub fn one_population(leaders: usize) -> &'static [u32] {
-    static ONE: [u32; MAX_AGENTS] = [0; MAX_AGENTS];
+    static ONE: [u32; MAX_LEARNERS] = [0; MAX_LEARNERS];
     &ONE[..leaders]
 }

@@ -9,17 +9,15 @@ use crate::model::{LEAST, LONGEST};
 use crate::reader::{Allowed, Reader, between, section};
 
 /// Maximum number of agents in a team.
-pub const MAX_AGENTS: usize = 1024;
+pub const MAX_AGENTS: usize = 1 << 20;
+/// Maximum number of agents in a team that learn, and of agents that `[world]` lists.
+pub const MAX_LEARNERS: usize = 1024;
 /// Maximum number of POIs in a world.
 pub const MAX_POIS: usize = 256;
 /// Maximum number of steps in an episode.
 pub const MAX_STEPS: usize = 10_000;
-/// Checks that a team's record is smaller than 1 GiB in every config.
-const _: () = {
-    // Sightings take the most memory if half of the agents are followers.
-    let (sets, sights) = (MAX_POIS * MAX_AGENTS.div_ceil(32), MAX_AGENTS / 2 * (MAX_AGENTS / 2).div_ceil(32));
-    assert!(MAX_STEPS * (sets + sights) * size_of::<u32>() < 1 << 30);
-};
+/// Maximum bytes of the record of one team's episode.
+pub(super) const MAX_RECORD_BYTES: u64 = 1 << 30;
 
 section! {
     /// `[world]`: where everything starts, how long an episode is, and who observes a POI. Positions are `[x, y]` in
@@ -71,23 +69,23 @@ impl WorldConfig {
         let has_agents = observers_in_full.is_some();
         let map = WorldConfig::map(r).pair(between(1.0, LONGEST), [50.0, 50.0]);
         let sides = map.map(|side| between(LEAST, side).or_zero().because("the map"));
-        let leaders = WorldConfig::leaders(r).positions(1..=MAX_AGENTS, sides, none(has_agents));
-        let followers = WorldConfig::followers(r).positions(0..=MAX_AGENTS - 1, sides, Some(vec![]));
+        let leaders = WorldConfig::leaders(r).positions(1..=MAX_LEARNERS, sides, none(has_agents));
+        let followers = WorldConfig::followers(r).positions(0..=MAX_LEARNERS - 1, sides, Some(vec![]));
         let pois = WorldConfig::pois(r).positions(1..=MAX_POIS, sides, none(has_pois));
-        let agents = leaders.as_ref().zip(followers.as_ref()).map_or(MAX_AGENTS, |(l, f)| l.len() + f.len());
-        if agents > MAX_AGENTS {
-            let message = format!("found {agents} agents with the leaders, allowed 1 to {MAX_AGENTS}");
+        let agents = leaders.as_ref().zip(followers.as_ref()).map_or(MAX_LEARNERS, |(l, f)| l.len() + f.len());
+        if agents > MAX_LEARNERS {
+            let message = format!("found {agents} agents with the leaders, allowed 1 to {MAX_LEARNERS}");
             r.report_key("world.followers", message);
         }
         let observers = Observers::read(r);
         let counted = match (leaders.as_ref(), followers.as_ref(), paradigm) {
-            _ if has_pois => MAX_AGENTS,
-            _ if has_agents => observers_in_full.filter(|&count| count > 0).unwrap_or(MAX_AGENTS),
+            _ if has_pois => MAX_LEARNERS,
+            _ if has_agents => observers_in_full.filter(|&count| count > 0).unwrap_or(MAX_LEARNERS),
             (Some(leaders), Some(followers), Paradigm::LeaderFollower) => {
                 observers.among(leaders.len(), followers.len()).len()
             }
             (Some(_), Some(_), Paradigm::AllLeaders) => observers.among(agents, 0).len(),
-            _ => MAX_AGENTS,
+            _ => MAX_LEARNERS,
         };
         if counted == 0 {
             let why = if paradigm == Paradigm::AllLeaders { "all agents lead" } else { "there are no followers" };
@@ -100,7 +98,7 @@ impl WorldConfig {
         let heading = Heading::read(r, counts);
         let world = WorldConfig {
             map,
-            coupling: Coupling::read(r, counted.clamp(1, MAX_AGENTS), observers.counted(), places),
+            coupling: Coupling::read(r, counted.clamp(1, MAX_LEARNERS), observers.counted(), places),
             observers,
             windows: windows(r, steps, places),
             after: after(r, places),

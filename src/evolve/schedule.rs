@@ -1,5 +1,7 @@
 //! Who plays with whom and from where: teams of a generation, and the start positions of its episodes.
 
+use std::ops::Range;
+
 use fearless_simd::{Level, Simd, dispatch, prelude::*};
 use glam::{DVec2, Vec2};
 
@@ -177,10 +179,12 @@ pub fn jitter_pois(key: Key, generation: usize, episode: usize, world: &World, j
 }
 
 /// Draws the positions in regions.
-fn spawn(key: Key, map: Vec2, regions: &[(usize, Region)], positions: &mut [Vec2]) {
-    for &(index, region) in regions {
-        let [x, y, ..] = key.draw(index as u32);
-        positions[index] = on_grid(DVec2::from(region.place([x, y])).as_vec2(), map);
+fn spawn(key: Key, map: Vec2, regions: &[(Range<usize>, Region)], positions: &mut [Vec2]) {
+    for (range, region) in regions {
+        for (index, position) in range.clone().zip(&mut positions[range.clone()]) {
+            let [x, y, ..] = key.draw(index as u32);
+            *position = on_grid(DVec2::from(region.place([x, y])).as_vec2(), map);
+        }
     }
 }
 

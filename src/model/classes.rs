@@ -1,5 +1,7 @@
 //! Classes of agents and groups of POIs as configs describe them, `[[agents]]` and `[[pois]]`.
 
+use std::ops::Range;
+
 use serde::{Serialize, Serializer};
 
 use super::motion::Mobility;
@@ -272,14 +274,20 @@ impl Classes {
         examples(self.agents.iter().map(|class| (&class.at[..], class.size(), class.region)))
     }
 
-    /// Returns the agents that start in regions.
-    pub fn start_regions(&self) -> Vec<(usize, Region)> {
+    /// Returns the agents that start in each region.
+    pub fn start_regions(&self) -> Vec<(Range<usize>, Region)> {
         regions(self.agents.iter().map(|class| (class.size(), class.region)))
     }
 
     /// Returns each agent's heading at the start in radians, `[agents]`.
     pub fn headings(&self) -> Vec<f64> {
         self.agents.iter().flat_map(|class| class.heading.of_each(class.size())).collect()
+    }
+
+    /// Returns the agents of a class.
+    pub fn agents_of(&self, class: usize) -> Range<usize> {
+        let first = self.agents[..class].iter().map(AgentClass::size).sum::<usize>();
+        first..first + self.agents[class].size()
     }
 
     /// Returns the index of each agent's class, `[agents]`.
@@ -293,8 +301,8 @@ impl Classes {
         examples(self.pois.iter().map(|group| (&group.at[..], group.size(), group.region)))
     }
 
-    /// Returns the POIs that are in regions.
-    pub fn poi_regions(&self) -> Vec<(usize, Region)> {
+    /// Returns the POIs that are in each region.
+    pub fn poi_regions(&self) -> Vec<(Range<usize>, Region)> {
         regions(self.pois.iter().map(|group| (group.size(), group.region)))
     }
 
@@ -362,9 +370,13 @@ fn examples<'a>(tables: impl Iterator<Item = (&'a [[f64; 2]], usize, Option<Regi
 }
 
 /// Returns the regions of those that are in one, with their indices.
-fn regions(tables: impl Iterator<Item = (usize, Option<Region>)>) -> Vec<(usize, Region)> {
-    let of_each = tables.flat_map(|(count, region)| std::iter::repeat_n(region, count));
-    of_each.enumerate().filter_map(|(index, region)| Some((index, region?))).collect()
+fn regions(tables: impl Iterator<Item = (usize, Option<Region>)>) -> Vec<(Range<usize>, Region)> {
+    let mut end = 0;
+    let region = |(count, region): (usize, Option<Region>)| {
+        end += count;
+        Some((end - count..end, region?))
+    };
+    tables.filter_map(region).collect()
 }
 
 impl PoiGroup {

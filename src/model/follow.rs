@@ -136,6 +136,25 @@ impl TermConstants {
     }
 }
 
+/// Returns the terms that are added together, each alone or two rings: one without an inner radius, and the one around it
+/// that counts the same agents and adds the same quantity.
+pub(crate) fn rings(terms: &[TermConstants]) -> Vec<Range<usize>> {
+    let mut rings: Vec<Range<usize>> = vec![];
+    for (index, outer) in terms.iter().enumerate() {
+        let is_around = |inner: &TermConstants| {
+            inner.shape == outer.shape
+                && inner.inner2 < 0.0
+                && outer.inner2 == inner.outer2
+                && outer.outer2 >= inner.outer2
+        };
+        match rings.last_mut() {
+            Some(ring) if ring.len() == 1 && is_around(&terms[ring.start]) => ring.end += 1,
+            _ => rings.push(index..index + 1),
+        }
+    }
+    rings
+}
+
 /// The sum over the agents that count for a term, in lattice distances, and their number.
 #[derive(Clone, Copy)]
 pub(crate) struct Sum<S: Simd> {

@@ -23,7 +23,7 @@ use std::cell::RefCell;
 use fearless_simd::{Level, dispatch};
 use glam::Vec2;
 
-use crate::config::{Fitness, MAX_POPULATION};
+use crate::config::{Fitness, MAX_LEARNERS, MAX_POPULATION};
 use crate::credit::{Credit, Scores};
 use crate::parallel::*;
 use crate::world::{GRID, OUTPUTS, World, on_grid};
@@ -73,6 +73,9 @@ pub enum StepError {
     /// The number of teams is 0 or too large.
     #[error("{0} teams; there may be 1 to {MAX_POPULATION}")]
     Teams(usize),
+    /// A team has too many agents.
+    #[error("teams of {0} agents; those that are stepped may have up to {MAX_LEARNERS}")]
+    Agents(usize),
     /// The system has too little memory.
     #[error("not enough memory for {teams} teams, {bytes} bytes")]
     Memory {
@@ -162,6 +165,9 @@ impl Stepper {
     pub fn at_level(level: Level, world: World, teams: usize, recording: Recording) -> Result<Stepper, StepError> {
         if !(1..=MAX_POPULATION).contains(&teams) {
             return Err(StepError::Teams(teams));
+        }
+        if world.agents() > MAX_LEARNERS {
+            return Err(StepError::Agents(world.agents()));
         }
         let (agents, leaders, pois) = (world.agents(), world.leaders(), world.pois.len());
         let words = world.constants.words as usize;

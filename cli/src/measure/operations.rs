@@ -36,52 +36,60 @@ impl Reach {
         };
         let (mut sensed, mut met) = (zeros(&|class| class.channels().len()), zeros(&|class| class.terms().len()));
         let [mut seen, mut pairs] = [0.0; 2];
-        let share = 1.0 / (world.steps() * trace.teams) as f64;
+        // Of a large class every n-th agent is looked at, and stands for as many as it is one of.
+        let looked_at = |class: &Class| class.agents().step_by(class.agents().len().div_ceil(MOST_LOOKED_AT).max(1));
+        let stands_for =
+            |class: &Class| class.agents().len() as f64 / (looked_at(class).len() * world.steps() * trace.teams) as f64;
         let class_of: Vec<usize> =
             world.classes.iter().enumerate().flat_map(|(index, class)| vec![index; class.agents().len()]).collect();
         for moments in trace.moments.chunks_exact(agents).take(world.steps() * trace.teams) {
-            let d2 = |[ax, ay]: [f32; 2], [bx, by]: [f32; 2]| {
+            let d2_of = |[ax, ay]: [f32; 2], [bx, by]: [f32; 2]| {
                 let (dx, dy) = (bx - ax, by - ay);
                 dx * dx + dy * dy
             };
-            let mut matters = vec![false; agents * agents];
-            for (i, a) in moments.iter().enumerate() {
-                let class = &world.classes[class_of[i]];
-                let others =
-                    |ranges: &model::Ranges| model::each(ranges).flatten().filter(|&j| j != i).collect::<Vec<_>>();
+            let d2 = |i: usize, j: usize| d2_of(moments[i].position, moments[j].position);
+            let sees = |i: usize, j: usize| {
+                let leads = j < world.leaders() && i >= world.leaders();
+                leads && d2(i, j) <= world.classes[class_of[j]].constants.influence2[class_of[i]]
+            };
+            let has = |ranges: &model::Ranges, j: usize| model::each(ranges).any(|range| range.contains(&j));
+            let matters = |i: usize, j: usize| {
+                let (class, d2) = (&world.classes[class_of[i]], d2(i, j));
+                let of_agents = class.channels().iter().filter(|channel| channel.shape.of_pois == 0);
+                of_agents.into_iter().any(|channel| d2 <= channel.range2 && has(&channel.shape.ranges, j))
+                    || class.terms().iter().any(|term| d2 <= term.outer2 && has(&term.shape.ranges, j))
+                    || sees(i, j)
+            };
+            for (i, class) in world.classes.iter().flat_map(|class| looked_at(class).map(move |i| (i, class))) {
+                let (a, share) = (&moments[i], stands_for(class));
+                let others = |ranges: &model::Ranges, counts: &dyn Fn(usize) -> bool| {
+                    model::each(ranges).flatten().filter(|&j| j != i && counts(j)).count()
+                };
                 for (channel, sensed) in class.channels().iter().zip(&mut sensed[class_of[i]]) {
-                    if channel.shape.of_pois != 0 {
+                    let near = if channel.shape.of_pois == 0 {
+                        others(&channel.shape.ranges, &|j| d2(i, j) <= channel.range2)
+                    } else {
                         let pois = model::each(&channel.shape.ranges).flatten();
-                        let near = pois.filter(|&poi| d2(a.position, world.pois[poi].to_array()) <= channel.range2);
-                        *sensed += near.count() as f64 * share;
-                        continue;
-                    }
-                    for j in others(&channel.shape.ranges) {
-                        let near = d2(a.position, moments[j].position) <= channel.range2;
-                        *sensed += f64::from(u8::from(near)) * share;
-                        matters[i * agents + j] |= near;
-                    }
+                        let place = |poi: usize| world.pois[poi].to_array();
+                        pois.filter(|&poi| d2_of(a.position, place(poi)) <= channel.range2).count()
+                    };
+                    *sensed += near as f64 * share;
                 }
                 for (term, met) in class.terms().iter().zip(&mut met[class_of[i]]) {
-                    for j in others(&term.shape.ranges) {
-                        let d2 = d2(a.position, moments[j].position);
-                        *met += f64::from(u8::from(d2 <= term.outer2 && d2 > term.inner2)) * share;
-                        matters[i * agents + j] |= d2 <= term.outer2;
-                    }
+                    let is_met = |j: usize| d2(i, j) <= term.outer2 && d2(i, j) > term.inner2;
+                    *met += others(&term.shape.ranges, &is_met) as f64 * share;
                 }
-                for j in (0..world.leaders()).filter(|_| i >= world.leaders()) {
-                    let influence2 = world.classes[class_of[j]].constants.influence2[class_of[i]];
-                    let sees = d2(a.position, moments[j].position) <= influence2;
-                    seen += f64::from(u8::from(sees)) * share;
-                    matters[i * agents + j] |= sees;
-                }
+                seen += (0..world.leaders()).filter(|&j| sees(i, j)).count() as f64 * share;
+                let in_reach = (0..agents).filter(|&j| j != i && (matters(i, j) || matters(j, i)));
+                pairs += in_reach.count() as f64 * share / 2.0;
             }
-            let both = |(i, j): &(usize, usize)| matters[i * agents + j] || matters[j * agents + i];
-            pairs += (0..agents).flat_map(|i| (0..i).map(move |j| (i, j))).filter(both).count() as f64 * share;
         }
         Reach { sensed, met, seen, pairs }
     }
 }
+
+/// Maximum agents of a class whose surroundings are looked at.
+const MOST_LOOKED_AT: usize = 1024;
 
 /// Lane operations of [`kernels`](flotilla::kernels): an f32 or integer operation, a comparison or a selection is one.
 mod kernel {

@@ -16,6 +16,8 @@ pub(super) struct WorldBatch<'a> {
     pub(super) teams: usize,
     /// Whether sightings are recorded.
     pub(super) sighted: bool,
+    /// Whether it matters which leader each follower saw most.
+    pub(super) counted: bool,
     /// The fitnesses of every group; `None` if these differ.
     pub(super) fitnesses: Option<&'a [Fitness]>,
     /// The number of teams up to the end of each group, `[groups]`.
@@ -32,9 +34,10 @@ impl<'a> WorldBatch<'a> {
         };
         let ends = groups.iter().map(add).collect();
         let sighted = groups.iter().any(|group| group.records().sights());
+        let counted = groups.iter().any(|group| group.records().owners());
         let fitnesses = Some(groups[0].fitnesses);
         let fitnesses = fitnesses.filter(|fitnesses| groups.iter().all(|group| group.fitnesses == *fitnesses));
-        WorldBatch { world: groups[0].world, first, groups, teams, sighted, fitnesses, ends }
+        WorldBatch { world: groups[0].world, first, groups, teams, sighted, counted, fitnesses, ends }
     }
 
     /// Returns the group, by its index here, and the team in it of a team of this batch.

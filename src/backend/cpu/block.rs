@@ -302,7 +302,7 @@ impl<S: Simd> Block<S> {
 struct Plan {
     /// The agents of each channel, `[channels]`.
     channels: Vec<Masks>,
-    /// Terms that are added together, one or two [rings](Attraction), and their agents.
+    /// Terms that are added together, see [`follow::rings`], and their agents.
     terms: Vec<(Range<usize>, Masks)>,
     /// The leaders, unless the first terms count them because they visit all of them and have their radius.
     leaders: Option<Masks>,
@@ -316,15 +316,9 @@ impl Plan {
         let leaders = 0..world.leaders();
         let leading: Vec<&Class> = leaders.clone().map(|leader| world.class_of(leader)).collect();
         let plan = |(index, class): (usize, &Class)| {
-            let mut terms: Vec<(Range<usize>, Masks)> = vec![];
-            for (term, constants) in class.terms().iter().enumerate() {
-                match terms.last_mut().map(|(range, _)| range) {
-                    Some(range) if range.len() == 1 && is_around(&class.terms()[range.start], constants) => {
-                        range.end += 1;
-                    }
-                    _ => terms.push((term..term + 1, masks(model::each(&constants.shape.ranges)))),
-                }
-            }
+            let of = |ring: &Range<usize>| masks(model::each(&class.terms()[ring.start].shape.ranges));
+            let terms: Vec<(Range<usize>, Masks)> =
+                follow::rings(class.terms()).into_iter().map(|ring| (ring.clone(), of(&ring))).collect();
             let influences2: Vec<f32> = leading.iter().map(|class| class.constants.influence2[index]).collect();
             let visits = |constants: &follow::TermConstants| {
                 model::each(&constants.shape.ranges).any(|range| range.start == 0 && range.end >= leaders.end)
@@ -341,12 +335,6 @@ impl Plan {
         };
         world.classes.iter().enumerate().map(plan).collect()
     }
-}
-
-/// Reports whether a term counts the same agents and adds the same quantity as one without an inner radius, in the ring
-/// around it.
-fn is_around(inner: &follow::TermConstants, outer: &follow::TermConstants) -> bool {
-    inner.shape == outer.shape && inner.inner2 < 0.0 && outer.inner2 == inner.outer2 && outer.outer2 >= inner.outer2
 }
 
 /// Returns the largest squared distance at which each agent and any after it matter to each other, `[agents]`.
@@ -546,8 +534,7 @@ fn count_leaders<S: Simd>(
     }
 }
 
-/// One term of a rule, or two that count the same agents and add the same quantity: one without an inner radius, and one
-/// in the ring around it.
+/// One term of a rule, or two [rings](follow::rings).
 struct Attraction<'a, S: Simd> {
     class: &'a ClassLanes<S>,
     terms: &'a [follow::TermLanes<S>],

@@ -11,7 +11,7 @@ use fearless_simd::{Level, Simd, dispatch, prelude::*};
 
 use super::scores::ScoreTable;
 use super::{Backend, BackendError, Group, GroupScores, Moment, Trace};
-use crate::config::Fitness;
+use crate::config::{Fitness, MAX_LEARNERS};
 use crate::parallel::*;
 use crate::world::World;
 
@@ -25,6 +25,7 @@ mod network;
 mod pois;
 mod record;
 mod steps;
+mod swarm;
 mod transpose;
 
 pub(crate) use agent::Agent;
@@ -37,16 +38,29 @@ pub(crate) use transpose::transpose_rows;
 
 use batch::{WorldBatch, world_batches};
 use episode::{EpisodeBlock, Observer, sight_words};
+use swarm::{Recorded, Swarm, Watch};
 
 /// Plays episodes on the CPU, with the widest instruction set that it has, on the threads of the current rayon pool.
 pub struct Cpu {
     level: Level,
+    /// Teams of so many agents play one at a time.
+    large_from: usize,
     /// A [`Workspace`] per thread, kept between batches.
     workspaces: Option<Box<dyn Any + Send>>,
 }
 
-/// The memory of a thread for one vector of teams, as it was last used.
-type Workspace<S> = Option<EpisodeBlock<S>>;
+/// Smaller teams are faster in vectors of teams, where all pairs are visited: with 256 agents 15 times, with 512 eight times, if a
+/// third of them learns.
+const LARGE_FROM: usize = MAX_LEARNERS + 1;
+
+/// The memory of a thread, as it was last used.
+enum Workspace<S: Simd> {
+    Unused,
+    /// For one vector of teams.
+    Block(Box<EpisodeBlock<S>>),
+    /// For one large team.
+    Swarm(Box<Swarm<S>>),
+}
 
 impl Default for Cpu {
     fn default() -> Cpu {
@@ -57,7 +71,12 @@ impl Default for Cpu {
 impl Cpu {
     /// Returns a backend that uses a given instruction set, for tests and benchmarks.
     pub fn at_level(level: Level) -> Cpu {
-        Cpu { level, workspaces: None }
+        Cpu { level, large_from: LARGE_FROM, workspaces: None }
+    }
+
+    /// Plays teams of at least so many agents one at a time. The bits are the same, so this is for tests and benchmarks.
+    pub fn with_large_from(self, agents: usize) -> Cpu {
+        Cpu { large_from: agents, ..self }
     }
 
     /// Returns every instruction set of this CPU, narrowest first. With the feature `scalar` the first uses no vectors.
@@ -106,9 +125,9 @@ pub fn level_name(level: Level) -> &'static str {
 impl Backend for Cpu {
     fn play(&mut self, groups: &[Group<'_>]) -> Result<Vec<GroupScores>, BackendError> {
         groups.iter().try_for_each(|group| group.check().and(group.weights.on_host().map(drop)))?;
-        let Cpu { level, workspaces } = self;
+        let Cpu { level, large_from, workspaces } = self;
         let (level, scores) = (*level, ScoreTable::new(groups));
-        dispatch!(level, simd => play(simd, groups, workspaces, &scores));
+        dispatch!(level, simd => play(simd, groups, *large_from, workspaces, &scores));
         Ok(scores.finish())
     }
 
@@ -116,7 +135,8 @@ impl Backend for Cpu {
         group.check()?;
         group.weights.on_host()?;
         let level = self.level;
-        Ok(dispatch!(level, simd => trace(simd, group)))
+        let is_large = group.world.agents() >= self.large_from;
+        Ok(dispatch!(level, simd => if is_large { trace_large(simd, group) } else { trace(simd, group) }))
     }
 
     fn describe(&self) -> String {
@@ -129,15 +149,23 @@ impl Backend for Cpu {
 /// one. Policies of fewer teams fit into the cache, and threads that take vectors early finish less evenly.
 const PREFETCH_FROM: usize = 32;
 
-/// Plays all groups. Threads take one vector of teams after another from a common counter, so that none waits for a
-/// lock and none is left with much to do at the end.
-fn play<S: Simd>(simd: S, groups: &[Group<'_>], workspaces: &mut Option<Box<dyn Any + Send>>, scores: &ScoreTable<'_>) {
-    let width = S::f32s::LEN;
+/// Plays all groups. Threads take one vector of teams, or one large team, after another from a common counter, so that none
+/// waits for a lock and none is left with much to do at the end.
+fn play<S: Simd>(
+    simd: S,
+    groups: &[Group<'_>],
+    large_from: usize,
+    workspaces: &mut Option<Box<dyn Any + Send>>,
+    scores: &ScoreTable<'_>,
+) {
     let batches = world_batches(groups);
-    let blocks: Vec<(&WorldBatch<'_>, usize)> =
-        batches.iter().flat_map(|batch| (0..batch.teams).step_by(width).map(move |team| (batch, team))).collect();
+    let width = |batch: &WorldBatch<'_>| if batch.world.agents() < large_from { S::f32s::LEN } else { 1 };
+    let blocks: Vec<(&WorldBatch<'_>, usize)> = batches
+        .iter()
+        .flat_map(|batch| (0..batch.teams).step_by(width(batch)).map(move |team| (batch, team)))
+        .collect();
     let mut own = workspaces.take().and_then(|kept| kept.downcast::<Vec<Workspace<S>>>().ok()).unwrap_or_default();
-    own.resize_with(current_num_threads(), || None);
+    own.resize_with(current_num_threads(), || Workspace::Unused);
     let next = AtomicUsize::new(0);
     let threads = own.len().min(blocks.len());
     let early = blocks.len() >= PREFETCH_FROM * threads;
@@ -146,27 +174,56 @@ fn play<S: Simd>(simd: S, groups: &[Group<'_>], workspaces: &mut Option<Box<dyn 
         let mut current = take();
         while let Some(&(batch, first)) = current {
             let following = if early { take() } else { None };
-            let episodes = match workspace {
-                Some(episodes) if episodes.fits(batch.world, batch.sighted) => episodes,
-                // There is none yet, or it is for another world.
-                _ => workspace.insert(EpisodeBlock::new(simd, batch.world, batch.sighted)),
-            };
-            let teams = width.min(batch.teams - first);
-            let ahead = match following {
-                Some((next, first)) if std::ptr::eq(*next, batch) => *first..(first + width).min(batch.teams),
-                _ => 0..0,
-            };
-            simd.vectorize(
-                #[inline(always)]
-                || {
-                    episodes.play(batch, first, teams, &mut Prefetch { batch, teams: ahead.clone() });
-                    episodes.score(batch, first, teams, scores);
-                },
-            );
+            if batch.world.agents() >= large_from {
+                let swarm = workspace.swarm(simd, batch);
+                simd.vectorize(
+                    #[inline(always)]
+                    || swarm.play(batch, first, &mut ()),
+                );
+                let (group, team) = batch.locate(first);
+                scores.score(batch.first + group, team, &swarm.episode());
+            } else {
+                let episodes = workspace.block(simd, batch);
+                let teams = S::f32s::LEN.min(batch.teams - first);
+                let ahead = match following {
+                    Some((next, first)) if std::ptr::eq(*next, batch) => {
+                        *first..(first + S::f32s::LEN).min(batch.teams)
+                    }
+                    _ => 0..0,
+                };
+                simd.vectorize(
+                    #[inline(always)]
+                    || {
+                        episodes.play(batch, first, teams, &mut Prefetch { batch, teams: ahead.clone() });
+                        episodes.score(batch, first, teams, scores);
+                    },
+                );
+            }
             current = if early { following } else { take() };
         }
     });
     *workspaces = Some(own);
+}
+
+impl<S: Simd> Workspace<S> {
+    /// Returns memory for vectors of teams of a batch.
+    fn block(&mut self, simd: S, batch: &WorldBatch<'_>) -> &mut EpisodeBlock<S> {
+        if !matches!(self, Workspace::Block(block) if block.fits(batch.world, batch.sighted)) {
+            *self = Workspace::Block(Box::new(EpisodeBlock::new(simd, batch.world, batch.sighted)));
+        }
+        let Workspace::Block(block) = self else { unreachable!("it was just made") };
+        block
+    }
+
+    /// Returns memory for large teams of a batch.
+    fn swarm(&mut self, simd: S, batch: &WorldBatch<'_>) -> &mut Swarm<S> {
+        let recorded = Recorded { counts: batch.counted, sights: batch.sighted, forces: false };
+        if !matches!(self, Workspace::Swarm(swarm) if swarm.fits(batch.world, recorded)) {
+            *self = Workspace::Swarm(Box::new(Swarm::new(simd, batch.world, recorded)));
+        }
+        let Workspace::Swarm(swarm) = self else { unreachable!("it was just made") };
+        swarm
+    }
 }
 
 /// Prefetches the policies of the teams that play next, during the steps of those before.
@@ -208,6 +265,64 @@ fn trace<S: Simd>(simd: S, group: &Group<'_>) -> Trace {
         }
     }
     Trace { teams, agents, leaders: world.leaders(), moments, inputs, sets, seen, trail, pois: group.pois().to_vec() }
+}
+
+/// [`trace`] of large teams.
+fn trace_large<S: Simd>(simd: S, group: &Group<'_>) -> Trace {
+    let world = group.world;
+    let (teams, agents, leaders) = (group.team_count(), world.agents(), world.leaders());
+    let of_team = leaders * world.inputs();
+    let batch = WorldBatch::new(std::slice::from_ref(group), 0);
+    let recorded = Recorded { counts: true, sights: batch.sighted, forces: true };
+    let mut swarm = Swarm::new(simd, world, recorded);
+    let mut watch = LargeMoments {
+        moments: vec![bytemuck::Zeroable::zeroed(); (world.steps() + 1) * teams * agents],
+        inputs: vec![0.0; (world.steps() + 1) * teams * of_team],
+        sizes: [teams, agents, of_team],
+        team: 0,
+    };
+    let (mut sets, mut seen, mut trail) = (Vec::new(), Vec::new(), Vec::new());
+    for team in 0..teams {
+        watch.team = team;
+        simd.vectorize(
+            #[inline(always)]
+            || swarm.play(&batch, team, &mut watch),
+        );
+        let episode = swarm.episode();
+        sets.extend(episode.sets.iter());
+        seen.extend(episode.seen.words().iter());
+        trail.extend(episode.trail().iter());
+    }
+    let LargeMoments { moments, inputs, .. } = watch;
+    Trace { teams, agents, leaders, moments, inputs, sets, seen, trail, pois: group.pois().to_vec() }
+}
+
+/// The moments and inputs of a [`Trace`] of large teams.
+struct LargeMoments {
+    moments: Vec<Moment>,
+    inputs: Vec<f32>,
+    /// Teams, agents, and inputs of a team.
+    sizes: [usize; 3],
+    team: usize,
+}
+
+impl LargeMoments {
+    fn write<S: Simd>(&mut self, swarm: &Swarm<S>, row: usize) {
+        let [teams, agents, inputs] = self.sizes;
+        let place = row * teams + self.team;
+        let moments = &mut self.moments[place * agents..][..agents];
+        swarm.moments(row > 0, moments, &mut self.inputs[place * inputs..][..inputs]);
+    }
+}
+
+impl<S: Simd> Watch<S> for LargeMoments {
+    fn started(&mut self, swarm: &mut Swarm<S>) {
+        self.write(swarm, 0);
+    }
+
+    fn moved(&mut self, swarm: &mut Swarm<S>, step: usize) {
+        self.write(swarm, step + 1);
+    }
 }
 
 /// Writes the moments of a vector of teams to those of all teams, `[steps + 1][teams][agents]`, and the inputs, of which
@@ -253,12 +368,14 @@ pub fn lanes() -> u64 {
     dispatch!(Level::new(), simd => count(simd))
 }
 
-/// Returns the bytes of one vector of teams that are scored by a fitness.
+/// Returns the bytes of one vector of teams, or one large team, that are scored by a fitness.
 pub(crate) fn block_bytes(world: &World, fitness: Fitness) -> u64 {
     let (agents, leaders, followers) = (world.agents(), world.leaders(), world.followers());
+    let is_large = agents >= LARGE_FROM;
     let paths = if world.paths.is_some() { world.path_words() } else { 0 };
-    let record = world.set_words() + followers * leaders + sight_words(world, fitness == Fitness::Dt) + paths;
-    let words = 8 * agents + leaders * world.constants.policy.words() + 3 * followers + record;
+    let counted = if is_large && fitness != Fitness::Df { 0 } else { followers * leaders };
+    let record = world.set_words() + counted + sight_words(world, fitness == Fitness::Dt) + paths;
+    let policies = leaders * world.constants.policy.words();
     // Scores from paths copy these, and under Dt find who leads whom at each moment.
     let moments = world.steps() + 1 + lanes() as usize;
     let led = 2 * agents * leaders.div_ceil(32) + leaders * world.constants.words as usize;
@@ -267,5 +384,9 @@ pub(crate) fn block_bytes(world: &World, fitness: Fitness) -> u64 {
         (_, Fitness::Dt) => moments * (3 * agents + led),
         _ => moments * 3 * agents,
     };
+    if is_large {
+        return (4 * (policies + record + scratch) + swarm::bytes(agents)) as u64;
+    }
+    let words = 8 * agents + policies + 3 * followers + record;
     words as u64 * lanes() * 4 + (8 * world.parameters() + agents * agents.div_ceil(64) * 8 + 4 * scratch) as u64
 }

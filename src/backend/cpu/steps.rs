@@ -6,9 +6,10 @@ use super::agent::Agent;
 use super::batch::{WorldBatch, world_batches};
 use super::block::Block;
 use super::episode::{EpisodeBlock, Observer};
+use super::swarm::{Recorded, Swarm, Watch};
 use super::transpose::to_rows;
 use super::{BackendError, Cpu, Group, GroupScores, ScoreTable};
-use crate::credit;
+use crate::credit::{self, Episode};
 use crate::evolve::{self, Key};
 use crate::kernels::{clamp_to, splat};
 use crate::parallel::*;
@@ -174,7 +175,10 @@ impl Cpu {
             return Err(BackendError::InvalidInput("noise is of every leader".into()));
         }
         let (level, scores) = (self.level, ScoreTable::new(groups));
-        dispatch!(level, simd => record(simd, batch, noise, arrays, &scores));
+        match batch.world.agents() < self.large_from {
+            true => dispatch!(level, simd => record(simd, batch, noise, arrays, &scores)),
+            false => dispatch!(level, simd => record_large(simd, batch, noise, arrays, &scores)),
+        }
         Ok(scores.finish())
     }
 }
@@ -211,11 +215,107 @@ fn record<S: Simd>(
                 },
             );
             for (lane, to) in arrays.observed_at.chunks_exact_mut(batch.world.pois.len()).enumerate() {
-                let steps = credit::observed_at(block.episode(batch, lane).sets, batch.world);
-                to.iter_mut().zip(steps).for_each(|(to, step)| *to = step.unwrap_or(0) as u32);
+                write_observed(block.episode(batch, lane), batch.world, to);
             }
         }
     });
+}
+
+/// Writes the step, from 1, at which each POI was observed, or 0.
+fn write_observed(episode: Episode<'_>, world: &World, to: &mut [u32]) {
+    let steps = credit::observed_at(episode.sets, world);
+    to.iter_mut().zip(steps).for_each(|(to, step)| *to = step.unwrap_or(0) as u32);
+}
+
+/// [`record`] of large teams.
+fn record_large<S: Simd>(
+    simd: S,
+    batch: &WorldBatch<'_>,
+    noise: Option<Noise<'_>>,
+    mut arrays: StepArrays<'_>,
+    scores: &ScoreTable<'_>,
+) {
+    let world = batch.world;
+    let sizes = step_sizes(world, world.steps() + 1, world.steps());
+    let recorded = Recorded { counts: batch.counted, sights: batch.sighted, forces: false };
+    let mut parts: Vec<(usize, StepArrays<'_>)> = (0..batch.teams).map(|team| (team, arrays.split(sizes, 1))).collect();
+    // As few swarms as threads, because they are large.
+    let share = parts.len().div_ceil(current_num_threads()).max(1);
+    parts.par_chunks_mut(share).for_each(|parts| {
+        let mut swarm = Swarm::new(simd, world, recorded);
+        for (team, arrays) in parts {
+            simd.vectorize(
+                #[inline(always)]
+                || swarm.play(batch, *team, &mut LargeRecorder { world, noise, team: *team, arrays }),
+            );
+            let (group, of_group) = batch.locate(*team);
+            scores.score(batch.first + group, of_group, &swarm.episode());
+            if !arrays.observed_at.is_empty() {
+                write_observed(swarm.episode(), world, arrays.observed_at);
+            }
+        }
+    });
+}
+
+/// Writes the steps of a large team, and adds noise to its actions.
+struct LargeRecorder<'a, 'b> {
+    world: &'a World,
+    noise: Option<Noise<'a>>,
+    team: usize,
+    arrays: &'a mut StepArrays<'b>,
+}
+
+/// Returns row `row` of an array of so many rows, or nothing of an empty array.
+fn row(array: &mut [f32], row: usize, rows: usize) -> &mut [f32] {
+    let width = array.len() / rows;
+    &mut array[row * width..][..width]
+}
+
+impl LargeRecorder<'_, '_> {
+    fn write_states<S: Simd>(&mut self, swarm: &Swarm<S>, moment: usize) {
+        let StepArrays { positions, headings, speeds, .. } = &mut *self.arrays;
+        let [positions, headings, speeds] =
+            [positions, headings, speeds].map(|array| row(array, moment, self.world.steps() + 1));
+        swarm.write_states(positions, headings, speeds);
+    }
+}
+
+impl<S: Simd> Watch<S> for LargeRecorder<'_, '_> {
+    fn started(&mut self, swarm: &mut Swarm<S>) {
+        self.write_states(swarm, 0);
+    }
+
+    fn decided(&mut self, swarm: &mut Swarm<S>, step: usize) {
+        let steps = self.world.steps();
+        let StepArrays { inputs, outputs, actions, .. } = &mut *self.arrays;
+        swarm.write_inputs(row(inputs, step, steps));
+        swarm.write_outputs(row(outputs, step, steps));
+        if let Some(Noise { key, deviations, first }) = self.noise {
+            let team = S::u32s::splat(swarm.simd, first.wrapping_add(self.team as u32));
+            for (leader, deviations) in deviations.iter().enumerate() {
+                let drawn = evolve::noise::<S>(key, step, leader, team);
+                let outputs = &mut swarm.outputs[leader / S::f32s::LEN];
+                for ((output, &deviation), drawn) in outputs.iter_mut().zip(deviations).zip(drawn) {
+                    output[leader % S::f32s::LEN] += drawn[0] * deviation;
+                }
+            }
+        }
+        swarm.write_outputs(row(actions, step, steps));
+        if self.noise.is_some() {
+            for output in swarm.outputs.as_flattened_mut() {
+                *output = clamp_to::<S>(*output, splat(swarm.simd, -1.0), splat(swarm.simd, 1.0));
+            }
+        }
+    }
+
+    fn moved(&mut self, swarm: &mut Swarm<S>, step: usize) {
+        self.write_states(swarm, step + 1);
+        if !self.arrays.agents_at_poi.is_empty() {
+            let words = self.world.words_per_step();
+            let sets = &swarm.sets[step * words..][..words];
+            self.arrays.agents_at_poi[step * words..][..words].copy_from_slice(sets);
+        }
+    }
 }
 
 /// Vectors of teams per task.

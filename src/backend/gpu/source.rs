@@ -6,7 +6,7 @@ use std::fmt::Write;
 use super::exact;
 use super::shape::{Capacity, ClassKind, MAX_THREADS, ROLE, Recorded, Shape, Sizes, TEAMS, WIDTHS, WORKGROUPS};
 use crate::backend::{MOMENT_WORDS, VECTOR};
-use crate::config::{Config, Control, MAX_AGENTS, MAX_SECTORS, Policy};
+use crate::config::{Config, Control, MAX_SECTORS, Policy};
 use crate::evolve::{MAX_WEIGHT, MIN_WEIGHT, UNCHANGED};
 use crate::gpu_struct::{GpuStruct, gpu_constants, gpu_struct};
 use crate::model;
@@ -16,6 +16,8 @@ use crate::model::policy::Actions;
 use crate::model::sense::ChannelShape;
 use crate::world::{OUTPUTS, World};
 
+/// Maximum agents of a team that a GPU plays.
+pub const MAX_AGENTS: usize = 1024;
 /// Maximum leaders whose sightings a follower counts in registers.
 const MAX_COUNTED_LEADERS: usize = 8;
 /// Threads per workgroup of the pipelines that pack records, and of those that work on populations.

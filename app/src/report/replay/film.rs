@@ -6,7 +6,8 @@ use super::Replayed;
 use crate::record::digests::UNVERIFIED;
 use crate::report::map::{self, FAINT, Legend, Marker, Poi, Team, Viewport};
 use crate::report::scene::{Anchor, BLACK, Scene};
-use flotilla::config::Config;
+use flotilla::config::{Config, drawn_agents, drawn_every};
+use flotilla::world::World;
 
 impl Replayed {
     /// Returns the team at `place` steps from the start, with its trails.
@@ -15,12 +16,15 @@ impl Replayed {
         const POINTS: usize = 40_000;
         let (step, part) = (place as usize, place.fract());
         let world = &self.world;
-        let shown = self.shown((POINTS / world.agents().max(1)).clamp(30, 400));
+        let drawn = drawn_agents(world.leaders(), world.agents());
+        let shown = self.shown((POINTS / drawn.len().max(1)).clamp(30, 400));
+        let has_trail = |agent: usize| agent < world.leaders() || drawn.len() == world.agents();
         let at = |step: usize, agent: usize| Vec2::from(self.position(step, agent)).as_dvec2();
         let toward = |step: usize, agent: usize| Vec2::from(self.heading(step, agent)).as_dvec2();
         let agent = |agent: usize| {
             let next = (step + 1).min(world.steps());
-            let mut trail: Vec<_> = shown.iter().filter(|&&shown| shown <= step).map(|&step| at(step, agent)).collect();
+            let trail = shown.iter().filter(|&&shown| shown <= step && has_trail(agent));
+            let mut trail: Vec<_> = trail.map(|&step| at(step, agent)).collect();
             let place = at(step, agent).lerp(at(next, agent), part);
             trail.push(place);
             let group = self.group(step, agent);
@@ -47,7 +51,7 @@ impl Replayed {
         };
         Team {
             leaders: world.leaders(),
-            agents: (0..world.agents()).map(agent).collect(),
+            agents: drawn.iter().copied().map(agent).collect(),
             pois: world.pois.iter().enumerate().map(poi).collect(),
         }
     }
@@ -73,6 +77,12 @@ impl Replayed {
             map::counted(world.followers(), "follower"),
         )
     }
+}
+
+/// Returns a note if not all followers are drawn.
+pub(super) fn sample(world: &World) -> Option<String> {
+    let every = drawn_every(world.leaders(), world.agents());
+    (every > 1).then(|| format!("1 of {every} followers drawn"))
 }
 
 /// Episodes side by side, to be drawn at any moment.
@@ -107,7 +117,8 @@ impl<'a> Screen<'a> {
         let label = if timed { format!("0: {near}/{needed}: POI 0,") } else { format!("{near}/{needed}:") };
         let mut legend = Legend::new(config, &view, &teams, &format!("{label} {near} {who} near of {needed} needed"));
         let unverified = played.iter().any(|played| played.unverified).then(|| UNVERIFIED.to_string());
-        note.into_iter().chain(unverified).for_each(|note| legend.note(note));
+        let sample = played.iter().find_map(|played| sample(&played.world));
+        note.into_iter().chain(unverified).chain(sample).for_each(|note| legend.note(note));
         Screen { played, view, width, legend }
     }
 

@@ -4,11 +4,12 @@ use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
 use serde_json::json;
 
+use super::film::sample;
 use super::{Counterfactual, Replayed, near};
 use crate::record::folder::OWN_FITNESS;
 use crate::report::map::{GROUPS, GROUPS_DARK};
 use crate::report::scene::hex;
-use flotilla::config::{AgentClass, Config, Fitness, Mobility, PoiGroup};
+use flotilla::config::{AgentClass, Config, Fitness, Mobility, PoiGroup, drawn_agents};
 use flotilla::credit::{self, Strided};
 use flotilla::world::OUTPUTS;
 
@@ -78,7 +79,8 @@ pub fn data(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Val
     let count = played.len().max(1);
     let size = |per_agent: usize, played: &Replayed| {
         let world = &played.world;
-        world.agents() * per_agent + world.pois.len() * 2 + played.led.len() / world.steps() * 4
+        let drawn = drawn_agents(world.leaders(), world.agents()).len();
+        drawn * per_agent + world.pois.len() * 2 + played.led.len() / world.steps() * 4
     };
     let exact = played.iter().map(|p| (p.world.steps() + 1) * size(16, p)).sum::<usize>() <= EXACT_BYTES;
     let episodes: Vec<_> = played
@@ -95,9 +97,11 @@ pub fn data(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Val
         None => world.pois.clone(),
     };
     let unverified = if played.iter().any(|played| played.unverified) { " (unverified)" } else { "" };
+    let sample = played.iter().find_map(|played| sample(&played.world)).map(|sample| format!(" ({sample})"));
+    let sample = sample.unwrap_or_default();
     let own_fitness = played.iter().any(|played| played.own_fitness);
     let mut data = json!({
-        "run": format!("{name}{unverified}"),
+        "run": format!("{name}{unverified}{sample}"),
         "paradigm": config.learning.paradigm,
         "fitness": if own_fitness { OWN_FITNESS.into() } else { words(&config.fitnesses()) },
         "map": world.map,
@@ -131,12 +135,15 @@ pub fn data(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Val
 pub fn parts(config: &Config) -> Vec<(&'static str, serde_json::Value)> {
     let (all, mut parts) = (config.classes(), Vec::new());
     let count = all.agents.len();
+    let drawn = drawn_agents(config.learners(), config.agent_count());
     if !config.agents.is_empty() {
         let class = |(index, class): (usize, &AgentClass)| {
             let free = matches!(class.motion, Mobility::Free { .. });
             let influence = (0..count).filter_map(|led| all.influence_radius(index, led)).fold(0.0, f64::max);
             let AgentClass { name, senses, .. } = class;
-            json!({ "name": name, "count": class.size(), "free": free, "influence": influence, "senses": senses })
+            let places = all.agents_of(index);
+            let size = drawn.iter().filter(|agent| places.contains(agent)).count();
+            json!({ "name": name, "count": size, "free": free, "influence": influence, "senses": senses })
         };
         parts.push(("classes", config.agents.iter().enumerate().map(class).collect()));
     }
@@ -170,13 +177,19 @@ fn colors() -> serde_json::Value {
 fn episode(played: &Replayed, shown: &[usize], exact: bool) -> serde_json::Value {
     let Replayed { world, scores, .. } = played;
     let map = world.map().to_array();
+    let (leaders, drawn) = (world.leaders(), drawn_agents(world.leaders(), world.agents()));
     let (mut positions, mut headings, mut near, mut led) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     for &step in shown {
         // These are the groups of the step that ended here, as in `Replayed::group`.
         let words = played.led.len() / world.steps();
         let of_step = &played.led[step.saturating_sub(1) * words..][..words];
-        led.extend(of_step.iter().flat_map(|word| word.to_le_bytes()));
-        for agent in 0..world.agents() {
+        if words > 0 {
+            let of_follower = words / world.followers();
+            let followers = drawn[leaders..].iter().map(|agent| (agent - leaders) * of_follower);
+            let of_drawn = followers.flat_map(|first| &of_step[first..first + of_follower]);
+            led.extend(of_drawn.flat_map(|word| word.to_le_bytes()));
+        }
+        for &agent in &drawn {
             let (place, heading) = (played.position(step, agent), played.heading(step, agent));
             if exact {
                 positions.extend(place.iter().flat_map(|at| at.to_le_bytes()));
@@ -190,8 +203,8 @@ fn episode(played: &Replayed, shown: &[usize], exact: bool) -> serde_json::Value
         }
         near.extend((0..world.pois.len()).flat_map(|poi| (played.near(step, poi) as u16).to_le_bytes()));
     }
-    let owner: Vec<i64> =
-        played.owner.iter().map(|&owner| if owner == credit::UNASSIGNED { -1 } else { i64::from(owner) }).collect();
+    let owner = drawn.iter().map(|&agent| played.owner[agent]);
+    let owner: Vec<i64> = owner.map(|owner| if owner == credit::UNASSIGNED { -1 } else { i64::from(owner) }).collect();
     json!({
         "trial": played.trial,
         "generation": played.generation,
@@ -204,7 +217,7 @@ fn episode(played: &Replayed, shown: &[usize], exact: bool) -> serde_json::Value
         "df": scores.df,
         "dt": scores.dt,
         "leaders": world.leaders(),
-        "agents": world.agents(),
+        "agents": drawn.len(),
         "coupling": world.coupling,
         "owner": owner,
         "observed": played.observed,

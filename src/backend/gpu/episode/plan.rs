@@ -9,7 +9,9 @@ use super::Records;
 use crate::backend::gpu::population::Held;
 use crate::backend::gpu::recording::{BINDING_ALIGNMENT, Buffer, Command, Recording, Slice, grid};
 use crate::backend::gpu::shape::{Capacity, MAX_THREADS, Recorded, Shape, WORKGROUPS, Workgroup};
-use crate::backend::gpu::source::{GatherJob, LEADERS_PER_GATHER, NOWHERE, PACK_WORKGROUP, Pipeline, State, Task};
+use crate::backend::gpu::source::{
+    GatherJob, LEADERS_PER_GATHER, MAX_AGENTS, NOWHERE, PACK_WORKGROUP, Pipeline, State, Task,
+};
 use crate::backend::{BackendError, Group, VECTOR, WeightVector, Weights, record_words, traced_words, weight_vectors};
 use crate::credit::{RecordRequest, owner_bits};
 use crate::model::Constants;
@@ -174,6 +176,12 @@ impl<'a> GroupPlan<'a> {
         specialised: &HashSet<Shape>,
     ) -> Result<GroupPlan<'a>, BackendError> {
         let world = group.world;
+        if world.agents() > MAX_AGENTS {
+            let agents = world.agents();
+            let text =
+                format!("teams of {agents} agents play on the CPU only, up to {MAX_AGENTS} on a GPU; use the CPU");
+            return Err(BackendError::TooLarge(text));
+        }
         let recorded = Recorded::of(group, trace);
         let own_kernel = Shape::specialised(world, capacity, recorded).filter(|(shape, _)| specialised.contains(shape));
         let (shape, workgroup) = own_kernel.unwrap_or_else(|| Shape::generic(world, capacity, recorded));

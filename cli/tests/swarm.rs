@@ -1,0 +1,47 @@
+//! Tests of large teams from config to picture.
+
+use std::fs;
+
+use flotilla::config::Config;
+use flotilla::memory::Peaks;
+
+use crate::support::{Place, root};
+
+/// Returns the config of the repository with this many followers.
+fn config(followers: usize) -> String {
+    let text = fs::read_to_string(root("configs/swarm.toml")).unwrap();
+    let edited = text.replace("count = 100000", &format!("count = {followers}"));
+    assert_ne!(edited, text);
+    edited.replace("coupling = 10000", &format!("coupling = {}", followers / 10))
+}
+
+#[test]
+fn a_swarm_trains_resumes_and_is_drawn_by_a_sample() {
+    let place = Place::new(&[("swarm.toml", &config(5000))]);
+    let train = ["train", "swarm.toml", "--backend", "cpu", "--set", "learning.population=4"];
+    let run = |more: &[&str]| place.good(&[&train[..], more].concat()[..]);
+    run(&["--generations", "2", "--out", "whole"]);
+    run(&["--generations", "1", "--out", "parts"]);
+    run(&["--generations", "2", "--out", "parts", "--resume"]);
+    for file in ["metrics.csv", "policies.safetensors"] {
+        let [whole, parts] = ["whole", "parts"].map(|run| fs::read(place.path(run).join(file)).unwrap());
+        assert!(whole == parts, "{file} differs");
+    }
+    place.good("replay whole --out page.html");
+    let page = fs::read_to_string(place.path("page.html")).unwrap();
+    assert!(page.contains("1 of 3 followers drawn"), "the page does not say that it has a sample");
+    // 1667 of 5000 followers, at 51 moments.
+    assert!(page.len() < 4 << 20, "{} bytes", page.len());
+    place.good("replay whole --out still.svg");
+    let still = fs::read_to_string(place.path("still.svg")).unwrap();
+    assert!(still.contains("1 of 3 followers drawn") && still.len() < 1 << 20, "{} bytes", still.len());
+}
+
+/// Four teams of 2^20 agents on four threads.
+#[test]
+fn a_million_agents_fit_in_two_gibibytes() {
+    let text = config((1 << 20) - 8).replace("population = 20", "population = 4");
+    let config = Config::parse(&text, "million.toml").unwrap().validate().unwrap();
+    let peak = Peaks::of([&config], 4).host;
+    assert!((1 << 28..2 << 30).contains(&peak), "{peak} bytes");
+}

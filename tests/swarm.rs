@@ -1,0 +1,113 @@
+//! Large teams, one at a time with a grid of cells, against vectors of teams: equal bits.
+
+use flotilla::backend::cpu::{Cpu, level_name};
+use flotilla::config::Config;
+use flotilla::verify::{Plan, compare};
+
+/// Compares traces, every fitness and whole trainings, on every instruction set.
+fn check(worlds: &[(&str, Config)], teams: usize) {
+    for level in Cpu::levels() {
+        let worlds = worlds.iter().map(|(name, config)| (name.to_string(), config.clone())).collect();
+        let plan = Plan { worlds, ..Plan::random(0..0, teams) };
+        let [mut vectors, mut swarms] = [usize::MAX, 0].map(|from| Cpu::at_level(level).with_large_from(from));
+        let outcome = compare(&plan, &mut vectors, &mut swarms, |_| ()).unwrap();
+        assert_eq!(outcome.mismatch, None, "{}", level_name(level));
+        assert!(outcome.agent_steps > 0);
+    }
+}
+
+#[test]
+fn random_worlds_are_equal_with_grids_and_without() {
+    let worlds: Vec<(String, Config)> = Plan::random(0..60, 5).worlds;
+    check(&worlds.iter().map(|(name, config)| (&**name, config.clone())).collect::<Vec<_>>(), 5);
+}
+
+/// As in `configs/swarm.toml`, with so few followers that all pairs can be visited, and more classes.
+const SWARM: &str = r#"
+[world]
+map = [60.0, 90.0]
+steps = 12
+
+[[agents]]
+name = "leader"
+at = [[20.0, 30.0], [40.0, 30.0], [20.0, 60.0], [40.0, 60.0]]
+senses = [{ of = "pois" }, { of = "agents" }, { of = "follower", range = 7.0, sectors = 5 }, { of = "stone", range = 9.0, combine = "closest" }]
+leads = ["follower", "drifter"]
+influence_radius = 12.0
+
+[[agents]]
+name = "follower"
+count = 900
+in = { disc = [30.0, 45.0, 25.0] }
+control = "follow"
+rule = [
+    { of = "agents", to = 1.0, gain = -1.0 },
+    { of = "agents", from = 1.0, to = 3.0, gain = 2.0 },
+    { of = "follower", to = 2.0, align = 1.0 },
+    { of = ["leader", "stone"], to = 15.0, gain = 3.0 },
+]
+
+[[agents]]
+name = "drifter"
+count = 300
+in = { box = [0.0, 0.0, 60.0, 90.0] }
+control = "follow"
+motion = { kind = "free", max_speed = 2.0 }
+rule = [{ of = "leader", to = 20.0, gain = -2.0 }, { of = "drifter", to = 1.5, gain = -1.0 }]
+
+[[agents]]
+name = "stone"
+count = 20
+in = { circle = [30.0, 45.0, 20.0] }
+control = "still"
+
+[[pois]]
+name = "place"
+at = [[30.0, 30.0], [10.0, 80.0]]
+coupling = [60, 12]
+radius = 5.0
+
+[learning]
+population = 4
+generations = 2
+trials = 1
+"#;
+
+#[test]
+fn a_swarm_is_equal_with_a_grid_and_without() {
+    let config = Config::parse(SWARM, "swarm.toml").unwrap();
+    let by_paths = Config::parse(&SWARM.replace("radius = 5.0", "radius = 5.0\nscore = \"closeness\""), "paths.toml");
+    check(&[("swarm", config), ("swarm by paths", by_paths.unwrap())], 2);
+}
+
+#[test]
+fn limits_of_large_teams_are_errors_with_their_key() {
+    let found = |edits: &[(&str, &str)]| {
+        let edit = |text: String, (from, to): &(&str, &str)| {
+            assert!(text.contains(from), "{from}");
+            text.replacen(from, to, 1)
+        };
+        Config::parse(&edits.iter().fold(SWARM.to_string(), edit), "swarm.toml").unwrap_err().to_string()
+    };
+    for (edits, message) in [
+        (
+            &[("count = 900", "count = 1048577")][..],
+            "swarm.toml:15: agents[1].count: found 1048577, allowed 1 to 1048576",
+        ),
+        (&[("count = 300", "count = 1048576")], "which makes 1049480 agents with those before, allowed 1 to 1048576"),
+        (
+            &[(
+                "at = [[20.0, 30.0], [40.0, 30.0], [20.0, 60.0], [40.0, 60.0]]",
+                "count = 2000\nin = { disc = [9, 9, 5] }",
+            )],
+            "agents: found 2000 agents that learn, allowed up to 1024",
+        ),
+        (
+            &[("count = 900", "count = 1000000"), ("steps = 12", "steps = 10000")],
+            "swarm.toml:4: world.steps: found 10000, with which the record of an episode takes",
+        ),
+    ] {
+        let error = found(edits);
+        assert!(error.contains(message), "{error}");
+    }
+}
