@@ -30,7 +30,7 @@ fn a_swarm_trains_resumes_and_is_drawn_by_a_sample() {
     place.good("replay whole --out page.html");
     let page = fs::read_to_string(place.path("page.html")).unwrap();
     assert!(page.contains("1 of 3 followers drawn"), "the page does not say that it has a sample");
-    // 1667 of 5000 followers, at 51 moments.
+    // 1667 of 5000 followers, at 76 moments.
     assert!(page.len() < 4 << 20, "{} bytes", page.len());
     place.good("replay whole --out still.svg");
     let still = fs::read_to_string(place.path("still.svg")).unwrap();
