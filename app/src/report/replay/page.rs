@@ -8,7 +8,7 @@ use super::{Counterfactual, Replayed, near};
 use crate::record::folder::OWN_FITNESS;
 use crate::report::map::{GROUPS, GROUPS_DARK};
 use crate::report::scene::hex;
-use flotilla::config::{AgentClass, Config, Fitness, Mobility, PoiGroup};
+use flotilla::config::{AgentClass, Channel, Config, Control, Fitness, Mobility, PoiGroup, Sectors};
 use flotilla::credit::{self, Strided};
 use flotilla::world::OUTPUTS;
 
@@ -122,10 +122,19 @@ pub fn data(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Val
     data
 }
 
+/// Returns a channel as pages have it.
+fn sensed(channel: &Channel) -> serde_json::Value {
+    let mut shown = json!(channel);
+    shown["sectors"] = channel.sectors.count().into();
+    shown["each"] = matches!(channel.sectors, Sectors::Each(_)).into();
+    shown
+}
+
 /// Returns what only pages of full configs have.
 ///
 /// With `[[agents]]`, they have `classes`, those that learn first: their `name`, the `count` of their agents, whether they
-/// move `free`, the distance up to which they `influence` others, and the channels of their `senses`. The `groups` of POIs
+/// move `free`, the class and the `agents` that they `choose` among, if any, the distance up to which they `influence` others, and the
+/// channels of their `senses`, with the number of `sectors` and whether `each` agent or POI has one. The `groups` of POIs
 /// have their `name`, the `count` of their POIs, and the indices of the classes that are `observers`. Only if POIs differ
 /// in their radius or value, there are `radii` or `values`.
 pub fn parts(config: &Config) -> Vec<(&'static str, serde_json::Value)> {
@@ -135,8 +144,22 @@ pub fn parts(config: &Config) -> Vec<(&'static str, serde_json::Value)> {
         let class = |(index, class): (usize, &AgentClass)| {
             let free = matches!(class.motion, Mobility::Free { .. });
             let influence = (0..count).filter_map(|led| all.influence_radius(index, led)).fold(0.0, f64::max);
-            let AgentClass { name, senses, .. } = class;
-            json!({ "name": name, "count": class.size(), "free": free, "influence": influence, "senses": senses })
+            let AgentClass { name, control, .. } = class;
+            let senses: Vec<_> = class.senses.iter().map(sensed).collect();
+            let mut class =
+                json!({ "name": name, "count": class.size(), "free": free, "influence": influence, "senses": senses });
+            if let Control::Choose(target) = control {
+                let is_target = |class: &usize| all.agents[*class].name == *target;
+                let chosen: Vec<usize> = all
+                    .class_of_each()
+                    .into_iter()
+                    .enumerate()
+                    .filter(|(_, class)| is_target(class))
+                    .map(|(agent, _)| agent)
+                    .collect();
+                class["choose"] = json!({ "name": target, "agents": chosen });
+            }
+            class
         };
         parts.push(("classes", config.agents.iter().enumerate().map(class).collect()));
     }
