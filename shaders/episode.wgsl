@@ -2,7 +2,7 @@
 // episodes take several dispatches, with the state stored in between.
 //
 // Uses: lib/layout.wgsl, lib/math.wgsl, generic.wgsl (shape, set_shape, class_shape, act, sense_all, obey_all, decide),
-// sense.wgsl, policy.wgsl, follow.wgsl, motion.wgsl, couple.wgsl.
+// sense.wgsl, policy.wgsl, follow.wgsl, pursue.wgsl, motion.wgsl, couple.wgsl.
 //
 // One text makes two kernels. In the specialised one all sizes and the shapes of all classes are constants. In the generic
 // one they are read with the task (`generic.wgsl`). The host prepends:
@@ -13,6 +13,8 @@
 //   INPUTS        room for the inputs of a policy
 //   MOMENT_WORDS  words of a moment
 //   ALIGNS        whether any rule aligns headings
+//   PURSUES       whether agents of any class move straight to others
+//   CONFINES      whether agents of any class cannot leave a part of the map, or move only near others
 //   TRACE         whether every stage of every step is recorded
 //   SIGHTINGS     whether the leaders that each follower sees at each step are recorded
 //   COUNTS_IN_REGISTERS, COUNTED_LEADERS
@@ -244,6 +246,37 @@ fn range_of(ranges: array<u32, 2u * MAX_RANGES>, run: u32) -> vec2<u32> {
     return select(low, high, run > 1u);
 }
 
+// Senses each POI or agent of a channel in a sector of its own. Its team's positions start at `first`.
+fn sense_each(
+    task: Task,
+    first: u32,
+    channel: ChannelShape,
+    gauge: Gauge,
+    me: ptr<function, Agent>,
+    inputs: ptr<function, array<f32, INPUTS>>,
+) {
+    var input = channel.input;
+    for (var run = 0u; run < MAX_RANGES; run++) {
+        let range = range_of(channel.ranges, run);
+        for (var index = range.x; index < range.y; index++) {
+            var place = vec2(0.0);
+            var value = 1.0;
+            var other = true;
+            if channel.of_pois != 0u {
+                place = places[task.pois + index];
+                value = poi_of(task, index).y;
+            } else {
+                place = positions[first + index * shape.teams];
+                other = index != (*me).agent;
+            }
+            let found = measured(channel, gauge, value, place.x - (*me).x, place.y - (*me).y);
+            let within = found.within && other;
+            (*inputs)[input] = input_of(channel, gauge, select(0, found.measure, other), select(0, 1, within));
+            input++;
+        }
+    }
+}
+
 // Senses one channel of the agent's class, and writes its inputs. Its team's positions start at `first`.
 fn sense_channel(
     task: Task,
@@ -254,6 +287,10 @@ fn sense_channel(
     inputs: ptr<function, array<f32, INPUTS>>,
 ) {
     let gauge = gauge_of(own_class, index);
+    if channel.each != 0u {
+        sense_each(task, first, channel, gauge, me, inputs);
+        return;
+    }
     var sensed = Sensed();
     if channel.combine == COMBINE_CLOSEST {
         for (var sector = 0u; sector < channel.sectors; sector++) {
@@ -297,6 +334,11 @@ fn lead(task: Task, first: u32, me: ptr<function, Agent>) {
     if TRACE {
         (*me).inputs = inputs;
         (*me).outputs = outputs;
+    }
+    if PURSUES && own.control == CONTROLKIND_CHOOSE {
+        let to = chosen(first, outputs.x, me);
+        obey(towards(to.x, to.y), me);
+        return;
     }
     if own.free != 0u {
         (*me).next = Steering(outputs.x * own.max_speed, outputs.y * own.max_speed, 0.0);
@@ -412,15 +454,26 @@ fn follow(task: Task, first: u32, me: ptr<function, Agent>) {
             record[sight(task, me, leader)] += seen;
         }
     }
-    if own.control == CONTROL_STILL {
+    if own.control == CONTROLKIND_STILL {
         return;
     }
-    var terms = SteeringForce();
-    obey_all(task, first, me, &terms);
-    let force = with_walls(terms, x, y);
+    var force: SteeringForce;
+    if PURSUES && own.control == CONTROLKIND_NEAREST {
+        let to = nearest(first, own.first_target, own.end_target, own.reach2, me);
+        force = towards(to.dx, to.dy);
+    } else {
+        var terms = SteeringForce();
+        obey_all(task, first, me, &terms);
+        force = with_walls(terms, x, y);
+    }
     if TRACE {
         (*me).force = vec2(force.x, force.y);
     }
+    obey(force, me);
+}
+
+// An agent takes the wanted velocity, or heading and speed, from the force on it.
+fn obey(force: SteeringForce, me: ptr<function, Agent>) {
     if own.free != 0u {
         let most = own.max_speed;
         (*me).next = Steering(clamp_to(force.x, -most, most), clamp_to(force.y, -most, most), 0.0);
@@ -429,22 +482,28 @@ fn follow(task: Task, first: u32, me: ptr<function, Agent>) {
     (*me).next = steer(force, sizes(force), (*me).hx, (*me).hy, (*me).speed);
 }
 
-// Moves the agent.
-fn move_agent(me: ptr<function, Agent>) {
+// Moves the agent. Its team's positions start at `first`.
+fn move_agent(first: u32, me: ptr<function, Agent>) {
     let next = (*me).next;
-    if own.control == CONTROL_STILL {
+    if own.control == CONTROLKIND_STILL {
         return;
     }
+    if CONFINES && own.end_near > 0u {
+        if !nearest(first, own.first_near, own.end_near, own.near2, me).found {
+            return;
+        }
+    }
+    let bounds = limits();
     if own.free != 0u {
-        (*me).x = advance((*me).x, world.dt, next.hx, world.map_x);
-        (*me).y = advance((*me).y, world.dt, next.hy, world.map_y);
+        (*me).x = advance((*me).x, world.dt, next.hx, bounds.x, bounds.z);
+        (*me).y = advance((*me).y, world.dt, next.hy, bounds.y, bounds.w);
         return;
     }
     let heading = renormalize(next.hx, next.hy);
     let speed = accelerate((*me).speed, next.speed);
     let step = speed * world.dt;
-    (*me).x = advance((*me).x, step, heading.x, world.map_x);
-    (*me).y = advance((*me).y, step, heading.y, world.map_y);
+    (*me).x = advance((*me).x, step, heading.x, bounds.x, bounds.z);
+    (*me).y = advance((*me).y, step, heading.y, bounds.y, bounds.w);
     (*me).hx = heading.x;
     (*me).hy = heading.y;
     (*me).speed = speed;

@@ -1,6 +1,6 @@
 // The rule of agents that do not learn: a force from other agents and walls (paper, Section 4.1, Figure 2b).
 //
-// Uses: lib/math.wgsl, motion.wgsl (rotate), episode.wgsl (world, own), and from src/model: TINY.
+// Uses: lib/math.wgsl, motion.wgsl (rotate, limits), episode.wgsl (own, CONFINES), and from src/model: TINY.
 
 // The sum over the agents that count for a term, in lattice distances, and their number.
 struct Sum {
@@ -48,19 +48,24 @@ fn add_term(pull: Pull, sum: Sum, force: ptr<function, SteeringForce>) {
     (*force).influenced = (*force).influenced || sum.count > 0;
 }
 
-// Returns the push of the two walls of one axis, at 0 and at `size`, and a number that is not negative if either is
-// within their radius.
-fn walls(at: f32, size: f32) -> vec2<f32> {
-    let low = own.wall_radius - at;
-    let high = own.wall_radius - (size - at);
+// Returns the push of the two walls of one axis, and a number that is not negative if either is within their radius. The
+// first pushes up to `near`, and the other is at `end`.
+fn walls(at: f32, near: f32, end: f32) -> vec2<f32> {
+    let low = near - at;
+    let high = own.wall_radius - (end - at);
     let push = select(0.0, low, low > 0.0) - select(0.0, high, high > 0.0);
     return vec2(push * own.wall_gain, select(high, low, low > high));
 }
 
 // Adds the walls' push at a position to the force of all terms.
 fn with_walls(terms: SteeringForce, x: f32, y: f32) -> SteeringForce {
-    let walls_x = walls(x, world.map_x);
-    let walls_y = walls(y, world.map_y);
+    var near = vec2(own.wall_radius);
+    if CONFINES {
+        near = vec2(own.near_x, own.near_y);
+    }
+    let bounds = limits();
+    let walls_x = walls(x, near.x, bounds.z);
+    let walls_y = walls(y, near.y, bounds.w);
     let influenced = terms.influenced || walls_x.y >= 0.0 || walls_y.y >= 0.0;
     return SteeringForce(flush(terms.x + walls_x.x, TINY), flush(terms.y + walls_y.x, TINY), influenced);
 }

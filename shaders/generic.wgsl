@@ -28,7 +28,7 @@ fn act(task: Task, first: u32, me: ptr<function, Agent>) {
     } else {
         follow(task, first, me);
     }
-    move_agent(me);
+    move_agent(first, me);
 }
 
 // Senses all channels of the agent's class.
@@ -81,6 +81,9 @@ fn decide(start: u32, stride: u32, sensed: array<f32, INPUTS>) -> vec2<f32> {
         }
         inputs = units;
         first += (rows + 1u) * columns;
+    }
+    if PURSUES && own.control == CONTROLKIND_CHOOSE {
+        return choose_agent(inputs);
     }
     if CHOOSES {
         let pois = vec4(sensed[0], sensed[1], sensed[2], sensed[3]);

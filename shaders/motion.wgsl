@@ -1,6 +1,6 @@
 // Motion: a proportional controller, limited in turn, acceleration and speed (paper, Section 3.1).
 //
-// Uses: lib/math.wgsl, episode.wgsl (own), and from src/model: TINY, GRID, INVERSE_GRID.
+// Uses: lib/math.wgsl, episode.wgsl (world, own, CONFINES), and from src/model: TINY, GRID, INVERSE_GRID.
 
 // Rotates a heading to the left, by the angle of this cosine and sine.
 fn rotate(hx: f32, hy: f32, cosine: f32, sine: f32) -> vec2<f32> {
@@ -27,9 +27,17 @@ fn accelerate(speed: f32, wanted: f32) -> f32 {
     return clamp_to(speed + change, own.min_speed, own.max_speed);
 }
 
-// Moves one coordinate by a distance along one component of a heading, clamped to the map and rounded to the grid.
-fn advance(at: f32, step: f32, heading: f32, size: f32) -> f32 {
-    return clamp_to(snap(at + step * heading), 0.0, size);
+// Moves one coordinate by a distance along one component of a heading, rounded to the grid and clamped to limits.
+fn advance(at: f32, step: f32, heading: f32, low: f32, high: f32) -> f32 {
+    return clamp_to(snap(at + step * heading), low, high);
+}
+
+// Returns the limits of an agent's coordinates: the lower ones, then the upper ones.
+fn limits() -> vec4<f32> {
+    if CONFINES {
+        return vec4(own.low_x, own.low_y, own.high_x, own.high_y);
+    }
+    return vec4(0.0, 0.0, world.map_x, world.map_y);
 }
 
 // Rounds a coordinate to the grid.

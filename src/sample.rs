@@ -341,8 +341,8 @@ pub fn classes_world(seed: u64) -> Config {
         .collect();
     let parts = split(rng, &starts, classes);
     let class = |(index, at): (usize, Vec<[f64; 2]>)| {
-        let control = controls[index];
-        let motion = if rng.random_bool(0.35) && !(is_behaviours && control == Control::Policy) {
+        let control = &controls[index];
+        let motion = if rng.random_bool(0.35) && !(is_behaviours && *control == Control::Policy) {
             Mobility::Free { max_speed: [0.0, 0.5, 1.0, 3.0][rng.random_range(0..4)] }
         } else {
             let max_speed = [0.5, 3.0, 5.0][rng.random_range(0..3)];
@@ -367,26 +367,26 @@ pub fn classes_world(seed: u64) -> Config {
             false => Heading::Each(at.iter().map(|_| heading(rng)).collect()),
         };
         let mut senses = vec![];
-        if control == Control::Policy {
+        if *control == Control::Policy {
             let count = rng.random_range(1..=4);
             senses.extend((0..count).map(|_| channel(rng, is_free, &names, &group_names, &lengths)));
             if is_behaviours {
                 let quadrants = |of: &str, channel: &Channel| Channel {
                     of: vec![of.into()],
                     pois: vec![],
-                    sectors: 4,
+                    sectors: Sectors::Equal(4),
                     frame: Frame::Heading,
                     ..channel.clone()
                 };
                 let [pois, agents] = [POIS, AGENTS].map(|of| quadrants(of, &senses[0]));
                 senses.splice(0..0, [pois, agents]);
             }
-            while senses.iter().map(|channel| channel.sectors).sum::<usize>() > MAX_INPUTS {
+            while senses.iter().map(|channel| channel.sectors.count()).sum::<usize>() > MAX_INPUTS {
                 senses.pop();
             }
         }
         let mut rule = vec![];
-        if control == Control::Follow {
+        if *control == Control::Follow {
             let count = rng.random_range(1..=4);
             rule.extend((0..count).map(|_| term(rng, &names, &lengths)));
         }
@@ -405,8 +405,11 @@ pub fn classes_world(seed: u64) -> Config {
             region: None,
             heading,
             speed: if rng.random_bool(0.5) { slow } else { fast },
-            control,
+            control: control.clone(),
+            reach: None,
             motion,
+            stays_in: None,
+            moves_near: None,
             senses,
             rule,
             wall_radius: if rng.random_bool(0.3) { 0.0 } else { lengths.draw(rng) },
@@ -486,8 +489,66 @@ pub fn classes_world(seed: u64) -> Config {
         config.learning.groups = (0..learners.min(2)).map(of_group).collect();
     }
     (config.agents, config.pois) = (agents, pois);
+    // Separate random streams, as in `world`.
+    move_otherwise(&mut ChaCha8Rng::seed_from_u64(seed ^ 0x6d6f_7665), &mut config, &lengths);
     score_otherwise(&mut ChaCha8Rng::seed_from_u64(seed ^ 0x7061_7468), &mut config, &lengths);
     config.without_replaced()
+}
+
+/// Makes some classes move to or near agents of others, or stay in a part of the map, and some channels sense each agent
+/// or POI.
+fn move_otherwise(rng: &mut ChaCha8Rng, config: &mut Config, lengths: &Lengths) {
+    let names: Vec<(String, usize)> = config.agents.iter().map(|class| (class.name.clone(), class.size())).collect();
+    let groups: Vec<(String, usize)> = config.pois.iter().map(|group| (group.name.clone(), group.size())).collect();
+    let behaves = config.policy.actions == Actions::Behaviours;
+    let map = config.world.map;
+    for class in &mut config.agents {
+        let target = names[rng.random_range(0..names.len())].0.clone();
+        if class.control == Control::Policy && rng.random_bool(0.25) {
+            class.control = Control::Choose(target);
+        } else if class.control == Control::Follow && rng.random_bool(0.35) {
+            class.control = Control::Nearest(target);
+            class.reach = rng.random_bool(0.6).then(|| lengths.draw(rng));
+            class.rule.clear();
+        }
+        if rng.random_bool(0.2) {
+            let corners = class.region.map(Region::corners).unwrap_or_default();
+            let places = if class.region.is_some() { &corners[..] } else { &class.at };
+            let margin = if rng.random_bool(0.3) { 0.0 } else { lengths.draw(rng) };
+            let side = |axis: usize, most: f64| {
+                let ends = places
+                    .iter()
+                    .map(|place| place[axis])
+                    .fold([most, 0.0], |[low, high], at: f64| [at.min(low), at.max(high)]);
+                [(ends[0] - margin).max(0.0), (ends[1] + margin).min(most)]
+            };
+            let [[x0, x1], [y0, y1]] = [side(0, map[0]), side(1, map[1])];
+            class.stays_in = Some([x0, y0, x1, y1]);
+        }
+        for index in if behaves { 2 } else { 0 }..class.senses.len() {
+            let channel = &class.senses[index];
+            let has = |name: &str| channel.of.iter().any(|of| of == name);
+            let is_named = |name: &String| channel.pois.is_empty() || channel.pois.contains(name);
+            let count: usize = match has(POIS) {
+                true => groups.iter().filter(|(name, _)| is_named(name)).map(|(_, size)| size).sum(),
+                false => names.iter().filter(|(name, _)| has(AGENTS) || has(name)).map(|(_, size)| size).sum(),
+            };
+            let inputs = class.inputs() - channel.sectors.count() + count;
+            if rng.random_bool(0.2) && inputs <= MAX_INPUTS {
+                class.senses[index].sectors = Sectors::Each(count);
+            }
+        }
+        let senses = |name: &str| class.senses.iter().any(|channel| channel.senses(name) && channel.range > 0.0);
+        let near = names.iter().map(|(name, _)| name).find(|name| senses(name)).filter(|_| rng.random_bool(0.25));
+        class.moves_near = near.cloned();
+    }
+    let is_ruleless = |class: &&AgentClass| class.rule.is_empty();
+    let ruleless: Vec<String> = config.agents.iter().filter(is_ruleless).map(|class| class.name.clone()).collect();
+    for class in &mut config.agents {
+        if class.influence_radius.is_none() && class.leads.iter().any(|led| ruleless.contains(led)) {
+            class.influence_radius = Some(lengths.draw(rng));
+        }
+    }
 }
 
 /// Sets the fitness of classes, and mostly scores that need paths.
@@ -566,7 +627,7 @@ fn channel(rng: &mut ChaCha8Rng, is_free: bool, names: &[String], groups: &[Stri
     Channel {
         pois: if of == [POIS] && rng.random_bool(0.3) { some_names(rng, groups) } else { vec![] },
         of,
-        sectors: [4, 4, 4, 1, 2, 3, 8, MAX_SECTORS][rng.random_range(0..8)],
+        sectors: Sectors::Equal([4, 4, 4, 1, 2, 3, 8, MAX_SECTORS][rng.random_range(0..8)]),
         frame: if is_free || rng.random_bool(0.3) { Frame::Map } else { Frame::Heading },
         range: match rng.random_range(0..10) {
             0 => 0.0,

@@ -4,14 +4,14 @@ use std::ops::{Deref, Range};
 
 use glam::{DVec2, Vec2};
 
-use crate::config::{Config, Control, LedBy, PoiGroup, Region, Score, StageConfig, When};
+use crate::config::{Config, LedBy, PoiGroup, Region, Score, StageConfig, When};
 use crate::model::class::Class;
 use crate::model::motion::MapConstants;
 use crate::model::policy::PolicyConstants;
 use crate::model::rule::Rule;
 
 pub use crate::model::Constants;
-pub use crate::model::motion::GRID;
+pub use crate::model::motion::{GRID, on_grid};
 pub use crate::model::policy::OUTPUTS;
 
 /// One world: constants, classes of agents, POIs, and the rule of observation.
@@ -138,7 +138,7 @@ impl World {
         }
         let values: Vec<f32> = of_each.iter().map(|group| group.value as f32).collect();
         let classes = Class::all(&described, &values, world.map, world.dt);
-        let learns = |class: &&Class| class.constants.shape.control() == Control::Policy;
+        let learns = |class: &&Class| class.constants.shape.control().learns();
         let leaders = classes.iter().filter(learns).map(|class| class.agents().len()).sum::<usize>();
         let starts: Vec<Vec2> = described.starts().into_iter().map(on_grid).collect();
         let agents = starts.len();
@@ -151,7 +151,7 @@ impl World {
             class_count: classes.len() as u32,
             first_class: 0,
             map: MapConstants::new(world.map, world.dt),
-            policy: PolicyConstants::new(policy, config.inputs()),
+            policy: PolicyConstants::new(&config.widths(), policy.actions),
         };
         let observers: Vec<Vec<Range<usize>>> = described
             .group_of_each()
@@ -203,6 +203,12 @@ impl World {
     /// Reports whether any rule aligns headings.
     pub(crate) fn aligns(&self) -> bool {
         self.classes.iter().flat_map(Class::terms).any(|term| term.shape.aligns != 0)
+    }
+
+    /// Returns the number of agents among which each leader's policy chooses, `[leaders]`: 0 unless it chooses agents.
+    pub(crate) fn choices(&self) -> Vec<usize> {
+        let of_class = |class: &Class| vec![class.constants.shape.choices(); class.agents().len()];
+        self.classes.iter().flat_map(of_class).take(self.leaders()).collect()
     }
 
     /// Returns the class of an agent.
@@ -283,11 +289,6 @@ fn greatest_common_divisor(a: u32, b: u32) -> u32 {
     if b == 0 { a } else { greatest_common_divisor(b, a % b) }
 }
 
-/// Rounds a position to the kernels' grid, and clamps it to the map.
-pub fn on_grid(place: Vec2, map: Vec2) -> Vec2 {
-    ((place * GRID + 0.5).floor() / GRID).clamp(Vec2::ZERO, map)
-}
-
 /// Returns the unit vector of an angle. Components smaller than 1e-6 become 0, so that layouts keep exact ties.
 ///
 /// Sine and cosine are from [`libm`], because the platform's may differ in the last bit.
@@ -308,7 +309,7 @@ mod tests {
         for seed in 0..200 {
             let world = World::new(&sample::any_world(seed).validate().unwrap());
             let WorldParts { constants, starts, headings, pois, coupling, rule, .. } = &*world;
-            let PolicyConstants { layers, widths, parameters } = constants.policy;
+            let PolicyConstants { layers, widths, parameters, .. } = constants.policy;
             let (used, unused) = widths.split_at(layers as usize + 1);
             let weights: u32 = used.windows(2).map(|widths| (widths[0] + 1) * widths[1]).sum();
             assert!(constants.leaders > 0 && constants.pois > 0 && constants.steps > 0, "{seed}: {constants:?}");
@@ -317,10 +318,7 @@ mod tests {
             assert_eq!(constants.words as usize, world.agents().div_ceil(32), "{seed}");
             assert!(rule.fits(constants.words as usize, pois.len()), "{seed}: {rule:?}");
             assert_eq!((used[0] as usize, weights), (world.inputs(), parameters), "{seed}: {widths:?}");
-            assert!(
-                constants.policy.actions().is_some() && unused.iter().all(|&width| width == 0),
-                "{seed}: {widths:?}"
-            );
+            assert!(unused.iter().all(|&width| width == 0), "{seed}: {widths:?}");
             assert!(used.iter().all(|&width| (1..=MAX_HIDDEN_UNITS as u32).contains(&width)), "{seed}: {widths:?}");
         }
     }

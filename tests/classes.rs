@@ -3,8 +3,8 @@
 use std::collections::HashSet;
 
 use flotilla::config::{
-    Actions, AgentClass, Choice, Combine, Config, Control, Coupling, Frame, Heading, Measure, Mobility, Observers,
-    Override, Paradigm, Sharing,
+    Actions, AgentClass, Choice, Combine, Config, Control, ControlKind, Coupling, Frame, Heading, Measure, Mobility,
+    Observers, Override, Paradigm, Sectors, Sharing,
 };
 use flotilla::reader::Document;
 use flotilla::sample;
@@ -104,7 +104,22 @@ fn every_problem_names_key_line_found_and_allowed() {
         (
             range,
             "range = 25, sectors = 2.5",
-            "8: agents[0].senses[0].sectors: found 2.5, allowed a whole number, 1 to 16",
+            "8: agents[0].senses[0].sectors: found 2.5, allowed a whole number, 1 to 16, or \"each\"",
+        ),
+        (
+            range,
+            "range = 25, sectors = \"all\"",
+            "8: agents[0].senses[0].sectors: found \"all\", allowed a whole number, 1 to 16, or \"each\"",
+        ),
+        (
+            range,
+            "measure = \"inverse-squared\", nearest = 0.02",
+            "8: agents[0].senses[0].measure: found \"inverse-squared\", up to 2500 with nearest = 0.02, times a POI's value of 1; allowed up to 2000",
+        ),
+        (
+            "range = 5, measure = \"closeness\"",
+            "measure = \"inverse-squared\", nearest = 0.02",
+            "9: agents[0].senses[1].measure: found \"inverse-squared\", up to 2500 with nearest = 0.02; allowed up to 2000",
         ),
         (
             range,
@@ -191,7 +206,7 @@ fn every_problem_names_key_line_found_and_allowed() {
         (
             control,
             "control = \"still\"\nfitness = \"D\"",
-            "16: agents[1].fitness: found with control = \"still\", allowed with \"policy\"\n17: agents[1].rule: found with control = \"still\", allowed with \"follow\"",
+            "16: agents[1].fitness: found with control = \"still\", allowed with \"policy\" or \"choose:CLASS\"\n17: agents[1].rule: found with control = \"still\", allowed with \"follow\"",
         ),
         (
             leads,
@@ -215,6 +230,11 @@ fn every_problem_names_key_line_found_and_allowed() {
         ),
         (
             "after = \"a\"",
+            "[credit]\nremoves = 3",
+            "26: credit.removes: found 3, allowed a list of 1 or more lists of agents, or none",
+        ),
+        (
+            "after = \"a\"",
             "[credit]\nremoves = [[0], [1], [2]]",
             "26: credit.removes[0]: found 3 lists, allowed one, or 2 (one per learner)",
         ),
@@ -230,7 +250,7 @@ fn every_problem_names_key_line_found_and_allowed() {
         (
             leads,
             "foo = 3",
-            "11: agents[0].foo: unknown key, allowed at, control, count, fitness, heading, in, influence_radius, leads, motion, name, observes, rule, senses, speed, wall_gain, wall_radius",
+            "11: agents[0].foo: unknown key, allowed at, control, count, fitness, heading, in, influence_radius, leads, motion, moves_near, name, observes, reach, rule, senses, speed, stays_in, wall_gain, wall_radius",
         ),
         (
             leads,
@@ -251,17 +271,54 @@ fn every_problem_names_key_line_found_and_allowed() {
         (
             control,
             "control = \"fly\"",
-            "15: agents[1].control: found \"fly\", allowed \"policy\" or \"follow\" or \"still\"",
+            "15: agents[1].control: found \"fly\", allowed \"policy\" or \"follow\" or \"nearest:CLASS\" or \"choose:CLASS\" or \"still\"",
+        ),
+        (
+            control,
+            "control = \"near:uav\"",
+            "15: agents[1].control: found \"near:uav\", allowed \"policy\" or \"follow\" or \"nearest:CLASS\" or \"choose:CLASS\" or \"still\"",
+        ),
+        (
+            control,
+            "control = \"nearest:cat\"",
+            "15: agents[1].control: found \"nearest:cat\", allowed \"nearest:uav\" or \"nearest:dog\"",
+        ),
+        (
+            control,
+            "control = \"nearest:uav\"\nreach = 0",
+            "16: agents[1].reach: found 0, allowed 0.01 to 10000 or inf (unlimited)\n17: agents[1].rule: found with control = \"nearest:uav\", allowed with \"follow\"",
+        ),
+        (
+            control,
+            "control = \"follow\"\nreach = 5",
+            "16: agents[1].reach: found with control = \"follow\", allowed with \"nearest:CLASS\"",
+        ),
+        (leads, "stays_in = [10, 10, 60, 20]", "11: agents[0].stays_in[2]: found 60, allowed 0 to 50 (the map)"),
+        (
+            leads,
+            "stays_in = [20, 10, 10, 20]",
+            "11: agents[0].stays_in: found [20, 10, 10, 20], allowed x0 <= x1 and y0 <= y1",
+        ),
+        (
+            leads,
+            "stays_in = [25, 25, 25.5, 25]",
+            "5: agents[0].at: found a start at (26, 25), allowed within stays_in, (25, 25) to (25.5, 25)",
+        ),
+        (leads, "moves_near = \"cat\"", "11: agents[0].moves_near: found \"cat\", allowed a class that it senses"),
+        (
+            control,
+            "control = \"follow\"\nmoves_near = \"uav\"",
+            "16: agents[1].moves_near: found \"uav\", allowed a class that it senses",
         ),
         (
             control,
             "control = \"follow\"\nsenses = [{ of = \"pois\" }]",
-            "16: agents[1].senses: found with control = \"follow\", allowed with \"policy\"",
+            "16: agents[1].senses: found with control = \"follow\", allowed with \"policy\" or \"choose:CLASS\"",
         ),
         (
             control,
             "control = \"follow\"\nleads = \"dog\"",
-            "16: agents[1].leads: found with control = \"follow\", allowed with \"policy\": others cannot lead yet",
+            "16: agents[1].leads: found with control = \"follow\", allowed with \"policy\" or \"choose:CLASS\": others cannot lead yet",
         ),
         (
             "rule = [{ of = \"agents\", to = 5, gain = -1 }]",
@@ -313,14 +370,14 @@ fn every_problem_names_key_line_found_and_allowed() {
             "12: agents[1].at: missing, allowed a list of 1 to 1024 positions [x, y], or `count` with `in`",
         ),
         (at, "count = 2", "12: agents[1].in: missing, allowed a table with one of box, disc and circle"),
-        (at, "in = { disc = [25, 25, 5] }", "12: agents[1].count: missing, allowed 1 to 1024, the number of agents"),
+        (at, "in = { disc = [25, 25, 5] }", "12: agents[1].count: missing, allowed 1 to 1048576, the number of agents"),
         (
             at,
             "at = [[20, 25]]\nin = { disc = [25, 25, 5] }",
             "15: agents[1].in: found with `at`, allowed either of them",
         ),
         (at, "at = [[20, 25]]\ncount = 1", "15: agents[1].count: found with `at`, allowed with `in`"),
-        (at, "count = 0\nin = { disc = [25, 25, 5] }", "14: agents[1].count: found 0, allowed 1 to 1024"),
+        (at, "count = 0\nin = { disc = [25, 25, 5] }", "14: agents[1].count: found 0, allowed 1 to 1048576"),
         (
             at,
             "count = 2\nin = { disc = [45, 25, 6] }",
@@ -477,8 +534,8 @@ fn classes_and_groups_have_their_limits() {
     for (from, to, expected) in [
         (
             "at = [[20, 25]]",
-            many(1023),
-            "x.toml:14: agents[1].at: found 1023, which makes 1025 agents with those before, allowed 1 to 1024",
+            "count = 1048575\nin = { disc = [9, 9, 5] }".into(),
+            "x.toml:14: agents[1].count: found 1048575, which makes 1048577 agents with those before, allowed 1 to 1048576",
         ),
         (
             "at = [[5, 6]]",
@@ -499,7 +556,7 @@ fn classes_and_groups_have_their_limits() {
     let all = all.replace("control = \"follow\"\nrule = [{ of = \"agents\", to = 5, gain = -1 }]\n", "");
     assert_eq!(
         Config::parse(&all.replace("leads = \"dog\"\n", ""), "x.toml").unwrap_err().to_string(),
-        "x.toml:13: agents[1].at: found 1, which makes 1025 agents with those before, allowed 1 to 1024"
+        "x.toml:3: agents: found 1025 agents that learn, allowed up to 1024"
     );
     let none = with("name = \"a\"", "name = \"a\"").split("[[pois]]").next().unwrap().to_string();
     let error = |text: String| Config::parse(&text, "x.toml").unwrap_err().to_string();
@@ -572,7 +629,7 @@ fn keys_of_tables_have_their_defaults() {
     let config = parse(TEXT);
     let [uav, dog] = &config.agents[..] else { panic!("{:?}", config.agents) };
     assert_eq!(
-        (uav.control, uav.speed, uav.observes, uav.wall_radius, uav.wall_gain),
+        (uav.control.clone(), uav.speed, uav.observes, uav.wall_radius, uav.wall_gain),
         (Control::Policy, 0.0, true, 1.0, 1.0)
     );
     assert_eq!(
@@ -583,7 +640,7 @@ fn keys_of_tables_have_their_defaults() {
     let [pois, agents] = &uav.senses[..] else { panic!("{:?}", uav.senses) };
     assert_eq!(
         (pois.sectors, pois.frame, pois.measure, pois.combine),
-        (4, Frame::Map, Measure::Linear, Combine::Share)
+        (Sectors::Equal(4), Frame::Map, Measure::Linear, Combine::Share)
     );
     assert_eq!((pois.nearest, pois.empty, pois.gain, pois.range), (1.0, 0.0, 1.0, 25.0));
     assert_eq!(agents.of, ["uav", "dog"]);
@@ -601,7 +658,7 @@ fn keys_of_tables_have_their_defaults() {
     assert_eq!((config.learners(), config.agent_count(), config.poi_count(), config.inputs()), (2, 3, 3, 8));
     assert_eq!(config.classes().influence_radius(0, 1), Some(5.0));
     let wide = parse(&with("range = 25", "range = 25, sectors = 12"));
-    assert_eq!((wide.inputs(), wide.policy.widths(wide.inputs())), (16, vec![16, 10, 2]));
+    assert_eq!((wide.inputs(), wide.widths()), (16, vec![16, 10, 2]));
     assert_eq!(wide.parameters(), 17 * 10 + 11 * 2);
 }
 
@@ -711,12 +768,15 @@ fn random_classes_survive_a_round_trip() {
             continue;
         }
         for class in &config.agents {
-            note("control", class.control.to_string());
+            note("control", class.control.kind().to_string());
             note("motion", matches!(class.motion, Mobility::Free { .. }).to_string());
+            note("stays in", class.stays_in.is_some().to_string());
+            note("moves near", class.moves_near.is_some().to_string());
             for channel in &class.senses {
                 note("measure", channel.measure.to_string());
                 note("combine", channel.combine.to_string());
                 note("frame", channel.frame.to_string());
+                note("each", matches!(channel.sectors, Sectors::Each(_)).to_string());
             }
             class.rule.iter().for_each(|term| note("gain", term.gain.is_some().to_string()));
         }
@@ -729,8 +789,8 @@ fn random_classes_survive_a_round_trip() {
         note("actions", config.policy.actions.to_string());
         note("sharing", config.learning.sharing.to_string());
     }
-    let words = Measure::ALL.len() + Combine::ALL.len() + Frame::ALL.len() + Control::ALL.len();
-    assert_eq!(seen.len(), words + 6 * 2 + Actions::Direct.outputs() + Sharing::ALL.len(), "{seen:?}");
+    let words = Measure::ALL.len() + Combine::ALL.len() + Frame::ALL.len() + ControlKind::ALL.len();
+    assert_eq!(seen.len(), words + 9 * 2 + Actions::Direct.outputs() + Sharing::ALL.len(), "{seen:?}");
 }
 
 /// A config in short is the same in full: same classes, learners, populations and policies.

@@ -5,7 +5,7 @@
 use crate::support;
 use flotilla::backend::cpu::Cpu;
 use flotilla::backend::{Backend, Group, GroupScores};
-use flotilla::config::{Choice, Coupling, Fitness, LedBy, MAX_AGENTS, Observers, Score, When, WorldConfig};
+use flotilla::config::{Choice, Coupling, Fitness, LedBy, MAX_LEARNERS, Observers, Score, When, WorldConfig};
 use flotilla::credit::{Credit, Episode, RecordRequest, Scores, Seen, Strided, owner_bits};
 use flotilla::front;
 use flotilla::sample;
@@ -313,9 +313,9 @@ fn with_random_rule(rng: &mut ChaCha8Rng, record: Record) -> Record {
     let mut record = Record { rule: Rule { observers, windows, after }, ..record };
     // At most as many as the leaders, or the followers that fit, can be needed.
     let most = match observers {
-        Observers::All => MAX_AGENTS,
+        Observers::All => MAX_LEARNERS,
         Observers::Leaders => record.leaders,
-        Observers::Followers => MAX_AGENTS - record.leaders,
+        Observers::Followers => MAX_LEARNERS - record.leaders,
     };
     record.coupling.iter_mut().for_each(|coupling| *coupling = (*coupling).min(most as u32));
     record.with_enough_observers()

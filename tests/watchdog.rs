@@ -312,7 +312,7 @@ impl Faults for Edited {
 #[test]
 fn opening_detects_an_edit_of_any_kernel() {
     type Edit = fn(String) -> String;
-    let edits: [(&str, Edit); 13] = [
+    let edits: [(&str, Edit); 18] = [
         ("linear density", |text| {
             text.replace("base - exact_sqrt(d2) * (gauge.slope * value)", "base - exact_sqrt(d2)")
         }),
@@ -332,6 +332,11 @@ fn opening_detects_an_edit_of_any_kernel() {
         ("aligned headings", |text| {
             text.replace("on_lattice((*state).hx, own.heading_base)", "on_lattice((*state).hy, own.heading_base)")
         }),
+        ("each agent sensed", |text| text.replace("select(0, found.measure, other)", "found.measure + 1")),
+        ("nearest agent", |text| text.replace("d2 < least", "d2 > least")),
+        ("chosen agent", |text| text.replace("f32(choice) * own.choice_step", "f32(choice + 1u) * own.choice_step")),
+        ("moves near others", |text| text.replace("own.near2, me)", "0.3 * own.near2, me)")),
+        ("box", |text| text.replace("vec4(own.low_x, own.low_y,", "vec4(own.low_x, own.low_y + 0.5,")),
         ("pack", |text| text.replace("size >= enough", "size > enough")),
         ("pack", |text| text.replace("if steps > most", "if steps >= most")),
         ("gather", |text| text.replace("vec4(tile[start], tile[start + 1u]", "vec4(tile[start + 1u], tile[start]")),

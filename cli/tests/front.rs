@@ -9,7 +9,7 @@ use flotilla::Config;
 use flotilla::backend::cpu::Cpu;
 use flotilla::backend::{Backend, Group};
 use flotilla::config::own_populations;
-use flotilla::config::{Fitness, MAX_AGENTS, MAX_POPULATION, MAX_STEPS, Stage};
+use flotilla::config::{Fitness, MAX_LEARNERS, MAX_POPULATION, MAX_STEPS, Stage};
 use flotilla::evaluate::Starts;
 use flotilla::front::{self, Coevolution, Failure, Processor};
 use flotilla::sample;
@@ -363,7 +363,7 @@ fn invalid_input_returns_an_error() {
     assert!(matches!(trace(2), Err(Failure::NoEpisode { episode: 2, episodes: 2 })));
 
     // The steps of a million large teams need more memory than any machine has.
-    let followers = "[1, 1], ".repeat(MAX_AGENTS - 1);
+    let followers = "[1, 1], ".repeat(MAX_LEARNERS - 1);
     let text = format!(
         "[world]\nleaders = [[2, 2]]\nfollowers = [{followers}]\npois = [[9, 9]]\n\
          steps = {MAX_STEPS}\n[policy]\nhidden = []"

@@ -13,8 +13,12 @@ use std::f64::consts::PI;
 
 use flotilla::backend::cpu::{Cpu, level_name};
 use flotilla::backend::{Backend, Group, Moment, Trace};
-use flotilla::config::{Actions, Config, Coupling, Density, Fitness, Paradigm, own_populations};
+use flotilla::config::{
+    Actions, AgentClass, Channel, Combine, Config, Control, Coupling, Density, Fitness, Measure, Mobility, Paradigm,
+    Sectors, own_populations,
+};
 use flotilla::sample;
+use flotilla::stepping::{Recording, Stepper};
 use flotilla::world::{GRID, World, on_grid};
 use flotilla_cli::measure::with_agents;
 use glam::{DVec2, Vec2};
@@ -731,4 +735,291 @@ fn random_worlds_cover_every_kind() {
     for world in &worlds {
         assert_eq!(Config::parse(&world.to_toml(), "sample").unwrap(), *world);
     }
+}
+
+/// A random world with classes, and the class of each of its agents.
+struct Described {
+    config: Config,
+    class_of: Vec<usize>,
+}
+
+impl Described {
+    fn class(&self, agent: usize) -> &AgentClass {
+        &self.config.agents[self.class_of[agent]]
+    }
+
+    /// Returns the agents of a class other than this one.
+    fn others(&self, class: &str, agent: usize) -> impl Iterator<Item = usize> {
+        (0..self.class_of.len()).filter(move |&other| other != agent && self.class(other).name == class)
+    }
+
+    /// Returns the offset to the nearest agent of a class within a radius, the first of equals.
+    fn nearest(
+        &self,
+        states: &[State],
+        agent: usize,
+        class: &str,
+        radius: f64,
+        borderline: &mut bool,
+    ) -> Option<DVec2> {
+        let mut best: Option<Offset> = None;
+        for other in self.others(class, agent) {
+            let offset = Offset::new(states[agent].position, states[other].position);
+            if !offset.within(radius, borderline) {
+                continue;
+            }
+            let Some(found) = &best else {
+                best = Some(offset);
+                continue;
+            };
+            *borderline |= (offset.d - found.d).abs() < MARGIN * found.d && !(offset.exact && found.exact);
+            if offset.d < found.d {
+                best = Some(offset);
+            }
+        }
+        best.map(|found| found.r)
+    }
+
+    /// Returns the state after a step towards an agent at an offset.
+    fn moved(&self, state: &State, class: &AgentClass, offset: DVec2, borderline: &mut bool) -> State {
+        let (world, length) = (&self.config.world, offset.length());
+        let most = class.motion.max_speed();
+        let velocity = if length == 0.0 { DVec2::ZERO } else { offset * (1.0 / world.dt).min(most / length) };
+        let [x0, y0, x1, y1] = class.stays_in.unwrap_or([0.0, 0.0, world.map[0], world.map[1]]);
+        let place = |position: DVec2| position.clamp(DVec2::new(x0, y0), DVec2::new(x1, y1));
+        let Mobility::Steered(motion) = &class.motion else {
+            return State { position: place(state.position + velocity * world.dt), ..*state };
+        };
+        let (dot, cross) = (state.heading.dot(velocity), state.heading.perp_dot(velocity));
+        let (angle, ahead) = (if velocity == DVec2::ZERO { 0.0 } else { cross.atan2(dot) }, velocity.length());
+        // Rounding may change the side to which it turns, or whether the agent is ahead.
+        *borderline |= ahead > 0.0 && (dot < 0.0 && cross.abs() < 1e-3 * ahead || dot.abs() < 1e-5 * ahead);
+        let wanted = if dot > 0.0 || ahead == 0.0 { ahead } else { motion.min_speed };
+        let (max_turn, max_change) = (motion.max_turn_rate * world.dt, motion.max_acceleration * world.dt);
+        let angle = state.heading.to_angle() + angle.clamp(-max_turn, max_turn);
+        let speed = state.speed + (wanted - state.speed).clamp(-max_change, max_change);
+        let speed = speed.clamp(motion.min_speed, motion.max_speed);
+        let heading = DVec2::from_angle(angle);
+        State { position: place(state.position + heading * speed * world.dt), heading, speed }
+    }
+
+    /// Returns the first of the largest outputs of a policy, unless rounding may decide.
+    fn choice(&self, weights: &[f32], inputs: &[f32], choices: usize) -> Option<usize> {
+        let mut values: Vec<f64> = inputs.iter().map(|&input| input.into()).collect();
+        let mut first = 0;
+        for widths in self.config.widths().windows(2) {
+            let weight = |row: usize, column: usize| f64::from(weights[first + row * widths[1] + column]);
+            let unit = |column: usize| {
+                let inputs = values.iter().enumerate().map(|(row, value)| value * weight(row, column));
+                (inputs.sum::<f64>() + weight(widths[0], column)).tanh()
+            };
+            values = (0..widths[1]).map(unit).collect();
+            first += (widths[0] + 1) * widths[1];
+        }
+        let outputs = &values[..=choices];
+        let best = (0..=choices).fold(0, |best, index| if outputs[index] > outputs[best] { index } else { best });
+        let is_certain = |other: usize| other == best || outputs[best] - outputs[other] > 1e-3;
+        (0..=choices).all(is_certain).then_some(best)
+    }
+
+    /// Returns the inputs of a channel that has a sector of each agent or POI, and what rounding may change.
+    fn sensed(&self, world: &World, channel: &Channel, states: &[State], agent: usize) -> Vec<(f64, bool)> {
+        let names = |of: &str| channel.of.iter().any(|name| name == of);
+        let groups = self.config.classes().group_of_each();
+        let group = |poi: usize| &self.config.pois[groups[poi]];
+        let entities: Vec<(DVec2, f64, bool)> = match names("pois") {
+            true => (0..world.pois.len())
+                .filter(|&poi| channel.pois.is_empty() || channel.pois.contains(&group(poi).name))
+                .map(|poi| (world.pois[poi].as_dvec2(), group(poi).value, true))
+                .collect(),
+            false => (0..states.len())
+                .filter(|&other| names("agents") || names(&self.class(other).name))
+                .map(|other| (states[other].position, 1.0, other != agent))
+                .collect(),
+        };
+        let map = self.config.world.map;
+        let share = if channel.combine == Combine::Share { entities.len() as f64 } else { 1.0 };
+        let input = |&(place, value, other): &(DVec2, f64, bool)| {
+            let mut borderline = false;
+            let offset = Offset::new(states[agent].position, place);
+            if !(other && channel.range > 0.0 && offset.within(channel.range, &mut borderline)) {
+                return (channel.empty, borderline && other);
+            }
+            let near = offset.d.max(channel.nearest);
+            let measure = match channel.measure {
+                Measure::Linear => 1.0 - offset.d / (2f64.sqrt() * map[0].max(map[1])),
+                Measure::Inverse => 1.0 / near,
+                Measure::InverseSquared => 1.0 / (near * near),
+                Measure::Exponential => (-offset.d).exp(),
+                Measure::Distance => offset.d / channel.range,
+                Measure::Closeness => 1.0 - offset.d / channel.range,
+            };
+            (channel.gain * value * measure / share, borderline)
+        };
+        entities.iter().map(input).collect()
+    }
+}
+
+/// Compares every step of random worlds with what the keys say: who is nearest or chosen and how an agent moves to it, who
+/// stays where it is, what a channel senses of each, and that no agent leaves its box.
+#[test]
+fn agents_move_to_others_and_sense_each_as_described() {
+    const TEAMS: usize = 5;
+    // To the nearest, to nobody, to a chosen one; inputs, in boxes, and steps at which nobody was near; borderline.
+    let (mut counts, mut borderlines, mut wrong) = ([0; 6], 0, vec![]);
+    for seed in (1..600u64).step_by(2) {
+        let config = sample::classes_world(seed);
+        let world = World::new(&config.validate().unwrap());
+        let described = Described { class_of: config.classes().class_of_each(), config };
+        let (leaders, steps) = (world.leaders(), world.steps());
+        let weights = sample::weights(&world, TEAMS, seed);
+        let teams: Vec<u32> = (0..TEAMS as u32).flat_map(|team| vec![team; leaders]).collect();
+        let group = Group {
+            world: &world,
+            starts: &world.starts,
+            weights: weights[..].into(),
+            policies: TEAMS,
+            populations: own_populations(leaders),
+            teams: &teams,
+            fitnesses: &[],
+        };
+        let trace = Cpu::default().trace(&group).unwrap();
+        for (team, step) in (0..TEAMS).flat_map(|team| (1..=steps).map(move |step| (team, step))) {
+            let states: Vec<State> =
+                (0..world.agents()).map(|agent| State::of(trace.moment(step - 1, team, agent))).collect();
+            for (agent, state) in states.iter().enumerate() {
+                let (class, moment) = (described.class(agent), trace.moment(step, team, agent));
+                let (now, place) = (State::of(moment), format!("seed {seed} team {team} step {step} agent {agent}"));
+                if let Some([x0, y0, x1, y1]) = class.stays_in {
+                    let (x, y) = (now.position.x, now.position.y);
+                    counts[3] += 1;
+                    // Corners are rounded to f32 and to the grid.
+                    let is_in = |at: f64, low: f64, high: f64| (low - 2e-5..=high + 2e-5).contains(&at);
+                    if !is_in(x, x0, x1) || !is_in(y, y0, y1) {
+                        wrong.push(format!("{place} is at ({x}, {y}), outside {:?}", class.stays_in));
+                    }
+                }
+                let mut first = 0;
+                for channel in &class.senses {
+                    if let Sectors::Each(count) = channel.sectors {
+                        let found = &trace.inputs_of(step, team, agent)[first..first + count];
+                        let expected = described.sensed(&world, channel, &states, agent);
+                        assert_eq!(expected.len(), count, "{place}");
+                        for (found, (expected, borderline)) in found.iter().zip(expected) {
+                            counts[4] += 1;
+                            let off = (f64::from(*found) - expected).abs();
+                            if !borderline && off > INPUT * (1.0 + expected.abs()) {
+                                wrong.push(format!("{place} senses {found}, expected {expected}"));
+                            }
+                        }
+                    }
+                    first += channel.sectors.count();
+                }
+                let mut borderline = false;
+                if let Some(near) = &class.moves_near {
+                    let names = |channel: &&Channel| channel.of.iter().any(|of| of == near || of == "agents");
+                    let range = class.senses.iter().filter(names).map(|channel| channel.range).fold(0.0, f64::max);
+                    let is_near = described.nearest(&states, agent, near, range, &mut borderline).is_some();
+                    if !is_near && !borderline {
+                        counts[5] += 1;
+                        let kept =
+                            (now.position, now.heading, now.speed) == (state.position, state.heading, state.speed);
+                        if !kept {
+                            wrong.push(format!("{place} moved with no {near} near"));
+                        }
+                        continue;
+                    }
+                }
+                let offset = match &class.control {
+                    Control::Nearest(target) => {
+                        let radius = class.reach.unwrap_or(f64::INFINITY);
+                        let offset = described.nearest(&states, agent, target, radius, &mut borderline);
+                        counts[usize::from(offset.is_none())] += 1;
+                        offset.unwrap_or_default()
+                    }
+                    Control::Choose(target) => {
+                        let all: Vec<usize> =
+                            (0..states.len()).filter(|&other| described.class(other).name == *target).collect();
+                        let [action, other] = moment.outputs.map(f64::from);
+                        let index = ((action + 1.0) / 2.0 * all.len() as f64).round();
+                        let exact = index * 2.0 / all.len() as f64 - 1.0;
+                        let policy = &weights[(agent * TEAMS + team) * world.parameters()..][..world.parameters()];
+                        let expected = described.choice(policy, trace.inputs_of(step, team, agent), all.len());
+                        if (action - exact).abs() > 1e-6
+                            || other != 0.0
+                            || expected.is_some_and(|of| of != index as usize)
+                        {
+                            wrong.push(format!("{place} chooses {action} {other}, expected {expected:?}"));
+                        }
+                        counts[2] += u32::from(expected.is_some());
+                        all.get(index as usize).map_or(DVec2::ZERO, |&to| states[to].position - state.position)
+                    }
+                    _ => continue,
+                };
+                let expected = described.moved(state, class, offset, &mut borderline);
+                borderlines += u32::from(borderline);
+                let off = [expected.position - now.position, expected.heading - now.heading].map(DVec2::length);
+                if !borderline && (off[0] > STATE || off[1] > STATE || (expected.speed - now.speed).abs() > STATE) {
+                    wrong.push(format!("{place} moves by {:?}, off by {off:?}", now.position - state.position));
+                }
+            }
+        }
+    }
+    println!("{counts:?}, {borderlines} borderline");
+    assert!(wrong.is_empty(), "{} differences, the first:\n{}", wrong.len(), wrong[..wrong.len().min(10)].join("\n"));
+    assert!(counts.iter().all(|&count| count > 2000) && borderlines * 5 < counts[0] + counts[2], "{counts:?}");
+}
+
+/// Ties go to the first agent, whether it is the nearest or chosen. An action between two choices is the nearest one.
+#[test]
+fn ties_between_agents_go_to_the_first() {
+    let text = "
+world = { map = [50, 50], steps = 1, dt = 1.0, pois = [[1, 1]], coupling = 1 }
+policy = { hidden = [] }
+[[agents]]
+name = 'scout'
+at = [[25, 25]]
+control = 'choose:post'
+motion = { kind = 'free', max_speed = 1 }
+senses = [{ of = 'pois' }]
+[[agents]]
+name = 'post'
+at = [[25, 29], [21, 25], [29, 25]]
+control = 'still'
+[[agents]]
+name = 'rover'
+at = [[25, 25], [25, 35], [25, 28.5]]
+control = 'nearest:post'
+reach = 4
+motion = { kind = 'free', max_speed = 1 }
+";
+    let world = World::new(&Config::parse(text, "ties").unwrap().validate().unwrap());
+    let play = |largest: &[usize]| {
+        let mut weights = vec![0.0; world.parameters()];
+        let biases = weights.len() - 4;
+        largest.iter().for_each(|&output| weights[biases + output] = 0.5);
+        let group = Group {
+            world: &world,
+            starts: &world.starts,
+            weights: weights[..].into(),
+            policies: 1,
+            populations: own_populations(1),
+            teams: &[0],
+            fitnesses: &[],
+        };
+        let trace = Cpu::default().trace(&group).unwrap();
+        let of = |agent: usize| trace.moment(1, 0, agent).position;
+        (trace.moment(1, 0, 0).outputs[0], of(0), [of(4), of(5), of(6)])
+    };
+    // The first rover is 4 from all three, the second is out of reach, and the third arrives.
+    let rovers = [[25.0, 26.0], [25.0, 35.0], [25.0, 29.0]];
+    assert_eq!(play(&[]), (-1.0, [25.0, 26.0], rovers));
+    assert_eq!(play(&[1, 2]).1, [24.0, 25.0]);
+    assert_eq!(play(&[2, 3]).1, [26.0, 25.0]);
+    assert_eq!(play(&[3]), (1.0, [25.0, 25.0], rovers));
+    let mut stepper = Stepper::new(world, 5, Recording::None).unwrap();
+    stepper.step(&[-0.8, 0.0, -0.5, 0.9, 0.2, 0.0, 0.8, 0.0, 7.0, 0.0]).unwrap();
+    let states = stepper.states();
+    let found: Vec<&[f32]> = states.positions.chunks_exact(14).map(|team| &team[..2]).collect();
+    assert_eq!(found, [[25.0, 26.0], [24.0, 25.0], [26.0, 25.0], [25.0, 25.0], [25.0, 25.0]]);
 }

@@ -520,7 +520,7 @@ def forward(policies: ArrayLike, inputs: ArrayLike, config: Config | None = None
         to the largest.
 
     Raises:
-        ValueError: the shapes do not fit.
+        ValueError: the shapes do not fit, or policies of the config choose agents to move to.
 
     Example:
         >>> ahead = np.zeros(112, np.float32)
@@ -532,6 +532,8 @@ def forward(policies: ArrayLike, inputs: ArrayLike, config: Config | None = None
         if array.dtype.kind not in "fiu" or array.ndim == 0:
             raise ValueError(f"{what} are {array.dtype} of shape {array.shape}, allowed are arrays of numbers")
     layers = _layers(config, weights.shape[-1])
+    if config is not None and config._native.chooses_agents:
+        raise ValueError("policies of this config choose agents to move to: forward computes no choices; use a trace")
     if given.shape[-1] != layers[0]:
         raise ValueError(f"inputs have the shape {given.shape}, allowed is [..., {layers[0]}]")
     shape = np.broadcast_shapes(weights.shape[:-1], given.shape[:-1])
@@ -549,7 +551,8 @@ def to_onnx(policy: ArrayLike, path: str | os.PathLike[str], config: Config | No
     """Writes one policy's network as an ONNX model with an input `inputs [n, inputs]` and an output `outputs [n, 2]`.
 
     Needs the package `onnx` (`pip install flotilla-teams[onnx]`). If a config says that policies choose among
-    behaviours, the output is `[n, 5]`, one value per behaviour.
+    behaviours, the output is `[n, 5]`, one value per behaviour. If policies choose agents to move to, it has one value per
+    agent of the largest class, and one for nobody.
 
     Args:
         policy: `[parameters]`.

@@ -159,7 +159,8 @@ class VectorEnv(Base):
 
     A config with `[[agents]]` says what each class senses, channel by channel. Observations have `config.num_inputs` numbers,
     and those of classes with fewer inputs end with zeros. The action of an agent with free motion is its velocity along x
-    and y.
+    and y. The first action of an agent that chooses another to move to is its choice: from -1, the first agent of the class,
+    to 1, nobody, in equal steps.
 
     Args:
         config: the world. Of its learning section, only the paradigm and the jitter of starts matter here.

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use flotilla::config::{self, Definition, Override};
+use flotilla::config::{self, Control, Definition, Override};
 use flotilla::world::World;
 use flotilla_app::sweep::Sweep;
 use flotilla_studies::paper::{Experiment, arms};
@@ -111,12 +111,18 @@ impl Config {
     /// Widths of a policy's layers, inputs and outputs included.
     #[getter]
     fn widths(&self) -> Vec<usize> {
-        self.0.policy.widths(self.0.inputs())
+        self.0.widths()
     }
 
     #[getter]
     fn parameters(&self) -> usize {
         self.0.parameters()
+    }
+
+    /// Whether policies of any class choose agents to move to.
+    #[getter]
+    fn chooses_agents(&self) -> bool {
+        self.0.agents.iter().any(|class| matches!(class.control, Control::Choose(_)))
     }
 
     /// Whether starts or POIs are drawn from regions.

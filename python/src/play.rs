@@ -4,7 +4,7 @@ use std::ops::ControlFlow;
 use std::time::{Duration, Instant};
 
 use flotilla::backend::cpu::{self, StepArrays};
-use flotilla::config::{Fitness, MAX_HIDDEN_UNITS};
+use flotilla::config::{Actions, Choice, Fitness, MAX_HIDDEN_UNITS};
 use flotilla::evaluate::{self, Batch, Spread, Starts, Tally};
 use flotilla::evolve::{self, MAX_WEIGHT};
 use flotilla::front::{self, ActionNoise, Failure, Played, Scored};
@@ -296,29 +296,29 @@ fn contiguous<'a, T: Element>(array: &'a mut Option<PyReadwriteArrayDyn<'_, T>>)
 #[pyfunction]
 pub fn forward(
     py: Python<'_>,
-    widths: Vec<u32>,
+    widths: Vec<usize>,
     policies: PyReadonlyArray2<'_, f32>,
     inputs: PyReadonlyArray2<'_, f32>,
     chosen: PyReadonlyArray1<'_, i64>,
     mut outputs: PyReadwriteArray2<'_, f32>,
 ) -> PyResult<()> {
-    let mut padded = [0; MAX_HIDDEN_LAYERS + 2];
-    let small = |&width: &u32| (1..=MAX_HIDDEN_UNITS as u32).contains(&width);
-    if !(2..=padded.len()).contains(&widths.len()) || !widths.iter().all(small) {
+    let small = |&width: &usize| (1..=MAX_HIDDEN_UNITS).contains(&width);
+    if !(2..=MAX_HIDDEN_LAYERS + 2).contains(&widths.len()) || !widths.iter().all(small) {
         return Err(PyValueError::new_err(format!(
             "layers of {widths:?} units, allowed are up to {MAX_HIDDEN_LAYERS} \
              hidden ones of 1 to {MAX_HIDDEN_UNITS}"
         )));
     }
-    padded[..widths.len()].copy_from_slice(&widths);
-    let parameters: u32 = widths.windows(2).map(|widths| (widths[0] + 1) * widths[1]).sum();
-    let policy = PolicyConstants { layers: widths.len() as u32 - 1, widths: padded, parameters };
-    let fits = policy.actions().is_some_and(|actions| actions == flotilla::config::Actions::Direct || widths[0] >= 8);
+    let outputs_of = |&(_, actions): &&(_, Actions)| actions.outputs() == widths[widths.len() - 1];
+    let actions = Actions::ALL.iter().find(outputs_of).map(|(_, actions)| *actions);
+    let policy = PolicyConstants::new(&widths, actions.unwrap_or(Actions::Direct));
+    let parameters = policy.parameters as usize;
+    let fits = actions.is_some_and(|actions| actions == Actions::Direct || widths[0] >= 8);
     let (count, rows) = (policies.shape()[0], inputs.shape()[0]);
     let chosen = chosen.as_slice()?;
     if !fits
-        || policies.shape()[1] != parameters as usize
-        || inputs.shape()[1] != widths[0] as usize
+        || policies.shape()[1] != parameters
+        || inputs.shape()[1] != widths[0]
         || outputs.shape() != [rows, OUTPUTS]
         || chosen.len() != rows
         || !chosen.iter().all(|&policy| (0..count as i64).contains(&policy))
@@ -328,13 +328,13 @@ pub fn forward(
     let (mut weights, inputs) = (policies.as_slice()?.to_vec(), inputs.as_slice()?);
     let outputs = outputs.as_slice_mut()?;
     if let Some(place) = evolve::flush_and_validate(&mut weights) {
-        let (policy, parameter) = (place / parameters as usize, place % parameters as usize);
+        let (policy, parameter) = (place / parameters, place % parameters);
         let value = weights[place];
         let text =
             format!("weight {parameter} of policy {policy} is {value}, allowed are -{MAX_WEIGHT} to {MAX_WEIGHT}");
         return Err(PyValueError::new_err(text));
     }
-    workers::aside(py, || cpu::forward(&policy, &weights, inputs, &|row| chosen[row] as usize, outputs));
+    workers::aside(py, || cpu::forward(&policy, &weights, inputs, &|row| chosen[row] as usize, 0, outputs));
     Ok(())
 }
 

@@ -5,7 +5,7 @@
 
 use super::{Config, Coupling, Density, Fitness, Follow, Heading, Observers, Paradigm, Sense, Sharing, WorldConfig};
 use crate::model::classes::{
-    AGENTS, AgentClass, Channel, Classes, Combine, Control, Frame, Measure, POIS, PoiGroup, Score, Term, When,
+    AGENTS, AgentClass, Channel, Classes, Combine, Control, Frame, Measure, POIS, PoiGroup, Score, Sectors, Term, When,
 };
 use crate::model::motion::Mobility;
 use crate::reader::{OneOrEach, Reader, includes};
@@ -68,6 +68,17 @@ impl Config {
     pub fn inputs(&self) -> usize {
         let learning = self.agents.iter().filter(|class| class.learns());
         learning.map(AgentClass::inputs).max().unwrap_or(SHORT_INPUTS)
+    }
+
+    /// Returns the widths of all layers of a policy, from inputs to outputs: the most that the policies of any class use.
+    pub fn widths(&self) -> Vec<usize> {
+        let size = |name: &str| self.agents.iter().find(|class| class.name == name).map_or(0, AgentClass::size);
+        let of_class = |class: &AgentClass| match &class.control {
+            Control::Choose(target) => size(target) + 1,
+            _ => self.policy.actions.outputs(),
+        };
+        let outputs = self.agents.iter().filter(|class| class.learns()).map(of_class).max();
+        [&[self.inputs()], &self.policy.hidden[..], &[outputs.unwrap_or(self.policy.actions.outputs())]].concat()
     }
 
     /// Returns the world in short as pictures draw it. Agents that learn are leaders, others are followers, and all POIs
@@ -233,8 +244,11 @@ impl Config {
             count: None,
             region: None,
             speed: world.speed,
-            control,
+            control: control.clone(),
+            reach: None,
             motion: Mobility::Steered(motion.clone()),
+            stays_in: None,
+            moves_near: None,
             senses: vec![],
             rule: vec![],
             wall_radius: follow.repulsion_radius,
@@ -301,7 +315,7 @@ impl Sense {
         let channel = |of: &str, range: f64| Channel {
             of: vec![of.into()],
             pois: vec![],
-            sectors: 4,
+            sectors: Sectors::Equal(4),
             frame: Frame::Heading,
             range,
             measure: if self.density == Density::Linear { Measure::Linear } else { Measure::Inverse },

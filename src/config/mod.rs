@@ -14,13 +14,14 @@ use std::collections::BTreeMap;
 use serde::ser::SerializeMap;
 use serde::{Serialize, Serializer};
 
+use crate::model::policy::parameters;
 use crate::reader::{self, Document, Keys, Reader, Section};
 use classes::Summary;
 
 pub use crate::config_enum::Choice;
 pub use crate::model::classes::{
-    AGENTS, AgentClass, Channel, Classes, Combine, Control, Fitness, Frame, MAX_CHANNELS, MAX_CLASSES, MAX_INPUTS,
-    MAX_SECTORS, MAX_TERMS, Measure, POIS, PoiGroup, Score, Term, When,
+    AGENTS, AgentClass, Channel, Classes, Combine, Control, ControlKind, Fitness, Frame, MAX_CHANNELS, MAX_CLASSES,
+    MAX_INPUTS, MAX_SECTORS, MAX_TERMS, Measure, POIS, PoiGroup, Score, Sectors, Term, When,
 };
 pub use crate::model::follow::Follow;
 pub use crate::model::motion::{Mobility, Motion};
@@ -342,7 +343,7 @@ impl Config {
 
     /// Returns the number of weights in one policy, including biases.
     pub fn parameters(&self) -> usize {
-        self.policy.parameters(self.inputs())
+        parameters(&self.widths())
     }
 
     /// Returns the size of the policies of all trials, in bytes.
@@ -395,8 +396,17 @@ impl Config {
             pois,
             stages: vec![],
         };
-        if learners > MAX_LEARNERS {
+        if has_agents && learners > MAX_LEARNERS {
             r.report_key(AGENTS, format!("found {learners} agents that learn, allowed up to {MAX_LEARNERS}"));
+        }
+        let small_only = config.agents.iter().find(|class| class.is_of_small_teams());
+        if let (true, Some(class)) = (agent_count > MAX_LEARNERS, small_only) {
+            let message = format!(
+                "found {agent_count} agents, allowed up to {MAX_LEARNERS}, because agents of {:?} move to others, sense each, \
+                 or move only near others",
+                class.name
+            );
+            r.report_key(AGENTS, message);
         }
         let record = config.record_bytes();
         if r.error_count() == 0 && record > MAX_RECORD_BYTES {
@@ -408,7 +418,8 @@ impl Config {
             );
             r.report_key("world.steps", text);
         }
-        let needs_quadrants = config.agents.iter().find(|class| class.learns() && !class.senses_quadrants());
+        let needs_quadrants =
+            config.agents.iter().find(|class| class.control == Control::Policy && !class.senses_quadrants());
         if let (Actions::Behaviours, Some(class)) = (config.policy.actions, needs_quadrants) {
             let message = format!(
                 "found \"behaviours\", but the senses of {:?} do not begin with POIs and agents in 4 sectors around the \

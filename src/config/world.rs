@@ -119,10 +119,10 @@ impl WorldConfig {
     pub(super) fn class_summaries(&self, paradigm: Paradigm) -> Vec<ClassSummary> {
         let class = |name: &str, control: Control, agents: usize| ClassSummary {
             name: name.into(),
+            has_rule: control == Control::Follow,
             control: Some(control),
             agents,
             observes: true,
-            has_rule: control == Control::Follow,
         };
         let (leaders, followers) = (self.leaders.len(), self.followers.len());
         match paradigm {
@@ -135,7 +135,7 @@ impl WorldConfig {
 
     /// Returns the groups of POIs that other tables can refer to.
     pub(super) fn group_summaries(&self) -> Vec<GroupSummary> {
-        let group = |name: String, pois: usize| GroupSummary { name, pois };
+        let group = |name: String, pois: usize| GroupSummary { name, pois, value: 1.0 };
         match self.after.iter().all(Vec::is_empty) {
             true => vec![group("poi".into(), self.pois.len())],
             false => (0..self.pois.len()).map(|poi| group(format!("poi{poi}"), 1)).collect(),

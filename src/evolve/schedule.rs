@@ -160,11 +160,14 @@ pub fn episode_positions(
 }
 
 /// Writes the start positions of one episode, `[agents]`: the world's, or drawn from its regions, each moved by a uniform
-/// offset in `-jitter..jitter` units on both axes. `key` is of [`Purpose::Starts`] or the like.
+/// offset in `-jitter..jitter` units on both axes, but not out of where its class stays. `key` is of [`Purpose::Starts`] or the like.
 pub fn jitter_starts(key: Key, generation: usize, episode: usize, world: &World, jitter: f64, starts: &mut Vec<Vec2>) {
     starts.clone_from(&world.starts);
     spawn(key.at(generation, episode, 1), world.map(), &world.start_regions, starts);
     scatter(key.at(generation, episode, 0), world.map(), jitter, starts);
+    for class in &world.classes {
+        starts[class.agents()].iter_mut().for_each(|start| *start = class.constants.motion.confine(*start));
+    }
 }
 
 /// Appends the POI positions of one episode, `[pois]`, drawn and moved the same way. Appends nothing if no POI moves.

@@ -5,9 +5,10 @@ use std::ops::Range;
 use bytemuck::Zeroable;
 use fearless_simd::Simd;
 
-use super::classes::{AgentClass, Classes, Control, MAX_CHANNELS, MAX_CLASSES, MAX_TERMS};
+use super::classes::{AgentClass, Classes, ControlKind, MAX_CHANNELS, MAX_CLASSES, MAX_TERMS};
 use super::follow::{RuleConstants, TermConstants};
 use super::motion::{Mobility, MotionConstants};
+use super::pursue::PursuitConstants;
 use super::sense::{ChannelConstants, NOTHING};
 use crate::gpu_struct::gpu_struct;
 
@@ -19,8 +20,18 @@ gpu_struct! {
         pub first_agent: u32,
         /// The agent after its last.
         pub end_agent: u32,
-        /// A [`Control`], by its number.
+        /// A [`ControlKind`], by its number.
         pub control: u32,
+        /// The first of the agents to which its agents move.
+        pub first_target: u32,
+        /// The agent after the last of these.
+        pub end_target: u32,
+        /// The first of the agents near which its agents move.
+        pub first_near: u32,
+        /// The agent after the last of these. 0 if they move anywhere.
+        pub end_near: u32,
+        /// Not 0 if its agents cannot leave a part of the map.
+        pub boxed: u32,
         /// Not 0 if it moves freely, 0 if it steers.
         pub free: u32,
         /// See [`MotionConstants::by_sine`].
@@ -39,6 +50,8 @@ gpu_struct! {
         pub motion: MotionConstants,
         /// Constants of its rule.
         pub rule: RuleConstants,
+        /// Constants of pursuit.
+        pub pursuit: PursuitConstants,
         /// The squared distance up to which its agents lead those of each class; below 0 if they do not.
         pub influence2: [f32; MAX_CLASSES],
     }
@@ -74,12 +87,14 @@ impl Class {
             let mut input = 0;
             for (to, channel) in channels.iter_mut().zip(&class.senses) {
                 *to = ChannelConstants::new(channel, input, &of_class, &of_group, values, end, map);
-                input += channel.sectors;
+                input += channel.sectors.count();
             }
             let mut terms = [TermConstants::zeroed(); MAX_TERMS];
             let own = TermConstants::all(class, &of_class, end);
             terms[..own.len()].copy_from_slice(&own);
-            let motion = MotionConstants::new(&class.motion, class.speed, dt);
+            let motion = MotionConstants::new(&class.motion, class.speed, class.stays_in, map, dt);
+            let targets = class.control.target().map_or(0..0, of_class);
+            let near = class.moves_near.as_deref().map_or(0..0, of_class);
             let mut influence2 = [NOTHING; MAX_CLASSES];
             for (led, influence2) in influence2.iter_mut().enumerate().take(classes.len()) {
                 if let Some(radius) = described.influence_radius(index, led) {
@@ -89,13 +104,20 @@ impl Class {
             let shape = ClassShape {
                 first_agent: places[index].start as u32,
                 end_agent: places[index].end as u32,
-                control: class.control as u32,
+                control: class.control.kind() as u32,
+                first_target: targets.start as u32,
+                end_target: targets.end as u32,
+                first_near: near.start as u32,
+                end_near: near.end as u32,
+                boxed: class.stays_in.is_some().into(),
                 free: matches!(class.motion, Mobility::Free { .. }).into(),
                 by_sine: motion.by_sine().into(),
                 channel_count: class.senses.len() as u32,
                 term_count: class.rule.len() as u32,
             };
-            let constants = ClassConstants { shape, motion, rule: RuleConstants::new(class, end), influence2 };
+            let rule = RuleConstants::new(class, &motion, end);
+            let pursuit = PursuitConstants::new(class, targets.len(), dt);
+            let constants = ClassConstants { shape, motion, rule, pursuit, influence2 };
             Class { constants, channels, terms }
         };
         classes.iter().enumerate().map(class).collect()
@@ -148,7 +170,7 @@ impl<S: Simd> ClassLanes<S> {
     }
 
     /// Returns what decides how its agents move.
-    pub(crate) fn control(&self) -> Control {
+    pub(crate) fn control(&self) -> ControlKind {
         self.constants.shape.control()
     }
 }
@@ -160,7 +182,22 @@ impl ClassShape {
     }
 
     /// Returns what decides how its agents move.
-    pub fn control(&self) -> Control {
-        Control::of(self.control)
+    pub fn control(&self) -> ControlKind {
+        ControlKind::of(self.control)
+    }
+
+    /// Returns the number of agents among which its policies choose: 0 unless they choose agents.
+    pub fn choices(&self) -> usize {
+        if self.control() == ControlKind::Choose { (self.end_target - self.first_target) as usize } else { 0 }
+    }
+
+    /// Reports whether its agents move straight to others.
+    pub(crate) fn pursues(&self) -> bool {
+        matches!(self.control(), ControlKind::Nearest | ControlKind::Choose)
+    }
+
+    /// Reports whether its agents cannot leave a part of the map, or move only near others.
+    pub(crate) fn is_confined(&self) -> bool {
+        self.boxed != 0 || self.end_near > 0
     }
 }

@@ -1,5 +1,6 @@
 //! Classes of agents and groups of POIs as configs describe them, `[[agents]]` and `[[pois]]`.
 
+use std::fmt;
 use std::ops::Range;
 
 use serde::{Serialize, Serializer};
@@ -55,12 +56,25 @@ table! {
         heading: OneOrEach<f64> = "rad",
         /// speed at the start
         speed: f64 = "units/s",
-        /// what decides how its agents move: a policy, which learns, its `rule`, or nothing, so that they stay where they
-        /// are; classes that learn come first
+        /// what decides how its agents move: a policy, which learns; its `rule`; the nearest agent of a class, to which
+        /// they move straight, or else they stay; a policy, which learns, with one output per agent of a class and one
+        /// for nobody, so that they move straight to the one with the largest (ties go to the first); or nothing, so
+        /// that they stay where they are; classes that learn come first
         control: Control = "",
+        /// with control = "nearest:CLASS": the distance up to which they move to an agent
+        #[serde(skip_serializing_if = "Option::is_none")]
+        reach: Option<f64> = "units",
         /// how its agents can move, see below
         motion: Mobility = "",
-        /// with control = "policy": what its policies sense, channel by channel, see below
+        /// a rectangle that its agents cannot leave, with the corners (x0, y0) and (x1, y1), whose sides are its walls;
+        /// by default the map
+        #[serde(skip_serializing_if = "Option::is_none")]
+        stays_in: Option<[f64; 4]> = "units",
+        /// a class that it senses: at a step before which an agent senses none of its agents, the agent keeps its place,
+        /// heading and speed
+        #[serde(skip_serializing_if = "Option::is_none")]
+        moves_near: Option<String> = "",
+        /// of classes that learn: what their policies sense, channel by channel, see below
         #[serde(skip_serializing_if = "Vec::is_empty")]
         senses: Vec<Channel> = "",
         /// with control = "follow": the terms of the force on its agents, see below
@@ -84,15 +98,89 @@ table! {
     }
 }
 
+/// The source of an agent's decisions.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Control {
+    /// A policy, which learns.
+    Policy,
+    /// The class's rule.
+    Follow,
+    /// It moves straight to the nearest agent of this class, if one is within its reach.
+    Nearest(String),
+    /// A policy, which learns, chooses the agent of this class that it moves straight to, or nobody.
+    Choose(String),
+    /// It stays where it is.
+    Still,
+}
+
 config_enum! {
-    /// The source of an agent's decisions.
-    Control {
-        /// A policy, which learns.
+    /// A [`Control`] without its class.
+    ControlKind {
+        /// See [`Control::Policy`].
         Policy = "policy",
-        /// The class's rule.
+        /// See [`Control::Follow`].
         Follow = "follow",
-        /// It stays where it is.
+        /// See [`Control::Nearest`].
+        Nearest = "nearest",
+        /// See [`Control::Choose`].
+        Choose = "choose",
+        /// See [`Control::Still`].
         Still = "still",
+    }
+}
+
+impl Control {
+    /// Returns the control that a word of a config names, if any.
+    pub(crate) fn of(word: &str) -> Option<Control> {
+        match word.split_once(':') {
+            Some(("nearest", class)) => Some(Control::Nearest(class.into())),
+            Some(("choose", class)) => Some(Control::Choose(class.into())),
+            Some(_) => None,
+            None => [Control::Policy, Control::Follow, Control::Still].into_iter().find(|of| of.to_string() == word),
+        }
+    }
+
+    /// Returns its kind.
+    pub fn kind(&self) -> ControlKind {
+        match self {
+            Control::Policy => ControlKind::Policy,
+            Control::Follow => ControlKind::Follow,
+            Control::Nearest(_) => ControlKind::Nearest,
+            Control::Choose(_) => ControlKind::Choose,
+            Control::Still => ControlKind::Still,
+        }
+    }
+
+    /// Returns the class to whose agents it moves, if any.
+    pub fn target(&self) -> Option<&str> {
+        if let Control::Nearest(class) | Control::Choose(class) = self { Some(class) } else { None }
+    }
+
+    /// Reports whether it learns.
+    pub fn learns(&self) -> bool {
+        self.kind().learns()
+    }
+}
+
+impl ControlKind {
+    /// Reports whether it learns.
+    pub fn learns(self) -> bool {
+        matches!(self, ControlKind::Policy | ControlKind::Choose)
+    }
+}
+
+impl fmt::Display for Control {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.target() {
+            Some(class) => write!(f, "{}:{class}", self.kind()),
+            None => self.kind().fmt(f),
+        }
+    }
+}
+
+impl Serialize for Control {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
     }
 }
 
@@ -121,8 +209,9 @@ table! {
         /// with of = "pois": the groups of POIs that it senses, by default all
         #[serde(skip_serializing_if = "Vec::is_empty", serialize_with = "one_or_list")]
         pois: Vec<String> = "",
-        /// number of sectors of equal angle, counterclockwise; each is an input
-        sectors: usize = "",
+        /// number of sectors of equal angle, counterclockwise; each is an input; with "each", every agent or POI that it
+        /// may sense has a sector of its own, in their order, the agent itself included, whose sector is empty
+        sectors: Sectors = "",
         /// what the sectors turn with: the agent's heading, so that the first begins straight behind, or the map, so that
         /// it begins at the x axis; always "map" with free motion
         frame: Frame = "",
@@ -140,6 +229,35 @@ table! {
         empty: f64 = "",
         /// multiplies the inputs of sectors with something in them
         gain: f64 = "",
+    }
+}
+
+/// The sectors of a channel.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Sectors {
+    /// So many of equal angle.
+    Equal(usize),
+    /// One of each of so many agents or POIs: all that the channel names.
+    Each(usize),
+}
+
+impl Sectors {
+    /// The word for [`Sectors::Each`].
+    pub(crate) const EACH: &str = "each";
+
+    /// Returns their number.
+    pub fn count(self) -> usize {
+        let (Sectors::Equal(count) | Sectors::Each(count)) = self;
+        count
+    }
+}
+
+impl Serialize for Sectors {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        match self {
+            Sectors::Equal(count) => count.serialize(serializer),
+            Sectors::Each(_) => Sectors::EACH.serialize(serializer),
+        }
     }
 }
 
@@ -392,20 +510,26 @@ impl AgentClass {
         self.count.unwrap_or(self.at.len())
     }
 
+    /// Reports whether only small teams can have it.
+    pub(crate) fn is_of_small_teams(&self) -> bool {
+        let senses_each = self.senses.iter().any(|channel| matches!(channel.sectors, Sectors::Each(_)));
+        senses_each || self.moves_near.is_some() || matches!(self.control, Control::Nearest(_) | Control::Choose(_))
+    }
+
     /// Reports whether its agents learn.
     pub fn learns(&self) -> bool {
-        self.control == Control::Policy
+        self.control.learns()
     }
 
     /// Returns the number of inputs that its policies use.
     pub fn inputs(&self) -> usize {
-        self.senses.iter().map(|channel| channel.sectors).sum()
+        self.senses.iter().map(|channel| channel.sectors.count()).sum()
     }
 
     /// Reports whether behaviours can use its inputs, which begin with POIs and agents in the quadrants around its heading.
     pub(crate) fn senses_quadrants(&self) -> bool {
         let is_quadrants = |(channel, of): (&Channel, &str)| {
-            channel.of == [of] && channel.sectors == 4 && channel.frame == Frame::Heading
+            channel.of == [of] && channel.sectors == Sectors::Equal(4) && channel.frame == Frame::Heading
         };
         self.senses.len() >= 2 && self.senses.iter().zip([POIS, AGENTS]).all(is_quadrants)
     }

@@ -6,7 +6,7 @@ use std::ops::Range;
 use fearless_simd::{Simd, prelude::*};
 
 use super::classes::{AGENTS, AgentClass, Term};
-use super::motion::{GRID, MapLanes, MotionLanes, rotate};
+use super::motion::{GRID, MotionConstants, MotionLanes, rotate};
 use super::sense::NOTHING;
 use super::{LONGEST, Ranges, TINY, one_range, ranges};
 use crate::gpu_struct::gpu_struct;
@@ -84,6 +84,10 @@ gpu_struct! {
     pub struct RuleConstants as RuleLanes {
         /// The distance within which walls push.
         pub wall_radius: f32,
+        /// The x up to which the wall on the left pushes.
+        pub near_x: f32,
+        /// The y up to which the wall below pushes.
+        pub near_y: f32,
         /// The push per unit that a wall is nearer than that.
         pub wall_gain: f32,
         /// The base of the lattice of offsets, on which they are added.
@@ -102,10 +106,12 @@ fn lattices(terms: &[Term], agents: usize) -> [[f32; 2]; 2] {
 
 impl RuleConstants {
     /// Computes the constants of a class's rule, in teams of so many agents.
-    pub(crate) fn new(class: &AgentClass, agents: usize) -> RuleConstants {
+    pub(crate) fn new(class: &AgentClass, motion: &MotionConstants, agents: usize) -> RuleConstants {
         let [[offset_base, _], [heading_base, _]] = lattices(&class.rule, agents);
         RuleConstants {
             wall_radius: class.wall_radius as f32,
+            near_x: motion.low_x + class.wall_radius as f32,
+            near_y: motion.low_y + class.wall_radius as f32,
             wall_gain: class.wall_gain as f32,
             offset_base,
             heading_base,
@@ -209,22 +215,22 @@ impl<S: Simd> SteeringForce<S> {
 
     /// Adds the walls' push at a position, after all terms.
     #[inline(always)]
-    pub(crate) fn add_walls(&mut self, rule: &RuleLanes<S>, map: &MapLanes<S>, x: S::f32s, y: S::f32s) {
-        let (push_x, near_x) = walls::<S>(rule, x, map.map_x);
-        let (push_y, near_y) = walls::<S>(rule, y, map.map_y);
+    pub(crate) fn add_walls(&mut self, rule: &RuleLanes<S>, motion: &MotionLanes<S>, x: S::f32s, y: S::f32s) {
+        let (push_x, near_x) = walls::<S>(rule, x, rule.near_x, motion.high_x);
+        let (push_y, near_y) = walls::<S>(rule, y, rule.near_y, motion.high_y);
         self.x = flush::<S>(self.x + push_x, TINY);
         self.y = flush::<S>(self.y + push_y, TINY);
         self.influenced |= larger::<S>(near_x, near_y).simd_ge(0.0);
     }
 }
 
-/// Returns the push of the two walls of one axis, at 0 and at `size`, and a number that is not negative if either is
-/// within their radius.
+/// Returns the push of the two walls of one axis, and a number that is not negative if either is within their radius. The
+/// first pushes up to `near`, and the other is at `end`.
 #[inline(always)]
-fn walls<S: Simd>(rule: &RuleLanes<S>, at: S::f32s, size: S::f32s) -> (S::f32s, S::f32s) {
+fn walls<S: Simd>(rule: &RuleLanes<S>, at: S::f32s, near: S::f32s, end: S::f32s) -> (S::f32s, S::f32s) {
     let zero = splat(at.token(), 0.0);
-    let low = rule.wall_radius - at;
-    let high = rule.wall_radius - (size - at);
+    let low = near - at;
+    let high = rule.wall_radius - (end - at);
     ((larger::<S>(low, zero) - larger::<S>(high, zero)) * rule.wall_gain, larger::<S>(low, high))
 }
 
@@ -304,7 +310,7 @@ mod tests {
             let (lanes, zero) = (Lanes::new(simd, world.constants, &world.classes), splat(simd, 0.0));
             let (class, mut force) = (&lanes.classes[1], SteeringForce::none(simd));
             (0..2).for_each(|term| force.add(&class.terms[term], &Sum::new(simd)));
-            force.add_walls(&class.constants.rule, &lanes.map, zero, zero);
+            force.add_walls(&class.constants.rule, &class.constants.motion, zero, zero);
             let force2 = sizes::<S>(&force).0;
             force2[0]
         }

@@ -15,13 +15,14 @@ pub(crate) mod couple;
 pub(crate) mod follow;
 pub(crate) mod motion;
 pub mod policy;
+pub(crate) mod pursue;
 pub mod region;
 pub mod rule;
 pub mod sense;
 pub mod start;
 
 use class::{Class, ClassConstants, ClassLanes, ClassShape};
-use classes::{Combine, Control, Frame, Measure};
+use classes::{Combine, ControlKind, Frame, Measure};
 use follow::{TermConstants, TermShape};
 use motion::{GRID, INVERSE_GRID, MapConstants, MapLanes};
 use policy::{BEHAVIOURS, PolicyConstants};
@@ -138,9 +139,9 @@ pub(crate) fn declarations() -> String {
         ClassConstants::wgsl(),
         Class::wgsl(),
     ];
-    [structs.concat(), Measure::wgsl(), Combine::wgsl(), Frame::wgsl(), Control::wgsl(), constants].concat()
+    [structs.concat(), Measure::wgsl(), Combine::wgsl(), Frame::wgsl(), ControlKind::wgsl(), constants].concat()
 }
 
 /// The parts' shaders.
 #[cfg_attr(not(feature = "gpu"), expect(dead_code, reason = "only GPUs have shaders"))]
-pub(crate) const WGSL: [&str; 5] = [sense::WGSL, policy::WGSL, follow::WGSL, motion::WGSL, couple::WGSL];
+pub(crate) const WGSL: [&str; 6] = [sense::WGSL, policy::WGSL, follow::WGSL, pursue::WGSL, motion::WGSL, couple::WGSL];

@@ -3,6 +3,7 @@
 use std::f64::consts::{FRAC_PI_2, PI};
 
 use fearless_simd::{Simd, prelude::*};
+use glam::{DVec2, Vec2};
 
 use super::{LEAST, TINY};
 use crate::gpu_struct::gpu_struct;
@@ -41,6 +42,16 @@ pub enum Mobility {
         /// The largest speed along each axis of the map, in units per second.
         max_speed: f64,
     },
+}
+
+impl Mobility {
+    /// Returns the largest speed, of free motion along each axis, in units per second.
+    pub fn max_speed(&self) -> f64 {
+        match self {
+            Mobility::Steered(motion) => motion.max_speed,
+            Mobility::Free { max_speed } => *max_speed,
+        }
+    }
 }
 
 impl Motion {
@@ -121,6 +132,14 @@ gpu_struct! {
         pub max_turn_cos: f32,
         /// The sine of the maximum turn, or 0 if any turn is allowed.
         pub max_turn_sin: f32,
+        /// The limits of x, in units: those of the map, or of a box on the grid.
+        pub low_x: f32,
+        /// The upper limit of x.
+        pub high_x: f32,
+        /// The limits of y.
+        pub low_y: f32,
+        /// The upper limit of y.
+        pub high_y: f32,
     }
 }
 
@@ -132,13 +151,23 @@ impl MapConstants {
 }
 
 impl MotionConstants {
-    /// Computes the constants for steps of `dt` seconds.
-    pub(crate) fn new(mobility: &Mobility, speed: f64, dt: f64) -> MotionConstants {
+    /// Computes the constants for steps of `dt` seconds on a map, in a box `[x0, y0, x1, y1]` if given.
+    pub(crate) fn new(
+        mobility: &Mobility,
+        speed: f64,
+        stays_in: Option<[f64; 4]>,
+        map: [f64; 2],
+        dt: f64,
+    ) -> MotionConstants {
         let free = |max_speed| Motion { min_speed: 0.0, max_speed, max_acceleration: 0.0, max_turn_rate: 0.0 };
         let motion = match mobility {
             Mobility::Steered(motion) => motion.clone(),
             Mobility::Free { max_speed } => free(*max_speed),
         };
+        let map = Vec2::new(map[0] as f32, map[1] as f32);
+        let [low, high] = stays_in.map_or([Vec2::ZERO, map], |[x0, y0, x1, y1]| {
+            [[x0, y0], [x1, y1]].map(|corner| on_grid(DVec2::from(corner).as_vec2(), map))
+        });
         let turn = (motion.max_turn_rate * dt).min(PI);
         let any_turn = turn >= PI;
         MotionConstants {
@@ -149,7 +178,16 @@ impl MotionConstants {
             max_turn: turn as f32,
             max_turn_cos: if any_turn { -2.0 } else { libm::cos(turn) as f32 },
             max_turn_sin: if any_turn { 0.0 } else { libm::sin(turn) as f32 },
+            low_x: low.x,
+            high_x: high.x,
+            low_y: low.y,
+            high_y: high.y,
         }
+    }
+
+    /// Clamps a place to the limits.
+    pub(crate) fn confine(&self, place: Vec2) -> Vec2 {
+        place.clamp(Vec2::new(self.low_x, self.low_y), Vec2::new(self.high_x, self.high_y))
     }
 
     /// Reports whether the maximum turn is so small that angles are compared by their sines instead of their cosines.
@@ -163,6 +201,11 @@ impl MotionConstants {
 pub const GRID: f32 = 262_144.0;
 /// The size of a grid cell.
 pub(crate) const INVERSE_GRID: f32 = 1.0 / GRID;
+
+/// Rounds a position to the kernels' grid, and clamps it to the map.
+pub fn on_grid(place: Vec2, map: Vec2) -> Vec2 {
+    ((place * GRID + 0.5).floor() / GRID).clamp(Vec2::ZERO, map)
+}
 
 /// Rotates a heading to the left, by the angle of this cosine and sine.
 #[inline(always)]
@@ -193,10 +236,10 @@ pub(crate) fn accelerate<S: Simd>(motion: &MotionLanes<S>, speed: S::f32s, wante
     clamp_to::<S>(speed + change, motion.min_speed, motion.max_speed)
 }
 
-/// Moves one coordinate by a distance along one component of a heading, clamped to the map and rounded to the grid.
+/// Moves one coordinate by a distance along one component of a heading, rounded to the grid and clamped to limits.
 #[inline(always)]
-pub fn advance<S: Simd>(at: S::f32s, step: S::f32s, heading: S::f32s, size: S::f32s) -> S::f32s {
-    clamp_to::<S>(snap::<S>(at + step * heading), splat(at.token(), 0.0), size)
+pub fn advance<S: Simd>(at: S::f32s, step: S::f32s, heading: S::f32s, [low, high]: [S::f32s; 2]) -> S::f32s {
+    clamp_to::<S>(snap::<S>(at + step * heading), low, high)
 }
 
 /// Rounds a coordinate to the grid.

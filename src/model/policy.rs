@@ -61,16 +61,11 @@ impl Policy {
             actions: Policy::actions(r).choice(Actions::Direct),
         }
     }
+}
 
-    /// Returns the widths of all layers, from inputs to outputs.
-    pub fn widths(&self, inputs: usize) -> Vec<usize> {
-        [&[inputs], &self.hidden[..], &[self.actions.outputs()]].concat()
-    }
-
-    /// Returns the weights of one policy with so many inputs, biases included.
-    pub fn parameters(&self, inputs: usize) -> usize {
-        self.widths(inputs).windows(2).map(|w| (w[0] + 1) * w[1]).sum()
-    }
+/// Returns the weights of one policy with layers of these widths, biases included.
+pub fn parameters(widths: &[usize]) -> usize {
+    widths.windows(2).map(|w| (w[0] + 1) * w[1]).sum()
 }
 
 gpu_struct! {
@@ -82,23 +77,32 @@ gpu_struct! {
         pub widths: [u32; MAX_HIDDEN_LAYERS + 2],
         /// Weights, biases included.
         pub parameters: u32,
+        /// The [`Actions`] of policies that choose no agent, by their number.
+        pub actions: u32,
     }
 }
 
 impl PolicyConstants {
-    /// Computes the sizes for a valid section and a number of inputs.
-    pub fn new(policy: &Policy, inputs: usize) -> PolicyConstants {
+    /// Computes the sizes of layers of these widths, from inputs to outputs.
+    ///
+    /// # Panics
+    /// There are too many layers.
+    pub fn new(layers: &[usize], actions: Actions) -> PolicyConstants {
         let mut widths = [0; MAX_HIDDEN_LAYERS + 2];
-        for (width, units) in widths.iter_mut().zip(policy.widths(inputs)) {
+        for (width, &units) in widths[..layers.len()].iter_mut().zip(layers) {
             *width = units as u32;
         }
-        PolicyConstants { layers: policy.hidden.len() as u32 + 1, widths, parameters: policy.parameters(inputs) as u32 }
+        PolicyConstants {
+            layers: layers.len() as u32 - 1,
+            widths,
+            parameters: parameters(layers) as u32,
+            actions: actions as u32,
+        }
     }
 
-    /// Returns what the outputs are, or `None` if their number is neither.
-    pub fn actions(&self) -> Option<Actions> {
-        let outputs = *self.widths.get(self.layers as usize)? as usize;
-        [Actions::Direct, Actions::Behaviours].into_iter().find(|actions| actions.outputs() == outputs)
+    /// Returns what the outputs of policies that choose no agent are.
+    pub fn actions(&self) -> Actions {
+        Actions::of(self.actions)
     }
 
     /// Returns the widest layer, inputs included.

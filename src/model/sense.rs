@@ -5,7 +5,7 @@ use std::ops::Range;
 
 use fearless_simd::{Simd, prelude::*};
 
-use super::classes::{AGENTS, Channel, Combine, Frame, MAX_SECTORS, Measure, POIS};
+use super::classes::{AGENTS, Channel, Combine, Frame, MAX_SECTORS, Measure, POIS, Sectors as SectorsOf};
 use super::{LONGEST, Ranges, one_range, ranges};
 use crate::config_enum::{Choice, config_enum};
 use crate::gpu_struct::gpu_struct;
@@ -21,6 +21,8 @@ pub(crate) const WGSL: &str = include_str!("../../shaders/sense.wgsl");
 // The shader has a case for each, and takes the last for the other one.
 const _: () = assert!(Measure::ALL.len() == 6, "add the new measure to shaders/sense.wgsl, too, and raise this number");
 
+/// Maximum of a measure times a POI's value.
+pub(crate) const MOST_MEASURED: f64 = 2000.0;
 /// The finest lattice of measures, on which they are added: 2^-20.
 const FINEST: f64 = 1.0 / 1_048_576.0;
 /// A squared range that exceeds every distance on a map.
@@ -79,6 +81,8 @@ gpu_struct! {
         pub ranges: Ranges,
         /// Sectors.
         pub sectors: u32,
+        /// Not 0 if each POI or agent has a sector of its own.
+        pub each: u32,
         /// A [`Frame`], by its number.
         pub frame: u32,
         /// A [`Measure`], by its number.
@@ -112,6 +116,17 @@ gpu_struct! {
     }
 }
 
+impl Measure {
+    /// Returns its largest value, if it does not grow below the distance `nearest`.
+    pub(crate) fn largest(self, nearest: f64) -> f64 {
+        match self {
+            Measure::Inverse => 1.0 / nearest,
+            Measure::InverseSquared => 1.0 / (nearest * nearest),
+            _ => 1.0,
+        }
+    }
+}
+
 impl ChannelConstants {
     /// Computes the constants. `of` returns the agents of a class and the POIs of a group; `values` are those of the POIs,
     /// and `agents` is the number of agents.
@@ -133,36 +148,30 @@ impl ChannelConstants {
             false => ranges(of.iter().map(|name| class(name))),
         };
         let value = if of_pois { values.iter().copied().fold(0.0, f32::max) } else { 1.0 };
-        let largest = match measure {
-            Measure::Inverse => 1.0 / nearest,
-            Measure::InverseSquared => 1.0 / (nearest * nearest),
-            _ => 1.0,
-        };
         // No measure exceeds the largest by more than rounding.
-        let size = 1.01 * largest * f64::from(value);
+        let size = 1.01 * measure.largest(*nearest) * f64::from(value);
         let [base, distance] = lattice(agents.max(values.len()), size, FINEST);
         let count = super::each(&ranges).map(|range| range.len()).sum::<usize>();
         let scale = gain * f64::from(distance) / if *combine == Combine::Share { count as f64 } else { 1.0 };
         let mut boundaries = [0.0; 2 * MAX_SECTORS];
-        for (sector, boundary) in boundaries.chunks_exact_mut(2).take(*sectors).enumerate() {
-            boundary.copy_from_slice(&boundary_of(sector, *sectors, *frame));
+        if let SectorsOf::Equal(sectors) = *sectors {
+            for (sector, boundary) in boundaries.chunks_exact_mut(2).take(sectors).enumerate() {
+                boundary.copy_from_slice(&boundary_of(sector, sectors, *frame));
+            }
         }
         ChannelConstants {
             shape: ChannelShape {
                 of_pois: of_pois.into(),
                 ranges,
-                sectors: *sectors as u32,
+                sectors: sectors.count() as u32,
+                each: matches!(sectors, SectorsOf::Each(_)).into(),
                 frame: *frame as u32,
                 measure: *measure as u32,
                 combine: *combine as u32,
                 counts: (matches!(combine, Combine::Mean | Combine::Closest) || *empty != 0.0).into(),
                 input: input as u32,
             },
-            range2: match range {
-                _ if range.is_infinite() => UNLIMITED,
-                0.0 => NOTHING,
-                _ => (range * range) as f32,
-            },
+            range2: squared_range(*range),
             base,
             slope: match measure {
                 Measure::Distance | Measure::Closeness => (1.0 / range) as f32,
@@ -173,6 +182,15 @@ impl ChannelConstants {
             empty: *empty as f32,
             boundaries,
         }
+    }
+}
+
+/// Returns the square of a range.
+pub(crate) fn squared_range(range: f64) -> f32 {
+    match range {
+        _ if range.is_infinite() => UNLIMITED,
+        0.0 => NOTHING,
+        _ => (range * range) as f32,
     }
 }
 
@@ -373,7 +391,7 @@ impl<S: Simd> Sectors<S> {
 
 /// Returns the input of a sector from the sum, or the largest, of its measures, and the number of its entities.
 #[inline(always)]
-fn input_of<S: Simd>(channel: &ChannelLanes<S>, sum: S::i32s, count: S::i32s) -> S::f32s {
+pub(crate) fn input_of<S: Simd>(channel: &ChannelLanes<S>, sum: S::i32s, count: S::i32s) -> S::f32s {
     let (sum, simd) = (nearest_f32::<S>(sum), channel.scale.token());
     let shape = &channel.shape;
     let value = if shape.combine == Combine::Mean as u32 {

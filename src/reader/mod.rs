@@ -627,7 +627,10 @@ impl<'a> Reader<'a> {
                 Some(items.into_iter().enumerate().map(named).collect())
             }
             _ => {
-                let lengths = between(*lengths.start(), *lengths.end());
+                let lengths = match (lengths.start(), lengths.end()) {
+                    (least, &usize::MAX) => format!("{least} or more"),
+                    (&least, &most) => between(least, most).to_string(),
+                };
                 self.report(place, &name, format!("found {found}, allowed a list of {lengths} {what}"));
                 None
             }

@@ -82,6 +82,38 @@ impl<'a> KeyRequest<'_, 'a> {
         String::new()
     }
 
+    /// Returns what `parse` makes of a word, or `None` without the key or if the word is wrong. `default` describes what
+    /// that means, `range` the words, and `parse` returns those that are allowed instead.
+    pub fn optional_word<T>(
+        mut self,
+        range: &str,
+        default: &str,
+        parse: impl FnOnce(&str) -> Result<T, String>,
+    ) -> Option<T> {
+        let entry = self.take(|| ("word".into(), range.into(), Some(default.into())))?;
+        let allowed = match entry.value.word().map(parse) {
+            Some(Ok(parsed)) => return Some(parsed),
+            Some(Err(allowed)) => allowed,
+            None => range.into(),
+        };
+        self.reader.report(entry.place(), &entry.name, format!("found {}, allowed {allowed}", entry.value.found()));
+        None
+    }
+
+    /// Returns a number, or `None` if the value is this word, or the default without the key.
+    pub fn number_or<T: Number>(mut self, allowed: Allowed<T>, word: &str, default: T) -> Option<T> {
+        let (kind, range) = (kind::<T>(), format!("{}, or {word:?}", allowed.in_general()));
+        match self.take(|| (format!("{kind}, or a word"), range, Some(written(&default)))) {
+            Some(entry) if entry.value.word() == Some(word) => None,
+            Some(entry) if T::read(&entry.value).is_none() => {
+                let message = format!("found {}, allowed {}, {allowed}, or {word:?}", entry.value.found(), T::KIND);
+                self.reader.report(entry.place(), &entry.name, message);
+                Some(allowed.nearest(default))
+            }
+            entry => Some(self.reader.number(self.name, entry, allowed, default)),
+        }
+    }
+
     /// Returns a list of names, written as such or as one name. By default it is empty, but `is_required` makes that a
     /// problem. `allowed` are the names that there are, unless they are unknown, and `range` describes them for any
     /// config. `check` returns what is wrong with one of these names.

@@ -53,11 +53,52 @@ coupling = 2
 value = 2.0
 ";
 
+/// UAVs in a box, which sense each POI and rover, scouts that choose rovers and move only near them, and rovers that follow
+/// the nearest UAV.
+const PURSUIT: &str = "
+[world]
+steps = 30
+dt = 0.5
+[[agents]]
+name = \"uav\"
+at = [[20, 20], [30, 20]]
+motion = { kind = \"free\", max_speed = 3.0 }
+stays_in = [15, 10, 40, 33.3]
+senses = [
+    { of = \"pois\", sectors = \"each\", measure = \"closeness\", range = 20, empty = -1 },
+    { of = [\"rover\", \"uav\"], sectors = \"each\", measure = \"inverse\", combine = \"sum\" },
+]
+leads = \"rover\"
+influence_radius = 8
+observes = false
+[[agents]]
+name = \"scout\"
+at = [[22, 24], [28, 24], [25, 17]]
+control = \"choose:rover\"
+senses = [{ of = \"rover\", range = 6, measure = \"closeness\", combine = \"closest\" }, { of = \"pois\" }]
+moves_near = \"rover\"
+[[agents]]
+name = \"rover\"
+at = [[18, 22], [25, 22], [33, 22], [26, 15]]
+control = \"nearest:uav\"
+reach = 9.0
+motion = { kind = \"free\", max_speed = 1.5 }
+[[agents]]
+name = \"truck\"
+at = [[24, 14], [25, 28]]
+control = \"nearest:truck\"
+stays_in = [20, 10, 30, 30]
+[[pois]]
+name = \"poi\"
+at = [[16, 27], [26, 31], [36, 26], [25, 12]]
+coupling = 2
+";
+
 /// Name, description, config, and the keys that are changed.
 pub type Case = (&'static str, &'static str, &'static str, &'static [(&'static str, &'static str)]);
 
 /// Together these cases cover every choice in a config, and sizes on both sides of every special case.
-pub const CASES: [Case; 45] = [
+pub const CASES: [Case; 46] = [
     ("generally-forward", "first layout, leader-follower, Df", GENERALLY_FORWARD, &[]),
     ("strictly-forward", "second layout, D++", STRICTLY_FORWARD, &[("learning.fitness", "'D++'")]),
     ("chaotic", "third layout, G", CHAOTIC, &[("learning.fitness", "'G'")]),
@@ -414,6 +455,12 @@ pub const CASES: [Case; 45] = [
             ("learning.start_jitter", "0.5"),
             ("learning.fitness", "'D'"),
         ],
+    ),
+    (
+        "pursuit",
+        "classes that move to the nearest agent, choose one, stay in a box and move only near others, Df",
+        PURSUIT,
+        &[("learning.start_jitter", "0.5")],
     ),
 ];
 

@@ -45,8 +45,8 @@ interface Episode extends Seen {
   senses?: Float32Array, without?: { alone: Seen, group: Seen }[],
 }
 /** A channel of a class's senses, and a class of agents. Those that learn come first. */
-interface Channel { of: string | string[], sectors: number, frame: "heading" | "map" }
-interface AgentClass { name: string, count: number, free: boolean, senses: Channel[] }
+interface Channel { of: string | string[], sectors: number, each?: boolean, frame: "heading" | "map" }
+interface AgentClass { name: string, count: number, free: boolean, senses: Channel[], choose?: { name: string, agents: number[] } }
 /** What only full configs have: classes of agents, groups of POIs, and the radius and value of each POI if they differ. */
 interface Parts { classes?: AgentClass[], groups?: { name: string, count: number }[], radii?: number[], values?: number[] }
 interface Scene extends Rule, Parts {

@@ -32,16 +32,20 @@ export const name_of_leader = (data, leader) => `${class_of(data, leader).name} 
  */
 export function moment(data, { senses = new Float32Array(), leaders, shown }, frame, leader) {
   const size = senses.length / (shown.length * leaders), at = (frame * leaders + leader) * size, own = [...senses.subarray(at, at + size)];
-  const { free, senses: channels } = class_of(data, leader), answer = own.slice(-2);
-  return { channels: channels.map(channel => ({ ...channel, values: own.splice(0, channel.sectors) })), free, answer };
+  const { free, choose, senses: channels } = class_of(data, leader), answer = own.slice(-2);
+  return { channels: channels.map(channel => ({ ...channel, values: own.splice(0, channel.sectors) })), free, choose, answer };
 }
 
 /** Describes a moment in words. @param {ReturnType<typeof moment>} now */
-export function words({ channels, free, answer: [turn, speed] }) {
+export function words({ channels, free, choose, answer: [turn, speed] }) {
   const list = channels.map(({ of, sectors, frame, values }) => {
     const name = [of].flat().map(name => name === "pois" ? "POIs" : name).join(" and "), quadrants = sectors === 4 && frame === "heading";
     return `${name}: ${values.map((value, sector) => (quadrants ? `${QUADRANTS[sector]} ` : "") + value.toFixed(2)).join(", ")}`;
   });
+  if (choose) {
+    const chosen = choose.agents[Math.round((turn + 1) / 2 * choose.agents.length)];
+    return `senses ${list.join("; ")}. It goes to ${chosen === undefined ? "nobody" : `${choose.name} ${chosen}`}.`;
+  }
   if (free) return `senses ${list.join("; ")}. It moves by ${(turn * 100).toFixed(0)} % of the largest speed along x, ${(speed * 100).toFixed(0)} % along y.`;
   const way = Math.abs(turn) < 0.02 ? "straight ahead" : `${(Math.abs(turn) * 180).toFixed(0)}° to the ${turn > 0 ? "left" : "right"}`;
   return `senses ${list.join("; ")}. It answers ${way}, at ${((speed + 1) * 50).toFixed(0)} % of the largest speed.`;

@@ -155,6 +155,7 @@ function senses(view, data) {
   const [x, y, cos, sin] = stage.moment(data, episode, frame - 1, leader), ahead = Math.atan2(sin, cos);
   const pen = pen_of(view.canvas), style = getComputedStyle(document.documentElement);
   now.channels.forEach(({ values, ...channel }, index) => {
+    if (channel.each) return;
     const most = Math.max(...values, 1e-9), size = 46 * (1 - index / now.channels.length);
     const tone = channel.of === "pois" ? "--poi" : "--accent", zero = channel.frame === "heading" ? ahead : 0;
     values.forEach((value, sector) => {

@@ -50,7 +50,13 @@ impl Drive {
     pub fn step(&mut self, own: [f32; 2]) -> Result<(), Refusal> {
         let world = self.stepper.world();
         let mut actions = vec![0.0; world.leaders() * OUTPUTS];
-        cpu::forward(&world.constants.policy, &self.policies, self.stepper.inputs(), &|leader| leader, &mut actions);
+        for class in world.classes.iter().filter(|class| class.constants.shape.control().learns()) {
+            let (own, width) = (class.agents(), world.inputs());
+            let inputs = &self.stepper.inputs()[own.start * width..own.end * width];
+            let to = &mut actions[own.start * OUTPUTS..own.end * OUTPUTS];
+            let choices = class.constants.shape.choices();
+            cpu::forward(&world.constants.policy, &self.policies, inputs, &|row| own.start + row, choices, to);
+        }
         actions[self.leader * OUTPUTS..][..OUTPUTS].copy_from_slice(&own);
         self.stepper.step(&actions).map_err(refuse)?;
         let step = self.stepper.steps()[0];

@@ -32,7 +32,9 @@ const QUADRANTS: &str = "pois_back_right,pois_front_right,pois_front_left,pois_b
 /// Returns the columns of what policies sense and answer. The inputs of several classes have numbers.
 fn sensed(world: &World) -> String {
     let by_quadrants = |channels: &[ChannelConstants]| {
-        let is_quadrants = |channel: &ChannelShape| channel.sectors == 4 && channel.frame == Frame::Heading as u32;
+        let is_quadrants = |channel: &ChannelShape| {
+            channel.sectors == 4 && channel.each == 0 && channel.frame == Frame::Heading as u32
+        };
         matches!(channels, [pois, agents] if pois.shape.of_pois != 0 && agents.shape.of_pois == 0)
             && channels.iter().all(|channel| is_quadrants(&channel.shape))
     };

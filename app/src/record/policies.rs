@@ -45,7 +45,7 @@ fn tensor(trial: usize) -> String {
 
 /// Returns the layer widths of a config's policies, such as "8,10,2".
 pub fn layers(config: &Config) -> String {
-    config.policy.widths(config.inputs()).iter().map(ToString::to_string).collect::<Vec<_>>().join(",")
+    config.widths().iter().map(ToString::to_string).collect::<Vec<_>>().join(",")
 }
 
 /// Writes the policies of all trials of a config, each `[populations][population][parameters]`. Returns the file's

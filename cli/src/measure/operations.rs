@@ -7,7 +7,7 @@
 //! | entities in reach of an agent of their team | tests of pairs that are out of reach |
 
 use flotilla::backend::Trace;
-use flotilla::config::{Combine, Control, Measure};
+use flotilla::config::{Combine, ControlKind, Measure};
 use flotilla::model;
 use flotilla::model::class::Class;
 use flotilla::model::policy::{Actions, PolicyConstants};
@@ -164,6 +164,8 @@ const STEER: u32 = 3 + RSQRT + 2 // the force's square and direction
     + 2; // 2 tests of the force
 /// The test whether the force is within the maximum turn: the sine, its size, and a test that is already counted.
 const WITHIN: u32 = 3;
+/// An agent to which, or near which, another one may move: two tests, three selections.
+const PURSUE: u32 = SQUARED_DISTANCE + 5;
 /// An agent is tested for a POI and added to its set: a test, a selection, a union.
 const OBSERVE: u32 = SQUARED_DISTANCE + 3;
 
@@ -182,6 +184,7 @@ fn sense(channel: &ChannelConstants) -> u32 {
     // The number, its selections and sums.
     let counted = if channel.shape.counts != 0 { 1 + 3 + 4 } else { 0 };
     let sectors = match (channel.shape.sectors, Combine::of(channel.shape.combine)) {
+        _ if channel.shape.each != 0 => 1,
         // 4 tests, their combinations, 3 selections of halves, 4 sums.
         (4, Combine::Share | Combine::Sum | Combine::Mean) => 4 + 4 + 3 + 4 + counted,
         // Per sector: two products, their difference, as many for the tie, its tests, selections and sums.
@@ -206,7 +209,7 @@ fn scale(channel: &ChannelConstants) -> u32 {
 /// conversion of the outputs to a wanted turn and speed. A bias starts a sum.
 fn decide(policy: &PolicyConstants) -> u32 {
     let layers = policy.widths[..=policy.layers as usize].windows(2);
-    let chosen = if policy.actions() == Some(Actions::Behaviours) { CHOOSE } else { 0 };
+    let chosen = if policy.actions() == Actions::Behaviours { CHOOSE } else { 0 };
     layers.map(|widths| widths[1] * (2 * widths[0] + FLUSH + TANH)).sum::<u32>() + chosen + 1
 }
 
@@ -219,17 +222,29 @@ pub fn per_team_step(world: &World, reach: &Reach) -> f64 {
         let sensing: f64 =
             channels.map(|(channel, &sensed)| count(sensed, sense(channel)) + count(agents, scale(channel))).sum();
         let met: f64 = reach.met[index].iter().map(|&met| count(met, MEET) + count(agents, TERM)).sum();
-        let control = match (class.constants.shape.control(), class.constants.shape.free != 0) {
-            (Control::Policy, free) => {
+        let shape = &class.constants.shape;
+        let pursuit = (shape.end_target - shape.first_target) * PURSUE + (shape.end_near - shape.first_near) * PURSUE;
+        let control = match (shape.control(), shape.free != 0) {
+            (ControlKind::Policy, free) => {
                 decide(&world.constants.policy)
                     + if free { 2 } else { TURN + 3 }
                     + if free { MOVE_FREELY } else { MOVE }
             }
-            (Control::Follow, true) => WALLS + INFLUENCED + 2 * CLAMP + MOVE_FREELY,
-            (Control::Follow, false) => FOLLOW + MOVE,
-            (Control::Still, _) => 0,
+            (ControlKind::Choose, free) => {
+                decide(&world.constants.policy) + if free { MOVE_FREELY } else { STEER + MOVE }
+            }
+            (ControlKind::Follow, true) => WALLS + INFLUENCED + 2 * CLAMP + MOVE_FREELY,
+            (ControlKind::Follow, false) => FOLLOW + MOVE,
+            (ControlKind::Nearest, free) => {
+                if free {
+                    MOVE_FREELY
+                } else {
+                    STEER + MOVE
+                }
+            }
+            (ControlKind::Still, _) => 0,
         };
-        sensing + met + count(agents, control)
+        sensing + met + count(agents, control + pursuit)
     };
     world.classes.iter().enumerate().map(per_class).sum::<f64>()
         + count(reach.seen, SEE + SQUARED_DISTANCE + 1)

@@ -9,14 +9,14 @@ use super::agent::Agent;
 use super::neighbours::{self, Bounds, Masks, masks};
 use super::pois::PoiPosition;
 use crate::backend::Moment;
-use crate::config::{Combine, Control, Frame, Measure};
+use crate::config::{Combine, ControlKind, Frame, Measure};
 use crate::config_enum::ConstDispatch;
 use crate::kernels::math::{on_lattice, within};
-use crate::kernels::{clamp_to, splat};
+use crate::kernels::{clamp_to, select, splat};
 use crate::model::class::{Class, ClassLanes};
 use crate::model::follow::{self, Sum};
 use crate::model::sense::{self, ChannelLanes};
-use crate::model::{self, Lanes, motion, policy};
+use crate::model::{self, Lanes, motion, policy, pursue};
 use crate::world::{OUTPUTS, World};
 
 /// The state of one vector of teams, one team per lane, with scratch memory for a step. A step reads only the
@@ -36,6 +36,8 @@ pub(crate) struct Block<S: Simd> {
     velocities: Vec<[S::f32s; 2]>,
     /// The headings before the step, `[agents]`; empty unless a rule aligns them.
     headings: Vec<[S::f32s; 2]>,
+    /// The agents of classes that move only near others, before the step, and the lanes in which they move.
+    kept: Vec<(Agent<S>, S::mask32s)>,
     /// `[followers]`.
     followers: Vec<Follower<S>>,
     /// The number of steps at which each follower saw each leader, `[followers][leaders]`.
@@ -68,6 +70,14 @@ pub(super) struct Follower<S: Simd> {
     sizes: (S::f32s, S::f32s),
 }
 
+impl<S: Simd> Follower<S> {
+    #[inline(always)]
+    fn new(simd: S, force: follow::SteeringForce<S>) -> Follower<S> {
+        let zero = splat(simd, 0.0);
+        Follower { sums: [Sum::new(simd); 2], force, sizes: (zero, zero) }
+    }
+}
+
 impl<S: Simd> Block<S> {
     pub fn new(simd: S, world: &World) -> Block<S> {
         let zero = splat(simd, 0.0);
@@ -82,7 +92,8 @@ impl<S: Simd> Block<S> {
             wanted: vec![zero; agents],
             velocities: vec![[zero; 2]; agents],
             headings: vec![[zero; 2]; if world.aligns() { agents } else { 0 }],
-            followers: vec![Follower { sums: [Sum::new(simd); 2], force, sizes: (zero, zero) }; followers],
+            kept: vec![],
+            followers: vec![Follower::new(simd, force); followers],
             counts: vec![S::u32s::splat(simd, 0); followers * leaders],
             near: vec![0; agents.div_ceil(64) * agents],
             bounds: vec![Bounds::nowhere(simd); agents.div_ceil(S::f32s::LEN)],
@@ -152,7 +163,9 @@ impl<S: Simd> Block<S> {
             for (channel, others) in class.channels.iter().zip(&plan.channels) {
                 let scene = Scene { simd: *simd, channel, pois, values, agents, near, others };
                 let (observers, inputs) = (shape.agents(), Inputs { all: &mut *inputs, width });
-                if channel.shape.sectors == 4 && channel.shape.combine != Combine::Closest as u32 {
+                if channel.shape.each != 0 {
+                    scene.sense_each(observers, inputs);
+                } else if channel.shape.sectors == 4 && channel.shape.combine != Combine::Closest as u32 {
                     Measure::of(channel.shape.measure).dispatch(Quartering { scene, observers, inputs });
                 } else {
                     scene.sense_sectors(observers, inputs);
@@ -168,20 +181,46 @@ impl<S: Simd> Block<S> {
         if !sights.is_empty() {
             self.record_sightings(sights);
         }
+        self.keep();
         self.lead();
         self.follow();
         self.move_agents();
         self.record_poi_sets(pois, sets);
     }
 
+    /// Keeps the agents of classes that move only near others, and finds out whether they move.
+    #[inline(always)]
+    fn keep(&mut self) {
+        let Block { world, agents, kept, .. } = self;
+        kept.clear();
+        for class in world.classes.iter().filter(|class| class.constants.shape.end_near > 0) {
+            let (shape, near2) = (&class.constants.shape, class.constants.pursuit.near2);
+            for agent in class.agents() {
+                let near = offsets(agents, agent, shape.first_near..shape.end_near);
+                kept.push((agents[agent], pursue::nearest::<S>(agent, near2, near).1));
+            }
+        }
+    }
+
     /// Leaders turn, and set their wanted speed or their velocity, by their policies' outputs.
     #[inline(always)]
     fn lead(&mut self) {
-        let Block { world, agents, outputs, wanted, velocities, headings, .. } = self;
+        let Block { simd, world, agents, outputs, wanted, velocities, headings, .. } = self;
         headings.iter_mut().zip(&*agents).for_each(|(heading, agent)| *heading = [agent.hx, agent.hy]);
-        for class in world.classes.iter().filter(|class| class.control() == Control::Policy) {
+        for class in world.classes.iter().filter(|class| class.control().learns()) {
             let (shape, motion) = (&class.constants.shape, &class.constants.motion);
             let own = shape.agents();
+            if shape.control() == ControlKind::Choose {
+                let pursuit = &class.constants.pursuit;
+                for agent in own {
+                    let targets = offsets(agents, agent, shape.first_target..shape.end_target);
+                    let to = pursue::chosen::<S>(pursuit, outputs[agent][0], targets);
+                    let mut one = [Follower::new(*simd, pursue::towards::<S>(pursuit, motion, to))];
+                    let it = agent..agent + 1;
+                    obey(class, &mut agents[it.clone()], &mut one, &mut wanted[it.clone()], &mut velocities[it]);
+                }
+                continue;
+            }
             if shape.free != 0 {
                 for (velocity, &[x, y]) in velocities[own.clone()].iter_mut().zip(&outputs[own]) {
                     *velocity = [x * motion.max_speed, y * motion.max_speed];
@@ -210,7 +249,22 @@ impl<S: Simd> Block<S> {
             if let Some(leaders) = &plan.leaders {
                 count_leaders(agents, near, own.clone(), leaders, &plan.influences2, counts);
             }
-            if shape.control() != Control::Follow {
+            if shape.control() == ControlKind::Nearest {
+                let pursuit = &class.constants.pursuit;
+                for (agent, follower) in own.clone().zip(&mut *followers) {
+                    let targets = offsets(agents, agent, shape.first_target..shape.end_target);
+                    let (to, _) = pursue::nearest::<S>(agent, pursuit.reach2, targets);
+                    follower.force = pursue::towards::<S>(pursuit, motion, to);
+                }
+                obey(
+                    class,
+                    &mut agents[own.clone()],
+                    followers,
+                    &mut wanted[own.clone()],
+                    &mut velocities[own.clone()],
+                );
+            }
+            if shape.control() != ControlKind::Follow {
                 continue;
             }
             for follower in &mut *followers {
@@ -228,39 +282,28 @@ impl<S: Simd> Block<S> {
                 }
             }
             for (agent, follower) in agents[own.clone()].iter().zip(&mut *followers) {
-                follower.force.add_walls(&class.constants.rule, &world.map, agent.x, agent.y);
+                follower.force.add_walls(&class.constants.rule, motion, agent.x, agent.y);
             }
-            if shape.free != 0 {
-                for (velocity, follower) in velocities[own].iter_mut().zip(followers) {
-                    let (follow::SteeringForce { x, y, .. }, most) = (follower.force, motion.max_speed);
-                    *velocity = [clamp_to::<S>(x, -most, most), clamp_to::<S>(y, -most, most)];
-                }
-                continue;
-            }
-            let (agents, wanted) = (&mut agents[own.clone()], &mut wanted[own]);
-            if shape.by_sine != 0 {
-                steer::<S, true>(motion, agents, followers, wanted);
-            } else {
-                steer::<S, false>(motion, agents, followers, wanted);
-            }
+            obey(class, &mut agents[own.clone()], followers, &mut wanted[own.clone()], &mut velocities[own]);
         }
     }
 
     /// Moves all agents.
     #[inline(always)]
     fn move_agents(&mut self) {
-        let Block { world, agents, wanted, velocities, .. } = self;
+        let Block { world, agents, wanted, velocities, kept, .. } = self;
         let map = &world.map;
         for class in &world.classes {
             let (shape, motion) = (&class.constants.shape, &class.constants.motion);
             let own = shape.agents();
-            if shape.control() == Control::Still {
+            if shape.control() == ControlKind::Still {
                 continue;
             }
+            let (in_x, in_y) = ([motion.low_x, motion.high_x], [motion.low_y, motion.high_y]);
             if shape.free != 0 {
                 for (agent, &[x, y]) in agents[own.clone()].iter_mut().zip(&velocities[own]) {
-                    agent.x = motion::advance::<S>(agent.x, map.dt, x, map.map_x);
-                    agent.y = motion::advance::<S>(agent.y, map.dt, y, map.map_y);
+                    agent.x = motion::advance::<S>(agent.x, map.dt, x, in_x);
+                    agent.y = motion::advance::<S>(agent.y, map.dt, y, in_y);
                 }
                 continue;
             }
@@ -271,9 +314,18 @@ impl<S: Simd> Block<S> {
             }
             for agent in agents {
                 let step = agent.speed * map.dt;
-                agent.x = motion::advance::<S>(agent.x, step, agent.hx, map.map_x);
-                agent.y = motion::advance::<S>(agent.y, step, agent.hy, map.map_y);
+                agent.x = motion::advance::<S>(agent.x, step, agent.hx, in_x);
+                agent.y = motion::advance::<S>(agent.y, step, agent.hy, in_y);
             }
+        }
+        let keep = world.classes.iter().filter(|class| class.constants.shape.end_near > 0).flat_map(ClassLanes::agents);
+        for (agent, &(before, moves)) in keep.zip(&*kept) {
+            let to = &mut agents[agent];
+            to.x = select::<S>(before.x, to.x, moves);
+            to.y = select::<S>(before.y, to.y, moves);
+            to.hx = select::<S>(before.hx, to.hx, moves);
+            to.hy = select::<S>(before.hy, to.hy, moves);
+            to.speed = select::<S>(before.speed, to.speed, moves);
         }
     }
 
@@ -453,6 +505,28 @@ impl<S: Simd, P: PoiPosition<S>> Scene<'_, S, P> {
         }
     }
 
+    /// Senses each POI or agent in a sector of its own.
+    #[inline(always)]
+    fn sense_each(&self, observers: Range<usize>, mut inputs: Inputs<'_, S>) {
+        let &Scene { simd, channel, pois, values, agents, .. } = self;
+        let measure = Measure::of(channel.shape.measure);
+        for observer in observers {
+            let &Agent { x, y, .. } = &agents[observer];
+            let entities = model::each(&channel.shape.ranges).flatten();
+            for (input, index) in inputs.of(observer, channel).iter_mut().zip(entities) {
+                let (offset, value) = match channel.shape.of_pois {
+                    0 => ([agents[index].x - x, agents[index].y - y], 1.0),
+                    _ => (self.offset(&pois[index], x, y), values[index]),
+                };
+                let (measured, within) =
+                    sense::measured::<S>(channel, measure, splat(simd, value), offset[0], offset[1]);
+                let other = S::mask32s::splat(simd, channel.shape.of_pois != 0 || index != observer);
+                let within = (within & other).to_vector();
+                *input = sense::input_of::<S>(channel, measured & within, -within);
+            }
+        }
+    }
+
     /// Senses by any number of sectors.
     #[inline(always)]
     fn sense_sectors(&self, observers: Range<usize>, mut inputs: Inputs<'_, S>) {
@@ -607,6 +681,42 @@ impl<S: Simd> Attraction<'_, S> {
                 follower.force.add(term, sum);
             }
         }
+    }
+}
+
+/// Returns the agents of a range, and the offsets of an agent to them.
+#[inline(always)]
+fn offsets<S: Simd>(
+    agents: &[Agent<S>],
+    agent: usize,
+    others: Range<u32>,
+) -> impl Iterator<Item = (usize, [S::f32s; 2])> {
+    let &Agent { x, y, .. } = &agents[agent];
+    (others.start as usize..others.end as usize).map(
+        #[inline(always)]
+        move |other| (other, [agents[other].x - x, agents[other].y - y]),
+    )
+}
+
+/// Agents of a class take the wanted velocity, or heading and speed, from the force on them.
+#[inline(always)]
+fn obey<S: Simd>(
+    class: &ClassLanes<S>,
+    agents: &mut [Agent<S>],
+    followers: &mut [Follower<S>],
+    wanted: &mut [S::f32s],
+    velocities: &mut [[S::f32s; 2]],
+) {
+    let (shape, motion) = (&class.constants.shape, &class.constants.motion);
+    if shape.free != 0 {
+        for (velocity, follower) in velocities.iter_mut().zip(followers) {
+            let (follow::SteeringForce { x, y, .. }, most) = (follower.force, motion.max_speed);
+            *velocity = [clamp_to::<S>(x, -most, most), clamp_to::<S>(y, -most, most)];
+        }
+    } else if shape.by_sine != 0 {
+        steer::<S, true>(motion, agents, followers, wanted);
+    } else {
+        steer::<S, false>(motion, agents, followers, wanted);
     }
 }
 

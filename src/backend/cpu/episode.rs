@@ -58,7 +58,7 @@ impl<S: Simd> EpisodeBlock<S> {
         EpisodeBlock {
             classes: world.classes.clone(),
             block: Block::new(simd, world),
-            network: Network::new(simd, &world.constants.policy, world.leaders()),
+            network: Network::new(simd, &world.constants.policy, world.choices()),
             places: Vec::with_capacity(S::f32s::LEN),
             moved: Vec::new(),
             sets: vec![0; world.set_words() * S::f32s::LEN],

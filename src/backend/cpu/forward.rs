@@ -12,7 +12,8 @@ use crate::world::OUTPUTS;
 /// Computes the outputs of policies for given inputs, with the bits of an episode.
 ///
 /// `weights` are `[policies][parameters]`, each 0 or of size 2^-30 to 2^20. `inputs` are `[rows][inputs]`. Row `i` is answered
-/// by policy `of(i)`. Writes `outputs`, `[rows][2]`.
+/// by policy `of(i)`. If policies choose agents, it is among `choices` agents; otherwise this is 0. Writes `outputs`,
+/// `[rows][2]`.
 ///
 /// # Panics
 /// An array has the wrong length, or a policy does not exist.
@@ -21,10 +22,11 @@ pub fn forward(
     weights: &[f32],
     inputs: &[f32],
     of: &(impl Fn(usize) -> usize + Sync),
+    choices: usize,
     outputs: &mut [f32],
 ) {
     assert_eq!(inputs.len() / policy.inputs(), outputs.len() / OUTPUTS);
-    dispatch!(Level::new(), simd => forward_rows(simd, policy, weights, inputs, of, outputs));
+    dispatch!(Level::new(), simd => forward_rows(simd, policy, weights, inputs, of, choices, outputs));
 }
 
 /// Rows per task.
@@ -36,11 +38,12 @@ fn forward_rows<S: Simd>(
     weights: &[f32],
     inputs: &[f32],
     of: &(impl Fn(usize) -> usize + Sync),
+    choices: usize,
     outputs: &mut [f32],
 ) {
     outputs.par_chunks_mut(ROWS_PER_TASK * OUTPUTS).enumerate().for_each(|(part, outputs)| {
         let (width, size, parameters) = (S::f32s::LEN, policy.inputs(), policy.parameters as usize);
-        let mut network = Network::new(simd, policy, 1);
+        let mut network = Network::new(simd, policy, vec![choices]);
         let (mut loaded, mut sensed) = (None, vec![splat(simd, 0.0); size]);
         let zero = splat(simd, 0.0);
         for (chunk, outputs) in outputs.chunks_mut(width * OUTPUTS).enumerate() {

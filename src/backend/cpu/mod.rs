@@ -1,4 +1,5 @@
-//! The reference backend: one team per lane, one vector of teams per block, blocks shared out over threads.
+//! The reference backend: one team per lane, one vector of teams per block, blocks shared out over threads. Large teams play
+//! one at a time ([`swarm`]).
 //!
 //! The loops here may skip whatever adds nothing (an agent out of reach in every lane), since sums start at +0 and
 //! keep their order. The formulas are those of [`crate::model`].
@@ -52,6 +53,11 @@ pub struct Cpu {
 /// Smaller teams are faster in vectors of teams, where all pairs are visited: with 256 agents 15 times, with 512 eight times, if a
 /// third of them learns.
 const LARGE_FROM: usize = MAX_LEARNERS + 1;
+
+/// Reports whether teams of a world play one at a time.
+fn is_large(world: &World, large_from: usize) -> bool {
+    world.agents() >= large_from && swarm::can_play(world)
+}
 
 /// The memory of a thread, as it was last used.
 enum Workspace<S: Simd> {
@@ -135,7 +141,7 @@ impl Backend for Cpu {
         group.check()?;
         group.weights.on_host()?;
         let level = self.level;
-        let is_large = group.world.agents() >= self.large_from;
+        let is_large = is_large(group.world, self.large_from);
         Ok(dispatch!(level, simd => if is_large { trace_large(simd, group) } else { trace(simd, group) }))
     }
 
@@ -159,7 +165,7 @@ fn play<S: Simd>(
     scores: &ScoreTable<'_>,
 ) {
     let batches = world_batches(groups);
-    let width = |batch: &WorldBatch<'_>| if batch.world.agents() < large_from { S::f32s::LEN } else { 1 };
+    let width = |batch: &WorldBatch<'_>| if is_large(batch.world, large_from) { 1 } else { S::f32s::LEN };
     let blocks: Vec<(&WorldBatch<'_>, usize)> = batches
         .iter()
         .flat_map(|batch| (0..batch.teams).step_by(width(batch)).map(move |team| (batch, team)))
@@ -174,7 +180,7 @@ fn play<S: Simd>(
         let mut current = take();
         while let Some(&(batch, first)) = current {
             let following = if early { take() } else { None };
-            if batch.world.agents() >= large_from {
+            if is_large(batch.world, large_from) {
                 let swarm = workspace.swarm(simd, batch);
                 simd.vectorize(
                     #[inline(always)]
@@ -371,7 +377,7 @@ pub fn lanes() -> u64 {
 /// Returns the bytes of one vector of teams, or one large team, that are scored by a fitness.
 pub(crate) fn block_bytes(world: &World, fitness: Fitness) -> u64 {
     let (agents, leaders, followers) = (world.agents(), world.leaders(), world.followers());
-    let is_large = agents >= LARGE_FROM;
+    let is_large = is_large(world, LARGE_FROM);
     let paths = if world.paths.is_some() { world.path_words() } else { 0 };
     let counted = if is_large && fitness != Fitness::Df { 0 } else { followers * leaders };
     let record = world.set_words() + counted + sight_words(world, fitness == Fitness::Dt) + paths;

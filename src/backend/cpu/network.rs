@@ -5,14 +5,15 @@ use fearless_simd::{Simd, prelude::*};
 use super::batch::WorldBatch;
 use super::transpose::transpose_rows;
 use crate::kernels::{math, splat};
-use crate::model::policy;
-use crate::model::policy::PolicyConstants;
+use crate::model::policy::{Actions, PolicyConstants};
+use crate::model::{policy, pursue};
 use crate::world::OUTPUTS;
 
 /// The leaders' policies of one vector of teams.
 pub(super) struct Network<S: Simd> {
     simd: S,
-    leaders: usize,
+    /// The number of agents among which each leader chooses, `[leaders]`: 0 unless it chooses agents.
+    choices: Vec<usize>,
     constants: PolicyConstants,
     /// `[leaders][parameters]`, layer by layer. Units that are computed together (see [`together`]) form a block: one
     /// row per input, then the biases.
@@ -24,7 +25,8 @@ pub(super) struct Network<S: Simd> {
 }
 
 impl<S: Simd> Network<S> {
-    pub(super) fn new(simd: S, policy: &PolicyConstants, leaders: usize) -> Network<S> {
+    pub(super) fn new(simd: S, policy: &PolicyConstants, choices: Vec<usize>) -> Network<S> {
+        let leaders = choices.len();
         let (zero, widest, parameters) = (splat(simd, 0.0), policy.widest(), policy.parameters as usize);
         let mut slots = vec![0; parameters];
         let (mut first, mut slot) = (0, 0);
@@ -43,7 +45,7 @@ impl<S: Simd> Network<S> {
         }
         Network {
             simd,
-            leaders,
+            choices,
             constants: *policy,
             weights: vec![zero; leaders * parameters],
             slots,
@@ -87,8 +89,8 @@ impl<S: Simd> Network<S> {
     /// Computes the leaders' outputs.
     #[inline(always)]
     pub(super) fn decide(&mut self, inputs: &[S::f32s], outputs: &mut [[S::f32s; OUTPUTS]]) {
-        let Network { weights, hidden, leaders, constants, .. } = self;
-        let (leaders, &mut PolicyConstants { layers, widths, parameters }) = (*leaders, constants);
+        let Network { weights, hidden, choices, constants, .. } = self;
+        let (leaders, &mut PolicyConstants { layers, widths, parameters, .. }) = (choices.len(), &mut *constants);
         let mut first = 0;
         let [mut to, mut from] = hidden.each_mut().map(|units| &mut units[..]);
         for (layer, widths) in widths[..=layers as usize].windows(2).enumerate() {
@@ -128,13 +130,19 @@ impl<S: Simd> Network<S> {
             first += (rows + 1) * columns;
             std::mem::swap(&mut from, &mut to);
         }
-        if widths[layers as usize] as usize == OUTPUTS {
+        let (actions, width) = (constants.actions(), widths[layers as usize] as usize);
+        if width == OUTPUTS && choices.iter().all(|&choices| choices == 0) {
             return outputs.copy_from_slice(&from.as_chunks::<OUTPUTS>().0[..leaders]);
         }
-        for ((answer, inputs), wanted) in
-            outputs.iter_mut().zip(inputs.chunks_exact(widths[0] as usize)).zip(from.as_chunks().0)
-        {
-            *answer = policy::choose::<S>(inputs, wanted);
+        let answers = outputs.iter_mut().zip(inputs.chunks_exact(widths[0] as usize)).zip(from.chunks_exact(width));
+        for (((answer, inputs), units), &choices) in answers.zip(&*choices) {
+            *answer = match (choices, actions) {
+                (1.., _) => pursue::choose::<S>(&units[..=choices]),
+                (0, Actions::Direct) => [units[0], units[1]],
+                (0, Actions::Behaviours) => {
+                    policy::choose::<S>(inputs, units.first_chunk().expect("there is an output per behaviour"))
+                }
+            };
         }
     }
 }

@@ -8,7 +8,7 @@ use super::block::Block;
 use super::episode::{EpisodeBlock, Observer};
 use super::swarm::{Recorded, Swarm, Watch};
 use super::transpose::to_rows;
-use super::{BackendError, Cpu, Group, GroupScores, ScoreTable};
+use super::{BackendError, Cpu, Group, GroupScores, ScoreTable, is_large};
 use crate::credit::{self, Episode};
 use crate::evolve::{self, Key};
 use crate::kernels::{clamp_to, splat};
@@ -175,9 +175,9 @@ impl Cpu {
             return Err(BackendError::InvalidInput("noise is of every leader".into()));
         }
         let (level, scores) = (self.level, ScoreTable::new(groups));
-        match batch.world.agents() < self.large_from {
-            true => dispatch!(level, simd => record(simd, batch, noise, arrays, &scores)),
-            false => dispatch!(level, simd => record_large(simd, batch, noise, arrays, &scores)),
+        match is_large(batch.world, self.large_from) {
+            true => dispatch!(level, simd => record_large(simd, batch, noise, arrays, &scores)),
+            false => dispatch!(level, simd => record(simd, batch, noise, arrays, &scores)),
         }
         Ok(scores.finish())
     }

@@ -114,8 +114,8 @@ fn arithmetic(executor: &Executor) -> Result<Option<String>, BackendError> {
     }))
 }
 
-/// A world with what the paper's layouts lack: every measure and combination, sectors of the map, both kinds of motion,
-/// POIs with values, and agents that align.
+/// A world with what the paper's layouts lack: every measure and combination, sectors of the map and of each agent, both
+/// kinds of motion, POIs with values, and agents that align, move to others, move only near others, or stay in a box.
 const CLASSES: &str = r#"
 world = { map = [50, 50], steps = 20 }
 learning = { population = 2 }
@@ -139,6 +139,14 @@ senses = [
     { of = "sheep", measure = "inverse-squared", nearest = 0.5, combine = "share" },
     { of = "agents", sectors = 2, range = 12 },
 ]
+stays_in = [21, 29, 27, 31]
+
+[[agents]]
+name = "scout"
+at = [[21, 28], [29, 22]]
+control = "choose:sheep"
+senses = [{ of = "sheep", sectors = "each", range = 7, empty = 1 }]
+moves_near = "sheep"
 
 [[agents]]
 name = "sheep"
@@ -150,6 +158,11 @@ rule = [
     { of = "rover", to = 5, gain = -3 },
     { of = "agents", to = 8, align = 1 },
 ]
+
+[[agents]]
+name = "dog"
+at = [[23, 23], [27, 21]]
+control = "nearest:sheep"
 
 [[pois]]
 name = "near"

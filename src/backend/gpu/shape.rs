@@ -12,7 +12,7 @@ use crate::config::MAX_HIDDEN_LAYERS;
 use crate::model::Constants;
 use crate::model::class::{Class, ClassShape};
 use crate::model::follow::TermShape;
-use crate::model::policy::{Actions, PolicyConstants};
+use crate::model::policy::Actions;
 use crate::model::sense::ChannelShape;
 use crate::parallel::lock;
 use crate::world::World;
@@ -87,10 +87,37 @@ impl Recorded {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Sizes {
     /// The widest layer, inputs included and rounded up to save compilations, whether the outputs choose a behaviour,
-    /// and whether any rule aligns headings.
-    Any { widest: usize, chooses: bool, aligns: bool },
+    /// and what classes of agents do.
+    Any { widest: usize, chooses: bool, uses: Uses },
     /// Everything that the code depends on.
-    Fixed { teams: usize, leaders: u32, agents: u32, pois: u32, widths: [u32; WIDTHS], kinds: &'static [ClassKind] },
+    Fixed {
+        teams: usize,
+        leaders: u32,
+        agents: u32,
+        pois: u32,
+        widths: [u32; WIDTHS],
+        chooses: bool,
+        uses: Uses,
+        kinds: &'static [ClassKind],
+    },
+}
+
+/// The parts of kernels that only some worlds use.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Uses {
+    /// Whether any rule aligns headings.
+    pub(super) aligns: bool,
+    /// Whether agents of any class move straight to others.
+    pub(super) pursues: bool,
+    /// Whether agents of any class cannot leave a part of the map, or move only near others.
+    pub(super) confines: bool,
+}
+
+impl Uses {
+    fn of(world: &World) -> Uses {
+        let any = |is: fn(&ClassShape) -> bool| world.classes.iter().any(|class| is(&class.constants.shape));
+        Uses { aligns: world.aligns(), pursues: any(ClassShape::pursues), confines: any(ClassShape::is_confined) }
+    }
 }
 
 /// The shapes of a class, its channels and its terms.
@@ -133,11 +160,10 @@ impl Shape {
     /// Returns the kernel that plays any world with policies up to this width.
     pub(super) fn generic(world: &World, capacity: Capacity, records: Recorded) -> (Shape, Workgroup) {
         let (workgroup, policy) = (Workgroup::generic(world, capacity.workgroup), &world.constants.policy);
-        let chooses = policy.actions() == Some(Actions::Behaviours);
         let sizes = Sizes::Any {
             widest: policy.widest().next_power_of_two().max(LEAST_WIDTH),
-            chooses,
-            aligns: world.aligns(),
+            chooses: policy.actions() == Actions::Behaviours,
+            uses: Uses::of(world),
         };
         (Shape { workgroup: workgroup.threads, slots: workgroup.slots, records, sizes }, workgroup)
     }
@@ -145,9 +171,17 @@ impl Shape {
     /// Returns the kernel that plays worlds of these sizes only, if one is possible.
     pub(super) fn specialised(world: &World, capacity: Capacity, records: Recorded) -> Option<(Shape, Workgroup)> {
         let workgroup = Workgroup::specialised(world, capacity)?;
-        let Constants { leaders, followers, pois, policy: PolicyConstants { widths, .. }, .. } = world.constants;
-        let (teams, agents, kinds) = (workgroup.teams, leaders + followers, ClassKind::of(world));
-        let sizes = Sizes::Fixed { teams, leaders, agents, pois, widths, kinds };
+        let Constants { leaders, followers, pois, policy, .. } = world.constants;
+        let sizes = Sizes::Fixed {
+            teams: workgroup.teams,
+            leaders,
+            agents: leaders + followers,
+            pois,
+            widths: policy.widths,
+            chooses: policy.actions() == Actions::Behaviours,
+            uses: Uses::of(world),
+            kinds: ClassKind::of(world),
+        };
         Some((Shape { workgroup: workgroup.threads, slots: workgroup.slots, records, sizes }, workgroup))
     }
 }

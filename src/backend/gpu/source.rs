@@ -4,15 +4,15 @@ use std::collections::HashSet;
 use std::fmt::Write;
 
 use super::exact;
-use super::shape::{Capacity, ClassKind, MAX_THREADS, ROLE, Recorded, Shape, Sizes, TEAMS, WIDTHS, WORKGROUPS};
+use super::shape::{Capacity, ClassKind, MAX_THREADS, ROLE, Recorded, Shape, Sizes, TEAMS, Uses, WIDTHS, WORKGROUPS};
 use crate::backend::{MOMENT_WORDS, VECTOR};
-use crate::config::{Config, Control, MAX_SECTORS, Policy};
+use crate::config::{Config, MAX_SECTORS, Policy};
 use crate::evolve::{MAX_WEIGHT, MIN_WEIGHT, UNCHANGED};
 use crate::gpu_struct::{GpuStruct, gpu_constants, gpu_struct};
 use crate::model;
 use crate::model::class::{ClassConstants, ClassShape};
 use crate::model::follow::TermShape;
-use crate::model::policy::Actions;
+use crate::model::policy::{Actions, BEHAVIOURS};
 use crate::model::sense::ChannelShape;
 use crate::world::{OUTPUTS, World};
 
@@ -230,13 +230,12 @@ fn declarations() -> String {
 /// Returns the episode's shader for a shape.
 fn episode(shape: Shape) -> String {
     let Shape { workgroup, slots, records: Recorded { trace, sightings }, sizes } = shape;
-    let (shared, in_registers, counted, aligns) = match sizes {
+    let (shared, in_registers, counted, Uses { aligns, pursues, confines }) = match sizes {
         // The agents of one large team, or of several small ones.
-        Sizes::Any { aligns, .. } => ((workgroup * slots).min(MAX_AGENTS), false, 1, aligns),
-        Sizes::Fixed { teams, leaders, agents, kinds, .. } => {
+        Sizes::Any { uses, .. } => ((workgroup * slots).min(MAX_AGENTS), false, 1, uses),
+        Sizes::Fixed { teams, leaders, agents, uses, .. } => {
             let in_registers = leaders < agents && leaders as usize <= MAX_COUNTED_LEADERS;
-            let aligns = kinds.iter().flat_map(|kind| &kind.terms).any(|term| term.aligns != 0);
-            (teams * agents as usize, in_registers, if in_registers { leaders } else { 1 }, aligns)
+            (teams * agents as usize, in_registers, if in_registers { leaders } else { 1 }, uses)
         }
     };
     let constants = gpu_constants!(
@@ -249,6 +248,8 @@ fn episode(shape: Shape) -> String {
         COUNTS_IN_REGISTERS = in_registers,
         COUNTED_LEADERS = counted,
         ALIGNS = aligns,
+        PURSUES = pursues,
+        CONFINES = confines,
         MAX_SECTORS,
         MOMENT_WORDS,
     );
@@ -258,7 +259,7 @@ fn episode(shape: Shape) -> String {
     );
     let front = match sizes {
         Sizes::Any { widest, chooses, .. } => [
-            gpu_constants!(INPUTS = widest, CHOOSES = chooses),
+            gpu_constants!(INPUTS = widest, CHOICES = widest, CHOOSES = chooses),
             getter("shape_of", "class_number: u32", &ClassShape::copied_from("classes[class_number]"), "ClassShape"),
             getter(
                 "channel_of",
@@ -275,14 +276,15 @@ fn episode(shape: Shape) -> String {
             include_str!("../../../shaders/generic.wgsl").into(),
         ]
         .concat(),
-        Sizes::Fixed { teams, leaders, agents, pois, widths, kinds } => {
+        Sizes::Fixed { teams, leaders, agents, pois, widths, chooses, uses, kinds } => {
+            let outputs = widths.into_iter().rfind(|&width| width > 0).expect("a policy has outputs");
             let (words, classes, inputs) = (agents.div_ceil(32), kinds.len(), widths[0]);
             format!(
                 "{}const shape = Shape({leaders}u, {agents}u, {pois}u, {words}u, {classes}u, {inputs}u, {teams}u);\n\
                  fn set_shape(task: Task) {{}}\n{}{}",
-                gpu_constants!(INPUTS = inputs),
+                gpu_constants!(INPUTS = inputs, CHOICES = outputs),
                 straight_classes(kinds),
-                straight_policy(&widths)
+                straight_policy(&widths, chooses, uses.pursues)
             )
         }
     };
@@ -310,9 +312,9 @@ fn straight_classes(kinds: &[ClassKind]) -> String {
     // With the class as a constant, all threads load the same numbers of it, once per wave.
     text += &format!("fn act({parameters}) {{\n");
     for (class, kind) in kinds.iter().enumerate() {
-        let role = if kind.shape.control() == Control::Policy { "lead" } else { "follow" };
+        let role = if kind.shape.control().learns() { "lead" } else { "follow" };
         text += &format!("    if (*me).class_index == {class}u {{\n        load_class({class}u);\n");
-        text += &format!("        {role}(task, first, me);\n        move_agent(me);\n        return;\n    }}\n");
+        text += &format!("        {role}(task, first, me);\n        move_agent(first, me);\n        return;\n    }}\n");
     }
     text += "}\n";
     text += &format!("fn sense_all({parameters}, inputs: ptr<function, array<f32, INPUTS>>) {{\n");
@@ -340,7 +342,9 @@ fn straight_classes(kinds: &[ClassKind]) -> String {
 /// Returns a policy of these widths as straight-line code: `decide` of `shaders/generic.wgsl` with its loops unrolled.
 /// Each unit is a variable. Weights are loaded four at a time, in order of use, so that a compiler may start many loads
 /// before it waits for the first.
-fn straight_policy(widths: &[u32; WIDTHS]) -> String {
+///
+/// Policies of classes that choose agents do so if any `pursues`, and others choose behaviours if `chooses`.
+fn straight_policy(widths: &[u32; WIDTHS], chooses: bool, pursues: bool) -> String {
     let mut text = String::from("fn decide(start: u32, stride: u32, inputs: array<f32, INPUTS>) -> vec2<f32> {\n");
     let mut line = |line: std::fmt::Arguments<'_>| writeln!(text, "    {line}").expect("a string takes a line");
     let mut read = HashSet::new();
@@ -369,12 +373,16 @@ fn straight_policy(widths: &[u32; WIDTHS]) -> String {
         }
         first += (rows + 1) * columns;
     }
-    match inputs.len() {
-        OUTPUTS => line(format_args!("return vec2({});", inputs.join(", "))),
-        _ => line(format_args!(
+    if pursues {
+        let all = inputs.join(", ");
+        line(format_args!("if own.control == CONTROLKIND_CHOOSE {{ return choose_agent(array({all})); }}"));
+    }
+    match chooses {
+        false => line(format_args!("return vec2({});", inputs[..OUTPUTS].join(", "))),
+        true => line(format_args!(
             "return choose(vec4(inputs[0], inputs[1], inputs[2], inputs[3]), vec4(inputs[4], inputs[5], inputs[6], \
              inputs[7]), array({}));",
-            inputs.join(", ")
+            inputs[..BEHAVIOURS].join(", ")
         )),
     }
     text + "}\n"
@@ -389,7 +397,8 @@ pub fn shaders() -> Vec<(&'static str, String)> {
     const SIGHTINGS: Recorded = Recorded { sightings: true, ..PLAIN };
     const TRACE: Recorded = Recorded { trace: true, sightings: true };
     let generic = |workgroup, slots, widest, records: Recorded| {
-        let sizes = Sizes::Any { widest, chooses: records.trace, aligns: records.trace };
+        let uses = Uses { aligns: records.trace, pursues: records.trace, confines: records.trace };
+        let sizes = Sizes::Any { widest, chooses: records.trace, uses };
         Pipeline::Episode(Shape { workgroup, slots, records, sizes })
     };
     let specialised = |records, actions: Actions| {

@@ -6,10 +6,12 @@ use std::f64::consts::FRAC_PI_2;
 use serde::Serialize;
 
 use crate::config::{
-    AGENTS, AgentClass, Channel, Choice, Combine, Control, Frame, MAX_AGENTS, MAX_CHANNELS, MAX_CLASSES, MAX_INPUTS,
-    MAX_POIS, MAX_SECTORS, MAX_TERMS, Measure, Mobility, Motion, POIS, PoiGroup, Region, Score, Term, When,
+    AGENTS, AgentClass, Channel, Choice, Combine, Control, Frame, MAX_AGENTS, MAX_CHANNELS, MAX_CLASSES,
+    MAX_HIDDEN_UNITS, MAX_INPUTS, MAX_LEARNERS, MAX_POIS, MAX_SECTORS, MAX_TERMS, Measure, Mobility, Motion, POIS,
+    PoiGroup, Region, Score, Sectors, Term, When,
 };
 use crate::model::rule::cycle;
+use crate::model::sense::MOST_MEASURED;
 use crate::model::{LEAST, LONGEST, MAX_RANGES};
 use crate::reader::{Allowed, KeyRequest, Number, Reader, Value, between, sized};
 
@@ -41,7 +43,7 @@ pub(in crate::config) struct ClassSummary {
 
 impl ClassSummary {
     fn learns(&self) -> bool {
-        self.control == Some(Control::Policy)
+        self.control.as_ref().is_some_and(Control::learns)
     }
 }
 
@@ -50,6 +52,7 @@ pub(in crate::config) struct GroupSummary {
     pub name: String,
     /// The number of its POIs.
     pub pois: usize,
+    pub value: f64,
 }
 
 impl Summary {
@@ -66,16 +69,20 @@ impl Summary {
         };
         let class = |table: &[(String, Value<'_>)]| {
             let control = get(table, "control").map_or(Some("policy"), Value::word);
-            let control = Control::ALL.iter().find(|(word, _)| Some(*word) == control).map(|found| found.1);
+            let control = control.and_then(Control::of);
             ClassSummary {
                 name: word(get(table, "name")),
-                control,
                 has_rule: control == Some(Control::Follow) || count(get(table, "rule")) > 0,
+                control,
                 agents: size(table),
                 observes: get(table, "observes").and_then(|value| value.flag()).unwrap_or(true),
             }
         };
-        let group = |table: &[(String, Value<'_>)]| GroupSummary { name: word(get(table, "name")), pois: size(table) };
+        let group = |table: &[(String, Value<'_>)]| GroupSummary {
+            name: word(get(table, "name")),
+            pois: size(table),
+            value: get(table, "value").and_then(f64::read).flatten().unwrap_or(1.0),
+        };
         let tables = r.peek(POIS);
         let groups: Vec<GroupSummary> = tables.iter().map(|table| group(table)).collect();
         let index: HashMap<&str, usize> =
@@ -88,7 +95,13 @@ impl Summary {
         let after: Vec<Vec<usize>> = tables.iter().take(MAX_POIS).map(after).collect();
         let is_short = |groups: &Vec<usize>| groups.iter().all(|&group| group < after.len());
         let cycle = if after.iter().all(is_short) { cycle(&after).unwrap_or_default() } else { vec![] };
-        Summary { classes: r.peek(AGENTS).into_iter().map(class).collect(), groups, cycle }
+        let mut classes: Vec<ClassSummary> = r.peek(AGENTS).into_iter().map(class).collect();
+        let names: HashSet<String> = classes.iter().map(|class| class.name.clone()).collect();
+        let is_wrong = |control: &Control| control.target().is_some_and(|target| !names.contains(target));
+        for class in &mut classes {
+            class.control.take_if(|control| is_wrong(control));
+        }
+        Summary { classes, groups, cycle }
     }
 
     /// Returns the number of agents that observe POIs whose group does not name its observers.
@@ -99,6 +112,23 @@ impl Summary {
     /// Returns the number of agents that learn.
     pub fn learners(&self) -> usize {
         self.classes.iter().filter(|class| class.learns()).map(|class| class.agents).sum()
+    }
+
+    /// Returns the agents of a class of this name, if there is one.
+    fn size_of(&self, name: &str) -> Option<usize> {
+        self.classes.iter().find(|class| class.name == name).map(|class| class.agents)
+    }
+
+    /// Returns the number of agents or POIs that a channel names.
+    fn named_by(&self, of: &[String], pois: &[String]) -> usize {
+        let all = |name: &str| of.iter().any(|of| of == name);
+        let classes = self.classes.iter().filter(|class| all(AGENTS) || all(&class.name)).map(|class| class.agents);
+        if all(POIS) { self.groups_of(pois).map(|group| group.pois).sum() } else { classes.sum() }
+    }
+
+    /// Returns the groups of these names, or all without names.
+    fn groups_of(&self, names: &[String]) -> impl Iterator<Item = &GroupSummary> {
+        self.groups.iter().filter(|group| names.is_empty() || names.contains(&group.name))
     }
 
     /// Returns the names of classes, and some further ones. Returns `None` if the list or a name is wrong, which is
@@ -168,6 +198,56 @@ fn limit(r: &mut Reader<'_>, key: &'static str, what: &str, [before, own, most]:
     }
 }
 
+/// How errors name the controls of classes that learn.
+const LEARNS: &str = "\"policy\" or \"choose:CLASS\"";
+
+/// Reads what decides how the agents of a class move.
+fn control(r: &mut Reader<'_>, summary: &Summary) -> Control {
+    const RANGE: &str = "\"policy\" or \"follow\" or \"nearest:CLASS\" or \"choose:CLASS\" or \"still\"";
+    /// Without the output for nobody.
+    const MOST: usize = MAX_HIDDEN_UNITS - 1;
+    let parse = |word: &str| {
+        let control = Control::of(word).ok_or(RANGE)?;
+        let names = || summary.class_names(&[]).unwrap_or_default().into_iter();
+        match control.target().map(|target| summary.size_of(target)) {
+            Some(None) => {
+                let kind = control.kind();
+                Err(names().map(|name| format!("\"{kind}:{name}\"")).collect::<Vec<_>>().join(" or "))
+            }
+            Some(Some(size)) if control.learns() && size > MOST => {
+                Err(format!("a class of 1 to {MOST} agents, and this has {size}"))
+            }
+            _ => Ok(control),
+        }
+    };
+    AgentClass::control(r).optional_word(RANGE, "\"policy\"", parse).unwrap_or(Control::Policy)
+}
+
+/// Reads the box in which agents stay that start at these places or in this region.
+fn stays_in(
+    r: &mut Reader<'_>,
+    [width, height]: [Allowed<f64>; 2],
+    at: &[[f64; 2]],
+    region: Option<Region>,
+) -> Option<[f64; 4]> {
+    let errors = r.error_count();
+    let found = AgentClass::stays_in(r).optional_tuple("x0, y0, x1, y1", [width, height, width, height]);
+    let [x0, y0, x1, y1] = found.filter(|_| r.error_count() == errors)?;
+    if x0 > x1 || y0 > y1 {
+        let message = format!("found [{x0}, {y0}, {x1}, {y1}], allowed x0 <= x1 and y0 <= y1");
+        r.report_key("agents.stays_in", message);
+        return None;
+    }
+    let corners = region.map(Region::corners).unwrap_or_default();
+    let places = if region.is_some() { &corners[..] } else { at };
+    let is_outside = |[x, y]: &&[f64; 2]| !((x0..=x1).contains(x) && (y0..=y1).contains(y));
+    if let Some([x, y]) = places.iter().find(is_outside) {
+        let message = format!("found a start at ({x}, {y}), allowed within stays_in, ({x0}, {y0}) to ({x1}, {y1})");
+        r.report_key(if region.is_some() { "agents.in" } else { "agents.at" }, message);
+    }
+    found
+}
+
 /// A key of a table.
 type Key = for<'r, 'a> fn(&'r mut Reader<'a>) -> KeyRequest<'r, 'a>;
 
@@ -180,7 +260,8 @@ fn places(
     sides: [Allowed<f64>; 2],
     (what, before, most): (&str, usize, usize),
 ) -> (Vec<[f64; 2]>, Option<usize>, Option<Region>) {
-    let at = at(r).positions(1..=most, sides, Some(vec![])).unwrap_or_default();
+    let listed = most.min(MAX_LEARNERS);
+    let at = at(r).positions(1..=listed, sides, Some(vec![])).unwrap_or_default();
     let errors = r.error_count();
     let count = count(r).optional_number(between(1, most), "none").filter(|_| r.error_count() == errors);
     let region = region(r).optional_table("in", "one of the keys below", |r| Region::read(r, sides)).flatten();
@@ -193,7 +274,7 @@ fn places(
         }
         [false, false, true] => r.report_key(count_name, format!("missing, allowed 1 to {most}, the number of {what}")),
         [false, false, false] => {
-            let message = format!("missing, allowed a list of 1 to {most} positions [x, y], or `count` with `in`");
+            let message = format!("missing, allowed a list of 1 to {listed} positions [x, y], or `count` with `in`");
             r.report_key(at_name, message);
         }
         [true, false, false] | [false, true, true] => {}
@@ -213,8 +294,8 @@ impl AgentClass {
         let size = count.unwrap_or(at.len());
         let counts = if size == 0 { 0..=usize::MAX } else { size..=size };
         let heading = AgentClass::heading(r).one_or_each(between(-1e3, 1e3), counts, FRAC_PI_2);
-        let control = AgentClass::control(r).choice(Control::Policy);
-        let learns = control == Control::Policy;
+        let control = control(r, summary);
+        let learns = control.learns();
         // If the control is wrong, what it needs is unknown.
         let is_known = summary.classes.get(index).is_none_or(|class| class.control.is_some());
         let other = before.iter().find(|class| class.control.is_some() && !class.learns());
@@ -228,24 +309,37 @@ impl AgentClass {
         let (motion, speeds) = AgentClass::motion(r)
             .table("motion", "the keys below", "kind = \"steered\", with its defaults", Mobility::read)
             .unwrap_or_else(|| (Mobility::Free { max_speed: 1e3 }, between(0.0, 1e3)));
+        let reach = AgentClass::reach(r)
+            .optional_number(between(0.01, LONGEST).or_unlimited(), "inf")
+            .filter(|reach| reach.is_finite());
+        if r.has("agents.reach") && is_known && !matches!(control, Control::Nearest(_)) {
+            let message = format!("found with control = \"{control}\", allowed with \"nearest:CLASS\"");
+            r.report_key("agents.reach", message);
+        }
+        let stays_in = stays_in(r, sides, &at, region);
         let speed = AgentClass::speed(r).number(speeds, 0.0);
         let is_free = matches!(motion, Mobility::Free { .. });
         let channel = |r: &mut Reader<'_>, _| Channel::read(r, is_free, summary);
         let errors = r.error_count();
         let senses = AgentClass::senses(r).tables(0..=MAX_CHANNELS, "channels", channel);
-        let inputs: usize = senses.iter().map(|channel| channel.sectors).sum();
+        let inputs: usize = senses.iter().map(|channel| channel.sectors.count()).sum();
         if !is_known || r.error_count() > errors {
             // A channel that is wrong is there.
         } else if learns && senses.is_empty() {
             r.report_key("agents.senses", format!("missing, allowed a list of 1 to {MAX_CHANNELS} channels"));
         } else if !learns && !senses.is_empty() {
-            r.report_key("agents.senses", format!("found with control = \"{control}\", allowed with \"policy\""));
+            r.report_key("agents.senses", format!("found with control = \"{control}\", allowed with {LEARNS}"));
         } else if inputs > MAX_INPUTS {
             r.report_key(
                 "agents.senses",
                 format!("found {inputs} sectors, allowed up to {MAX_INPUTS} in all channels"),
             );
         }
+        let parse = |name: &str| match senses.iter().any(|channel| channel.senses(name) && channel.range > 0.0) {
+            true if summary.size_of(name).is_some() => Ok(name.to_string()),
+            _ => Err("a class that it senses".to_string()),
+        };
+        let moves_near = AgentClass::moves_near(r).optional_word("the name of a class that it senses", "none", parse);
         let errors = r.error_count();
         let rule = AgentClass::rule(r).tables(0..=MAX_TERMS, "terms", |r, _| Term::read(r, summary));
         if !is_known || r.error_count() > errors {
@@ -259,8 +353,7 @@ impl AgentClass {
         let names = summary.class_names(&[]);
         let leads = AgentClass::leads(r).names("names of classes", false, names.as_deref(), |_| None);
         if !leads.is_empty() && is_known && !learns {
-            let message =
-                format!("found with control = \"{control}\", allowed with \"policy\": others cannot lead yet");
+            let message = format!("found with control = \"{control}\", allowed with {LEARNS}: others cannot lead yet");
             r.report_key("agents.leads", message);
         }
         let influence_radius = AgentClass::influence_radius(r)
@@ -277,8 +370,7 @@ impl AgentClass {
         }
         let fitness = AgentClass::fitness(r).optional_choice("learning.fitness");
         if fitness.is_some() && is_known && !learns {
-            let message = format!("found with control = \"{control}\", allowed with \"policy\"");
-            r.report_key("agents.fitness", message);
+            r.report_key("agents.fitness", format!("found with control = \"{control}\", allowed with {LEARNS}"));
         }
         AgentClass {
             name,
@@ -288,7 +380,10 @@ impl AgentClass {
             heading,
             speed,
             control,
+            reach,
             motion,
+            stays_in,
+            moves_near,
             senses,
             rule,
             wall_radius: AgentClass::wall_radius(r).number(between(0.01, LONGEST).or_zero(), 1.0),
@@ -351,7 +446,10 @@ impl Channel {
         if !pois.is_empty() && !of.is_empty() && of != [POIS] {
             r.report_key("agents.senses.pois", "found without of = \"pois\", allowed with it".into());
         }
-        let sectors = Channel::sectors(r).number(between(1, MAX_SECTORS), 4);
+        let sectors = match Channel::sectors(r).number_or(between(1, MAX_SECTORS), Sectors::EACH, 4) {
+            Some(count) => Sectors::Equal(count),
+            None => Sectors::Each(summary.named_by(&of, &pois)),
+        };
         let frame = Channel::frame(r).choice(if is_free { Frame::Map } else { Frame::Heading });
         if is_free && frame == Frame::Heading {
             let message = "found \"heading\" with free motion, which has no heading; allowed \"map\"";
@@ -364,6 +462,17 @@ impl Channel {
             let message = format!("{found}, allowed 0 to {LONGEST} with measure = \"{measure}\"");
             r.report_key("agents.senses.range", message);
         }
+        let nearest = Channel::nearest(r).number(between(0.01, LONGEST), 1.0);
+        let valued = of == [POIS];
+        let value = summary.groups_of(&pois).map(|group| group.value).filter(|_| valued).fold(1.0, f64::max);
+        let largest = measure.largest(nearest);
+        if largest * value > MOST_MEASURED {
+            let times = if valued { format!(", times a POI's value of {value}") } else { String::new() };
+            let message = format!(
+                "found \"{measure}\", up to {largest} with nearest = {nearest}{times}; allowed up to {MOST_MEASURED}"
+            );
+            r.report_key("agents.senses.measure", message);
+        }
         Channel {
             of,
             pois,
@@ -371,7 +480,7 @@ impl Channel {
             frame,
             range,
             measure,
-            nearest: Channel::nearest(r).number(between(0.01, LONGEST), 1.0),
+            nearest,
             combine: Channel::combine(r).choice(Combine::Share),
             empty: Channel::empty(r).number(sized(LEAST, 1e3), 0.0),
             gain: Channel::gain(r).number(between(1e-3, 1e3), 1.0),

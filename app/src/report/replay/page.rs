@@ -9,7 +9,7 @@ use super::{Counterfactual, Replayed, near};
 use crate::record::folder::OWN_FITNESS;
 use crate::report::map::{GROUPS, GROUPS_DARK};
 use crate::report::scene::hex;
-use flotilla::config::{AgentClass, Config, Fitness, Mobility, PoiGroup, drawn_agents};
+use flotilla::config::{AgentClass, Channel, Config, Control, Fitness, Mobility, PoiGroup, Sectors, drawn_agents};
 use flotilla::credit::{self, Strided};
 use flotilla::world::OUTPUTS;
 
@@ -126,10 +126,19 @@ pub fn data(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Val
     data
 }
 
+/// Returns a channel as pages have it.
+fn sensed(channel: &Channel) -> serde_json::Value {
+    let mut shown = json!(channel);
+    shown["sectors"] = channel.sectors.count().into();
+    shown["each"] = matches!(channel.sectors, Sectors::Each(_)).into();
+    shown
+}
+
 /// Returns what only pages of full configs have.
 ///
 /// With `[[agents]]`, they have `classes`, those that learn first: their `name`, the `count` of their agents, whether they
-/// move `free`, the distance up to which they `influence` others, and the channels of their `senses`. The `groups` of POIs
+/// move `free`, the class and the `agents` that they `choose` among, if any, the distance up to which they `influence` others, and the
+/// channels of their `senses`, with the number of `sectors` and whether `each` agent or POI has one. The `groups` of POIs
 /// have their `name`, the `count` of their POIs, and the indices of the classes that are `observers`. Only if POIs differ
 /// in their radius or value, there are `radii` or `values`.
 pub fn parts(config: &Config) -> Vec<(&'static str, serde_json::Value)> {
@@ -140,10 +149,18 @@ pub fn parts(config: &Config) -> Vec<(&'static str, serde_json::Value)> {
         let class = |(index, class): (usize, &AgentClass)| {
             let free = matches!(class.motion, Mobility::Free { .. });
             let influence = (0..count).filter_map(|led| all.influence_radius(index, led)).fold(0.0, f64::max);
-            let AgentClass { name, senses, .. } = class;
+            let AgentClass { name, control, .. } = class;
+            let senses: Vec<_> = class.senses.iter().map(sensed).collect();
             let places = all.agents_of(index);
             let size = drawn.iter().filter(|agent| places.contains(agent)).count();
-            json!({ "name": name, "count": size, "free": free, "influence": influence, "senses": senses })
+            let mut class =
+                json!({ "name": name, "count": size, "free": free, "influence": influence, "senses": senses });
+            if let Control::Choose(target) = control {
+                let targets = all.agents.iter().position(|class| class.name == *target);
+                let chosen: Vec<usize> = targets.map(|class| all.agents_of(class)).into_iter().flatten().collect();
+                class["choose"] = json!({ "name": target, "agents": chosen });
+            }
+            class
         };
         parts.push(("classes", config.agents.iter().enumerate().map(class).collect()));
     }

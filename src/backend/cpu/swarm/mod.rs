@@ -13,13 +13,14 @@ use super::agent::Agent;
 use super::batch::WorldBatch;
 use super::network::Network;
 use crate::backend::Moment;
-use crate::config::{Combine, Control, Frame, Measure};
+use crate::config::{Combine, ControlKind, Frame, Measure};
 use crate::credit::{Episode, Paths, Seen, Strided};
 use crate::kernels::math::on_lattice;
 use crate::kernels::{clamp_to, splat};
 use crate::model::class::{Class, ClassLanes};
 use crate::model::classes::MAX_SECTORS;
 use crate::model::follow::{self, SteeringForce, Sum, TermLanes};
+use crate::model::motion::MotionLanes;
 use crate::model::sense::{self, ChannelLanes};
 use crate::model::{self, Lanes, couple, motion, policy};
 use crate::world::{OUTPUTS, World};
@@ -123,6 +124,14 @@ fn radius(world: &World, class: &Class) -> f32 {
     of_terms.reduce(f32::max).unwrap_or_else(of_pois).sqrt()
 }
 
+/// Reports whether a world can be played: with everything but pursuit, senses of each agent, and motion near others only.
+pub(super) fn can_play(world: &World) -> bool {
+    world.classes.iter().all(|class| {
+        let shape = &class.constants.shape;
+        !shape.pursues() && shape.end_near == 0 && class.channels().iter().all(|channel| channel.shape.each == 0)
+    })
+}
+
 impl<S: Simd> Swarm<S> {
     pub fn new(simd: S, world: &World, recorded: Recorded) -> Swarm<S> {
         let zero = splat(simd, 0.0);
@@ -141,7 +150,7 @@ impl<S: Simd> Swarm<S> {
             plans: world.classes.iter().map(|class| Plan::new(world, class)).collect(),
             cells: world.classes.iter().map(cells).collect(),
             pois: world.pois.clone(),
-            network: Network::new(simd, &world.constants.policy, vectors),
+            network: Network::new(simd, &world.constants.policy, vec![0; vectors]),
             inputs: vec![zero; vectors * world.inputs()],
             outputs: vec![[zero; OUTPUTS]; vectors],
             forces: vec![[0.0; 2]; if recorded.forces { followers } else { 0 }],
@@ -188,7 +197,7 @@ impl<S: Simd> Swarm<S> {
                 self.advance(class);
             }
             for (cells, class) in self.cells.iter_mut().zip(&self.constants) {
-                if class.constants.shape.control() != Control::Still {
+                if class.constants.shape.control() != ControlKind::Still {
                     cells.sort();
                 }
             }
@@ -305,13 +314,13 @@ impl<S: Simd> Swarm<S> {
     /// Moves the agents of a class, from the state before the step.
     #[inline(always)]
     fn advance(&mut self, index: usize) {
-        if self.constants[index].constants.shape.control() == Control::Still {
+        if self.constants[index].constants.shape.control() == ControlKind::Still {
             return;
         }
         let leaders = self.world.constants.leaders as usize;
         let (mut next, mut forces) = (std::mem::take(&mut self.cells[index].next), std::mem::take(&mut self.forces));
         let (class, cells) = (&self.world.classes[index], &self.cells[index]);
-        let learns = class.control() == Control::Policy;
+        let learns = class.control().learns();
         cells.each_group(
             S::f32s::LEN,
             #[inline(always)]
@@ -349,7 +358,7 @@ impl<S: Simd> Swarm<S> {
     fn lead(&self, class: &ClassLanes<S>, agent: Agent<S>, [first, second]: [S::f32s; OUTPUTS]) -> Agent<S> {
         let motion = &class.constants.motion;
         if class.constants.shape.free != 0 {
-            return self.drift(agent, [first * motion.max_speed, second * motion.max_speed]);
+            return self.drift(motion, agent, [first * motion.max_speed, second * motion.max_speed]);
         }
         let (hx, hy) = motion::turn::<S>(motion, agent.hx, agent.hy, policy::wanted_turn::<S>(first));
         self.drive(class, Agent { hx, hy, ..agent }, policy::wanted_speed::<S>(motion, second))
@@ -361,7 +370,11 @@ impl<S: Simd> Swarm<S> {
         let (shape, motion) = (&class.constants.shape, &class.constants.motion);
         if shape.free != 0 {
             let most = motion.max_speed;
-            return self.drift(agent, [clamp_to::<S>(force.x, -most, most), clamp_to::<S>(force.y, -most, most)]);
+            return self.drift(
+                motion,
+                agent,
+                [clamp_to::<S>(force.x, -most, most), clamp_to::<S>(force.y, -most, most)],
+            );
         }
         let (sizes, Agent { hx, hy, speed, .. }) = (follow::sizes::<S>(&force), agent);
         let (hx, hy, wanted) = match shape.by_sine != 0 {
@@ -373,22 +386,22 @@ impl<S: Simd> Swarm<S> {
 
     /// Moves agents by velocities.
     #[inline(always)]
-    fn drift(&self, agent: Agent<S>, [x, y]: [S::f32s; 2]) -> Agent<S> {
-        let map = &self.world.map;
-        let x = motion::advance::<S>(agent.x, map.dt, x, map.map_x);
-        let y = motion::advance::<S>(agent.y, map.dt, y, map.map_y);
+    fn drift(&self, motion: &MotionLanes<S>, agent: Agent<S>, [x, y]: [S::f32s; 2]) -> Agent<S> {
+        let dt = self.world.map.dt;
+        let x = motion::advance::<S>(agent.x, dt, x, [motion.low_x, motion.high_x]);
+        let y = motion::advance::<S>(agent.y, dt, y, [motion.low_y, motion.high_y]);
         Agent { x, y, ..agent }
     }
 
     /// Moves agents along their headings.
     #[inline(always)]
     fn drive(&self, class: &ClassLanes<S>, agent: Agent<S>, wanted: S::f32s) -> Agent<S> {
-        let map = &self.world.map;
+        let motion = &class.constants.motion;
         let (hx, hy) = motion::renormalize::<S>(agent.hx, agent.hy);
-        let speed = motion::accelerate::<S>(&class.constants.motion, agent.speed, wanted);
-        let step = speed * map.dt;
-        let x = motion::advance::<S>(agent.x, step, hx, map.map_x);
-        let y = motion::advance::<S>(agent.y, step, hy, map.map_y);
+        let speed = motion::accelerate::<S>(motion, agent.speed, wanted);
+        let step = speed * self.world.map.dt;
+        let x = motion::advance::<S>(agent.x, step, hx, [motion.low_x, motion.high_x]);
+        let y = motion::advance::<S>(agent.y, step, hy, [motion.low_y, motion.high_y]);
         Agent { x, y, hx, hy, speed }
     }
 
@@ -409,7 +422,7 @@ impl<S: Simd> Swarm<S> {
                 (_, false) => attraction.add::<2, false>(&mut force),
             }
         }
-        force.add_walls(&class.constants.rule, &self.world.map, x, y);
+        force.add_walls(&class.constants.rule, &class.constants.motion, x, y);
         force
     }
 

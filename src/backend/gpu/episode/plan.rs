@@ -46,10 +46,13 @@ fn iterations_per_step(world: &World, workgroup: Workgroup, records: Recorded) -
             _ => world.pois.len(),
         };
         let sectors = channel.shape.sectors as usize;
-        if sectors == 4 { entities } else { entities * (1 + sectors) + 2 * sectors }
+        if sectors == 4 || channel.shape.each != 0 { entities } else { entities * (1 + sectors) + 2 * sectors }
     };
-    let class =
-        |class: &Class| class.channels().iter().map(channel).sum::<usize>() + class.terms().len() * world.agents();
+    let class = |class: &Class| {
+        let shape = &class.constants.shape;
+        let pursued = (shape.end_target - shape.first_target + shape.end_near - shape.first_near) as usize;
+        class.channels().iter().map(channel).sum::<usize>() + class.terms().len() * world.agents() + pursued
+    };
     let busiest = world.classes.iter().map(class).max().unwrap_or(0);
     let agent = busiest + world.leaders() + network as usize + 20 + world.classes.len() * 4;
     let sights = if records.sightings { world.followers() * world.leader_words() } else { 0 };
