@@ -23,6 +23,7 @@ mod exactness;
 mod faults;
 mod first;
 mod front;
+mod import;
 mod input;
 mod json;
 mod learning;
