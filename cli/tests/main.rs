@@ -24,6 +24,7 @@ mod faults;
 mod first;
 mod front;
 mod import;
+mod influence;
 mod input;
 mod json;
 mod learning;
