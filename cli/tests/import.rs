@@ -309,7 +309,14 @@ fn bad_input_is_refused_with_its_line() {
     fails(LEADERS, "POISpawner:", "Spawner:", "POISpawner.positions: missing, and the translation needs it");
     fails(LEADERS, "num_generations: 30", "num_generations: [1, 2]", "learning.generations, from num_generations");
 
+    let many = format!("    - *rover\n{}", "    - {a: 1}\n".repeat(2000));
+    fails(INFLUENCE, "    - *rover\n", &many, "env.agents.rovers: found 2003 items, allowed up to 1024");
+
     let place = Place::new(&[]);
+    let unknown: String = (0..60_000).map(|key| format!("key{key}: 1\n")).collect();
+    place.write("long.yaml", format!("leader_positions: [[2, 3]]\npoi_positions: [[8, 9]]\n{unknown}"));
+    let (_, listed) = place.good("import long.yaml --out long.toml");
+    assert!(listed.ends_with("keys not translated: 60000; the config has them as comments\n"));
     let mut bomb = String::from("env: &a0 [x, x, x, x, x, x, x, x, x]\n");
     (1..30).for_each(|i| bomb += &format!("b{i}: &a{i} [*a{0}, *a{0}, *a{0}, *a{0}, *a{0}, *a{0}]\n", i - 1));
     for (text, message) in [

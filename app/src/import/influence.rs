@@ -169,6 +169,16 @@ fn grouped(members: Vec<Group>) -> Vec<(String, Group)> {
     names.into_iter().zip(groups).collect()
 }
 
+/// Returns the items of a list, of which there can be as many as a team can have agents.
+fn few<'a>(root: &At<'a>, path: &str) -> Result<Vec<At<'a>>, Problem> {
+    const MOST: usize = 1024;
+    let items = root.list(path)?;
+    match items.get(MOST) {
+        None => Ok(items),
+        Some(_) => Err(root.need(path)?.problem(format!("found {} items, allowed up to {MOST}", items.len()))),
+    }
+}
+
 /// Translates a config.
 pub(super) fn translate(root: &At<'_>) -> Result<Vec<Section>, Problem> {
     let mut world = Section::new("[world]");
@@ -176,12 +186,12 @@ pub(super) fn translate(root: &At<'_>) -> Result<Vec<Section>, Problem> {
     world.set("dt", "1.0", "an action is a displacement");
     world.set("start_counts", "true", "the program scores the start, too");
 
-    let kinds = [("rover", root.list("env.agents.rovers")?), ("uav", root.list("env.agents.uavs")?)];
+    let kinds = [("rover", few(root, "env.agents.rovers")?), ("uav", few(root, "env.agents.uavs")?)];
     let reach = kinds[0].1.iter().map(|rover| rover.need("observation_radius")?.number());
     let reach = reach.collect::<Result<Vec<_>, _>>()?.into_iter().fold(0.0, f64::max);
     let mut pois = Vec::new();
     for kind in ["rover", "hidden"] {
-        for poi in root.list(&format!("env.pois.{kind}_pois"))? {
+        for poi in few(root, &format!("env.pois.{kind}_pois"))? {
             pois.push(of_poi(&poi, kind, reach)?);
         }
     }

@@ -135,20 +135,22 @@ pub(super) fn quoted(word: &str) -> toml::Value {
 /// Returns the config as text, and for each of its lines the line of the YAML file, or 0, and its key.
 pub(super) fn write(heading: &str, sections: &[Section]) -> (String, Vec<(usize, String)>) {
     let mut text = heading.to_string();
-    let mut origins = Vec::new();
+    let mut origins = vec![(0, String::new()); text.lines().count()];
     for Section { head, lines } in sections.iter().filter(|section| !section.lines.is_empty()) {
         let _ = writeln!(text, "\n{head}");
+        origins.resize(origins.len() + 2, (0, String::new()));
         for Line { text: key, line, path, comment } in lines {
             let place = if *line == 0 { String::new() } else { format!(" (line {line})") };
             let comment = format!("{comment}{place}");
             // TOML allows no control characters in comments.
             let comment = escape::line(&comment);
-            let _ = match (key.is_empty(), key.contains('\n')) {
-                (true, _) => writeln!(text, "# {comment}"),
-                (_, true) => writeln!(text, "# {comment}\n{key}"),
-                (_, false) => writeln!(text, "{key:<32} # {comment}"),
+            let added = match (key.is_empty(), key.contains('\n')) {
+                (true, _) => format!("# {comment}\n"),
+                (_, true) => format!("# {comment}\n{key}\n"),
+                (_, false) => format!("{key:<32} # {comment}\n"),
             };
-            origins.resize(text.lines().count(), (*line, path.clone()));
+            origins.resize(origins.len() + added.lines().count(), (*line, path.clone()));
+            text += &added;
         }
     }
     (text, origins)
