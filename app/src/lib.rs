@@ -7,6 +7,7 @@
 //! | module | contents |
 //! |---|---|
 //! | [`shell`] | command lines for people to copy |
+//! | [`import`] | configs of the authors' programs |
 //! | [`script`] | teams whose leaders drive to given places |
 //! | [`record`] | files: policies, metrics, checkpoints, folders |
 //! | [`run`] | a trainer together with its runs' folders |
@@ -19,6 +20,7 @@
 #![allow(rustdoc::private_intra_doc_links, reason = "tables of modules name the internal ones, too")]
 
 pub mod choice;
+pub mod import;
 pub mod ops;
 pub mod record;
 pub mod report;

@@ -16,6 +16,7 @@ use flotilla::backend::cpu::{Cpu, level_name};
 use flotilla::config::{self, Config};
 use flotilla::front;
 use flotilla::memory::Peaks;
+use flotilla_app::import;
 use flotilla_app::run::RunError;
 
 /// Default numbers of teams, for the table and for JSON.
@@ -67,7 +68,7 @@ pub fn run(args: Args) -> Result<(), Error> {
         return Err(Error::Refused(message.into()));
     }
     let (name, text) = match &args.config {
-        Some(path) => (config::name(path), config::read_file(path)?),
+        Some(path) => (config::name(path), import::read_file(path)?),
         None => ("configs/generally_forward.toml".into(), config::LAYOUTS[0].1.into()),
     };
     // Only the first stage is measured.

@@ -36,6 +36,7 @@ mod compare;
 mod completions;
 mod console;
 mod devices;
+mod import;
 mod init;
 mod layout;
 mod man;
@@ -77,6 +78,8 @@ commands! {
     "Design an experiment" {
         /// Write a commented config to start from.
         Init(init),
+        /// Translate a config of the authors' programs.
+        Import(import),
         /// Check a config, and show its values, cost and layout.
         Check(check),
         /// Score teams that need no learning.
@@ -404,7 +407,7 @@ pub struct ConfigFile {
 impl ConfigFile {
     /// Reads the file, for a request that sets some keys.
     pub fn text(&self, set: Vec<Override>) -> Result<ConfigText, Error> {
-        Ok(ConfigText { text: config::read_file(&self.path)?, name: config::name(&self.path), set })
+        Ok(ConfigText { text: flotilla_app::import::read_file(&self.path)?, name: config::name(&self.path), set })
     }
 }
 

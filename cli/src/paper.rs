@@ -3,16 +3,20 @@
 use std::ffi::OsString;
 use std::path::PathBuf;
 
+use serde::Serialize;
+
 use super::console::Console;
 use super::recovery::{self, Checkpoints};
 use super::{Error, ExistingResults, Overrides, Printed, RunOptions, SetKeys, number};
 use flotilla::config::Override;
 use flotilla::escape::PathExt;
+use flotilla_app::ops::{BackendSource, Context};
 use flotilla_app::record::folder::ARMS;
 use flotilla_app::shell;
 use flotilla_studies::paper::run::{OUT, Request};
 use flotilla_studies::populations::layout;
 use flotilla_studies::questions::letter;
+use flotilla_studies::{influence, paper, populations, questions};
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -29,10 +33,16 @@ pub struct Args {
         default_missing_value = "generally-forward,strictly-forward,chaotic,coupling-6", value_parser = layout,
         conflicts_with = "questions")]
     populations: Vec<String>,
-    /// Independent repetitions [default: 5, or 30 with --questions]
+    /// Compare credits for rovers and UAVs instead, in all layouts or some of rover_uav, 3_rovers_1_uav, 3_rovers_3_uavs,
+    /// 4_rovers_4_uavs (docs/results/influence.md)
+    #[arg(long, value_name = "LAYOUTS", num_args = 0..=1, require_equals = true, value_delimiter = ',',
+        default_missing_value = "rover_uav,3_rovers_1_uav,3_rovers_3_uavs,4_rovers_4_uavs", value_parser = influence::layout,
+        conflicts_with_all = ["questions", "populations"])]
+    influence: Vec<String>,
+    /// Independent repetitions [default: 5, or 30 with --questions or --influence]
     #[arg(long, value_name = "N", value_parser = number)]
     trials: Option<String>,
-    /// Number of generations after the random generation 0 [default: 100, or the question's own]
+    /// Number of generations after the random generation 0 [default: 100, or the study's own]
     #[arg(long, value_name = "N", value_parser = number)]
     generations: Option<String>,
     /// Random seed [default: 0]
@@ -62,39 +72,41 @@ impl Args {
     fn command_to_resume(&self) -> String {
         let (overrides, out) = (self.overrides(), shell::argument(&self.out));
         let letters: Vec<String> = self.questions.iter().map(char::to_string).collect();
-        let questions = (!letters.is_empty()).then(|| format!("--questions={}", letters.join(",")).into());
-        let words = ["flotilla", "paper"].map(OsString::from).into_iter().chain(questions);
-        let layouts =
-            (!self.populations.is_empty()).then(|| format!("--populations={}", self.populations.join(",")).into());
-        let words = words.chain(layouts).chain(["--out".into(), out]);
+        let studies = [("questions", &letters), ("populations", &self.populations), ("influence", &self.influence)];
+        let study = |(name, chosen): (&str, &Vec<String>)| {
+            (!chosen.is_empty()).then(|| format!("--{name}={}", chosen.join(",")).into())
+        };
+        let words = ["flotilla", "paper"].map(OsString::from).into_iter().chain(studies.into_iter().filter_map(study));
+        let words = words.chain(["--out".into(), out]);
         let machine = recovery::words_of_machine(&self.run);
         shell::command(words.chain(recovery::words_of(&overrides)).chain(["--resume".into()]).chain(machine))
     }
 }
 
+/// A study: trains what a request asks for.
+type Study<T> = fn(&Request, &mut dyn BackendSource, Context<'_>) -> Result<T, Error>;
+
 pub fn run(args: Args) -> Result<(), Error> {
-    let mut console = Console::new(&args.run, args.printed.quiet);
-    let (set, start) = (args.overrides(), args.existing.start());
-    let (questions, populations) = (args.questions.clone(), args.populations.clone());
-    let request = Request { out: args.out.clone(), start, set, questions, populations };
-    let resume = |error: Error| error.or_advise(|| format!("continue with\n  {}", args.command_to_resume()));
     let out = args.out.escaped();
     if !args.populations.is_empty() {
-        let found = console
-            .run(|backends, context| flotilla_studies::populations::run(&request, backends, context))
-            .map_err(resume)?;
-        return args.printed.outcome(&found, |found| {
+        return args.study(populations::run, |found| {
             format!(
                 "{}\nFiles in {out}: populations (.svg, .png, .pdf), cells.csv, pairs.csv, and a run each in {ARMS}/\n",
                 found.text
             )
         });
     }
+    if !args.influence.is_empty() {
+        return args.study(influence::run, |found| {
+            format!(
+                "{}\nFiles in {out}: baselines.csv, and of each layout its credits (LAYOUT.csv), every pair of them \
+                 (LAYOUT_pairs.csv) and its sweep, in a folder\n",
+                found.text
+            )
+        });
+    }
     if !args.questions.is_empty() {
-        let found = console
-            .run(|backends, context| flotilla_studies::questions::run::run(&request, backends, context))
-            .map_err(resume)?;
-        return args.printed.outcome(&found, |found| {
+        return args.study(questions::run::run, |found| {
             format!(
                 "{}\nFiles in {out}: questions.md, for each table its figure (.svg, .png, .pdf) and every comparison (.csv), and \
                  the sweep that it is of, in a folder\n",
@@ -102,14 +114,29 @@ pub fn run(args: Args) -> Result<(), Error> {
             )
         });
     }
-    let found = console
-        .run(|backends, context| flotilla_studies::paper::run::run(&request, backends, context))
-        .map_err(resume)?;
-    args.printed.outcome(&found, |found| {
+    args.study(paper::run::run, |found| {
         format!(
             "{}Trained in {:.1} s. Files in {out}: figure4, figure5, figure6 (.svg, .png, .pdf), claims.md (with every \
              figure), summary.json, and a run each in {ARMS}/\n",
             found.text, found.seconds
         )
     })
+}
+
+impl Args {
+    /// Runs a study, and prints its results. If it is stopped, advises how to continue.
+    fn study<T: Serialize>(&self, study: Study<T>, text: impl FnOnce(&T) -> String) -> Result<(), Error> {
+        let Args { out, questions, populations, influence, existing, printed, .. } = self;
+        let request = Request {
+            out: out.clone(),
+            start: existing.start(),
+            set: self.overrides(),
+            questions: questions.clone(),
+            populations: populations.clone(),
+            influence: influence.clone(),
+        };
+        let found = Console::new(&self.run, printed.quiet).run(|backends, context| study(&request, backends, context));
+        let resume = |error: Error| error.or_advise(|| format!("continue with\n  {}", self.command_to_resume()));
+        printed.outcome(&found.map_err(resume)?, text)
+    }
 }

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use super::{Error, Printed, SetKeys, backend, between, console};
 use flotilla::config;
+use flotilla_app::import;
 use flotilla_app::ops::verify::{self, Compared, TEAMS, VerifyRequest};
 
 #[derive(clap::Args)]
@@ -42,7 +43,7 @@ const EXIT_CODES: &str =
 /// Prints a table of adapters, passes and kernels, and the differences below it.
 pub fn run(args: Args) -> Result<(), Error> {
     backend::start_threads(None);
-    let read = |path: PathBuf| Ok::<_, Error>((config::name(&path), config::read_file(&path)?));
+    let read = |path: PathBuf| Ok::<_, Error>((config::name(&path), import::read_file(&path)?));
     let Args { config, set, teams, worlds, seed, adapter, pass, kernel, printed } = args;
     let request = VerifyRequest {
         config: config.map(read).transpose()?,

@@ -642,7 +642,7 @@ fn a_training_works_with_fewer_threads_than_requested() {
 fn too_little_address_space_is_reported() {
     let place = Place::new(&[("small.toml", TINY)]);
     let mut refused = 0;
-    for mib in (20..=120).step_by(10) {
+    for mib in (30..=120).step_by(10) {
         let line = "flotilla train small.toml --backend cpu --threads 4 --quiet --out run";
         let output = place.shell(&format!("ulimit -v {}; exec {line}{mib}", mib << 10));
         let stderr = String::from_utf8(output.stderr).unwrap();

@@ -23,6 +23,8 @@ mod exactness;
 mod faults;
 mod first;
 mod front;
+mod import;
+mod influence;
 mod input;
 mod json;
 mod learning;

@@ -492,4 +492,15 @@ fn the_page_on_rovers_and_uavs_agrees_with_its_files() {
         }
     }
     assert_eq!((pairs, uncorrected), (84, 1));
+    let baselines = read("baselines.csv".into());
+    for (layout, baseline, g) in [
+        ("3_rovers_3_uavs", "random networks", "0.56"),
+        ("4_rovers_4_uavs", "random networks", "0.59"),
+        ("3_rovers_3_uavs", "hill climbing", "0.71"),
+        ("4_rovers_4_uavs", "hill climbing", "0.64"),
+    ] {
+        let row = baselines.iter().find(|row| row["layout"] == layout && row["baseline"] == baseline).unwrap();
+        assert_eq!(format!("{:.2}", row["g"].parse::<f64>().unwrap()), g, "{layout}, {baseline}");
+        assert!(page.contains(g), "{g}");
+    }
 }

@@ -22,7 +22,8 @@ pub struct Config(pub flotilla::Config);
 impl Config {
     #[staticmethod]
     fn load(path: PathBuf) -> PyResult<Config> {
-        flotilla::Config::load(&path).raise().map(Config)
+        let text = flotilla_app::import::read_file(&path).raise()?;
+        flotilla::Config::parse(&text, &flotilla::config::name(&path)).raise().map(Config)
     }
 
     #[staticmethod]

@@ -8,10 +8,12 @@
 //! | [`questions`] | the open questions of the paper, as sweeps |
 //! | [`tasks`] | a suite of tasks, and which of them no baseline solves |
 //! | [`populations`] | followers against the number of populations |
+//! | [`influence`] | credits for rovers and UAVs |
 
 #![deny(missing_docs)]
 #![allow(rustdoc::private_intra_doc_links, reason = "tables of modules name the internal ones, too")]
 
+pub mod influence;
 pub mod paper;
 pub mod populations;
 pub mod questions;

@@ -32,9 +32,9 @@ pub const BUDGET: usize = 10;
 /// Number of policies in the small populations, and their number of generations.
 pub const SMALL: (i64, i64) = (50, 100);
 /// Number of repetitions of the baselines.
-const SEEDS: usize = 10;
+pub(crate) const SEEDS: usize = 10;
 /// Number of held-out episodes per champion, if starts or POIs move.
-const EPISODES: u32 = 200;
+pub(crate) const EPISODES: u32 = 200;
 /// G above which a team solves a task. If starts or POIs move, no team observes all POIs in all episodes.
 pub const SOLVED: f64 = 0.9;
 /// The fitnesses of both kinds of populations.

@@ -24,9 +24,8 @@ use std::path::Path;
 use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
 
-use flotilla::config::{
-    self, Config, ConfigError, GENERATIONS, GRID, Override, Problem, STAGES, VARY, ValidConfig, read_file,
-};
+use crate::import;
+use flotilla::config::{self, Config, ConfigError, GENERATIONS, GRID, Override, Problem, STAGES, VARY, ValidConfig};
 use flotilla::escape;
 use flotilla::file;
 use flotilla::reader::Document;
@@ -112,7 +111,7 @@ pub struct Point {
 impl Sweep {
     /// Reads a sweep file. `flags` set config keys of all points, and `skip` skips invalid points.
     pub fn load(path: &Path, flags: &[Override], skip: bool) -> Result<Sweep, ConfigError> {
-        let mut sweep = Sweep::read(&read_file(path)?, &config::name(path), flags, skip)?;
+        let mut sweep = Sweep::read(&import::read_file(path)?, &config::name(path), flags, skip)?;
         if config::is_standard_input(path) {
             sweep.name = "sweep".into();
         }

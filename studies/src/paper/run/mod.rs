@@ -51,6 +51,9 @@ pub struct Request {
     /// Names of layouts. Only [`crate::populations`] uses them.
     #[serde(default)]
     pub populations: Vec<String>,
+    /// Names of layouts. Only [`crate::influence`] uses them.
+    #[serde(default)]
+    pub influence: Vec<String>,
 }
 
 impl Request {

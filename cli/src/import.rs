@@ -1,0 +1,41 @@
+//! `flotilla import`: translates a config of the authors' programs.
+
+use std::path::PathBuf;
+
+use super::{Error, print, say};
+use flotilla::config;
+use flotilla::escape::PathExt;
+use flotilla_app::import;
+use flotilla_app::ops::output;
+
+#[derive(clap::Args)]
+pub struct Args {
+    /// Config file (YAML) of the program influence shaping or leader-follower, or - for standard input
+    file: PathBuf,
+    /// New file to write [default: standard output]
+    #[arg(long, short, value_name = "FILE")]
+    out: Option<PathBuf>,
+    /// Overwrite the file
+    #[arg(long, requires = "out")]
+    force: bool,
+}
+
+/// Prints or writes the config, and lists the keys that are not translated on standard error.
+pub fn run(args: Args) -> Result<(), Error> {
+    let Args { file, out, force } = args;
+    output::check(&[("--out", out.as_deref())], &[&file])?;
+    let found = import::translate(&config::read_file(&file)?, &config::name(&file))?;
+    match &out {
+        None => print(&found.text)?,
+        Some(path) => {
+            let write = if force { output::write } else { output::write_new };
+            write(path, found.text.as_bytes())?;
+            print(&format!("{}\n", path.escaped()))?;
+        }
+    }
+    found.skipped.iter().for_each(say);
+    if !found.skipped.is_empty() {
+        say(format_args!("keys not translated: {}; the config has them as comments", found.skipped.len()));
+    }
+    Ok(())
+}

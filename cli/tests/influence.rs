@@ -1,0 +1,59 @@
+//! Tests the study of rovers and UAVs, `flotilla paper --influence`.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::process::Stdio;
+use std::time::Duration;
+
+use crate::support::{Place, flotilla};
+
+/// Returns the contents of the files with results.
+fn tables(place: &Place, out: &str) -> BTreeMap<String, Vec<u8>> {
+    let files = fs::read_dir(place.path(out)).unwrap().map(|entry| entry.unwrap().path());
+    let tables = files.filter(|path| path.extension().is_some_and(|extension| extension == "csv"));
+    tables.map(|path| (path.file_name().unwrap().to_str().unwrap().into(), fs::read(&path).unwrap())).collect()
+}
+
+#[test]
+fn a_killed_study_resumes_to_the_same_tables() {
+    let place = Place::new(&[]);
+    let line = "paper --influence=rover_uav,3_rovers_1_uav --trials 3 --generations 8 --set learning.population=10 \
+                --backend cpu";
+    let (printed, _) = place.good(&format!("{line} --out whole --quiet"));
+    let whole = tables(&place, "whole");
+    let names: Vec<_> = whole.keys().map(|name| &**name).collect();
+    let of =
+        ["3_rovers_1_uav.csv", "3_rovers_1_uav_pairs.csv", "baselines.csv", "rover_uav.csv", "rover_uav_pairs.csv"];
+    assert_eq!(names, of);
+    assert!(printed.as_bytes().starts_with(&whole["baselines.csv"]), "{printed}");
+    let rows = |name: &str| String::from_utf8_lossy(&whole[name]).lines().count() - 1;
+    // G, D, Df and Dt under four rules are seven credits, with 21 pairs. There are six baselines.
+    assert_eq!((rows("rover_uav.csv"), rows("rover_uav_pairs.csv"), rows("baselines.csv")), (7, 21, 12));
+
+    // Killed several times, each time a little later.
+    let resumed = format!("{line} --out killed --quiet --resume");
+    let mut kills = 0;
+    for moment in (1..7).map(|kills| Duration::from_millis(100 * kills)) {
+        let mut command = flotilla();
+        command.args(resumed.split_whitespace()).current_dir(place.root()).stderr(Stdio::null()).stdout(Stdio::null());
+        let mut child = command.spawn().unwrap();
+        std::thread::sleep(moment);
+        child.kill().unwrap();
+        kills += u32::from(!child.wait().unwrap().success());
+    }
+    assert!(kills > 1, "killed {kills} times");
+    place.good(&resumed);
+    assert!(tables(&place, "killed") == whole, "killed {kills} times");
+
+    // The tables are those of the sweep, and of a comparison of its runs.
+    assert_eq!(fs::read(place.path("whole/rover_uav/points.csv")).unwrap(), whole["rover_uav.csv"]);
+    let points: Vec<String> = (0..7).map(|point| format!("whole/rover_uav/points/{point:04}")).collect();
+    let (compared, _) = place.good(&format!("compare {} --paired --csv", points.join(" ")));
+    let lines = String::from_utf8_lossy(&whole["rover_uav_pairs.csv"]).into_owned();
+    assert!(lines.lines().all(|line| compared.lines().any(|other| other == line)), "{lines}\n{compared}");
+
+    assert!(place.refused(1, &format!("{line} --out whole")).contains("--resume"));
+    assert!(place.refused(1, &format!("{line} --out whole --resume --seed 4")).contains("holds another sweep"));
+    assert!(place.refused(2, "paper --influence=nowhere").contains("3_rovers_3_uavs"));
+    assert!(place.refused(2, "paper --influence --trials 1 --out none").contains("two trials or more"));
+}
