@@ -766,8 +766,10 @@ mod tests {
 
     #[test]
     fn no_bit_depends_on_the_order_of_agents_in_cells() {
-        for seed in 0..100 {
-            let world = World::new(&sample::any_world(seed).validate().unwrap());
+        let worlds = (0..150).map(|seed| (seed, World::new(&sample::any_world(seed).validate().unwrap())));
+        let worlds: Vec<_> = worlds.filter(|(_, world)| can_play(world)).collect();
+        assert!(worlds.len() >= 100, "{}", worlds.len());
+        for (seed, world) in worlds {
             let compare = |[(a, at_a), (b, at_b)]: [(Vec<&[u32]>, Vec<u32>); 2]| {
                 assert_eq!(a, b, "{seed}");
                 assert_eq!(at_a, at_b, "{seed}");
