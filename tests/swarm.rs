@@ -18,7 +18,7 @@ fn check(worlds: &[(&str, Config)], teams: usize) {
 
 #[test]
 fn random_worlds_are_equal_with_grids_and_without() {
-    let worlds: Vec<(String, Config)> = Plan::random(0..60, 5).worlds;
+    let worlds: Vec<(String, Config)> = Plan::random(0..120, 5).worlds;
     check(&worlds.iter().map(|(name, config)| (&**name, config.clone())).collect::<Vec<_>>(), 5);
 }
 

@@ -130,7 +130,7 @@ fn less_base(raised: f32, base: f32) -> i32 {
 
 // The f32 nearest to an integer. Drivers may convert large ones otherwise, but both of these parts are exact.
 fn nearest_f32(x: i32) -> f32 {
-    return f32(x >> 12u) * 4096.0 + f32(x & 0xfff);
+    return f32(x & ~0xfff) + f32(x & 0xfff);
 }
 
 // +0 where |x| < limit, else x.

@@ -479,6 +479,7 @@ fn scalar_action(name: &str) -> Option<Action> {
         ("and", "b32" | "b64") => scalar(|a, b| a & b, NotZero),
         ("or", "b32" | "b64") => scalar(|a, b| a | b, NotZero),
         ("andn2" | "and_not1", "b32" | "b64") => scalar(|a, b| a & !b, NotZero),
+        ("orn2" | "or_not1", "b32" | "b64") => scalar(|a, b| a | !b, NotZero),
         ("add", "u32") => scalar(|a, b| a + b, Carry),
         ("add" | "addk", "i32") => scalar(|a, b| a.wrapping_add(b), Overflow),
         ("sub", "i32") => scalar(|a, b| a.wrapping_sub(b), OverflowDown),

@@ -466,7 +466,7 @@ impl Channel {
         let valued = of == [POIS];
         let value = summary.groups_of(&pois).map(|group| group.value).filter(|_| valued).fold(1.0, f64::max);
         let largest = measure.largest(nearest);
-        if largest * value > MOST_MEASURED {
+        if largest * value > MOST_MEASURED * (1.0 + 1e-9) {
             let times = if valued { format!(", times a POI's value of {value}") } else { String::new() };
             let message = format!(
                 "found \"{measure}\", up to {largest} with nearest = {nearest}{times}; allowed up to {MOST_MEASURED}"
