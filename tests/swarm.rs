@@ -1,8 +1,13 @@
 //! Large teams, one at a time with a grid of cells, against vectors of teams: equal bits.
 
-use flotilla::backend::cpu::{Cpu, level_name};
-use flotilla::config::Config;
+use flotilla::backend::Group;
+use flotilla::backend::cpu::{Cpu, Noise, StepArrays, level_name};
+use flotilla::config::{Config, own_populations};
+use flotilla::evaluate::SCORES_AND_DT;
+use flotilla::evolve::{Key, Purpose};
+use flotilla::sample;
 use flotilla::verify::{Plan, compare};
+use flotilla::world::World;
 
 /// Compares traces, every fitness and whole trainings, on every instruction set.
 fn check(worlds: &[(&str, Config)], teams: usize) {
@@ -78,6 +83,62 @@ fn a_swarm_is_equal_with_a_grid_and_without() {
     let config = Config::parse(SWARM, "swarm.toml").unwrap();
     let by_paths = Config::parse(&SWARM.replace("radius = 5.0", "radius = 5.0\nscore = \"closeness\""), "paths.toml");
     check(&[("swarm", config), ("swarm by paths", by_paths.unwrap())], 2);
+}
+
+/// Steps with noise, as Python's `rollout` and `collect` get them.
+#[test]
+fn recorded_steps_are_equal_with_a_grid_and_without() {
+    let world = World::new(&Config::parse(SWARM, "swarm.toml").unwrap().validate().unwrap());
+    let (steps, agents, leaders, pois) = (world.steps(), world.agents(), world.leaders(), world.pois.len());
+    let (weights, teams) = (sample::weights(&world, 3, 7), [0, 1, 2, 0, 2, 1, 0, 1]);
+    let (starts, populations) = (&world.starts, own_populations(leaders));
+    let (weights, fitnesses, policies) = (weights[..].into(), SCORES_AND_DT, 3);
+    let group = Group { world: &world, starts, weights, policies, populations, teams: &teams, fitnesses };
+    let key = Key::new(5, 0, Purpose::Exploration);
+    let noise = Noise { key, deviations: &vec![[0.1, 0.2]; leaders], first: 3 };
+    let record = |large_from: usize| {
+        let zeros = |moments: usize, numbers: usize| vec![0.0; 2 * moments * numbers];
+        let [mut positions, mut headings, mut speeds] = [2, 2, 1].map(|width| zeros(steps + 1, agents * width));
+        let [mut inputs, mut outputs, mut actions] = [world.inputs(), 2, 2].map(|width| zeros(steps, leaders * width));
+        let mut agents_at_poi = vec![0; 2 * world.set_words()];
+        let mut observed_at = vec![0; 2 * pois];
+        let arrays = StepArrays {
+            positions: &mut positions,
+            headings: &mut headings,
+            speeds: &mut speeds,
+            inputs: &mut inputs,
+            outputs: &mut outputs,
+            actions: &mut actions,
+            agents_at_poi: &mut agents_at_poi,
+            observed_at: &mut observed_at,
+        };
+        let cpu = Cpu::default().with_large_from(large_from);
+        let scores = cpu.record(&[group], Some(noise), arrays).unwrap();
+        let floats = [positions, headings, speeds, inputs, outputs, actions];
+        (
+            scores,
+            floats.map(|array| array.into_iter().map(f32::to_bits).collect::<Vec<_>>()),
+            agents_at_poi,
+            observed_at,
+        )
+    };
+    let (vectors, swarms) = (record(usize::MAX), record(0));
+    assert!(vectors == swarms);
+    assert!(
+        vectors.1[5] != vectors.1[4] && vectors.2.iter().any(|&set| set != 0),
+        "there is noise, and agents at POIs"
+    );
+}
+
+/// Every POI may need all agents, in the short form as well.
+#[test]
+fn a_coupling_may_be_as_large_as_a_team() {
+    let (head, _) = SWARM.split_once("[[pois]]").unwrap();
+    let short = head.replace("steps = 12", "steps = 12\npois = [[30.0, 30.0]]\ncoupling = 1224");
+    let config = Config::parse(&short, "short.toml").unwrap();
+    assert_eq!(World::new(&config.validate().unwrap()).coupling, [1224]);
+    let error = Config::parse(&short.replace("1224", "1225"), "short.toml").unwrap_err().to_string();
+    assert!(error.contains("world.coupling: found 1225, allowed 1 to 1224"), "{error}");
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! Tests `flotilla import`, with configs that have the structure of the authors' programs.
 
-use flotilla::config::Config;
+use flotilla::config::{Config, Sectors};
 
 use crate::support::Place;
 
@@ -148,7 +148,7 @@ fn rovers_and_uavs_become_classes() {
         "{ of = \"pois\", sectors = 3, frame = \"map\", range = 30.0",
         "{ of = \"pois\", pois = [\"rover\"], sectors = 3, frame = \"map\", range = 30.0",
         "name = \"hidden_A\" # 2 of them count = 2 # drawn anew for every episode in = { circle = [30.0, 20.0, 10.0] }",
-        "# not translated: env.agents.rovers[2].bounds.high_x = 30: agents can be anywhere on the map (line 16)",
+        "stays_in = [0.0, 0.0, 30.0, 40.0] # env.agents.rovers[2].bounds (line 16)",
         "led_by = \"any-seen\" # IndirectDifference.automatic.credit",
         "removes = [[0], [1], [2], [3], [0, 3]]",
         "add_g = true",
@@ -168,7 +168,6 @@ fn rovers_and_uavs_become_classes() {
     assert_eq!((learning.team_elites, learning.episodes_per_team, learning.mutation_sigma), (2, 3, 0.2));
     // One line per key that is lost, each with its place, and none for keys that are translated.
     for place in [
-        "config.yaml:16: not translated: env.agents.rovers[2].bounds.low_x = 0",
         "disappear_bool = true",
         "config.yaml:8: not translated: env.agents.rovers[0].reward_type = \"Difference\": credit.add_g is one for all",
         "config.yaml:53: not translated: ccea.network.uav_max_velocity = 1.5: there, the first UAV has",
@@ -212,22 +211,46 @@ fn every_word_of_an_influence_config_has_a_translation() {
     for (theirs, ours) in [("random_teams", "random"), ("softmax_teams", "softmax"), ("fixed_teams", "sorted")] {
         assert_eq!(import(&INFLUENCE.replace("softmax_teams", theirs)).0.learning.teams.to_string(), ours);
     }
-    // Earlier versions have other keys, and rovers that follow.
+    // Earlier versions have other keys.
     let earlier = INFLUENCE
         .replace("populations: {agent_population_size: 20}", "population: {subpopulation_size: 20}")
         .replace(
             "multi_rollout: {num_rollouts: 3}",
             "multi_evaluation: {num_evaluations: 3, aggregation_method: average}",
         )
-        .replace("n_individual_elites: 4, n_team_elites: 2", "n_elites: 4")
-        .replace("    - &rover\n", "    - &rover\n      policy: {type: follow}\n      action: {type: pick_uav}\n");
-    let (config, text, listed) = import(&earlier);
+        .replace("n_individual_elites: 4, n_team_elites: 2", "n_elites: 4");
+    let (config, ..) = import(&earlier);
     assert_eq!((config.learning.population, config.learning.episodes_per_team), (20, 3));
-    let names: Vec<_> = config.agents.iter().map(|class| &*class.name).collect();
-    assert_eq!(names, ["rover", "uav", "uav_2", "rover_2"], "{text}");
-    assert!(listed.contains("policy.type = \"follow\""), "{listed}");
+}
+
+#[test]
+fn rovers_follow_choose_and_need_uavs() {
+    let first = INFLUENCE.find("    - observation_radius: 30.0").unwrap();
+    let second = first + 1 + INFLUENCE[first + 1..].find("    - observation_radius: 30.0").unwrap();
+    let end = INFLUENCE.find("  pois:").unwrap();
+    // Both UAVs are scored by the agents that are taken out, so their class is one.
+    let uav = &INFLUENCE[second..end];
+    let equal = [&INFLUENCE[..first], uav, uav, &INFLUENCE[end..]].concat();
+    let with = |keys: &str| equal.replace("    - &rover\n", &format!("    - &rover\n{keys}"));
+    let follows = with("      policy: {type: follow}\n      action: {type: pick_uav}\n");
+    let (config, text, listed) = import(&follows);
+    let classes: Vec<_> = config.agents.iter().map(|class| (&*class.name, class.control.to_string())).collect();
+    let expected = [("rover", "policy"), ("uav", "policy"), ("rover_2", "nearest:uav")];
+    assert_eq!(classes, expected.map(|(name, control)| (name, control.to_string())), "{text}");
+    assert_eq!(config.agents[2].reach, Some(6.0));
     // Agents have other numbers then: rovers 0 and 1 are the last.
-    assert!(text.contains("removes = [[0], [1], [3, 1]]"), "{text}");
+    assert!(text.contains("removes = [[0], [3, 1], [3, 1]]"), "{text}");
+    assert!(!listed.contains("follow") && !listed.contains("pick_uav"), "{listed}");
+    let picks = with("      action: {type: pick_uav}\n").replace("RoverLidar", "UavDistanceLidar");
+    let (config, text, _) = import(&picks.replace("needs_uav_to_move: false", "needs_uav_to_move: true"));
+    let rover = &config.agents[0];
+    assert_eq!((rover.control.to_string(), rover.moves_near.as_deref()), ("choose:uav".into(), Some("uav")), "{text}");
+    assert_eq!(rover.senses.iter().map(|channel| channel.sectors).collect::<Vec<_>>(), [Sectors::Each(2)], "{text}");
+    let message =
+        "config.yaml:8: env.agents.rovers[0].action.type: found, allowed if all UAVs differ in their positions";
+    let different = INFLUENCE
+        .replace("      reward_type: Difference\n", "      action: {type: pick_uav}\n      reward_type: Difference\n");
+    fails(&different, "RoverLidar", "UavDistanceLidar", message);
 }
 
 #[test]

@@ -446,17 +446,48 @@ fn every_relative_link_has_a_target() {
     assert_eq!(broken_links(&page).len(), 3, "{:?}", broken_links(&page));
 }
 
+/// Reads a file of comma-separated values.
+fn read_csv(path: std::path::PathBuf) -> Vec<BTreeMap<String, String>> {
+    csv::Reader::from_path(path).unwrap().deserialize().map(Result::unwrap).collect()
+}
+
+/// Every line of the tables on swarms is in the published files.
+#[test]
+fn the_page_on_swarms_agrees_with_its_files() {
+    let folder = crate::support::root("docs/results");
+    let page = fs::read_to_string(folder.join("swarms.md")).unwrap();
+    let number = |row: &BTreeMap<String, String>, key: &str| row[key].parse::<f64>().unwrap();
+    for row in read_csv(folder.join("swarms/baselines.csv")) {
+        let keys = ["constant_speed", "random_networks", "random_shared_networks", "hill_climbing"];
+        let cells = keys.map(|key| format!("{:.2}", number(&row, key))).join(" | ");
+        let line = format!("| {} | {cells} |", row["followers_per_leader"]);
+        assert!(page.contains(&line), "{line}");
+    }
+    let rows = read_csv(folder.join("swarms/champions.csv"));
+    for means in rows.iter().filter(|row| row["other"].is_empty()).collect::<Vec<_>>().chunks(4) {
+        let cell = |row: &&BTreeMap<String, String>| {
+            let [g, low, high] = ["value", "low", "high"].map(|key| number(row, key));
+            format!("{g:.2} [{low:.2}, {high:.2}]")
+        };
+        let cells = means.iter().map(cell).collect::<Vec<_>>().join(" | ");
+        let line = format!("| {} | {cells} |", means[0]["followers_per_leader"]);
+        assert!(page.contains(&line), "{line}");
+    }
+    let p = |arm: &str, other: &str| {
+        let is = |row: &&BTreeMap<String, String>| row["arm"].starts_with(arm) && row["other"].starts_with(other);
+        let pairs = rows.iter().filter(is).filter(|row| row["arm"].ends_with("none") && row["other"].ends_with("none"));
+        pairs.map(|row| number(row, "p_holm")).collect::<Vec<_>>()
+    };
+    assert!(p("fitness G,", "fitness Df,").iter().all(|&p| p >= 0.07));
+    assert!(p("fitness G,", "fitness D,")[2..].iter().all(|&p| p < 0.05));
+}
+
 /// Every cell of the table on rovers and UAVs is in the published files, and no pair of credits differs.
 #[test]
 fn the_page_on_rovers_and_uavs_agrees_with_its_files() {
     let folder = crate::support::root("docs/results");
     let page = fs::read_to_string(folder.join("influence.md")).unwrap();
-    let read = |name: String| {
-        let text = fs::read_to_string(folder.join("influence").join(name)).unwrap();
-        let mut reader = csv::Reader::from_reader(text.as_bytes());
-        let rows: Vec<BTreeMap<String, String>> = reader.deserialize().map(Result::unwrap).collect();
-        rows
-    };
+    let read = |name: String| read_csv(folder.join("influence").join(name));
     let layouts = ["rover_uav", "3_rovers_1_uav", "3_rovers_3_uavs", "4_rovers_4_uavs"];
     let tables: Vec<_> = layouts.iter().map(|layout| read(format!("{layout}.csv"))).collect();
     let rule = |rule: &'static str| ("Dt", rule);

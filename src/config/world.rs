@@ -80,7 +80,7 @@ impl WorldConfig {
         let observers = Observers::read(r);
         let counted = match (leaders.as_ref(), followers.as_ref(), paradigm) {
             _ if has_pois => MAX_LEARNERS,
-            _ if has_agents => observers_in_full.filter(|&count| count > 0).unwrap_or(MAX_LEARNERS),
+            _ if has_agents => observers_in_full.filter(|&count| count > 0).unwrap_or(MAX_AGENTS),
             (Some(leaders), Some(followers), Paradigm::LeaderFollower) => {
                 observers.among(leaders.len(), followers.len()).len()
             }
@@ -98,7 +98,7 @@ impl WorldConfig {
         let heading = Heading::read(r, counts);
         let world = WorldConfig {
             map,
-            coupling: Coupling::read(r, counted.clamp(1, MAX_LEARNERS), observers.counted(), places),
+            coupling: Coupling::read(r, counted.max(1), observers.counted(), places),
             observers,
             windows: windows(r, steps, places),
             after: after(r, places),

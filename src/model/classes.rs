@@ -235,9 +235,9 @@ table! {
 /// The sectors of a channel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Sectors {
-    /// So many of equal angle.
+    /// Sectors of equal angle: their number.
     Equal(usize),
-    /// One of each of so many agents or POIs: all that the channel names.
+    /// A sector of its own for each agent or POI that the channel names: their number.
     Each(usize),
 }
 

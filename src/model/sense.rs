@@ -185,6 +185,24 @@ impl ChannelConstants {
     }
 }
 
+impl ChannelShape {
+    /// Reports whether its sectors are quadrants whose measures are added, see [`Quadrants`].
+    pub(crate) fn is_in_quadrants(&self) -> bool {
+        self.each == 0 && self.sectors == 4 && self.combine != Combine::Closest as u32
+    }
+}
+
+impl<S: Simd> ChannelLanes<S> {
+    /// Returns the heading that the sectors of an agent with this heading turn with.
+    #[inline(always)]
+    pub(crate) fn heading(&self, hx: S::f32s, hy: S::f32s) -> [S::f32s; 2] {
+        match self.shape.frame == Frame::Map as u32 {
+            true => [splat(hx.token(), 1.0), splat(hx.token(), 0.0)],
+            false => [hx, hy],
+        }
+    }
+}
+
 /// Returns the square of a range.
 pub(crate) fn squared_range(range: f64) -> f32 {
     match range {

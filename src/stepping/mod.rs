@@ -257,9 +257,9 @@ impl Stepper {
     /// If policies of this world choose behaviours, actions are still turns and speeds. Each behaviour is a turn of 0,
     /// ±0.25 or ±0.75 and a speed of -1 or 1, see [`crate::model::policy::choose`].
     ///
-    /// Of classes that move freely, actions are velocities along x and y, as fractions of the maximum speed. Of classes that
-    /// choose agents to move to, the first action is the choice: from -1, the first agent, to 1, nobody, in equal steps; the
-    /// nearest one counts.
+    /// Actions of agents that move freely are velocities along x and y, as fractions of the maximum speed. The first action
+    /// of an agent that chooses agents to move to is its choice: from -1, the first agent, to 1, nobody, in equal steps. It is
+    /// rounded to the nearest of them.
     ///
     /// A team whose episode is over does not move until it is reset.
     ///

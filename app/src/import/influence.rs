@@ -24,8 +24,8 @@ const AGENT: &[Row] = &[
     ("IndirectDifference.type", To::Only("removal", "credits take agents out")),
     ("IndirectDifference", To::Code("assignment manual automatic add_G")),
     ("influence", To::Nothing("UAVs influence rovers within 5 units, as in the newest version of the program")),
-    ("bounds", To::Nothing("agents can be anywhere on the map")),
-    ("needs_uav_to_move", To::Only("false", "rovers move whether they sense UAVs or not")),
+    ("bounds", To::Code("low_x low_y high_x high_y")),
+    ("needs_uav_to_move", To::Code("")),
 ];
 
 const POI: &[Row] = &[
@@ -255,6 +255,11 @@ pub(super) fn translate(root: &At<'_>) -> Result<Vec<Section>, Problem> {
             agents.iter().filter(|(_, group)| group.stem == kind).map(|(name, _)| quoted(name)).collect();
         if let [name] = &of_kind[..] { name.to_string() } else { toml::Value::Array(of_kind).to_string() }
     };
+    let of_uav = agents.iter().flat_map(|(_, group)| &group.section.lines).find(|line| line.text.contains(UAV));
+    if let (Some(line), true) = (of_uav, agents.iter().filter(|(_, group)| group.stem == "uav").count() != 1) {
+        let message = "found, allowed if all UAVs differ in their positions only".into();
+        return Err(Problem { line: Some(line.line), key: line.path.clone(), message });
+    }
     let [rovers, uavs] = ["rover", "uav"].map(names);
     let finish = |(name, group): (String, Group)| {
         let mut section = Section::new(group.section.head);
@@ -272,7 +277,7 @@ pub(super) fn translate(root: &At<'_>) -> Result<Vec<Section>, Problem> {
         }
         section.lines.extend(group.section.lines);
         for line in &mut section.lines {
-            line.text = line.text.replace(ROVERS, &rovers).replace(UAVS, &uavs);
+            line.text = line.text.replace(ROVERS, &rovers).replace(UAVS, &uavs).replace(UAV, "uav");
         }
         section
     };
@@ -284,6 +289,8 @@ pub(super) fn translate(root: &At<'_>) -> Result<Vec<Section>, Problem> {
 const ROVERS: &str = "\u{0}rovers";
 /// See [`ROVERS`].
 const UAVS: &str = "\u{0}uavs";
+/// Stands for the name of the only class of UAVs.
+const UAV: &str = "\u{0}one uav";
 
 fn place(at: &At<'_>) -> Result<Place, Problem> {
     let position = at.need("position")?;
@@ -345,17 +352,24 @@ fn of_agent(
     section.fill(at, AGENT)?;
     let follows = at.word("policy.type", "network", &[("network", false), ("follow", true)])?;
     let picks = at.word("action.type", "dxdy", &[("dxdy", false), ("pick_uav", true)])?;
+    let needs_uav = at.word("needs_uav_to_move", "false", &[("false", false), ("true", true)])?;
     let motion = format!("{{ kind = \"free\", max_speed = {:?} }}", max_speed.number()?);
     section.put("motion", motion, max_speed);
+    if let Some(bounds) = at.get("bounds") {
+        let side = |key: &str| bounds.need(key)?.number();
+        let stays_in = [side("low_x")?, side("low_y")?, side("high_x")?, side("high_y")?];
+        section.put("stays_in", format!("{stays_in:?}"), &bounds);
+    }
     if follows {
-        let policy = at.need("policy.type")?;
-        let radius = at.need("observation_radius")?.number()?.min(1000.0);
-        section.put("control", quoted("follow"), &policy);
-        section.put("rule", format!("[{{ of = {UAVS}, to = {radius:?}, gain = {radius:?} }}]"), &policy);
-        section.skip(&policy, "it goes to the nearest UAV there, and towards the mean of those in range here");
+        section.put("control", format!("\"nearest:{UAV}\""), &at.need("policy.type")?);
+        let radius = at.need("observation_radius")?;
+        section.put("reach", format!("{:?}", radius.number()?), &radius);
     } else {
         if picks {
-            section.skip(&at.need("action.type")?, "the policy chooses a velocity here, not one of the UAVs");
+            section.put("control", format!("\"choose:{UAV}\""), &at.need("action.type")?);
+        }
+        if needs_uav && kind == "rover" {
+            section.put("moves_near", format!("\"{UAV}\""), &at.need("needs_uav_to_move")?);
         }
         senses(at, kind, pois, has_uavs, &mut section)?;
     }
@@ -404,9 +418,9 @@ fn senses(
     let sensor =
         at.word("sensor.type", "SmartLidar", &[("SmartLidar", 0), ("RoverLidar", 1), ("UavDistanceLidar", 2)])?;
     let channels = if sensor == 2 {
-        let why = "there is one input per UAV there, and one per sector here";
-        section.skip(&at.need("sensor.type")?, why);
-        channel(UAVS, range, "distance", "mean", -1.0)
+        format!(
+            "    {{ of = {UAVS}, sectors = \"each\", range = {range:?}, measure = \"distance\", combine = \"sum\", empty = -1.0 }},\n"
+        )
     } else {
         let of_uavs = if has_uavs { channel(UAVS, range, measure, combine, empty) } else { nothing() };
         let of_agents = channel(ROVERS, range, measure, combine, empty) + &of_uavs;

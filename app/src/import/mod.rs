@@ -1,6 +1,6 @@
 //! Translates configs of the authors' programs, which are YAML.
 //!
-//! Each program has a module with tables of its keys: a key, and what becomes of it. To translate a further key, add a
+//! Each program has a module with tables of its keys and their translations. To translate a further key, add a
 //! row. A key without a row is listed as unknown.
 //!
 //! | module | contents |

@@ -6,7 +6,7 @@ use super::yaml::At;
 use flotilla::config::Problem;
 use flotilla::escape;
 
-/// What becomes of a key.
+/// The translation of a key.
 pub(super) enum To {
     /// The same value under another name.
     Key(&'static str),

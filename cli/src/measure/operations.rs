@@ -37,7 +37,8 @@ impl Reach {
         let (mut sensed, mut met) = (zeros(&|class| class.channels().len()), zeros(&|class| class.terms().len()));
         let [mut seen, mut pairs] = [0.0; 2];
         // Of a large class every n-th agent is looked at, and stands for as many as it is one of.
-        let looked_at = |class: &Class| class.agents().step_by(class.agents().len().div_ceil(MOST_LOOKED_AT).max(1));
+        let most = (LOOKED_AT / agents).clamp(16, 1024);
+        let looked_at = |class: &Class| class.agents().step_by(class.agents().len().div_ceil(most).max(1));
         let stands_for =
             |class: &Class| class.agents().len() as f64 / (looked_at(class).len() * world.steps() * trace.teams) as f64;
         let class_of: Vec<usize> =
@@ -88,8 +89,8 @@ impl Reach {
     }
 }
 
-/// Maximum agents of a class whose surroundings are looked at.
-const MOST_LOOKED_AT: usize = 1024;
+/// About as many pairs of agents are looked at, per class and step.
+const LOOKED_AT: usize = 1 << 24;
 
 /// Lane operations of [`kernels`](flotilla::kernels): an f32 or integer operation, a comparison or a selection is one.
 mod kernel {

@@ -9,7 +9,7 @@ use super::agent::Agent;
 use super::neighbours::{self, Bounds, Masks, masks};
 use super::pois::PoiPosition;
 use crate::backend::Moment;
-use crate::config::{Combine, ControlKind, Frame, Measure};
+use crate::config::{Combine, ControlKind, Measure};
 use crate::config_enum::ConstDispatch;
 use crate::kernels::math::{on_lattice, within};
 use crate::kernels::{clamp_to, select, splat};
@@ -165,7 +165,7 @@ impl<S: Simd> Block<S> {
                 let (observers, inputs) = (shape.agents(), Inputs { all: &mut *inputs, width });
                 if channel.shape.each != 0 {
                     scene.sense_each(observers, inputs);
-                } else if channel.shape.sectors == 4 && channel.shape.combine != Combine::Closest as u32 {
+                } else if channel.shape.is_in_quadrants() {
                     Measure::of(channel.shape.measure).dispatch(Quartering { scene, observers, inputs });
                 } else {
                     scene.sense_sectors(observers, inputs);
@@ -425,15 +425,6 @@ struct Scene<'a, S: Simd, P> {
 }
 
 impl<S: Simd, P: PoiPosition<S>> Scene<'_, S, P> {
-    /// Returns the heading that an agent's sectors turn with.
-    #[inline(always)]
-    fn heading(&self, agent: &Agent<S>) -> [S::f32s; 2] {
-        match self.channel.shape.frame == Frame::Map as u32 {
-            true => [splat(self.simd, 1.0), splat(self.simd, 0.0)],
-            false => [agent.hx, agent.hy],
-        }
-    }
-
     /// Returns the offset of a POI from a place.
     #[inline(always)]
     fn offset(&self, poi: &P, x: S::f32s, y: S::f32s) -> [S::f32s; 2] {
@@ -461,7 +452,7 @@ impl<S: Simd, P: PoiPosition<S>> Scene<'_, S, P> {
         let inputs = inputs.all.chunks_exact_mut(inputs.width).skip(observers.start);
         for ((observer, agent), inputs) in observers.clone().zip(&agents[observers]).zip(inputs) {
             let &Agent { x, y, .. } = agent;
-            let heading = self.heading(agent);
+            let heading = channel.heading(agent.hx, agent.hy);
             let mut quadrants = sense::Quadrants::new(simd);
             if channel.shape.of_pois == 0 {
                 neighbours::each_near(
@@ -534,7 +525,7 @@ impl<S: Simd, P: PoiPosition<S>> Scene<'_, S, P> {
         let measure = Measure::of(channel.shape.measure);
         for observer in observers {
             let &Agent { x, y, .. } = &agents[observer];
-            let heading = self.heading(&agents[observer]);
+            let heading = channel.heading(agents[observer].hx, agents[observer].hy);
             let mut sectors = sense::Sectors::new(simd, Combine::of(channel.shape.combine));
             if channel.shape.of_pois == 0 {
                 neighbours::each_near(

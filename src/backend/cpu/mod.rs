@@ -186,8 +186,7 @@ fn play<S: Simd>(
                     #[inline(always)]
                     || swarm.play(batch, first, &mut ()),
                 );
-                let (group, team) = batch.locate(first);
-                scores.score(batch.first + group, team, &swarm.episode());
+                swarm.score(batch, first, scores);
             } else {
                 let episodes = workspace.block(simd, batch);
                 let teams = S::f32s::LEN.min(batch.teams - first);

@@ -5,10 +5,10 @@ use fearless_simd::{Simd, dispatch, prelude::*};
 use super::agent::Agent;
 use super::batch::{WorldBatch, world_batches};
 use super::block::Block;
-use super::episode::{EpisodeBlock, Observer};
-use super::swarm::{Recorded, Swarm, Watch};
+use super::episode::Observer;
+use super::swarm::{Swarm, Watch};
 use super::transpose::to_rows;
-use super::{BackendError, Cpu, Group, GroupScores, ScoreTable, is_large};
+use super::{BackendError, Cpu, Group, GroupScores, ScoreTable, Workspace, is_large};
 use crate::credit::{self, Episode};
 use crate::evolve::{self, Key};
 use crate::kernels::{clamp_to, splat};
@@ -175,86 +175,63 @@ impl Cpu {
             return Err(BackendError::InvalidInput("noise is of every leader".into()));
         }
         let (level, scores) = (self.level, ScoreTable::new(groups));
-        match is_large(batch.world, self.large_from) {
-            true => dispatch!(level, simd => record_large(simd, batch, noise, arrays, &scores)),
-            false => dispatch!(level, simd => record(simd, batch, noise, arrays, &scores)),
-        }
+        let is_large = is_large(batch.world, self.large_from);
+        dispatch!(level, simd => record(simd, batch, is_large, noise, arrays, &scores));
         Ok(scores.finish())
     }
 }
 
-/// Plays and scores the teams of a batch, and writes every step to the arrays.
+/// Plays and scores the teams of a batch, and writes every step to the arrays. Large teams play one at a time.
 fn record<S: Simd>(
     simd: S,
     batch: &WorldBatch<'_>,
+    is_large: bool,
     noise: Option<Noise<'_>>,
     mut arrays: StepArrays<'_>,
     scores: &ScoreTable<'_>,
 ) {
-    let (width, steps) = (S::f32s::LEN, batch.world.steps());
-    let sizes = step_sizes(batch.world, steps + 1, steps);
+    let (world, steps) = (batch.world, batch.world.steps());
+    let (width, sizes) = (if is_large { 1 } else { S::f32s::LEN }, step_sizes(world, steps + 1, steps));
     let part = |first: usize| {
         let teams = width.min(batch.teams - first);
         (first, teams, arrays.split(sizes, teams))
     };
     let mut parts: Vec<(usize, usize, StepArrays<'_>)> = (0..batch.teams).step_by(width).map(part).collect();
-    // One block for several vectors, because blocks are large.
-    parts.par_chunks_mut(VECTORS_PER_TASK).for_each(|parts| {
-        let mut block = EpisodeBlock::new(simd, batch.world, batch.sighted);
-        for (first, teams, arrays) in parts {
-            simd.vectorize(
-                #[inline(always)]
-                || {
-                    block.play(
-                        batch,
-                        *first,
-                        *teams,
-                        &mut Recorder { world: batch.world, noise, first: *first, arrays },
-                    );
-                    block.score(batch, *first, *teams, scores);
-                },
-            );
-            for (lane, to) in arrays.observed_at.chunks_exact_mut(batch.world.pois.len()).enumerate() {
-                write_observed(block.episode(batch, lane), batch.world, to);
+    // One workspace for several parts, because they are large.
+    let together = if is_large { parts.len().div_ceil(current_num_threads()).max(1) } else { VECTORS_PER_TASK };
+    parts.par_chunks_mut(together).for_each(|parts| {
+        let mut workspace = Workspace::Unused;
+        for &mut (first, teams, ref mut arrays) in parts {
+            let observed_at = std::mem::take(&mut arrays.observed_at);
+            if is_large {
+                let swarm = workspace.swarm(simd, batch);
+                simd.vectorize(
+                    #[inline(always)]
+                    || swarm.play(batch, first, &mut LargeRecorder { world, noise, team: first, arrays }),
+                );
+                swarm.score(batch, first, scores);
+                write_observed(world, observed_at, |_| swarm.episode());
+            } else {
+                let block = workspace.block(simd, batch);
+                simd.vectorize(
+                    #[inline(always)]
+                    || {
+                        block.play(batch, first, teams, &mut Recorder { world, noise, first, arrays });
+                        block.score(batch, first, teams, scores);
+                    },
+                );
+                write_observed(world, observed_at, |lane| block.episode(batch, lane));
             }
         }
     });
 }
 
-/// Writes the step, from 1, at which each POI was observed, or 0.
-fn write_observed(episode: Episode<'_>, world: &World, to: &mut [u32]) {
-    let steps = credit::observed_at(episode.sets, world);
-    to.iter_mut().zip(steps).for_each(|(to, step)| *to = step.unwrap_or(0) as u32);
-}
-
-/// [`record`] of large teams.
-fn record_large<S: Simd>(
-    simd: S,
-    batch: &WorldBatch<'_>,
-    noise: Option<Noise<'_>>,
-    mut arrays: StepArrays<'_>,
-    scores: &ScoreTable<'_>,
-) {
-    let world = batch.world;
-    let sizes = step_sizes(world, world.steps() + 1, world.steps());
-    let recorded = Recorded { counts: batch.counted, sights: batch.sighted, forces: false };
-    let mut parts: Vec<(usize, StepArrays<'_>)> = (0..batch.teams).map(|team| (team, arrays.split(sizes, 1))).collect();
-    // As few swarms as threads, because they are large.
-    let share = parts.len().div_ceil(current_num_threads()).max(1);
-    parts.par_chunks_mut(share).for_each(|parts| {
-        let mut swarm = Swarm::new(simd, world, recorded);
-        for (team, arrays) in parts {
-            simd.vectorize(
-                #[inline(always)]
-                || swarm.play(batch, *team, &mut LargeRecorder { world, noise, team: *team, arrays }),
-            );
-            let (group, of_group) = batch.locate(*team);
-            scores.score(batch.first + group, of_group, &swarm.episode());
-            if !arrays.observed_at.is_empty() {
-                write_observed(swarm.episode(), world, arrays.observed_at);
-            }
-        }
-    });
+/// Writes the step, from 1, at which each POI was observed, or 0, `[teams][pois]`, from the record of each team.
+fn write_observed<'a>(world: &World, observed_at: &mut [u32], episode: impl Fn(usize) -> Episode<'a>) {
+    for (team, to) in observed_at.chunks_exact_mut(world.pois.len()).enumerate() {
+        let steps = credit::observed_at(episode(team).sets, world);
+        to.iter_mut().zip(steps).for_each(|(to, step)| *to = step.unwrap_or(0) as u32);
+    }
 }
 
 /// Writes the steps of a large team, and adds noise to its actions.

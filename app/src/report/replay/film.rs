@@ -80,7 +80,7 @@ impl Replayed {
 }
 
 /// Returns a note if not all followers are drawn.
-pub(super) fn sample(world: &World) -> Option<String> {
+pub(super) fn sample_note(world: &World) -> Option<String> {
     let every = drawn_every(world.leaders(), world.agents());
     (every > 1).then(|| format!("1 of {every} followers drawn"))
 }
@@ -117,7 +117,7 @@ impl<'a> Screen<'a> {
         let label = if timed { format!("0: {near}/{needed}: POI 0,") } else { format!("{near}/{needed}:") };
         let mut legend = Legend::new(config, &view, &teams, &format!("{label} {near} {who} near of {needed} needed"));
         let unverified = played.iter().any(|played| played.unverified).then(|| UNVERIFIED.to_string());
-        let sample = played.iter().find_map(|played| sample(&played.world));
+        let sample = played.iter().find_map(|played| sample_note(&played.world));
         note.into_iter().chain(unverified).chain(sample).for_each(|note| legend.note(note));
         Screen { played, view, width, legend }
     }

@@ -4,7 +4,7 @@ use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
 use serde_json::json;
 
-use super::film::sample;
+use super::film::sample_note;
 use super::{Counterfactual, Replayed, near};
 use crate::record::folder::OWN_FITNESS;
 use crate::report::map::{GROUPS, GROUPS_DARK};
@@ -79,8 +79,8 @@ pub fn data(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Val
     let count = played.len().max(1);
     let size = |per_agent: usize, played: &Replayed| {
         let world = &played.world;
-        let drawn = drawn_agents(world.leaders(), world.agents()).len();
-        drawn * per_agent + world.pois.len() * 2 + played.led.len() / world.steps() * 4
+        let [drawn, led] = [drawn_agents(world.leaders(), world.agents()).len(), led_words(played)];
+        drawn * per_agent + world.pois.len() * 2 + (drawn - world.leaders()) * led * 4
     };
     let exact = played.iter().map(|p| (p.world.steps() + 1) * size(16, p)).sum::<usize>() <= EXACT_BYTES;
     let episodes: Vec<_> = played
@@ -97,8 +97,8 @@ pub fn data(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Val
         None => world.pois.clone(),
     };
     let unverified = if played.iter().any(|played| played.unverified) { " (unverified)" } else { "" };
-    let sample = played.iter().find_map(|played| sample(&played.world)).map(|sample| format!(" ({sample})"));
-    let sample = sample.unwrap_or_default();
+    let sample = played.iter().find_map(|played| sample_note(&played.world));
+    let sample = sample.map_or(String::new(), |note| format!(" ({note})"));
     let own_fitness = played.iter().any(|played| played.own_fitness);
     let mut data = json!({
         "run": format!("{name}{unverified}{sample}"),
@@ -190,6 +190,11 @@ fn colors() -> serde_json::Value {
     json!({ "light": GROUPS.map(hex), "dark": GROUPS_DARK.map(hex) })
 }
 
+/// Returns the words per follower and step of [`Replayed::led`].
+fn led_words(Replayed { world, led, .. }: &Replayed) -> usize {
+    led.len() / (world.steps() * world.followers()).max(1)
+}
+
 /// Returns one episode as the page reads it. Motion is base64 of little-endian numbers, `[shown][agents]`.
 fn episode(played: &Replayed, shown: &[usize], exact: bool) -> serde_json::Value {
     let Replayed { world, scores, .. } = played;
@@ -198,13 +203,10 @@ fn episode(played: &Replayed, shown: &[usize], exact: bool) -> serde_json::Value
     let (mut positions, mut headings, mut near, mut led) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
     for &step in shown {
         // These are the groups of the step that ended here, as in `Replayed::group`.
-        let words = played.led.len() / world.steps();
-        let of_step = &played.led[step.saturating_sub(1) * words..][..words];
-        if words > 0 {
-            let of_follower = words / world.followers();
-            let followers = drawn[leaders..].iter().map(|agent| (agent - leaders) * of_follower);
-            let of_drawn = followers.flat_map(|first| &of_step[first..first + of_follower]);
-            led.extend(of_drawn.flat_map(|word| word.to_le_bytes()));
+        let (words, first) = (led_words(played), step.saturating_sub(1) * world.followers());
+        for &agent in &drawn[leaders..] {
+            let of_follower = &played.led[(first + agent - leaders) * words..][..words];
+            led.extend(of_follower.iter().flat_map(|word| word.to_le_bytes()));
         }
         for &agent in &drawn {
             let (place, heading) = (played.position(step, agent), played.heading(step, agent));
@@ -219,6 +221,10 @@ fn episode(played: &Replayed, shown: &[usize], exact: bool) -> serde_json::Value
             }
         }
         near.extend((0..world.pois.len()).flat_map(|poi| (played.near(step, poi) as u16).to_le_bytes()));
+    }
+    let mut followers = vec![0; leaders];
+    for &owner in played.owner[leaders..].iter().filter(|&&owner| owner != credit::UNASSIGNED) {
+        followers[owner as usize] += 1;
     }
     let owner = drawn.iter().map(|&agent| played.owner[agent]);
     let owner: Vec<i64> = owner.map(|owner| if owner == credit::UNASSIGNED { -1 } else { i64::from(owner) }).collect();
@@ -235,6 +241,8 @@ fn episode(played: &Replayed, shown: &[usize], exact: bool) -> serde_json::Value
         "dt": scores.dt,
         "leaders": world.leaders(),
         "agents": drawn.len(),
+        "size": world.agents(),
+        "followers": followers,
         "coupling": world.coupling,
         "owner": owner,
         "observed": played.observed,

@@ -9,11 +9,12 @@ use std::ops::Range;
 use fearless_simd::{Simd, prelude::*};
 use glam::Vec2;
 
+use super::ScoreTable;
 use super::agent::Agent;
 use super::batch::WorldBatch;
 use super::network::Network;
 use crate::backend::Moment;
-use crate::config::{Combine, ControlKind, Frame, Measure};
+use crate::config::{Combine, ControlKind, Measure};
 use crate::credit::{Episode, Paths, Seen, Strided};
 use crate::kernels::math::on_lattice;
 use crate::kernels::{clamp_to, splat};
@@ -207,6 +208,12 @@ impl<S: Simd> Swarm<S> {
         }
     }
 
+    /// Scores the team of the batch that was played.
+    pub fn score(&self, batch: &WorldBatch<'_>, team: usize, scores: &ScoreTable<'_>) {
+        let (group, team) = batch.locate(team);
+        scores.score(batch.first + group, team, &self.episode());
+    }
+
     /// Returns the record of the team that was played.
     pub fn episode(&self) -> Episode<'_> {
         let positions = Strided::contiguous(&self.paths);
@@ -266,15 +273,11 @@ impl<S: Simd> Swarm<S> {
     ) -> [S::f32s; MAX_SECTORS] {
         let (simd, own) = (self.simd, &self.cells[class]);
         let agent = own.load(simd, slots.start);
-        let heading = match channel.shape.frame == Frame::Map as u32 {
-            true => [splat(simd, 1.0), splat(simd, 0.0)],
-            false => [agent.hx, agent.hy],
-        };
         let mut sensing = Sensing {
             channel,
             agent,
-            heading,
-            in_quadrants: channel.shape.sectors == 4 && channel.shape.combine != Combine::Closest as u32,
+            heading: channel.heading(agent.hx, agent.hy),
+            in_quadrants: channel.shape.is_in_quadrants(),
             quadrants: sense::Quadrants::new(simd),
             sectors: sense::Sectors::new(simd, Combine::of(channel.shape.combine)),
         };
@@ -586,7 +589,7 @@ fn each_within<S: Simd>(simd: S, cells: &Cells, at: Vec2, radius2: f32, mut visi
     );
 }
 
-/// What some agents sense with a channel.
+/// The sensing of some agents with one channel.
 struct Sensing<'a, S: Simd> {
     channel: &'a ChannelLanes<S>,
     agent: Agent<S>,
