@@ -1,6 +1,6 @@
 // The rule of agents that do not learn: a force from other agents and walls (paper, Section 4.1, Figure 2b).
 //
-// Uses: lib/math.wgsl, motion.wgsl (rotate, limits), episode.wgsl (own, CONFINES), and from src/model: TINY.
+// Uses: lib/math.wgsl, motion.wgsl (rotate, limits), agent.wgsl (own, CONFINES), and from src/model: TINY.
 
 // The sum over the agents that count for a term, in lattice distances, and their number.
 struct Sum {

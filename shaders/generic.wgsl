@@ -1,6 +1,6 @@
 // The sizes and the classes of a task's world, which are constants in specialised kernels.
 //
-// Uses: lib/layout.wgsl (weights, classes), policy.wgsl, follow.wgsl, episode.wgsl (world, own, Shape, Agent).
+// Uses: lib/layout.wgsl (weights, classes), policy.wgsl, follow.wgsl, agent.wgsl (world, own, Shape, Agent).
 //
 // The host prepends:
 //   CHOOSES        whether outputs choose a behaviour

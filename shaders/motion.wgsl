@@ -1,6 +1,6 @@
 // Motion: a proportional controller, limited in turn, acceleration and speed (paper, Section 3.1).
 //
-// Uses: lib/math.wgsl, episode.wgsl (world, own, CONFINES), and from src/model: TINY, GRID, INVERSE_GRID.
+// Uses: lib/math.wgsl, agent.wgsl (world, own, CONFINES), and from src/model: TINY, GRID, INVERSE_GRID.
 
 // Rotates a heading to the left, by the angle of this cosine and sine.
 fn rotate(hx: f32, hy: f32, cosine: f32, sine: f32) -> vec2<f32> {

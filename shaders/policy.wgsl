@@ -1,6 +1,6 @@
 // A leader's policy: a fully connected network with biases and tanh in every layer (paper, Sections 2.4 and 3.1).
 //
-// Uses: lib/math.wgsl, episode.wgsl (own), and from src/model: TINY, BEHAVIOURS.
+// Uses: lib/math.wgsl, agent.wgsl (own), and from src/model: TINY, BEHAVIOURS.
 
 // Returns the tanh of a unit's sum. Small sums are flushed to 0, so that the next layer has no denormals.
 fn activate(sum: f32) -> f32 {

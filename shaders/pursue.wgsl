@@ -1,7 +1,7 @@
 // Pursuit: moving straight to an agent, the nearest of a class or the one that a policy chooses. Used only if PURSUES or
 // CONFINES.
 //
-// Uses: lib/math.wgsl, follow.wgsl, episode.wgsl (own, shape, positions, Agent), and from src/model: TINY.
+// Uses: lib/math.wgsl, follow.wgsl, agent.wgsl (own, Agent), episode.wgsl (position_of), and from src/model: TINY.
 //
 // The host prepends CHOICES, room for a policy's outputs.
 
@@ -26,7 +26,7 @@ fn chosen(first: u32, action: f32, me: ptr<function, Agent>) -> vec2<f32> {
     if other >= own.end_target {
         return vec2(0.0);
     }
-    let place = positions[first + other * shape.teams];
+    let place = position_of(first, other);
     return vec2(place.x - (*me).x, place.y - (*me).y);
 }
 
@@ -44,7 +44,7 @@ fn nearest(first: u32, begin: u32, end: u32, reach2: f32, me: ptr<function, Agen
     var to = Nearest(0.0, 0.0, false);
     var least = 0x7f7fffff;
     for (var other = begin; other < end; other++) {
-        let place = positions[first + other * shape.teams];
+        let place = position_of(first, other);
         let dx = place.x - (*me).x;
         let dy = place.y - (*me).y;
         let d2 = bitcast<i32>(dx * dx + dy * dy);

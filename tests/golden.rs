@@ -236,7 +236,7 @@ fn both_forms() -> Vec<(String, [Config; 2])> {
 
 #[cfg(not(target_family = "wasm"))]
 fn check_forms(backend: &mut dyn Backend) {
-    // Large teams have no short form, and play on the CPU only.
+    // Large teams have no short form, and would take minutes on software drivers.
     let is_small = |(_, [config, _]): &(String, [Config; 2])| config.agent_count() <= config::MAX_LEARNERS;
     let forms: Vec<_> = both_forms().into_iter().filter(is_small).collect();
     assert!(forms.len() >= 17);

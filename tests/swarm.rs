@@ -1,8 +1,10 @@
-//! Large teams, one at a time with a grid of cells, against vectors of teams: equal bits.
+//! Large teams, one at a time with a grid of cells, against vectors of teams: equal bits, on the CPU and on GPUs.
 
-use flotilla::backend::Group;
+use crate::support;
 use flotilla::backend::cpu::{Cpu, Noise, StepArrays, level_name};
-use flotilla::config::{Config, own_populations};
+use flotilla::backend::gpu::episode::{GpuBackend, Records};
+use flotilla::backend::{Group, gpu};
+use flotilla::config::{Config, Sectors, own_populations};
 use flotilla::evaluate::SCORES_AND_DT;
 use flotilla::evolve::{Key, Purpose};
 use flotilla::sample;
@@ -83,6 +85,57 @@ fn a_swarm_is_equal_with_a_grid_and_without() {
     let config = Config::parse(SWARM, "swarm.toml").unwrap();
     let by_paths = Config::parse(&SWARM.replace("radius = 5.0", "radius = 5.0\nscore = \"closeness\""), "paths.toml");
     check(&[("swarm", config), ("swarm by paths", by_paths.unwrap())], 2);
+}
+
+/// Compares GPUs that play with cells whatever can be played so with a CPU that uses none.
+fn check_gpus(test: &str, plan: &Plan, edit: fn(GpuBackend) -> GpuBackend) {
+    for (request, info) in support::adapters(test) {
+        let backend = GpuBackend::new(gpu::open(request).unwrap()).unwrap();
+        let mut swarms = edit(backend.with_large_from(0).with_records(Records::Packed));
+        let outcome = compare(plan, &mut Cpu::default().with_large_from(usize::MAX), &mut swarms, |_| ()).unwrap();
+        println!("{info}: {} worlds, {} agent-steps", outcome.worlds, outcome.agent_steps);
+        assert_eq!(outcome.mismatch, None, "{info}");
+    }
+}
+
+#[test]
+fn random_worlds_with_grids_are_equal_on_gpus() {
+    let mut plan = Plan::random(0..400, 3);
+    // Teams with these are never large.
+    plan.worlds.retain(|(_, config)| {
+        config.agents.iter().all(|class| {
+            let each = class.senses.iter().any(|channel| matches!(channel.sectors, Sectors::Each(_)));
+            class.control.target().is_none() && class.moves_near.is_none() && !each
+        })
+    });
+    plan.worlds.truncate(if support::is_long() { 200 } else { 12 });
+    assert!(plan.worlds.len() == 12 || plan.worlds.len() == 200);
+    check_gpus("random_worlds_with_grids_are_equal_on_gpus", &plan, |gpu| gpu);
+}
+
+#[test]
+fn a_swarm_is_equal_on_gpus_whatever_the_order_in_cells() {
+    let name = "a_swarm_is_equal_on_gpus_whatever_the_order_in_cells";
+    let by_paths = SWARM.replace("radius = 5.0", "radius = 5.0\nscore = \"closeness\"");
+    let worlds = [("swarm", SWARM), ("swarm by paths", &by_paths)]
+        .map(|(name, text)| (name.to_string(), Config::parse(text, "swarm.toml").unwrap()));
+    let mut plan = Plan { worlds: worlds.into(), ..Plan::random(0..0, 2) };
+    check_gpus(name, &plan, |gpu| gpu);
+    // Agents enter their cells in the opposite order.
+    plan.worlds.truncate(1);
+    #[cfg(debug_assertions)]
+    check_gpus(name, &plan, |gpu| {
+        let edit = |text: String| {
+            let edited = text.replace("let agent = id.x;", "let agent = shape.agents - 1u - id.x;");
+            assert!(edited != text || !text.contains("fn fill("), "the shader has this line");
+            edited
+        };
+        // SAFETY: every agent still enters one slot.
+        #[expect(unsafe_code, reason = "an edited shader is compiled without bounds checks")]
+        unsafe {
+            gpu.edited(edit)
+        }
+    });
 }
 
 /// Steps with noise, as Python's `rollout` and `collect` get them.

@@ -5,7 +5,6 @@ use std::ops::AddAssign;
 use flotilla::backend::BackendError;
 use flotilla::backend::gpu::device::DeviceError;
 use flotilla::backend::gpu::episode::{GpuBackend, ResidencyPolicy};
-use flotilla::backend::gpu::source::MAX_AGENTS;
 use flotilla::config::Config;
 use flotilla::front::{self, GpuSearch, Processor};
 
@@ -21,8 +20,6 @@ const MIN_TOTAL: f64 = 4e9;
 pub struct Work {
     generations: f64,
     agent_steps: f64,
-    /// Whether any team has too many agents for a GPU.
-    is_too_large: bool,
 }
 
 impl Work {
@@ -34,7 +31,6 @@ impl Work {
             Work {
                 generations: work.generations.max(generations),
                 agent_steps: work.agent_steps + generations * trials * generation(config),
-                is_too_large: work.is_too_large || is_too_large(config),
             }
         })
     }
@@ -42,12 +38,12 @@ impl Work {
     /// Returns the work of one generation of a config.
     pub fn of_generation(config: &Config) -> Work {
         let agent_steps = config.learning.trials as f64 * generation(config);
-        Work { generations: 1.0, agent_steps, is_too_large: is_too_large(config) }
+        Work { generations: 1.0, agent_steps }
     }
 
     /// Returns the work of playing this many teams of a config.
     pub fn of_teams(config: &Config, teams: usize) -> Work {
-        Work { generations: 1.0, agent_steps: teams as f64 * team(config), is_too_large: is_too_large(config) }
+        Work { generations: 1.0, agent_steps: teams as f64 * team(config) }
     }
 }
 
@@ -55,7 +51,6 @@ impl AddAssign for Work {
     fn add_assign(&mut self, other: Work) {
         self.generations += other.generations;
         self.agent_steps += other.agent_steps;
-        self.is_too_large |= other.is_too_large;
     }
 }
 
@@ -63,7 +58,6 @@ impl Work {
     /// Returns why a GPU does not pay for this work, for people. `None` means that it does.
     fn is_little(self) -> Option<&'static str> {
         match self {
-            _ if self.is_too_large => Some("teams of more than 1024 agents play on the CPU"),
             _ if self.agent_steps < MIN_TOTAL => Some("too little work for a GPU to pay"),
             _ if self.agent_steps < MIN_PER_GENERATION * self.generations => {
                 Some("too few teams per generation for a GPU to pay")
@@ -85,7 +79,7 @@ pub struct WorkTotal {
 impl WorkTotal {
     /// Returns a total of no work.
     pub const fn new() -> WorkTotal {
-        const NONE: Work = Work { generations: 0.0, agent_steps: 0.0, is_too_large: false };
+        const NONE: Work = Work { generations: 0.0, agent_steps: 0.0 };
         WorkTotal { all: NONE, looked: NONE }
     }
 
@@ -127,10 +121,6 @@ pub fn find(
     let reason = if gpu.is_some() { "enough work for a GPU to pay" } else { "no GPU found" };
     let reason = work.filter(|_| passed_over.is_none()).map(|_| reason);
     Ok(Chosen { gpu, reason, passed_over })
-}
-
-fn is_too_large(config: &Config) -> bool {
-    config.agent_count() > MAX_AGENTS
 }
 
 /// Returns the agent-steps of one trial's generation.

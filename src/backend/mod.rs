@@ -4,6 +4,7 @@
 //! |---|---|
 //! | `batch` | the input: groups of teams, where their policies are, and the fitnesses |
 //! | `scores` | the output: the scores of each group, computed while others play |
+//! | `grid` | cells in which large teams find the agents near a place |
 //! | `size` | how many bytes episodes and populations take |
 //! | `trace` | all quantities of every step, for comparison and replays |
 //! | `compare` | the first difference of two traces |
@@ -22,6 +23,7 @@ pub mod cpu;
 mod error;
 #[cfg(feature = "gpu")]
 pub mod gpu;
+mod grid;
 mod scores;
 mod size;
 mod trace;

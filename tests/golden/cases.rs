@@ -94,11 +94,44 @@ at = [[16, 27], [26, 31], [36, 26], [25, 12]]
 coupling = 2
 ";
 
+/// A large team: three leaders, 1100 followers that align with each other, and walls that they reach.
+const SWARM: &str = "
+[world]
+map = [40, 30]
+steps = 8
+dt = 0.5
+[[agents]]
+name = \"leader\"
+at = [[12, 15], [28, 15], [20, 22]]
+senses = [
+    { of = \"pois\" },
+    { of = \"follower\", range = 9, sectors = 3 },
+    { of = \"agents\", range = 4, combine = \"closest\" },
+]
+leads = \"follower\"
+influence_radius = 6
+[[agents]]
+name = \"follower\"
+count = 1100
+in = { box = [0, 0, 40, 30] }
+control = \"follow\"
+rule = [
+    { of = \"follower\", to = 0.5, gain = -1 },
+    { of = \"follower\", from = 0.5, to = 2, align = 0.5 },
+    { of = \"leader\", to = 8, gain = 4 },
+]
+[[pois]]
+name = \"poi\"
+at = [[8, 15], [32, 15], [20, 27]]
+coupling = 40
+radius = 4
+";
+
 /// Name, description, config, and the keys that are changed.
 pub type Case = (&'static str, &'static str, &'static str, &'static [(&'static str, &'static str)]);
 
 /// Together these cases cover every choice in a config, and sizes on both sides of every special case.
-pub const CASES: [Case; 46] = [
+pub const CASES: [Case; 47] = [
     ("generally-forward", "first layout, leader-follower, Df", GENERALLY_FORWARD, &[]),
     ("strictly-forward", "second layout, D++", STRICTLY_FORWARD, &[("learning.fitness", "'D++'")]),
     ("chaotic", "third layout, G", CHAOTIC, &[("learning.fitness", "'G'")]),
@@ -461,6 +494,12 @@ pub const CASES: [Case; 46] = [
         "classes that move to the nearest agent, choose one, stay in a box and move only near others, Df",
         PURSUIT,
         &[("learning.start_jitter", "0.5")],
+    ),
+    (
+        "swarm",
+        "a large team, in a grid of cells, with jittered starts, Dt",
+        SWARM,
+        &[("learning.start_jitter", "0.5"), ("learning.fitness", "'Dt'")],
     ),
 ];
 

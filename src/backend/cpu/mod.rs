@@ -10,9 +10,10 @@ use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
 use fearless_simd::{Level, Simd, dispatch, prelude::*};
 
+use super::grid::{LARGE_FROM, is_large};
 use super::scores::ScoreTable;
 use super::{Backend, BackendError, Group, GroupScores, Moment, Trace};
-use crate::config::{Fitness, MAX_LEARNERS};
+use crate::config::Fitness;
 use crate::parallel::*;
 use crate::world::World;
 
@@ -48,15 +49,6 @@ pub struct Cpu {
     large_from: usize,
     /// A [`Workspace`] per thread, kept between batches.
     workspaces: Option<Box<dyn Any + Send>>,
-}
-
-/// Smaller teams are faster in vectors of teams, where all pairs are visited: with 256 agents 15 times, with 512 eight times, if a
-/// third of them learns.
-const LARGE_FROM: usize = MAX_LEARNERS + 1;
-
-/// Reports whether teams of a world play one at a time.
-fn is_large(world: &World, large_from: usize) -> bool {
-    world.agents() >= large_from && swarm::can_play(world)
 }
 
 /// The memory of a thread, as it was last used.

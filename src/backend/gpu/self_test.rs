@@ -212,6 +212,19 @@ fn episode(executor: &Executor) -> Result<Option<String>, BackendError> {
     Ok(None)
 }
 
+/// Tests an episode of classes that large teams may have, by the kernel of large teams. Few trainings need it, so it is tested
+/// only before these.
+pub(super) fn large_teams(executor: &Executor) -> Result<Option<String>, BackendError> {
+    const TEAMS: usize = 4;
+    let mut config = Config::parse(CLASSES, "classes").expect("the project's own config");
+    config.agents.retain(|class| class.control.target().is_none());
+    let world = World::new(&config.validate().expect("the project's own config"));
+    let (weights, teams) = (sample::weights(&world, 1, 0), vec![0; TEAMS * world.leaders()]);
+    let mut backend = GpuBackend::with_executor(executor.clone()).with_large_from(0);
+    let mismatch = compare_traces(&group(&world, &weights, 1, &teams), &mut Cpu::default(), &mut backend)?;
+    Ok(mismatch.map(|mismatch| format!("an episode of a large team differs: {mismatch}")))
+}
+
 /// Tests what a generation of training uses: populations on the device, from which teams are gathered, both kernels, and
 /// packed records.
 fn training(executor: &Executor) -> Result<Option<String>, BackendError> {

@@ -8,6 +8,7 @@ use std::sync::Mutex;
 use glam::Vec2;
 
 use crate::backend::Group;
+use crate::backend::grid::{LARGE_FROM, is_large};
 use crate::config::MAX_HIDDEN_LAYERS;
 use crate::model::Constants;
 use crate::model::class::{Class, ClassShape};
@@ -87,8 +88,8 @@ impl Recorded {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Sizes {
     /// The widest layer, inputs included and rounded up to save compilations, whether the outputs choose a behaviour,
-    /// and what classes of agents do.
-    Any { widest: usize, chooses: bool, uses: Uses },
+    /// what classes of agents do, and whether teams are large: each step then takes several dispatches.
+    Any { widest: usize, chooses: bool, uses: Uses, large: bool },
     /// Everything that the code depends on.
     Fixed {
         teams: usize,
@@ -159,18 +160,29 @@ impl Shape {
 
     /// Returns the kernel that plays any world with policies up to this width.
     pub(super) fn generic(world: &World, capacity: Capacity, records: Recorded) -> (Shape, Workgroup) {
-        let (workgroup, policy) = (Workgroup::generic(world, capacity.workgroup), &world.constants.policy);
+        let large = is_large(world, capacity.large_from);
+        let workgroup = match large {
+            true => Workgroup { threads: WORKGROUPS[0], slots: 1, teams: 1 },
+            false => Workgroup::generic(world, capacity.workgroup),
+        };
+        let policy = &world.constants.policy;
         let sizes = Sizes::Any {
             widest: policy.widest().next_power_of_two().max(LEAST_WIDTH),
             chooses: policy.actions() == Actions::Behaviours,
             uses: Uses::of(world),
+            large,
         };
         (Shape { workgroup: workgroup.threads, slots: workgroup.slots, records, sizes }, workgroup)
     }
 
+    /// Reports whether each step takes several dispatches.
+    pub(super) fn is_large(&self) -> bool {
+        matches!(self.sizes, Sizes::Any { large: true, .. })
+    }
+
     /// Returns the kernel that plays worlds of these sizes only, if one is possible.
     pub(super) fn specialised(world: &World, capacity: Capacity, records: Recorded) -> Option<(Shape, Workgroup)> {
-        let workgroup = Workgroup::specialised(world, capacity)?;
+        let workgroup = Workgroup::specialised(world, capacity).filter(|_| !is_large(world, capacity.large_from))?;
         let Constants { leaders, followers, pois, policy, .. } = world.constants;
         let sizes = Sizes::Fixed {
             teams: workgroup.teams,
@@ -265,6 +277,8 @@ pub(super) struct Capacity {
     /// Maximum threads per workgroup, and bytes of workgroup memory.
     pub(super) workgroup: usize,
     pub(super) workgroup_bytes: usize,
+    /// Agents from which teams are large.
+    pub(super) large_from: usize,
 }
 
 impl Capacity {
@@ -276,6 +290,6 @@ impl Capacity {
     /// Returns the limits of a device with this maximum of threads per workgroup, and no limit on batches.
     pub(super) fn of_workgroups(threads: usize) -> Capacity {
         let bytes = MAX_OFFSET;
-        Capacity { batch: bytes, buffer: bytes, workgroup: threads, workgroup_bytes: 16 << 10 }
+        Capacity { batch: bytes, buffer: bytes, workgroup: threads, workgroup_bytes: 16 << 10, large_from: LARGE_FROM }
     }
 }

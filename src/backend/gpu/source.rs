@@ -5,8 +5,9 @@ use std::fmt::Write;
 
 use super::exact;
 use super::shape::{Capacity, ClassKind, MAX_THREADS, ROLE, Recorded, Shape, Sizes, TEAMS, Uses, WIDTHS, WORKGROUPS};
+use crate::backend::grid::LARGE_FROM;
 use crate::backend::{MOMENT_WORDS, VECTOR};
-use crate::config::{Config, MAX_SECTORS, Policy};
+use crate::config::{Config, MAX_CLASSES, MAX_SECTORS, Policy};
 use crate::evolve::{MAX_WEIGHT, MIN_WEIGHT, UNCHANGED};
 use crate::gpu_struct::{GpuStruct, gpu_constants, gpu_struct};
 use crate::model;
@@ -16,10 +17,15 @@ use crate::model::policy::{Actions, BEHAVIOURS};
 use crate::model::sense::ChannelShape;
 use crate::world::{OUTPUTS, World};
 
-/// Maximum agents of a team that a GPU plays.
-pub const MAX_AGENTS: usize = 1024;
+/// Maximum agents of teams whose positions are in a workgroup's memory.
+const MAX_SHARED: usize = LARGE_FROM - 1;
+/// Threads that share the agents of a cell when a learner of a large team senses.
+const LANES: usize = 8;
 /// Maximum leaders whose sightings a follower counts in registers.
 const MAX_COUNTED_LEADERS: usize = 8;
+/// Maximum loop iterations per thread and dispatch, over all loops: Mesa's llvmpipe 22.3 abandons every loop after 65 535
+/// iterations, and drivers stop a dispatch that runs for seconds.
+pub(super) const MAX_ITERATIONS: usize = 60_000;
 /// Threads per workgroup of the pipelines that pack records, and of those that work on populations.
 pub(super) const PACK_WORKGROUP: usize = 64;
 pub(super) const POPULATION_WORKGROUP: usize = 256;
@@ -160,6 +166,25 @@ pub enum Pipeline {
     Pack,
     /// Plays episodes.
     Episode(Shape),
+    /// Plays a part of a step of large teams.
+    Swarm(SwarmPart, Shape),
+}
+
+/// The parts of a step of large teams, in order, see `shaders/swarm.wgsl`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum SwarmPart {
+    /// Clears the record and the cells before the first step.
+    Clear,
+    /// Puts the agents at their start.
+    Enter,
+    /// Gives slots to cells.
+    Allocate,
+    /// Puts the agents into the slots.
+    Fill,
+    /// Moves learners.
+    Learn,
+    /// Moves the other agents.
+    ObeyRule,
 }
 
 impl Pipeline {
@@ -172,13 +197,19 @@ impl Pipeline {
             Pipeline::Gather => "gather",
             Pipeline::Pack => "pack",
             Pipeline::Episode(_) => "episode",
+            Pipeline::Swarm(SwarmPart::Clear, _) => "clear",
+            Pipeline::Swarm(SwarmPart::Enter, _) => "enter",
+            Pipeline::Swarm(SwarmPart::Allocate, _) => "allocate",
+            Pipeline::Swarm(SwarmPart::Fill, _) => "fill",
+            Pipeline::Swarm(SwarmPart::Learn, _) => "learn",
+            Pipeline::Swarm(SwarmPart::ObeyRule, _) => "obey_rule",
         }
     }
 
     /// Returns what an episode's kernel is compiled for.
     pub(super) fn shape(&self) -> Option<Shape> {
         match self {
-            Pipeline::Episode(shape) => Some(*shape),
+            Pipeline::Episode(shape) | Pipeline::Swarm(_, shape) => Some(*shape),
             _ => None,
         }
     }
@@ -192,7 +223,7 @@ impl Pipeline {
             Pipeline::Breed => &[Read, Read, Read, Write, Write],
             Pipeline::Gather => &[Read, Read, Read, Write, Read, Read, Read],
             Pipeline::Pack => &[Read, Read, Read, Write, Write],
-            Pipeline::Episode(_) => &[Read, Read, Read, Read, Write, Write, Write, Read],
+            Pipeline::Episode(_) | Pipeline::Swarm(..) => &[Read, Read, Read, Read, Write, Write, Write, Read],
         }
     }
 
@@ -209,6 +240,7 @@ impl Pipeline {
             ]),
             Pipeline::Pack => exact::assemble(&[
                 &declarations(),
+                RECORD_WORD,
                 &gpu_constants!(
                     WORKGROUP = PACK_WORKGROUP,
                     TEAMS = WORKGROUPS[WORKGROUPS.len() - 1].max(TEAMS[0]),
@@ -217,22 +249,26 @@ impl Pipeline {
                 include_str!("../../../shaders/lib/layout.wgsl"),
                 include_str!("../../../shaders/pack.wgsl"),
             ]),
-            Pipeline::Episode(shape) => episode(shape),
+            Pipeline::Episode(shape) | Pipeline::Swarm(_, shape) => episode(shape),
         }
     }
 }
+
+const RECORD_WORD: &str = "alias RecordWord = u32;\n";
+/// Threads of several workgroups write one word of a large team's record.
+const ATOMIC_RECORD_WORD: &str = "alias RecordWord = atomic<u32>;\n";
 
 /// Returns the structs of episodes and records.
 fn declarations() -> String {
     [model::declarations(), Task::wgsl(), State::wgsl()].concat()
 }
 
-/// Returns the episode's shader for a shape.
+/// Returns the shader of episodes for a shape, of large teams or of others.
 fn episode(shape: Shape) -> String {
     let Shape { workgroup, slots, records: Recorded { trace, sightings }, sizes } = shape;
     let (shared, in_registers, counted, Uses { aligns, pursues, confines }) = match sizes {
         // The agents of one large team, or of several small ones.
-        Sizes::Any { uses, .. } => ((workgroup * slots).min(MAX_AGENTS), false, 1, uses),
+        Sizes::Any { uses, .. } => ((workgroup * slots).min(MAX_SHARED), false, 1, uses),
         Sizes::Fixed { teams, leaders, agents, uses, .. } => {
             let in_registers = leaders < agents && leaders as usize <= MAX_COUNTED_LEADERS;
             (teams * agents as usize, in_registers, if in_registers { leaders } else { 1 }, uses)
@@ -251,7 +287,10 @@ fn episode(shape: Shape) -> String {
         PURSUES = pursues,
         CONFINES = confines,
         MAX_SECTORS,
+        MAX_CLASSES,
         MOMENT_WORDS,
+        LANES,
+        MAX_VISITS = MAX_ITERATIONS,
     );
     let own = format!(
         "fn class_constants(class_number: u32) -> ClassConstants {{ return {}; }}\n",
@@ -290,8 +329,12 @@ fn episode(shape: Shape) -> String {
     };
     let structs = declarations();
     let libraries = [include_str!("../../../shaders/lib/layout.wgsl"), include_str!("../../../shaders/lib/math.wgsl")];
-    let parts = [&*constants, &front, &own, &structs].into_iter().chain(libraries).chain(model::WGSL);
-    exact::assemble(&parts.chain([include_str!("../../../shaders/episode.wgsl")]).collect::<Vec<_>>())
+    let (word, driver) = match shape.is_large() {
+        true => (ATOMIC_RECORD_WORD, include_str!("../../../shaders/swarm.wgsl")),
+        false => (RECORD_WORD, include_str!("../../../shaders/episode.wgsl")),
+    };
+    let parts = [&*constants, &front, &own, &structs, word].into_iter().chain(libraries).chain(model::WGSL);
+    exact::assemble(&parts.chain([include_str!("../../../shaders/agent.wgsl"), driver]).collect::<Vec<_>>())
 }
 
 /// Returns a function that returns an expression.
@@ -398,8 +441,13 @@ pub fn shaders() -> Vec<(&'static str, String)> {
     const TRACE: Recorded = Recorded { trace: true, sightings: true };
     let generic = |workgroup, slots, widest, records: Recorded| {
         let uses = Uses { aligns: records.trace, pursues: records.trace, confines: records.trace };
-        let sizes = Sizes::Any { widest, chooses: records.trace, uses };
+        let sizes = Sizes::Any { widest, chooses: records.trace, uses, large: false };
         Pipeline::Episode(Shape { workgroup, slots, records, sizes })
+    };
+    let swarm = |records: Recorded| {
+        let uses = Uses { aligns: records.trace, pursues: false, confines: records.trace };
+        let sizes = Sizes::Any { widest: 16, chooses: records.trace, uses, large: true };
+        Pipeline::Swarm(SwarmPart::Clear, Shape { workgroup: WORKGROUPS[0], slots: 1, records, sizes })
     };
     let specialised = |records, actions: Actions| {
         let text = include_str!("../../../configs/generally_forward.toml");
@@ -414,11 +462,13 @@ pub fn shaders() -> Vec<(&'static str, String)> {
         ("ceiling", Pipeline::Ceiling),
         ("episode", generic(64, 1, 16, PLAIN)),
         ("episode, traced", generic(128, 1, 64, TRACE)),
-        ("episode, large teams", generic(256, 5, 64, PLAIN)),
+        ("episode, agents in turn", generic(256, 5, 64, PLAIN)),
         ("episode, specialised", specialised(PLAIN, Actions::Direct)),
         ("episode, specialised, behaviours", specialised(PLAIN, Actions::Behaviours)),
         ("episode, specialised, with sights", specialised(SIGHTINGS, Actions::Direct)),
         ("episode, specialised, traced", specialised(TRACE, Actions::Direct)),
+        ("swarm", swarm(PLAIN)),
+        ("swarm, traced", swarm(TRACE)),
         ("pack", Pipeline::Pack),
         ("population", Pipeline::Breed),
     ];

@@ -6,6 +6,9 @@ use fearless_simd::{Simd, prelude::*};
 use glam::Vec2;
 
 use crate::backend::cpu::agent::Agent;
+use crate::backend::grid::Grid;
+use crate::model::class::Class;
+use crate::world::World;
 
 /// The states of the agents of a class, in any order, one slot each. Every array has spare slots at its end, so that a
 /// vector can be loaded from each slot.
@@ -60,43 +63,28 @@ pub(super) struct Cells {
     pub next: Slots,
     /// The class's agents, by their index in the team.
     pub agents: Range<usize>,
-    columns: usize,
-    rows: usize,
-    /// Cells per unit.
-    inverse: f32,
-    /// The distance by which rounding could move a place.
-    margin: f32,
+    grid: Grid,
     /// The first slot of each cell, and the number of agents, `[cells + 1]`; one more while sorting.
     starts: Vec<u32>,
     /// The cell of each slot while sorting.
     cells: Vec<u32>,
 }
 
-/// Limits the memory of cells on long and narrow maps.
-const MOST_CELLS_PER_SIDE: f32 = 8192.0;
 /// Columns that a group may extend beyond its first.
 const MOST_COLUMNS: usize = 16;
 
 impl Cells {
-    /// Returns a grid for agents that others look for within `radius`.
-    pub fn new(agents: Range<usize>, map: Vec2, radius: f32, spare: usize) -> Cells {
+    /// Returns memory for the agents of a class, with some spare slots.
+    pub fn new(world: &World, class: &Class, spare: usize) -> Cells {
+        let (agents, grid) = (class.agents(), Grid::new(world, class));
         let slots = Slots::new(agents.clone(), spare);
-        let longest = map.max_element();
-        // About one cell per agent at most.
-        let smallest = (map.x * map.y / agents.len().max(1) as f32).sqrt().max(longest / MOST_CELLS_PER_SIDE);
-        let side = radius.clamp(smallest, longest);
-        let count = |length: f32| (length / side) as usize + 1;
-        let (columns, rows) = (count(map.x), count(map.y));
         Cells {
             next: slots.clone(),
             cells: vec![0; slots.x.len()],
-            starts: vec![0; columns * rows + 2],
-            margin: longest / (1 << 20) as f32,
-            inverse: 1.0 / side,
+            starts: vec![0; grid.cells() + 2],
             slots,
             agents,
-            columns,
-            rows,
+            grid,
         }
     }
 
@@ -119,16 +107,6 @@ impl Cells {
         }
     }
 
-    #[inline(always)]
-    fn column(&self, x: f32) -> usize {
-        ((x * self.inverse) as usize).min(self.columns - 1)
-    }
-
-    #[inline(always)]
-    fn row(&self, y: f32) -> usize {
-        ((y * self.inverse) as usize).min(self.rows - 1)
-    }
-
     /// Puts the agents at their start, with their headings, `[agents]` of the team, and speed.
     pub fn start(&mut self, starts: &[Vec2], headings: &[Vec2], speed: f32) {
         let own = self.agents.clone();
@@ -149,7 +127,7 @@ impl Cells {
         let count = self.len();
         self.starts.fill(0);
         for slot in 0..count {
-            let cell = self.row(self.next.y[slot]) * self.columns + self.column(self.next.x[slot]);
+            let cell = self.grid.row(self.next.y[slot]) * self.grid.columns + self.grid.column(self.next.x[slot]);
             self.cells[slot] = cell as u32;
             self.starts[cell + 2] += 1;
         }
@@ -169,10 +147,10 @@ impl Cells {
     /// Calls `visit` with every run of slots that may be within a radius of a rectangle, given by its corners.
     #[inline(always)]
     pub fn each_run(&self, [low, high]: [Vec2; 2], radius: f32, mut visit: impl FnMut(Range<usize>)) {
-        let reach = radius * 1.001 + self.margin;
-        let (first, last) = (self.column(low.x - reach), self.column(high.x + reach));
-        for row in self.row(low.y - reach)..=self.row(high.y + reach) {
-            let cell = row * self.columns;
+        let (grid, reach) = (&self.grid, radius * 1.001 + self.grid.margin);
+        let (first, last) = (grid.column(low.x - reach), grid.column(high.x + reach));
+        for row in grid.row(low.y - reach)..=grid.row(high.y + reach) {
+            let cell = row * grid.columns;
             let slots = self.starts[cell + first] as usize..self.starts[cell + last + 1] as usize;
             if !slots.is_empty() {
                 visit(slots);
@@ -183,13 +161,14 @@ impl Cells {
     /// Calls `visit` with groups of at most `most` slots that are near each other: of one row, and a few columns.
     #[inline(always)]
     pub fn each_group(&self, most: usize, mut visit: impl FnMut(Range<usize>)) {
-        for row in 0..self.rows {
-            let cell = row * self.columns;
-            let (mut slot, end) = (self.starts[cell] as usize, self.starts[cell + self.columns] as usize);
+        let grid = &self.grid;
+        for row in 0..grid.rows {
+            let cell = row * grid.columns;
+            let (mut slot, end) = (self.starts[cell] as usize, self.starts[cell + grid.columns] as usize);
             while slot < end {
-                let first = self.column(self.slots.x[slot]);
+                let first = grid.column(self.slots.x[slot]);
                 let mut count = most.min(end - slot);
-                while count > 1 && self.column(self.slots.x[slot + count - 1]) > first + MOST_COLUMNS {
+                while count > 1 && grid.column(self.slots.x[slot + count - 1]) > first + MOST_COLUMNS {
                     count /= 2;
                 }
                 visit(slot..slot + count);

@@ -116,30 +116,13 @@ pub(super) fn bytes(agents: usize) -> usize {
     agents * (2 * 6 + 1 + 2) * size_of::<u32>()
 }
 
-/// Returns the radius within which most agents look for those of a class.
-fn radius(world: &World, class: &Class) -> f32 {
-    let counts =
-        |term: &&follow::TermConstants| model::each(&term.shape.ranges).any(|run| run.contains(&class.agents().start));
-    let of_terms = world.classes.iter().flat_map(Class::terms).filter(counts).map(|term| term.outer2);
-    let of_pois = || world.radii2.iter().copied().fold(0.0, f32::max);
-    of_terms.reduce(f32::max).unwrap_or_else(of_pois).sqrt()
-}
-
-/// Reports whether a world can be played: with everything but pursuit, senses of each agent, and motion near others only.
-pub(super) fn can_play(world: &World) -> bool {
-    world.classes.iter().all(|class| {
-        let shape = &class.constants.shape;
-        !shape.pursues() && shape.end_near == 0 && class.channels().iter().all(|channel| channel.shape.each == 0)
-    })
-}
-
 impl<S: Simd> Swarm<S> {
     pub fn new(simd: S, world: &World, recorded: Recorded) -> Swarm<S> {
         let zero = splat(simd, 0.0);
         let (leaders, followers) = (world.leaders(), world.followers());
         let vectors = leaders.div_ceil(S::f32s::LEN);
         let zeros = |is_recorded: bool, words: usize| vec![0; if is_recorded { words } else { 0 }];
-        let cells = |class: &Class| Cells::new(class.agents(), world.map(), radius(world, class), S::f32s::LEN);
+        let cells = |class: &Class| Cells::new(world, class, S::f32s::LEN);
         Swarm {
             simd,
             lanes: S::u32s::from_fn(simd, |lane| lane as u32),
@@ -717,6 +700,7 @@ mod tests {
 
     use super::*;
     use crate::backend::Group;
+    use crate::backend::grid::is_large;
     use crate::config::own_populations;
     use crate::evaluate::SCORES_AND_DT;
     use crate::sample;
@@ -770,7 +754,7 @@ mod tests {
     #[test]
     fn no_bit_depends_on_the_order_of_agents_in_cells() {
         let worlds = (0..400).map(|seed| (seed, World::new(&sample::any_world(seed).validate().unwrap())));
-        let worlds: Vec<_> = worlds.filter(|(_, world)| can_play(world)).collect();
+        let worlds: Vec<_> = worlds.filter(|(_, world)| is_large(world, 0)).collect();
         assert!(worlds.len() >= 200, "{}", worlds.len());
         for (seed, world) in worlds {
             let compare = |[(a, at_a), (b, at_b)]: [(Vec<&[u32]>, Vec<u32>); 2]| {

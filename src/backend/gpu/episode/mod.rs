@@ -6,7 +6,8 @@
 //! | `inspect` | shaders and inputs of one workgroup, to see what compilers make of them |
 //!
 //! One shader text makes two kernels. The generic one plays any world. The specialised one is compiled for a world's
-//! sizes: all loops have constant bounds and the policy is straight-line code. See [`Kernel`].
+//! sizes: all loops have constant bounds and the policy is straight-line code. See [`Kernel`]. Large teams have a kernel of
+//! their own, `shaders/swarm.wgsl`, with several dispatches per step.
 //!
 //! While the GPU plays one batch, the CPU reads the record of the batch before it. If only scores are requested, the
 //! GPU keeps the record and returns only what the scores depend on, see [`Records`].
@@ -21,8 +22,10 @@ use bytemuck::Zeroable;
 use super::device::{DeviceError, Executor, Gpu, Kind, Traffic, Workspace};
 use super::population::{Held, Population};
 use super::recording::{Readback, iterations};
+use super::self_test;
 use super::shape::{Capacity, MAX_OFFSET, specialised_shapes};
 use super::source::{NOWHERE, Pipeline, Task};
+use crate::backend::grid::LARGE_FROM;
 use crate::backend::scores::ScoreTable;
 use crate::backend::{
     BATCH_BYTES, Backend, BackendError, DevicePopulation, Group, GroupScores, HELD_FROM, MOMENT_WORDS, Moment,
@@ -106,6 +109,10 @@ pub struct GpuBackend {
     records: Records,
     /// Target bytes of one buffer of a batch.
     batch_bytes: u64,
+    /// Agents from which teams are large.
+    large_from: usize,
+    /// Whether the kernel of large teams is to be tested before they play for the first time.
+    tests_large: bool,
     /// Whether rollouts are timed by the device's clock.
     clock: bool,
     /// Two sets of buffers, so that one batch plays while the other is read.
@@ -177,10 +184,10 @@ impl GpuBackend {
     /// # Errors
     /// The device does not support the episode's bindings.
     pub fn new(gpu: Gpu) -> Result<GpuBackend, DeviceError> {
-        Ok(GpuBackend::with_executor(Executor::new(gpu)))
+        Ok(GpuBackend { tests_large: true, ..GpuBackend::with_executor(Executor::new(gpu)) })
     }
 
-    /// Returns a backend that shares the pipelines of an executor.
+    /// Returns a backend that shares the pipelines of an executor, and tests nothing.
     pub(super) fn with_executor(executor: Executor) -> GpuBackend {
         let software = executor.gpu.adapter.kind == Kind::Software;
         GpuBackend {
@@ -189,6 +196,8 @@ impl GpuBackend {
             residency: if software { ResidencyPolicy::Never } else { ResidencyPolicy::From(HELD_FROM) },
             records: if software { Records::Whole } else { Records::PackedFrom(PACKED_FROM) },
             batch_bytes: BATCH_BYTES,
+            large_from: LARGE_FROM,
+            tests_large: false,
             clock: false,
             workspaces: Default::default(),
             staging: Vec::new(),
@@ -202,6 +211,11 @@ impl GpuBackend {
     /// Sets the target bytes of a batch's buffers. Results do not depend on it.
     pub fn with_batch_bytes(self, bytes: u64) -> GpuBackend {
         GpuBackend { batch_bytes: bytes, ..self }
+    }
+
+    /// Plays teams of at least so many agents as large ones. Results do not depend on it.
+    pub fn with_large_from(self, agents: usize) -> GpuBackend {
+        GpuBackend { large_from: agents, ..self }
     }
 
     /// Chooses kernels. The default is [`Kernel::Best`], and [`Kernel::Generic`] on software renderers, whose compilers
@@ -245,7 +259,7 @@ impl GpuBackend {
         }
         // SAFETY: see the function's own contract.
         let gpu = unsafe { self.executor.gpu.failing(std::sync::Arc::new(Edit(edit))) };
-        GpuBackend { executor: Executor::new(gpu), ..self }
+        GpuBackend { executor: Executor::new(gpu), tests_large: false, ..self }
     }
 
     /// Starts to time rollouts by the GPU's clock, if it has one.
@@ -272,6 +286,7 @@ impl GpuBackend {
             buffer: (limits.max_buffer_size - (1 << 20)).min(limits.max_storage_buffer_binding_size).min(MAX_OFFSET),
             workgroup: limits.max_compute_invocations_per_workgroup.min(limits.max_compute_workgroup_size_x) as usize,
             workgroup_bytes: limits.max_compute_workgroup_storage_size as usize,
+            large_from: self.large_from,
         }
     }
 
@@ -292,6 +307,13 @@ impl GpuBackend {
         let is_compiled = |shape| compiled.contains_key(&Pipeline::Episode(shape));
         let specialised = specialised_shapes(groups, trace, self.kernel, capacity, &is_compiled);
         let batches = plan(groups, trace, self.records, capacity, &specialised)?;
+        if self.tests_large && batches.iter().flat_map(|batch| &batch.tasks).any(|planned| planned.shape.is_large()) {
+            if let Some(mismatch) = self_test::large_teams(&self.executor)? {
+                let (adapter, failures) = (self.gpu().adapter.to_string(), vec![(self.gpu().pass, mismatch)]);
+                return Err(DeviceError::Inexact { adapter, failures }.into());
+            }
+            self.tests_large = false;
+        }
         self.times.gather += start.elapsed();
         let mut previous = None;
         for (index, plan) in batches.iter().enumerate() {

@@ -10,9 +10,11 @@ use crate::backend::gpu::population::Held;
 use crate::backend::gpu::recording::{BINDING_ALIGNMENT, Buffer, Command, Recording, Slice, grid};
 use crate::backend::gpu::shape::{Capacity, MAX_THREADS, Recorded, Shape, WORKGROUPS, Workgroup};
 use crate::backend::gpu::source::{
-    GatherJob, LEADERS_PER_GATHER, MAX_AGENTS, NOWHERE, PACK_WORKGROUP, Pipeline, State, Task,
+    GatherJob, LEADERS_PER_GATHER, MAX_ITERATIONS, NOWHERE, PACK_WORKGROUP, Pipeline, State, SwarmPart, Task,
 };
+use crate::backend::grid::{Grid, LARGE_FROM, is_large};
 use crate::backend::{BackendError, Group, VECTOR, WeightVector, Weights, record_words, traced_words, weight_vectors};
+use crate::config::MAX_CLASSES;
 use crate::credit::{RecordRequest, owner_bits};
 use crate::model::Constants;
 use crate::model::class::Class;
@@ -21,18 +23,54 @@ use crate::model::sense::ChannelConstants;
 use crate::parallel::*;
 use crate::world::World;
 
-/// Maximum loop iterations per thread and dispatch, over all loops. Longer episodes take several dispatches: Mesa's
-/// llvmpipe 22.3 abandons every loop after 65 535 iterations, and drivers stop a dispatch that runs for seconds.
-const MAX_ITERATIONS: usize = 60_000;
 /// Words before the others in a packed record (`struct Packed` in the shader): words used, and words available.
 pub(super) const PACKED_HEAD: usize = 2;
-/// Words after a task's record.
+/// Words of a task's status.
 const STATUS: usize = 1;
 /// Alignment of each kernel's first task, in tasks, so that a binding may start there.
 const TASK_ALIGNMENT: usize = BINDING_ALIGNMENT / size_of::<Task>();
 const _: () = assert!(BINDING_ALIGNMENT.is_multiple_of(size_of::<Task>()));
 /// Words of a packed record beyond the share of sets that it has room for.
 const SPARE_PACKED_WORDS: usize = 256;
+
+/// Words of a cell of a large team, see `shaders/swarm.wgsl`.
+const CELL_WORDS: usize = 3;
+/// Maximum workgroups that clear the record of a large team.
+const CLEARERS: usize = 4096;
+
+/// Returns the first words of the cells of each class after a large team's status word, and the words in all. A word per
+/// class precedes them.
+fn cell_words(world: &World) -> (Vec<usize>, usize) {
+    let mut words = MAX_CLASSES;
+    let first = |class| {
+        words += CELL_WORDS * Grid::new(world, class).cells();
+        words - CELL_WORDS * Grid::new(world, class).cells()
+    };
+    (world.classes.iter().map(first).collect(), words)
+}
+
+/// Returns the workgroups of a part of a step of a large team.
+fn workgroups(part: SwarmPart, world: &World, workgroup: usize) -> usize {
+    let (_, cells) = cell_words(world);
+    match part {
+        SwarmPart::Clear => (world.set_words() + cells).div_ceil(workgroup).min(CLEARERS),
+        SwarmPart::Enter | SwarmPart::Fill => world.agents().div_ceil(workgroup),
+        SwarmPart::Allocate => ((cells - MAX_CLASSES) / CELL_WORDS).div_ceil(workgroup),
+        SwarmPart::Learn => world.leaders(),
+        SwarmPart::ObeyRule => world.followers().div_ceil(workgroup).max(1),
+    }
+}
+
+/// Returns the estimated loop iterations of a step of a large team over all threads, if agents are spread evenly.
+fn iterations_of_large(world: &World) -> usize {
+    let visits = |class: &Class| {
+        let near = |other: &Class| 9 * other.agents().len().div_ceil(Grid::new(world, other).cells());
+        let terms = if class.terms().is_empty() { 0 } else { world.classes.iter().map(near).sum() };
+        let senses = if class.channels().is_empty() { 0 } else { world.agents() };
+        class.agents().len() * (terms * class.terms().len() + senses * class.channels().len() + world.pois.len() + 50)
+    };
+    world.classes.iter().map(visits).sum()
+}
 
 /// Returns the estimated loop iterations per thread and step, over all loops.
 fn iterations_per_step(world: &World, workgroup: Workgroup, records: Recorded) -> usize {
@@ -73,7 +111,9 @@ pub fn state_bytes(world: &World, request: RecordRequest<'_>) -> u64 {
     let generic = Workgroup::generic(world, WORKGROUPS[2]);
     let specialised = Workgroup::specialised(world, Capacity::of_workgroups(MAX_THREADS));
     let is_parted = |workgroup| world.steps() > steps_per_dispatch(world, workgroup, recorded);
-    if world.aligns() {
+    if is_large(world, LARGE_FROM) {
+        (3 * world.agents() * size_of::<State>() + cell_words(world).1 * size_of::<u32>()) as u64
+    } else if world.aligns() {
         (2 * world.agents() * size_of::<State>()) as u64
     } else if is_parted(generic) || specialised.is_some_and(is_parted) {
         (world.agents() * size_of::<State>()) as u64
@@ -162,6 +202,8 @@ impl Elements {
 struct GroupPlan<'a> {
     group: &'a Group<'a>,
     per_team: Elements,
+    /// Words after a task's record.
+    after_record: usize,
     /// Maximum bytes per team in one buffer.
     bytes_per_team: u64,
     teams_per_task: usize,
@@ -179,27 +221,29 @@ impl<'a> GroupPlan<'a> {
         specialised: &HashSet<Shape>,
     ) -> Result<GroupPlan<'a>, BackendError> {
         let world = group.world;
-        if world.agents() > MAX_AGENTS {
-            let agents = world.agents();
-            let text =
-                format!("teams of {agents} agents play on the CPU only, up to {MAX_AGENTS} on a GPU; use the CPU");
-            return Err(BackendError::TooLarge(text));
-        }
         let recorded = Recorded::of(group, trace);
         let own_kernel = Shape::specialised(world, capacity, recorded).filter(|(shape, _)| specialised.contains(shape));
         let (shape, workgroup) = own_kernel.unwrap_or_else(|| Shape::generic(world, capacity, recorded));
-        let steps_per_dispatch = steps_per_dispatch(world, workgroup, recorded);
+        let (steps_per_dispatch, iterations_per_step) = match shape.is_large() {
+            true => (1, iterations_of_large(world)),
+            false => (
+                steps_per_dispatch(world, workgroup, recorded),
+                iterations_per_step(world, workgroup, recorded) * workgroup.threads,
+            ),
+        };
         let per_team = Elements {
             record: record_words(world, group.records()),
             weights: weight_vectors(world),
             traced: if trace { (world.steps() + 1) * traced_words(world) } else { 0 },
             states: match world.aligns() {
+                _ if shape.is_large() => 3 * world.agents(),
                 true => 2 * world.agents(),
                 false if world.steps() > steps_per_dispatch => world.agents(),
                 false => 0,
             },
         };
-        let bytes_per_team = Elements { record: per_team.record + STATUS, ..per_team }.largest();
+        let after_record = STATUS + if shape.is_large() { cell_words(world).1 } else { 0 };
+        let bytes_per_team = Elements { record: per_team.record + after_record, ..per_team }.largest();
         if bytes_per_team > capacity.buffer {
             return Err(BackendError::TooLarge(format!(
                 "one team takes {bytes_per_team} bytes in one buffer, this adapter allows {}; \
@@ -214,9 +258,9 @@ impl<'a> GroupPlan<'a> {
             shape,
             task: Task::default(),
             steps_per_dispatch,
-            iterations_per_step: iterations_per_step(world, workgroup, recorded) * workgroup.threads,
+            iterations_per_step,
         };
-        Ok(GroupPlan { group, per_team, bytes_per_team, teams_per_task, template })
+        Ok(GroupPlan { group, per_team, after_record, bytes_per_team, teams_per_task, template })
     }
 }
 
@@ -241,7 +285,10 @@ impl BatchPlan {
     fn is_full(&self, plan: &GroupPlan<'_>, teams: usize, capacity: Capacity) -> bool {
         let more = teams as u64 * plan.bytes_per_team;
         let world = plan.group.world;
-        let places = self.places.len() + plan.group.starts.len() + 2 * world.pois.len() + world.headings.len();
+        let places = self.places.len()
+            + plan.group.starts.len()
+            + 2 * (world.pois.len() + world.classes.len())
+            + world.headings.len();
         let of_groups = [
             places * size_of::<Vec2>(),
             (self.worlds.len() + 1) * size_of::<Constants>(),
@@ -263,6 +310,13 @@ impl BatchPlan {
         // The shader finds headings behind the POIs, and then more about these.
         self.places.extend(&world.headings);
         self.places.extend(world.radii2.iter().zip(&world.values).map(|(&radius2, &value)| Vec2::new(radius2, value)));
+        if plan.template.shape.is_large() {
+            for (class, word) in world.classes.iter().zip(cell_words(world).0) {
+                let grid = Grid::new(world, class);
+                let numbers = [grid.columns as f32, grid.rows as f32, grid.inverse, word as f32];
+                self.places.extend([Vec2::new(numbers[0], numbers[1]), Vec2::new(numbers[2], numbers[3])]);
+            }
+        }
         self.worlds.push(Constants { first_class: self.classes.len() as u32, ..world.constants });
         self.classes.extend(&world.classes);
         let (pois, end) = (first + world.agents() as u32, world.constants.steps);
@@ -282,7 +336,7 @@ impl BatchPlan {
             status: (used.record + per_team.record * teams) as u32,
             ..stored
         };
-        used.record += per_team.record * teams + STATUS;
+        used.record += per_team.record * teams + plan.after_record;
         used.weights += per_team.weights * teams;
         used.traced += per_team.traced * teams;
         used.states += per_team.states * teams;
@@ -350,7 +404,7 @@ impl BatchPlan {
         let &RecordingOptions { groups, held, weights: staging, trace, nonce, .. } = options;
         let mut recording = Recording::new("episodes");
         let [record, weights, traced, states] = self.used.bytes();
-        let (tasks, runs) = self.lay_out(nonce);
+        let (tasks, runs) = self.lay_out(groups, nonce);
         let worlds = recording.input(Buffer::Worlds, &self.worlds);
         recording.input(Buffer::Tasks, tasks);
         let places = recording.input(Buffer::Places, &self.places);
@@ -375,7 +429,7 @@ impl BatchPlan {
         // The dispatches, in submissions of at most `cap` iterations, and then those that pack.
         let most = options.most_workgroups as usize / TASK_ALIGNMENT * TASK_ALIGNMENT;
         let (mut packing, mut load, mut is_split) = (Vec::new(), 0, false);
-        for Run { shape, is_first_round, mut tasks, iterations: per_task } in runs {
+        for Run { dispatches, is_first_round, mut tasks, iterations: per_task } in runs {
             while !tasks.is_empty() {
                 let allowed = (options.cap.saturating_sub(load) / per_task) as usize / TASK_ALIGNMENT * TASK_ALIGNMENT;
                 if allowed == 0 && load > 0 {
@@ -387,17 +441,21 @@ impl BatchPlan {
                 tasks.start = part.end;
                 let work = part.len() as u64 * per_task;
                 load += work;
-                let grid = [part.len() as u32, 1, 1];
+                let count = part.len() as u32;
                 let bytes = (part.start * size_of::<Task>()) as u64..(part.end * size_of::<Task>()) as u64;
                 let tasks = Slice { buffer: Buffer::Tasks, bytes };
                 if let (Some((_, packed, minimums)), true) = (&packed, is_first_round) {
                     let bindings = [&worlds, &tasks, minimums, packed, &record].map(Slice::clone).into();
+                    let grid = [count, 1, 1];
                     packing.push(Command::Dispatch { pipeline: Pipeline::Pack, bindings, grid, iterations: 0 });
                 }
-                let bindings =
-                    [&worlds, &tasks, &places, &weights, &record, &traced, &states, &classes].map(Slice::clone).into();
-                let pipeline = Pipeline::Episode(shape);
-                recording.commands.push(Command::Dispatch { pipeline, bindings, grid, iterations: work });
+                for (index, &(pipeline, workgroups)) in dispatches.iter().enumerate() {
+                    let bindings = [&worlds, &tasks, &places, &weights, &record, &traced, &states, &classes];
+                    let bindings = bindings.map(Slice::clone).into();
+                    let grid = workgroups.map_or([count, 1, 1], |workgroups| [workgroups as u32, count, 1]);
+                    let iterations = if index + 1 == dispatches.len() { work } else { 0 };
+                    recording.commands.push(Command::Dispatch { pipeline, bindings, grid, iterations });
+                }
             }
         }
         if is_split && !packing.is_empty() {
@@ -461,7 +519,7 @@ impl BatchPlan {
 
     /// Lays out the tasks of all rounds. In each round the tasks of a shape are consecutive, and the first is at an
     /// offset where a binding may start.
-    fn lay_out(&self, nonce: u32) -> (Vec<Task>, Vec<Run>) {
+    fn lay_out(&self, groups: &[Group<'_>], nonce: u32) -> (Vec<Task>, Vec<Run>) {
         let shapes: BTreeSet<Shape> = self.tasks.iter().map(|planned| planned.shape).collect();
         let (mut tasks, mut runs): (Vec<Task>, Vec<Run>) = Default::default();
         for (round, &shape) in (0..self.rounds()).flat_map(|round| shapes.iter().map(move |shape| (round, shape))) {
@@ -474,10 +532,29 @@ impl BatchPlan {
                 }
             }
             if tasks.len() > first {
-                runs.push(Run { shape, is_first_round: round == 0, tasks: first..tasks.len(), iterations });
+                let (tasks, is_first_round) = (first..tasks.len(), round == 0);
+                let dispatches = self.dispatches(groups, shape, is_first_round);
+                runs.push(Run { dispatches, is_first_round, tasks, iterations });
             }
         }
         (tasks, runs)
+    }
+
+    /// Returns the dispatches of a round of a shape: pipelines and, if a task takes several, the workgroups of each task.
+    fn dispatches(&self, groups: &[Group<'_>], shape: Shape, is_first_round: bool) -> Vec<(Pipeline, Option<usize>)> {
+        use SwarmPart::{Allocate, Clear, Enter, Fill, Learn, ObeyRule};
+        if !shape.is_large() {
+            return vec![(Pipeline::Episode(shape), None)];
+        }
+        let tasks = self.tasks.chunk_by(|a, b| a.group == b.group).map(|tasks| &tasks[0]);
+        let worlds: Vec<&World> =
+            tasks.filter(|planned| planned.shape == shape).map(|planned| groups[planned.group].world).collect();
+        let parts = [Clear, Enter, Allocate, Fill, Learn, ObeyRule].into_iter();
+        let dispatch = |part| {
+            let most = worlds.iter().map(|world| workgroups(part, world, shape.workgroup)).max();
+            (Pipeline::Swarm(part, shape), most)
+        };
+        parts.skip(if is_first_round { 0 } else { 2 }).map(dispatch).collect()
     }
 
     /// Records how policies are gathered from populations on the device.
@@ -535,7 +612,8 @@ impl BatchPlan {
 
 /// Tasks of one shape and round.
 struct Run {
-    shape: Shape,
+    /// See [`BatchPlan::dispatches`].
+    dispatches: Vec<(Pipeline, Option<usize>)>,
     is_first_round: bool,
     tasks: Range<usize>,
     /// The estimated work of a task.
@@ -669,12 +747,18 @@ mod tests {
 
     /// Plans groups, `(teams, world)` each, and checks the recording of every batch. Returns the numbers of batches,
     /// submissions, and dispatches that play.
-    fn check(
+    fn check(groups: &[(usize, &World)], buffer: u64, limits: [u64; 2], records: Records, is_held: bool) -> [usize; 3] {
+        check_from(groups, buffer, limits, records, is_held, LARGE_FROM)
+    }
+
+    /// [`check`] with large teams of at least so many agents.
+    fn check_from(
         groups: &[(usize, &World)],
         buffer: u64,
         [cap, most_workgroups]: [u64; 2],
         records: Records,
         is_held: bool,
+        large_from: usize,
     ) -> [usize; 3] {
         let held = Held { sizes: [1, 1, groups[0].1.parameters()], turn: 1, status: vec![7, 8] };
         let (weights, choices) = (vec![0.0; groups[0].1.parameters()], vec![0; 30_000]);
@@ -689,7 +773,7 @@ mod tests {
             fitnesses: &[Fitness::Df],
         };
         let groups: Vec<Group<'_>> = groups.iter().map(group).collect();
-        let capacity = Capacity { batch: BATCH_BYTES, buffer, ..Capacity::of_workgroups(256) };
+        let capacity = Capacity { batch: BATCH_BYTES, buffer, large_from, ..Capacity::of_workgroups(256) };
         let batches = plan(&groups, false, records, capacity, &HashSet::new()).unwrap();
         // Every team is in one task.
         let mut next = vec![0; groups.len()];
@@ -747,9 +831,14 @@ mod tests {
                     assert!(bindings.iter().all(|slice| slice.bytes.start % BINDING_ALIGNMENT as u64 == 0));
                     let Some(slice) = bindings.iter().find(|slice| slice.buffer == Buffer::Tasks) else { continue };
                     let [start, end] = [slice.bytes.start, slice.bytes.end].map(|at| at as usize / size_of::<Task>());
-                    assert_eq!(grid.iter().product::<u32>() as usize, end - start);
+                    let per_task = if let Pipeline::Swarm(..) = pipeline { grid[0] } else { 1 };
+                    assert_eq!(grid.iter().product::<u32>() as usize, (end - start) * per_task as usize);
                     if *pipeline == Pipeline::Pack {
                         packed += tasks[start..end].iter().map(|task| task.teams).sum::<u32>();
+                    } else if let Pipeline::Swarm(part, _) = pipeline {
+                        // The last of each step has its work.
+                        played.extend(tasks[start..end].iter().filter(|_| *part == SwarmPart::ObeyRule));
+                        dispatches += 1;
                     } else {
                         played.extend(&tasks[start..end]);
                         dispatches += 1;
@@ -815,5 +904,17 @@ mod tests {
         assert_eq!(found[..6], one_batch);
         assert_eq!(found[6..], [[133, 133, 266], [5, 5, 5]]);
         assert_eq!(state_bytes(&long, RecordRequest(&[Fitness::Df])), 256 * 20);
+    }
+
+    /// Each step of large teams takes four dispatches, after two at the start. Each team is a task.
+    #[test]
+    fn recordings_of_large_teams_play_every_step_once() {
+        const FREE: [u64; 2] = [u64::MAX, 65_535];
+        let (short, long) = (crowd(20), crowd(60));
+        let check = |groups: &[(usize, &World)], limits| check_from(groups, 1 << 24, limits, Records::Whole, true, 256);
+        assert_eq!(check(&[(3, &short)], FREE), [1, 1, 2 + 4 * 20]);
+        assert_eq!(check(&[(3, &short), (2, &long)], FREE), [1, 1, 2 + 4 * 60]);
+        // Every step is a submission.
+        assert_eq!(check(&[(3, &short)], [1, 65_535]), [1, 20, 2 + 4 * 20]);
     }
 }
