@@ -1,9 +1,7 @@
 // One agent: what it senses, decides and obeys, and how it moves. Both kinds of kernels use this.
 //
 // Uses: lib/layout.wgsl, lib/math.wgsl, generic.wgsl (shape, class_shape, sense_all, obey_all, decide), sense.wgsl,
-// policy.wgsl, follow.wgsl, pursue.wgsl, motion.wgsl, couple.wgsl.
-//
-// The kernel, episode.wgsl or swarm.wgsl, has what depends on where the states of others are:
+// policy.wgsl, follow.wgsl, pursue.wgsl, motion.wgsl, and of the kernel, episode.wgsl or swarm.wgsl:
 //   position_of    the position of another agent
 //   sense_agents   senses other agents
 //   obey_agents    adds other agents to the terms of a rule

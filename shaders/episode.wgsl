@@ -1,7 +1,7 @@
 // Whole episodes: a workgroup plays some teams from start to end, with state in registers and workgroup memory. Long
 // episodes take several dispatches, with the state stored in between.
 //
-// Uses: lib/layout.wgsl, lib/math.wgsl, generic.wgsl (set_shape, act), agent.wgsl.
+// Uses: lib/layout.wgsl, lib/math.wgsl, generic.wgsl (set_shape, act), agent.wgsl, sense.wgsl, follow.wgsl, couple.wgsl.
 //
 // One text makes two kernels. In the specialised one all sizes and the shapes of all classes are constants. In the generic
 // one they are read with the task (`generic.wgsl`). The host prepends, with what agent.wgsl needs:

@@ -1,6 +1,6 @@
 // Episodes of large teams: a step takes several dispatches, and each agent finds those near it in a grid of cells.
 //
-// Uses: lib/layout.wgsl, lib/math.wgsl, generic.wgsl (set_shape, channel_of), agent.wgsl.
+// Uses: lib/layout.wgsl, lib/math.wgsl, generic.wgsl (set_shape, channel_of), agent.wgsl, sense.wgsl, follow.wgsl, couple.wgsl.
 //
 // The host prepends, with what agent.wgsl needs:
 //   WORKGROUP   threads per workgroup

@@ -34,9 +34,10 @@ pub struct Args {
         conflicts_with = "questions")]
     populations: Vec<String>,
     /// Compare credits for rovers and UAVs instead, in all layouts or some of rover_uav, 3_rovers_1_uav, 3_rovers_3_uavs,
-    /// 4_rovers_4_uavs (docs/results/influence.md)
+    /// 4_rovers_4_uavs, 3_rovers_3_uavs_random (docs/results/influence.md)
     #[arg(long, value_name = "LAYOUTS", num_args = 0..=1, require_equals = true, value_delimiter = ',',
-        default_missing_value = "rover_uav,3_rovers_1_uav,3_rovers_3_uavs,4_rovers_4_uavs", value_parser = influence::layout,
+        default_missing_value = "rover_uav,3_rovers_1_uav,3_rovers_3_uavs,4_rovers_4_uavs,3_rovers_3_uavs_random",
+        value_parser = influence::layout,
         conflicts_with_all = ["questions", "populations"])]
     influence: Vec<String>,
     /// Independent repetitions [default: 5, or 30 with --questions or --influence]

@@ -323,7 +323,7 @@ fn compiled_shaders_are_exact_small_and_fast() {
                 };
                 // The limits do not apply to the other episode shaders. They index arrays, for several agents per
                 // thread or wide networks, or they trace, which need not be fast.
-                if name.starts_with("episode, ") || !is_known {
+                if name.starts_with("episode, ") || name.starts_with("swarm, traced, ") || !is_known {
                     continue;
                 }
                 assert_eq!(count("Scratch size"), 0, "{context}: scratch memory");
@@ -335,6 +335,10 @@ fn compiled_shaders_are_exact_small_and_fast() {
                     assert_eq!(count(name), 0, "{context}: {name}");
                 }
                 assert!(count("VGPRs") <= MAX_REGISTERS, "{context}: {} registers", count("VGPRs"));
+                // Kernels of large teams play any classes, too.
+                if name.starts_with("swarm, ") {
+                    continue;
+                }
                 assert!(count("Instructions") <= max_instructions, "{context}: {} instructions", count("Instructions"));
             }
             let mut finding = format!("{chip}, {pass} pass: {} shaders, none fused", results.len());

@@ -114,68 +114,8 @@ fn arithmetic(executor: &Executor) -> Result<Option<String>, BackendError> {
     }))
 }
 
-/// A world with what the paper's layouts lack: every measure and combination, sectors of the map and of each agent, both
-/// kinds of motion, POIs with values, and agents that align, move to others, move only near others, or stay in a box.
-const CLASSES: &str = r#"
-world = { map = [50, 50], steps = 20 }
-learning = { population = 2 }
-
-[[agents]]
-name = "rover"
-at = [[20, 20], [25, 22], [28, 24], [30, 26]]
-motion = { kind = "free" }
-senses = [
-    { of = "pois", sectors = 6, frame = "map", range = 20, measure = "closeness", combine = "closest", empty = -1 },
-    { of = ["rover", "uav"], sectors = 3, frame = "map", measure = "exponential", combine = "sum" },
-    { of = "agents", frame = "map", range = 9, measure = "distance", combine = "mean" },
-]
-leads = "sheep"
-
-[[agents]]
-name = "uav"
-at = [[22, 30], [26, 30]]
-senses = [
-    { of = "pois", pois = "far", sectors = 5, measure = "inverse", combine = "mean", empty = 0.5 },
-    { of = "sheep", measure = "inverse-squared", nearest = 0.5, combine = "share" },
-    { of = "agents", sectors = 2, range = 12 },
-]
-stays_in = [21, 29, 27, 31]
-
-[[agents]]
-name = "scout"
-at = [[21, 28], [29, 22]]
-control = "choose:sheep"
-senses = [{ of = "sheep", sectors = "each", range = 7, empty = 1 }]
-moves_near = "sheep"
-
-[[agents]]
-name = "sheep"
-at = [[20, 24], [22, 24], [24, 25], [26, 25], [27, 27], [21, 27]]
-control = "follow"
-rule = [
-    { of = "sheep", to = 1, gain = -1 },
-    { of = "sheep", from = 1, to = 6, gain = 2 },
-    { of = "rover", to = 5, gain = -3 },
-    { of = "agents", to = 8, align = 1 },
-]
-
-[[agents]]
-name = "dog"
-at = [[23, 23], [27, 21]]
-control = "nearest:sheep"
-
-[[pois]]
-name = "near"
-at = [[20, 26], [24, 21], [27, 24]]
-value = 2
-radius = 3
-observers = ["rover", "sheep"]
-
-[[pois]]
-name = "far"
-at = [[30, 30], [18, 18]]
-coupling = 1
-"#;
+/// A world with what the paper's layouts lack.
+const CLASSES: &str = include_str!("self_test.toml");
 
 /// Returns the world of the paper's first layout, with a density, and its config.
 fn world(density: Density) -> (World, Config) {
@@ -198,7 +138,7 @@ fn episode(executor: &Executor) -> Result<Option<String>, BackendError> {
     if executor.gpu.adapter.kind != Kind::Software {
         backend = backend.with_kernel(Kernel::Specialised);
     }
-    let classes = Config::parse(CLASSES, "classes").and_then(|config| config.validate());
+    let classes = Config::parse(CLASSES, "self_test.toml").and_then(|config| config.validate());
     let classes = World::new(&classes.expect("the project's own config"));
     let worlds = Density::ALL.iter().map(|&(name, density)| (format!("{name} density"), world(density).0));
     for (name, world) in worlds.chain([("classes of agents".into(), classes)]) {
@@ -210,19 +150,6 @@ fn episode(executor: &Executor) -> Result<Option<String>, BackendError> {
         }
     }
     Ok(None)
-}
-
-/// Tests an episode of classes that large teams may have, by the kernel of large teams. Few trainings need it, so it is tested
-/// only before these.
-pub(super) fn large_teams(executor: &Executor) -> Result<Option<String>, BackendError> {
-    const TEAMS: usize = 4;
-    let mut config = Config::parse(CLASSES, "classes").expect("the project's own config");
-    config.agents.retain(|class| class.control.target().is_none());
-    let world = World::new(&config.validate().expect("the project's own config"));
-    let (weights, teams) = (sample::weights(&world, 1, 0), vec![0; TEAMS * world.leaders()]);
-    let mut backend = GpuBackend::with_executor(executor.clone()).with_large_from(0);
-    let mismatch = compare_traces(&group(&world, &weights, 1, &teams), &mut Cpu::default(), &mut backend)?;
-    Ok(mismatch.map(|mismatch| format!("an episode of a large team differs: {mismatch}")))
 }
 
 /// Tests what a generation of training uses: populations on the device, from which teams are gathered, both kernels, and

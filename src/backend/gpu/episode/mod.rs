@@ -3,6 +3,7 @@
 //! | file | holds |
 //! |---|---|
 //! | `plan` | teams cut into tasks, tasks into batches, and the recording of each batch |
+//! | `check` | the test of the kernel of large teams |
 //! | `inspect` | shaders and inputs of one workgroup, to see what compilers make of them |
 //!
 //! One shader text makes two kernels. The generic one plays any world. The specialised one is compiled for a world's
@@ -22,7 +23,6 @@ use bytemuck::Zeroable;
 use super::device::{DeviceError, Executor, Gpu, Kind, Traffic, Workspace};
 use super::population::{Held, Population};
 use super::recording::{Readback, iterations};
-use super::self_test;
 use super::shape::{Capacity, MAX_OFFSET, specialised_shapes};
 use super::source::{NOWHERE, Pipeline, Task};
 use crate::backend::grid::LARGE_FROM;
@@ -36,6 +36,7 @@ use crate::host::Instant;
 use crate::parallel::*;
 use crate::world::World;
 
+mod check;
 mod inspect;
 mod plan;
 
@@ -308,7 +309,7 @@ impl GpuBackend {
         let specialised = specialised_shapes(groups, trace, self.kernel, capacity, &is_compiled);
         let batches = plan(groups, trace, self.records, capacity, &specialised)?;
         if self.tests_large && batches.iter().flat_map(|batch| &batch.tasks).any(|planned| planned.shape.is_large()) {
-            if let Some(mismatch) = self_test::large_teams(&self.executor)? {
+            if let Some(mismatch) = check::large_teams(&self.executor)? {
                 let (adapter, failures) = (self.gpu().adapter.to_string(), vec![(self.gpu().pass, mismatch)]);
                 return Err(DeviceError::Inexact { adapter, failures }.into());
             }
