@@ -4,7 +4,7 @@
 
 - A file outside docs/ that a page links to is copied to repository/PATH, and the links are adapted.
 - `<!-- site: TEXT -->` on a page becomes TEXT. It is for links that exist only on the site, such as the browser page.
-- On the Python page, mkdocstrings replaces the text after the introduction.
+- On the pages of the Python reference, mkdocstrings replaces the text after the introduction.
 - FLOTILLA is the program. If it is given, the page of commands gets the full help of each command.
 """
 
@@ -19,8 +19,6 @@ ROOT = Path(__file__).resolve().parent.parent
 STAGE = ROOT / "target/docs"
 PYTHON = ROOT / "target/docs-python"
 SITE_ONLY = re.compile(r"<!-- site: (.*?) -->", re.S)
-# mkdocstrings documents what the package exports, member by member.
-PYTHON_API = "::: flotilla\n    options:\n      show_root_heading: false\n      show_root_toc_entry: false\n"
 LINK = re.compile(r"(\]\()([^)\s#]+)(#[^)\s]*)?(\))")
 
 
@@ -92,9 +90,10 @@ def main():
                 there = STAGE / in_site(path)
                 there.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(ROOT / path, there)
-        if page == "docs/reference/python.md":
-            introduction = text.split("\n## ")[0].split("\nThis page is made from")[0]
-            text = f"{introduction}\n{PYTHON_API}"
+        if page.startswith("docs/reference/python/"):
+            # mkdocstrings documents each name, member by member.
+            names = re.findall(r"^## `(\w+)`$", text, re.M)
+            text = text.split("\n## ")[0] + "".join(f"\n::: flotilla.{name}\n" for name in names)
         if page == "docs/reference/commands.md" and len(sys.argv) > 1:
             text += command_help(sys.argv[1])
         there = STAGE / in_site(page)

@@ -1,4 +1,7 @@
-"""Prints docs/reference/python.md, made from the package's docstrings and signatures."""
+"""Writes python.md and python/*.md into a directory, made from the package's docstrings and signatures.
+
+    python python/api.py docs/reference
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import inspect
 import re
 import sys
 import textwrap
+from pathlib import Path
 
 # Import the installed package. The sources next to this file have no native module.
 sys.path = sys.path[1:]
@@ -20,21 +24,19 @@ For Python users: every function and class of `import flotilla`.
 `[teams, leaders, inputs]`. Every
 example is run by the package's tests, with `np` for NumPy.
 
-This page is made from the docstrings by `python python/api.py > docs/reference/python.md`.
+The pages are made from the docstrings by `python python/api.py docs/reference`.
 """
 ORDER = [
     ("Configs", ["Config", "Key", "ConfigError", "Problem"]),
     ("Training", ["train", "Run", "Generation", "Error", "loggers"]),
     ("Your own fitness", ["Coevolution", "Proposal", "Played"]),
     ("Looking", ["Replay", "Episode", "Figure", "plot", "compare", "Comparison"]),
-    ("Evaluating", ["rollout", "Rollout", "Trace", "score", "Scores", "replay", "forward", "collect", "Collected", "to_onnx"]),
+    ("Evaluating", ["rollout", "Rollout", "Trace", "score", "Scores", "replay"]),
+    ("Networks", ["forward", "collect", "Collected", "to_onnx"]),
     ("Environments", ["VectorEnv", "team_env", "parallel_env"]),
     ("Many runs", ["sweep", "Sweep", "Point", "paper"]),
     ("The machine", ["devices", "verify"]),
 ]
-
-
-CONTENTS = "Sections: " + ", ".join(f"[{title}](#{title.lower().replace(' ', '-')})" for title, _ in ORDER) + ".\n"
 
 
 def markdown(text: str) -> str:
@@ -106,27 +108,36 @@ def entry(name: str, thing: object, level: str) -> str:
 HIDDEN = {"Run", "Replay", "Figure", "Rollout", "Trace", "Sweep", "Generation", "Proposal", "Played", "Collected", "Comparison"}
 
 
-def page() -> str:
-    parts = [OPENING, CONTENTS]
-    for title, names in ORDER:
-        parts.append(f"## {title}\n")
-        for name in names:
-            thing = getattr(flotilla, name)
-            parts.append(entry(name, thing, "###"))
-            if inspect.isclass(thing):
-                members = [(member, value) for member, value in vars(thing).items() if not member.startswith("_")]
-                for member, value in members:
-                    function = getattr(value, "__func__", value)
-                    if inspect.isfunction(function) or (isinstance(value, property) and inspect.getdoc(value)):
-                        parts.append(entry(f"{name}.{member}", function, "####"))
-            elif inspect.ismodule(thing):
-                for member, value in vars(thing).items():
-                    if inspect.isfunction(value) and value.__module__ == thing.__name__:
-                        parts.append(entry(f"{name}.{member}", value, "####"))
-    missing = set(flotilla.__all__) - {name for _, names in ORDER for name in names}
-    assert not missing, f"the page leaves out {missing}"
+def section(title: str, names: list[str]) -> str:
+    """Returns the page with these names."""
+    parts = [f"# {title}\n\nA part of the [Python reference](../python.md).\n"]
+    for name in names:
+        thing = getattr(flotilla, name)
+        parts.append(entry(name, thing, "##"))
+        if inspect.isclass(thing):
+            members = [(member, value) for member, value in vars(thing).items() if not member.startswith("_")]
+            for member, value in members:
+                function = getattr(value, "__func__", value)
+                if inspect.isfunction(function) or (isinstance(value, property) and inspect.getdoc(value)):
+                    parts.append(entry(f"{name}.{member}", function, "###"))
+        elif inspect.ismodule(thing):
+            for member, value in vars(thing).items():
+                if inspect.isfunction(value) and value.__module__ == thing.__name__:
+                    parts.append(entry(f"{name}.{member}", value, "###"))
     return "\n".join(parts)
 
 
+def main(folder: Path) -> None:
+    missing = set(flotilla.__all__) - {name for _, names in ORDER for name in names}
+    assert not missing, f"the pages leave out {missing}"
+    (folder / "python").mkdir(exist_ok=True)
+    contents = ""
+    for title, names in ORDER:
+        page = f"python/{title.lower().replace(' ', '-')}.md"
+        contents += f"- [{title}]({page}): {', '.join(f'`{name}`' for name in names)}\n"
+        (folder / page).write_text(section(title, names))
+    (folder / "python.md").write_text(f"{OPENING}\n{contents}")
+
+
 if __name__ == "__main__":
-    print(page(), end="")
+    main(Path(sys.argv[1]))

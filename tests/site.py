@@ -24,7 +24,7 @@ SEARCHES = {
     "leaders that cannot sense": "how-to/blind-leaders.html",
     "Slurm": "how-to/clusters.html",
     "resume": "how-to/resume.html",
-    "VectorEnv": "reference/python.html",
+    "VectorEnv": "reference/python/environments.html",
 }
 
 
@@ -97,7 +97,7 @@ def main():
                 wrong.append(query)
         assert not wrong, f"these searches find another page first: {wrong}"
         for page, selector in {
-            "reference/python.html": "[id='flotilla.VectorEnv.step']",
+            "reference/python/environments.html": "[id='flotilla.VectorEnv.step']",
             "reference/rust.html": "a[href='../rust/flotilla/index.html']",
             "rust/flotilla/index.html": "#modules",
             "reference/commands.html": "#flotilla-train",

@@ -1,7 +1,7 @@
-//! Tests `flotilla paper --questions`, and that docs/results/questions-tables.md has its results.
+//! Tests `flotilla paper --questions`, and that docs/results/questions-*-tables.md have its results.
 //!
 //! `cargo test --release questions:: -- --ignored` trains all questions in full. If results change on purpose, run
-//! `flotilla paper --questions --out DIR`. Then `FLOTILLA_WRITE_QUESTIONS=DIR`, with the same command, writes the page's
+//! `flotilla paper --questions --out DIR`. Then `FLOTILLA_WRITE_QUESTIONS=DIR`, with the same command, writes the pages'
 //! tables, figures and files again.
 
 use std::fs;
@@ -94,33 +94,41 @@ fn results_file(name: &str) -> PathBuf {
     Path::new(crate::ROOT).join("docs/results").join(name)
 }
 
+/// Returns every part with the page that has its tables.
+fn parts_and_pages() -> impl Iterator<Item = (&'static Study, PathBuf)> {
+    QUESTIONS.iter().flat_map(|question| {
+        let page = results_file(&format!("questions-{}-tables.md", question.letter));
+        question.parts.iter().map(move |part| (part, page.clone()))
+    })
+}
+
 fn file_name(part: &Study, ending: &str) -> String {
     format!("questions/{}.{ending}", part.name)
 }
 
 #[test]
 #[ignore = "trains for minutes; .ci/nightly runs it"]
-fn the_page_equals_a_new_study() {
-    let page = fs::read_to_string(results_file("questions-tables.md")).unwrap();
+fn the_pages_equal_a_new_study() {
     if let Some(source) = std::env::var_os("FLOTILLA_WRITE_QUESTIONS").map(PathBuf::from) {
         let written = fs::read_to_string(source.join("questions.md")).unwrap();
-        let mut page = page;
-        for part in QUESTIONS.iter().flat_map(|question| question.parts) {
-            page = page.replace(block(&page, part), block(&written, part));
+        for (part, path) in parts_and_pages() {
+            let page = fs::read_to_string(&path).unwrap();
+            fs::write(path, page.replace(block(&page, part), block(&written, part))).unwrap();
             for ending in ["svg", "csv"] {
                 fs::copy(source.join(part.name).with_extension(ending), results_file(&file_name(part, ending)))
                     .unwrap();
             }
         }
-        return fs::write(results_file("questions-tables.md"), page).unwrap();
+        return;
     }
     let place = TempDir::new().unwrap();
     let out = succeed(place.path(), "--questions --quiet --out all");
-    for part in QUESTIONS.iter().flat_map(|question| question.parts) {
+    for (part, path) in parts_and_pages() {
         assert_eq!(
-            block(&page, part),
+            block(&fs::read_to_string(&path).unwrap(), part),
             block(&out, part),
-            "docs/results/questions-tables.md; see the head of cli/tests/questions.rs"
+            "{}; see the head of cli/tests/questions.rs",
+            path.display()
         );
         for ending in ["svg", "csv"] {
             let [expected, actual] = [
@@ -135,8 +143,8 @@ fn the_page_equals_a_new_study() {
 /// Covers in short what the test above trains: tables, figures and files must belong to one run.
 #[test]
 fn the_pages_tables_agree_with_their_files() {
-    let page = fs::read_to_string(results_file("questions-tables.md")).unwrap();
-    for part in QUESTIONS.iter().flat_map(|question| question.parts) {
+    for (part, path) in parts_and_pages() {
+        let page = fs::read_to_string(path).unwrap();
         let (block, mut checked) = (block(&page, part), 0);
         let mut table = csv::Reader::from_path(results_file(&file_name(part, "csv"))).unwrap();
         for row in table.records().map(Result::unwrap) {
