@@ -2,8 +2,9 @@
 
 use crate::support;
 use flotilla::backend::cpu::{Cpu, Noise, StepArrays, level_name};
+use flotilla::backend::gpu::device::DeviceError;
 use flotilla::backend::gpu::episode::{GpuBackend, Records};
-use flotilla::backend::{Group, gpu};
+use flotilla::backend::{BackendError, Group, gpu};
 use flotilla::config::{Config, Sectors, own_populations};
 use flotilla::evaluate::SCORES_AND_DT;
 use flotilla::evolve::{Key, Purpose};
@@ -136,6 +137,23 @@ fn a_swarm_is_equal_on_gpus_whatever_the_order_in_cells() {
             gpu.edited(edit)
         }
     });
+}
+
+/// Drivers may end loops that are longer. So a task in which a thread had one is not believed.
+#[cfg(debug_assertions)]
+#[test]
+fn loops_that_drivers_may_end_are_reported() {
+    for (request, info) in support::adapters("loops_that_drivers_may_end_are_reported") {
+        let backend = GpuBackend::new(gpu::open(request).unwrap()).unwrap();
+        let edit = |text: String| text.replace("visits > MAX_VISITS", "visits > 100u");
+        // SAFETY: the edit changes a limit.
+        #[expect(unsafe_code, reason = "an edited shader is compiled without bounds checks")]
+        let mut backend = unsafe { backend.edited(edit) };
+        let worlds = vec![("swarm".into(), Config::parse(SWARM, "swarm.toml").unwrap())];
+        let plan = Plan { worlds, ..Plan::random(0..0, 1) };
+        let error = compare(&plan, &mut Cpu::default(), &mut backend, |_| ()).unwrap_err();
+        assert!(matches!(error, BackendError::Gpu(DeviceError::Lost { .. })), "{info}: {error}");
+    }
 }
 
 /// Steps with noise, as Python's `rollout` and `collect` get them.

@@ -171,9 +171,10 @@ impl Progress {
             }
         }
         self.whole.set_position(next.min(last) as u64);
-        if !self.is_due() {
-            return;
-        }
+        // Large teams take long until anything is known.
+        let newest = self.arms.iter().filter(|(curve, _)| curve.newest.trials > 0);
+        let newest = newest.map(|(curve, _)| curve.newest.generation).max();
+        let Some(generation) = newest.filter(|_| self.is_due()) else { return };
         let rate = format!("{:.1} generations/s", self.whole.per_sec());
         if self.terminal.is_some() {
             for (curve, bar) in self.arms.iter().take(MAX_BARS) {
@@ -185,7 +186,7 @@ impl Progress {
             [(curve, _)] => curve.value(true),
             arms => format!("{} experiments", arms.len()),
         };
-        let (generation, left) = (next.saturating_sub(1).min(last), self.whole.eta().as_secs());
+        let left = self.whole.eta().as_secs();
         self.line(&format!("generation {generation}/{last}  {values}  {rate}  {left} s left"));
     }
 

@@ -353,6 +353,8 @@ fn bad_input_is_refused_with_its_line() {
         ("CCEA: 3\n".into(), "CCEA.config.BoidsEnv.config: missing"),
         ("env:\n  map_size: .nan\n".into(), "line 2"),
         ("env: \u{1}".into(), "not YAML that can be read: "),
+        ("[world]\nsteps = 5\n".into(), "; it is TOML, as configs of this program are"),
+        ("env: 1\nenv: 2\n".into(), "; remove one of both"),
         ("# x\n".repeat(300_000), "cannot be read"),
     ] {
         place.write("bad.yaml", &text);

@@ -11,7 +11,7 @@ use crate::support::{Place, root};
 fn config(followers: usize) -> String {
     let text = fs::read_to_string(root("configs/swarm.toml")).unwrap();
     let edited = text.replace("count = 100000", &format!("count = {followers}"));
-    assert_ne!(edited, text);
+    assert!(edited != text || followers == 100_000);
     edited.replace("coupling = 10000", &format!("coupling = {}", followers / 10))
 }
 
@@ -33,6 +33,16 @@ fn a_swarm_trains_resumes_and_is_drawn_by_a_sample() {
     place.good("replay whole --out still.svg");
     let still = fs::read_to_string(place.path("still.svg")).unwrap();
     assert!(still.contains("1 of 3 followers drawn") && still.len() < 1 << 20, "{} bytes", still.len());
+}
+
+#[test]
+fn layouts_of_swarms_are_samples_and_baselines_are_refused_at_once() {
+    let place = Place::new(&[("swarm.toml", &config(100_000))]);
+    place.good("check swarm.toml --out layout.svg");
+    let layout = fs::read_to_string(place.path("layout.svg")).unwrap();
+    assert!(layout.contains("1 of 50 followers drawn") && layout.len() < 1 << 20, "{} bytes", layout.len());
+    let error = place.refused(2, "baseline swarm.toml");
+    assert!(error.contains("teams of 100008 agents: baselines step teams, of up to 1024 agents"), "{error}");
 }
 
 /// Four teams of 2^20 agents on four threads.

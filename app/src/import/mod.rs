@@ -73,7 +73,10 @@ pub fn translate(text: &str, name: &str) -> Result<Imported, ConfigError> {
     };
     let sections = translate(&root).map_err(|problem| refused(vec![problem]))?;
     let lines = sections.iter().flat_map(|section| &section.lines).filter(|line| line.text.is_empty());
-    let skipped = lines.map(|line| format!("{name}:{}: {}", line.line, escape::line(&line.comment))).collect();
+    let mut lines: Vec<_> = lines.collect();
+    lines.sort_by_key(|line| line.line);
+    let skipped =
+        lines.into_iter().map(|line| format!("{name}:{}: {}", line.line, escape::line(&line.comment))).collect();
     let heading = format!("# From {name} of the authors' program {program}, by `flotilla import`.\n");
     let (text, origins) = table::write(&heading, &sections);
     match Config::parse(&text, name) {

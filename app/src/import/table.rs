@@ -145,6 +145,7 @@ pub(super) fn write(heading: &str, sections: &[Section]) -> (String, Vec<(usize,
             // TOML allows no control characters in comments.
             let comment = escape::line(&comment);
             let added = match (key.is_empty(), key.contains('\n')) {
+                (false, false) if comment.is_empty() => format!("{key}\n"),
                 (true, _) => format!("# {comment}\n"),
                 (_, true) => format!("# {comment}\n{key}\n"),
                 (_, false) => format!("{key:<32} # {comment}\n"),

@@ -106,8 +106,13 @@ pub(super) fn parse(text: &str) -> Result<Node, Problem> {
     let options = serde_saphyr::options! { with_snippet: false };
     serde_saphyr::from_str_with_options(text, options).map_err(|error| {
         let line = error.location().map(|location| location.line() as usize);
-        let message = error.render_with_formatter(&UserMessageFormatter);
-        Problem { line, key: String::new(), message: format!("not YAML that can be read: {message}") }
+        let found = error.render_with_formatter(&UserMessageFormatter);
+        let advice = match () {
+            () if text.parse::<toml::Table>().is_ok() => "; it is TOML, as configs of this program are",
+            () if found.contains("duplicate") => "; remove one of both (the authors' programs take the last)",
+            () => "",
+        };
+        Problem { line, key: String::new(), message: format!("not YAML that can be read: {found}{advice}") }
     })
 }
 

@@ -2,16 +2,16 @@
 
 use glam::DVec2;
 
-use super::{FAINT, Legend, Marker, Poi, Team, Viewport, counted, poi_label, radius_of, values_differ};
+use super::{FAINT, Legend, Marker, Poi, Team, Viewport, counted, poi_label, radius_of, sample_note, values_differ};
 use crate::report::scene::{Anchor, BLACK, Pen, Scene};
-use flotilla::config::{Observers, Region, StageConfig};
+use flotilla::config::{Observers, Region, StageConfig, drawn_agents};
 use flotilla::world::World;
 
 /// Returns the team of a config before training.
 fn team(config: &StageConfig, world: &World) -> Team {
     let leaders = world.leaders();
-    let agent = |(index, start): (usize, &glam::Vec2)| Marker {
-        place: start.as_dvec2(),
+    let agent = |index: usize| Marker {
+        place: world.starts[index].as_dvec2(),
         heading: world.headings[index].as_dvec2(),
         group: (index < leaders).then_some(index),
         counts: world.rule.counts(index),
@@ -28,7 +28,7 @@ fn team(config: &StageConfig, world: &World) -> Team {
     };
     Team {
         leaders,
-        agents: world.starts.iter().enumerate().map(agent).collect(),
+        agents: drawn_agents(leaders, world.agents()).into_iter().map(agent).collect(),
         pois: config.classes().places().iter().zip(&world.coupling).enumerate().map(poi).collect(),
     }
 }
@@ -77,6 +77,7 @@ pub fn layout(name: &str, config: &StageConfig) -> Scene {
         _ => format!("what each POI needs has no room here; it counts {within}"),
     };
     legend.note(needs);
+    sample_note(&world).into_iter().for_each(|note| legend.note(note));
     let agents = config.agents.iter().filter_map(|class| Some((class.name.clone(), class.region?)));
     let pois = config.pois.iter().filter_map(|group| Some((format!("POIs of {}", group.name), group.region?)));
     let regions: Vec<(String, Region)> = agents.chain(pois).collect();

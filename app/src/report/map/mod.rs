@@ -6,7 +6,7 @@ use glam::DVec2;
 
 use super::curves::round_step;
 use super::scene::{Anchor, BLACK, COLORS, Color, Fill, GREY, LIGHT, Pen, Scene, WHITE, colors, text_width};
-use flotilla::config::Config;
+use flotilla::config::{Config, drawn_every};
 use flotilla::world::World;
 
 mod layout;
@@ -29,6 +29,12 @@ pub const GROUPS_DARK: [Color; 16] = colors([
     0x4aa8e0, 0xf0883e, 0xe39cc4, 0xeedd00, 0x3366ff, 0xdd2244, 0xbb33bb, 0x99ddff, 0x008866, 0x99eeaa, 0xaa6699,
     0x8888ff, 0xffbb66, 0xff55cc, 0xff4400, 0x22ccff,
 ]);
+/// Returns a note if not all followers are drawn.
+pub(crate) fn sample_note(world: &World) -> Option<String> {
+    let every = drawn_every(world.leaders(), world.agents());
+    (every > 1).then(|| format!("1 of {every} followers drawn"))
+}
+
 /// Dashes distinguish groups once all colours are used. Beyond that, only the leaders' numbers do.
 const DASHES: [&[f64]; 3] = [&[], &[0.9, 0.5], &[0.3, 0.35]];
 

@@ -4,10 +4,9 @@ use glam::{DVec2, Vec2};
 
 use super::Replayed;
 use crate::record::digests::UNVERIFIED;
-use crate::report::map::{self, FAINT, Legend, Marker, Poi, Team, Viewport};
+use crate::report::map::{self, FAINT, Legend, Marker, Poi, Team, Viewport, sample_note};
 use crate::report::scene::{Anchor, BLACK, Scene};
-use flotilla::config::{Config, drawn_agents, drawn_every};
-use flotilla::world::World;
+use flotilla::config::{Config, drawn_agents};
 
 impl Replayed {
     /// Returns the team at `place` steps from the start, with its trails.
@@ -77,12 +76,6 @@ impl Replayed {
             map::counted(world.followers(), "follower"),
         )
     }
-}
-
-/// Returns a note if not all followers are drawn.
-pub(super) fn sample_note(world: &World) -> Option<String> {
-    let every = drawn_every(world.leaders(), world.agents());
-    (every > 1).then(|| format!("1 of {every} followers drawn"))
 }
 
 /// Episodes side by side, to be drawn at any moment.

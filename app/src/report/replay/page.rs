@@ -4,10 +4,9 @@ use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
 use serde_json::json;
 
-use super::film::sample_note;
 use super::{Counterfactual, Replayed, near};
 use crate::record::folder::OWN_FITNESS;
-use crate::report::map::{GROUPS, GROUPS_DARK};
+use crate::report::map::{GROUPS, GROUPS_DARK, sample_note};
 use crate::report::scene::hex;
 use flotilla::config::{AgentClass, Channel, Config, Control, Fitness, Mobility, PoiGroup, Sectors, drawn_agents};
 use flotilla::credit::{self, Strided};
