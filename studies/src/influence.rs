@@ -164,8 +164,8 @@ fn pairs(folders: Vec<PathBuf>, context: Context<'_>) -> Result<Comparison, Erro
         Measure::ChampionG { .. } => !tests,
         _ => false,
     });
-    // The sweep's table has the arms.
-    found.measures.iter_mut().for_each(|measured| measured.arms.clear());
+    // The sweep's table has the champions of the arms.
+    found.measures.iter_mut().filter(|_| !tests).for_each(|measured| measured.arms.clear());
     Ok(found)
 }
 
