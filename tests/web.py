@@ -238,6 +238,9 @@ def check_map_in_view(tab, page):
         tab.window(width, height, dark=False)
         tab.load(page)
         look("the opening", width)
+        # There is no empty chart before a training.
+        empty = "['curves', 'legend', 'scrub'].filter(id => document.getElementById(id).checkVisibility())"
+        assert tab.evaluate(empty) == [], (width, tab.evaluate(empty))
         # The POIs that go dark without a leader are in view, too, and so is who is missing.
         tab.evaluate("scrollTo(0, 100000); " + press('#credits button[data-credit="true 3"]'))
         look("without a leader", width)
@@ -246,11 +249,33 @@ def check_map_in_view(tab, page):
             for mode in ["arrange", "drive", "watch"]:
                 tab.evaluate(f"scrollTo(0, {scroll}); {press(f'[data-mode={mode}]')}; 0")
                 look(mode, width)
+                # So is what to do there.
+                if mode != "watch":
+                    label, bottom = tab.evaluate(
+                        f"(() => {{ const e = document.querySelector('#{mode} button');"
+                        " return [e.textContent, e.getBoundingClientRect().bottom]; })()"
+                    )
+                    assert bottom <= height, (mode, width, label, bottom)
+        # Nor do answers in the guide, Next, and Train move the maps out of view. The guide's text is longest after a
+        # training. A visitor can press only what is in view.
+        tab.load(page)
+        for selector in ["#guide-choices button", "#guide-next", "#guide-choices button", "#train"]:
+            tab.evaluate("window.before = page.state.training; scrollTo(0, 100000)")
+            tab.evaluate(f"document.querySelector({selector!r}).scrollIntoView({{ block: 'nearest' }}); 0")
+            tab.evaluate(f"{press(selector)}; 0")
+            if tab.text("#guide-step").startswith("2") and selector != "#guide-next":
+                tab.wait(f"page.state.training !== before && {DONE}")
+                tab.wait("document.querySelector('#guide-says').textContent.includes('Training is finished.')")
+            look(selector, width)
         for name, arms in [("two_groups", 2), ("population", 3)]:
             tab.evaluate(f"scrollTo(0, 100000); {press(f'[data-exhibit={name}]')}; 0")
             tab.wait(f"page.state.views.length === {arms} && page.state.views.every(view => view.data)")
             look(name, width)
-            # All teams are side by side, and the chart is below them.
+            # All teams are side by side, with whole titles, in almost the width of a phone, and the chart is below them.
+            cut = "page.state.views.filter(({ title: { parentElement: e } }) => e.scrollWidth > e.clientWidth).length"
+            assert tab.evaluate(cut) == 0, (width, name)
+            shown = tab.evaluate("page.state.views.reduce((sum, { canvas }) => sum + canvas.clientWidth, 0)")
+            assert width > 640 or shown > 0.87 * width, (width, name, shown)
             tops = tab.evaluate("page.state.views.map(view => Math.round(view.canvas.getBoundingClientRect().top))")
             assert len(set(tops)) == 1, (width, tops)
             chart = tab.evaluate("document.querySelector('#curves').getBoundingClientRect().top")

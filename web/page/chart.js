@@ -55,7 +55,7 @@ export const chart = (() => {
     for (const { tone, band } of arms) {
       if (!band) continue;
       draw.fillStyle = color(tone);
-      draw.globalAlpha = 0.16;
+      draw.globalAlpha = 0.1;
       draw.beginPath();
       for (const [generation, value] of band) draw.lineTo(X(generation), Y(value));
       draw.fill();

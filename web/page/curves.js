@@ -5,28 +5,31 @@ import { TONES, part, state } from "./state.js";
 
 /** The chart, once it is drawn. @type {ReturnType<typeof chart.paint> | null} */
 export let drawn_chart = null;
-part(() => [state.training, state.training && state.training.version, state.follow || state.generation, state.over, state.pois, state.config.learning.generations], curves);
+part(() => [state.training, state.training && state.training.version, state.follow || state.generation, state.over], curves);
 
 export function curves() {
   const { training, follow, generation, over } = state;
+  // Before a training, there is neither a chart nor a generation to choose.
+  $("curves").hidden = $("legend").hidden = $("training").hidden = !training;
+  $("needless").textContent = needless(training);
+  if (!training) return;
   // If the number of POIs differs between stages, the curves show shares instead.
-  const pois = (training ? training.pois : state.pois) ?? 1;
+  const pois = training.pois ?? 1;
   // About 1000 points per curve are enough for the width of the chart.
-  const every = training ? Math.ceil(Math.max(1, training.reached) / 1000) : 1;
+  const every = Math.ceil(Math.max(1, training.reached) / 1000);
   const sample = (/** @type {Row[]} */ trial) => Array.from({ length: Math.ceil(trial.length / every) }, (_, index) => trial[index * every].best * pois);
   const scaled = (/** @type {Place[] | null} */ points) => points && points.map(([generation, g]) => /** @type {Place} */ ([generation, g * pois]));
-  const arms = (training ? training.arms : []).map(({ style, trials, constant, random }, index) => {
-    const found = training && training.found && training.found.curves[index];
+  const arms = training.arms.map(({ style, trials, constant, random }, index) => {
+    const found = training.found && training.found.curves[index];
     return {
       tone: TONES[style], dashes: chart.DASHES[style], trials: trials.map(sample), constant: constant === null ? null : constant * pois, random: random.map(g => g * pois),
       mean: found ? scaled(found.generation.map((generation, at) => /** @type {Place} */ ([generation, found.mean[at]]))) : null, band: found ? scaled(found.band) : null,
     };
   });
-  const last = training ? training.last : state.config.learning.generations;
-  const cursor = !training ? null : over ?? (follow ? null : generation);
-  drawn_chart = chart.paint($("curves"), arms, every, last, pois, cursor);
+  const cursor = over ?? (follow ? null : generation);
+  drawn_chart = chart.paint($("curves"), arms, every, training.last, pois, cursor);
   $("legend").replaceChildren();
-  const many = training ? training.unit : "POIs", own = training ? training.arms : [];
+  const many = training.unit, own = training.arms;
   const reached = Math.min(...own.map(({ trials }) => Math.min(...trials.map(trial => trial.length)) - 1), Infinity), at = Math.min(cursor ?? reached, reached);
   /** @param {string} tone @param {number[]} dashes @param {string} text */
   const item = (tone, dashes, text) => {
@@ -49,9 +52,8 @@ export function curves() {
   };
   baseline(chart.CONSTANT, "best constant action", own.map(({ constant }) => constant));
   baseline(chart.RANDOM, "best of as many random teams", own.map(({ random }) => random[Math.min(Math.max(0, at), random.length - 1)]));
-  make("span", `${many} observed by the best team${training && at >= 0 ? ` at generation ${at}` : ""}, mean over trials${arms.some(arm => arm.band) ? " with its 95 % interval" : ""}; thin: each trial`, $("legend"));
-  $("curves").setAttribute("aria-label", `Learning curves, best team, mean over trials: ${words.join("; ") || "nothing trained yet"}`);
-  $("needless").textContent = needless(training);
+  make("span", `${many} observed by the best team${at >= 0 ? ` at generation ${at}` : ""}, mean over trials${arms.some(arm => arm.band) ? " with its 95 % interval" : ""}; thin: each trial`, $("legend"));
+  $("curves").setAttribute("aria-label", `Learning curves, best team, mean over trials: ${words.join("; ")}`);
 }
 
 /** Says if a constant action observes as much as what was trained, because then nothing had to be learned. @param {Training | null} training */

@@ -174,7 +174,7 @@ type Elements =
   & Record<"png" | "gif" | "webm" | "csv" | "guide-next" | "guide-end", HTMLButtonElement>
   & Record<"text", HTMLTextAreaElement> & Record<"curves", HTMLCanvasElement> & Record<"config" | "more", HTMLDetailsElement>
   & Record<"setup" | "guide" | "guide-step" | "guide-says" | "guide-choices" | "bar" | "arrange" | "adds" | "drive" | "modes" | "views" | "plain-label", HTMLElement>
-  & Record<"credit" | "play" | "team" | "credits" | "lost" | "compared" | "compared-says" | "means" | "pairs" | "tests" | "gallery" | "digests", HTMLElement>
+  & Record<"credit" | "play" | "training" | "team" | "credits" | "lost" | "compared" | "compared-says" | "means" | "pairs" | "tests" | "gallery" | "digests", HTMLElement>
   & Record<"trouble" | "stale" | "announced" | "machine" | "version" | "legend" | "needless" | "problems" | "lines" | "marks", HTMLElement>
   & Record<"chosen" | "driven" | "generation" | "message" | "verified", HTMLElement>
   & Record<"wasm" | "worker" | "opening" | `layout-${string}` | `gallery-${string}`, HTMLElement>;
