@@ -524,6 +524,7 @@ fn the_page_on_rovers_and_uavs_agrees_with_its_files() {
         }
     }
     assert_eq!((pairs, uncorrected), (84, 1));
+    let page = page + &fs::read_to_string(folder.join("influence-drawn.md")).unwrap();
     let studies = ["3_rovers_3_uavs_random_pairs.csv", "random_again.csv"].map(|name| read(name.into()));
     let near = read("near.csv".into());
     for (fitness, led_by) in credits {
