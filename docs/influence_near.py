@@ -1,4 +1,4 @@
-"""How long UAVs stay with rovers: python3 docs/influence_near.py FLOTILLA POINTS > docs/results/influence/near.csv
+"""How long UAVs stay with rovers: python3 docs/influence_near.py POINTS > docs/results/influence/near.csv
 
 POINTS is the folder `points` of a layout that `flotilla paper --influence` trained. Of each credit: the share of steps, over UAVs and
 trials, at which a champion's UAV has a rover within 5 units, in the first episode from the config's own starts.
@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 
-flotilla, points = sys.argv[1:]
+(points,) = sys.argv[1:]
 print("fitness,led_by,trials,share,deviation")
 for point in sorted(pathlib.Path(points).iterdir()):
     text = (point / "config.toml").read_text()
@@ -23,7 +23,7 @@ for point in sorted(pathlib.Path(points).iterdir()):
     with tempfile.TemporaryDirectory() as folder:
         trace = pathlib.Path(folder) / "trace.csv"
         for trial in range(count):
-            command = [flotilla, "rollout", point, "--trial", str(trial), "--trace", trace, "--quiet", "--backend", "cpu"]
+            command = ["flotilla", "rollout", point, "--trial", str(trial), "--trace", trace, "--quiet", "--backend", "cpu"]
             subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
             places = {}
             for row in csv.DictReader(io.StringIO(trace.read_text())):
