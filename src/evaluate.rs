@@ -61,13 +61,15 @@ impl Starts {
         }
     }
 
-    /// Returns an episode's start positions, `[agents]`, the same for all teams. If POIs move, their positions follow.
+    /// Returns an episode's start positions, `[agents]`, the same for all teams. If POIs move, their positions follow, and
+    /// then the headings if any are drawn, see [`Group::starts`].
     pub fn of(&self, episode: usize, world: &World) -> Vec<Vec2> {
         let mut starts = world.starts.clone();
         if let Starts::Drawn { seed, jitter, poi_jitter, .. } = *self {
             let key = |purpose| Key::new(seed, 0, purpose);
             evolve::jitter_starts(key(Purpose::HeldOut), 0, episode, world, jitter, &mut starts);
             evolve::jitter_pois(key(Purpose::HeldOutPois), 0, episode, world, poi_jitter, &mut starts);
+            evolve::draw_headings(key(Purpose::HeldOut), 0, episode, world, &mut starts);
         }
         starts
     }

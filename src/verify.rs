@@ -82,6 +82,7 @@ impl Teams {
         let mut places = world.starts.clone();
         let learning = &config.learning;
         evolve::jitter_pois(Key::new(seed, 0, Purpose::Pois), 0, 0, &world, learning.poi_jitter, &mut places);
+        evolve::draw_headings(Key::new(seed, 0, Purpose::Starts), 0, 0, &world, &mut places);
         let fitnesses = if sights { SCORES_AND_DT } else { SCORES };
         Teams { policies, weights, choice, places, fitnesses, world }
     }

@@ -34,6 +34,8 @@ pub struct WorldParts {
     pub starts: Vec<Vec2>,
     /// Initial headings, unit vectors, `[agents]`.
     pub headings: Vec<Vec2>,
+    /// The agents whose headings are drawn anew for every episode.
+    pub drawn_headings: Vec<Range<usize>>,
     /// The agents that start in each region. Their starts here are examples.
     pub start_regions: Vec<(Range<usize>, Region)>,
     /// POI positions in units, on the kernels' grid, `[pois]`.
@@ -165,6 +167,7 @@ impl World {
             constants,
             starts,
             headings: described.headings().into_iter().map(unit).collect(),
+            drawn_headings: described.drawn_headings(),
             start_regions: described.start_regions(),
             pois: described.places().into_iter().map(on_grid).collect(),
             poi_regions: described.poi_regions(),
@@ -292,7 +295,7 @@ fn greatest_common_divisor(a: u32, b: u32) -> u32 {
 /// Returns the unit vector of an angle. Components smaller than 1e-6 become 0, so that layouts keep exact ties.
 ///
 /// Sine and cosine are from [`libm`], because the platform's may differ in the last bit.
-fn unit(angle: f64) -> Vec2 {
+pub(crate) fn unit(angle: f64) -> Vec2 {
     let tidy = |component: f64| if component.abs() < 1e-6 { 0.0 } else { component as f32 };
     Vec2::new(tidy(libm::cos(angle)), tidy(libm::sin(angle)))
 }

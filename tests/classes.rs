@@ -634,7 +634,7 @@ fn keys_of_tables_have_their_defaults() {
     );
     assert_eq!(
         (&uav.motion, &uav.heading),
-        (&Mobility::Free { max_speed: 1.0 }, &Heading::Same(std::f64::consts::FRAC_PI_2))
+        (&Mobility::Free { max_speed: 1.0 }, &Some(Heading::Same(std::f64::consts::FRAC_PI_2)))
     );
     assert_eq!((uav.leads.clone(), uav.influence_radius), (vec!["dog".to_string()], None));
     let [pois, agents] = &uav.senses[..] else { panic!("{:?}", uav.senses) };
@@ -692,7 +692,7 @@ fn classes_and_groups_in_regions_have_their_sizes() {
     let text = text.replace("at = [[5, 6]]", "count = 2\nin = { circle = [25, 25, 10] }\nwindows = [[1, 5], [2, 6]]");
     let config = parse(&text);
     assert_eq!((config.agent_count(), config.learners(), config.poi_count()), (4, 3, 4));
-    assert_eq!((config.starts_move(), config.pois_move(), config.has_regions()), (true, true, true));
+    assert_eq!((config.starts_move(), config.pois_move(), config.draws_starts()), (true, true, true));
     let classes = config.classes();
     assert_eq!(classes.class_of_each(), [0, 0, 0, 1]);
     assert_eq!(classes.group_of_each(), [0, 0, 1, 1]);

@@ -6,6 +6,7 @@
 
 use crate::support;
 use std::collections::HashSet;
+use std::f64::consts::TAU;
 use std::ops::Range;
 
 use fearless_simd::Level;
@@ -18,6 +19,7 @@ use flotilla::config::{
 use flotilla::credit::Credit;
 use flotilla::evaluate::Starts;
 use flotilla::evolve::{self, Episodes, Key, MAX_WEIGHT, MIN_WEIGHT, Purpose, Selection, UNCHANGED};
+use flotilla::stepping::{Recording, Stepper};
 use flotilla::trainer::{Row, Trainer};
 use flotilla::world::{GRID, World};
 use glam::Vec2;
@@ -249,6 +251,73 @@ fn start_jitter_is_uniform_and_differs_between_episodes() {
     }
     assert_distribution("offsets", &counts, |_| 1.0 / 30.0);
     assert_eq!(seen.len(), 1000, "no two episodes start alike");
+}
+
+/// Every generation, episode and purpose has headings of its own. Teams start with them when they are played and stepped.
+#[test]
+fn drawn_headings_are_uniform_and_teams_start_with_them() {
+    let text = "
+[[agents]]
+name = \"a\"
+at = [[1, 2]]
+heading = 0
+senses = [{ of = \"pois\" }]
+[[agents]]
+name = \"b\"
+at = [[10, 20], [11, 20], [12, 20], [13, 20]]
+heading = \"random\"
+control = \"still\"
+[[pois]]
+name = \"p\"
+at = [[3, 4], [5, 6]]
+coupling = 1
+";
+    let config = Config::parse(text, "headings").unwrap();
+    assert_eq!(Config::parse(&config.to_toml(), "again").unwrap(), config, "the written config is another");
+    let world = World::new(&config.validate().unwrap());
+    let (mut counts, mut seen, mut places) = (vec![0; 16], HashSet::new(), Vec::new());
+    let mut add = |places: &[Vec2]| {
+        let [positions @ .., _, b, c, d, e] = places else { panic!("{places:?}") };
+        assert_eq!(positions, [&world.starts[..], &world.pois].concat());
+        assert_eq!(places[7], Vec2::X, "a heading that is given");
+        for heading in [b, c, d, e] {
+            assert!((heading.length() - 1.0).abs() < 1e-6, "{heading}");
+            counts[((f64::from(heading.to_angle()) / TAU + 1.0) * 16.0) as usize % 16] += 1;
+        }
+        assert!(seen.insert(places[8..].iter().map(|at| at.to_array().map(f32::to_bits)).collect::<Vec<_>>()));
+    };
+    for (generation, episode) in (0..100).flat_map(|generation| (0..5).map(move |episode| (generation, episode))) {
+        for episodes in [Episodes::Training, Episodes::Test] {
+            evolve::episode_positions(&config.learning, 0, generation, (episodes, episode), &world, &mut places);
+            add(&places);
+        }
+    }
+    let held_out = Starts::Drawn { episodes: 100, seed: 0, jitter: 0.0, poi_jitter: 0.0 };
+    (0..100).for_each(|episode| add(&held_out.of(episode, &world)));
+    assert_distribution("headings", &counts, |_| 1.0 / 16.0);
+
+    let weights = vec![0.0; world.parameters()];
+    let group = Group {
+        world: &world,
+        starts: &places,
+        weights: weights[..].into(),
+        policies: 1,
+        populations: &world.populations,
+        teams: &[0],
+        fitnesses: &[],
+    };
+    let trace = Cpu::default().trace(&group).unwrap();
+    let headings = |agent| Vec2::from(trace.moment(0, 0, agent).heading);
+    assert_eq!((0..5).map(headings).collect::<Vec<_>>(), places[7..]);
+    let mut stepper = Stepper::new(world.clone(), 1, Recording::None).unwrap();
+    let numbers: Vec<f32> = places.iter().flat_map(|at| at.to_array()).collect();
+    stepper.reset_to(&numbers).unwrap();
+    assert_eq!(stepper.states().headings, &numbers[14..]);
+    let long = [&numbers[..23], &[7.0]].concat();
+    assert_eq!(
+        stepper.reset_to(&long).unwrap_err().to_string(),
+        format!("agent 4 of team 0 would have the heading ({}, 7), which is no unit vector", numbers[22])
+    );
 }
 
 /// Every generation, episode and purpose has starts and POIs of its own, which jitter moves further.

@@ -36,13 +36,20 @@ fn a_swarm_trains_resumes_and_is_drawn_by_a_sample() {
 }
 
 #[test]
-fn layouts_of_swarms_are_samples_and_baselines_are_refused_at_once() {
+fn layouts_of_swarms_are_samples() {
     let place = Place::new(&[("swarm.toml", &config(100_000))]);
     place.good("check swarm.toml --out layout.svg");
     let layout = fs::read_to_string(place.path("layout.svg")).unwrap();
     assert!(layout.contains("1 of 50 followers drawn") && layout.len() < 1 << 20, "{} bytes", layout.len());
-    let error = place.refused(2, "baseline swarm.toml");
-    assert!(error.contains("teams of 100008 agents: baselines step teams, of up to 1024 agents"), "{error}");
+}
+
+#[test]
+fn swarms_have_baselines() {
+    let place = Place::new(&[("swarm.toml", &config(2000))]);
+    let (table, _) = place.good("baseline swarm.toml --seeds 1 --generations 1 --population 4 --episodes 2");
+    for name in ["constant speeds", "random networks", "open-loop", "teams of networks"] {
+        assert!(table.contains(name), "{table}");
+    }
 }
 
 /// Four teams of 2^20 agents on four threads.

@@ -27,7 +27,8 @@ class Proposal(NamedTuple):
     teams: NDArray[np.uint32]
     """The policy of each leader in each team, `[trials, teams, leaders]`. Teams with past champions are the last."""
     starts: Floats
-    """Start positions of agents, leaders first, `[trials, episodes, agents, 2]`; if POIs move, their positions follow."""
+    """Start positions of agents, leaders first, `[trials, episodes, agents, 2]`; if POIs move, their positions follow, and then
+    headings if any are drawn."""
 
 
 class Played(NamedTuple):

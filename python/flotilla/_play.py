@@ -209,7 +209,7 @@ def _starts(
     config: Config, episodes: int | None, seed: int, jitter: float | None, poi_jitter: float | None
 ) -> Starts | None:
     """Returns held-out starts, or None for the config's own start. A config with regions has none."""
-    if episodes is not None or config._native.has_regions:
+    if episodes is not None or config._native.draws_starts:
         return _drawn(config, 1 if episodes is None else episodes, seed, jitter, poi_jitter)
     if jitter is not None or poi_jitter is not None:
         raise ValueError("a jitter applies to drawn starts; pass episodes= with their number")
@@ -304,7 +304,7 @@ def rollout(
     array, name = _checked(config, policies), word("backend", backend)
     fields = _fields(record, trace, out)
     starts = _starts(config, episodes, seed, jitter, poi_jitter)
-    if starts is not None and starts[0] > 1 and max(starts[2:]) == 0 and not config._native.has_regions:
+    if starts is not None and starts[0] > 1 and max(starts[2:]) == 0 and not config._native.draws_starts:
         warn(f"{episodes} episodes without jitter are all the same; pass jitter= or poi_jitter=", UserWarning)
     total = sum(config._native.worth)
     # What a POI is worth on average. It is 1 if all have the same value.

@@ -113,7 +113,7 @@ class TeamBatch:
         if seed is not None:
             self.seed, self.drawn = whole("seed", seed, 0, 2**63 - 1), 0
         starts = None
-        if max(self.jitters) > 0 or self.config._native.has_regions:
+        if max(self.jitters) > 0 or self.config._native.draws_starts:
             if self.seed is None:
                 self.seed = secrets.randbits(63)
             starts = _native.starts(self.config._native, self.seed, *self.jitters, self.drawn, self.count)

@@ -128,8 +128,8 @@ impl Config {
 
     /// Whether starts or POIs are drawn from regions.
     #[getter]
-    fn has_regions(&self) -> bool {
-        self.0.has_regions()
+    fn draws_starts(&self) -> bool {
+        self.0.draws_starts()
     }
 }
 

@@ -209,7 +209,11 @@ pub fn record<'py>(
         let scores =
             front::record(&config.0, teams, weights, &starts, episodes.0..episodes.1, noise, arrays).raise()?;
         write_members(&sets, world.agents(), near);
-        let places = |team: usize| starts.of(episodes.0 + team / teams, &world).split_off(world.agents());
+        let places = |team: usize| {
+            let mut pois = starts.of(episodes.0 + team / teams, &world).split_off(world.agents());
+            pois.truncate(world.pois.len());
+            pois
+        };
         write_distances(&world, positions, &places, of_pois, of_agents);
         PyResult::Ok(scores)
     })?;
@@ -339,7 +343,8 @@ pub fn forward(
 }
 
 /// Draws start positions, `[count, agents, 2]`, moved by at most `jitter` on each axis, in map units. If POIs
-/// move, they follow, `[count, agents + pois, 2]`, moved by at most that.
+/// move, they follow, `[count, agents + pois, 2]`, moved by at most that. If headings are drawn, these follow, unit vectors,
+/// `[count, agents + pois + agents, 2]`.
 ///
 /// Team `i` uses draw number `first + i`.
 #[pyfunction]
@@ -353,14 +358,14 @@ pub fn starts<'py>(
     count: usize,
 ) -> PyResult<Bound<'py, PyArray3<f32>>> {
     let world = World::new(&config.0.validate().raise()?);
-    let places = world.agents() + if poi_jitter > 0.0 || !world.poi_regions.is_empty() { world.pois.len() } else { 0 };
+    let starts = Starts::Drawn { episodes: 1, seed, jitter, poi_jitter };
+    let places = starts.of(0, &world).len();
     let bytes = (count as u128) * places as u128 * 8;
     if ![jitter, poi_jitter].iter().all(|jitter| jitter.is_finite() && *jitter >= 0.0)
         || !(usize::try_from(bytes).is_ok_and(|bytes| bytes < 1 << 36))
     {
         return Err(Failure::Starts { episodes: count.try_into().unwrap_or(u32::MAX), jitter }).raise();
     }
-    let starts = Starts::Drawn { episodes: 1, seed, jitter, poi_jitter };
     let drawn = workers::aside(py, || {
         let mut drawn = Vec::with_capacity(count * places * 2);
         (0..count).for_each(|team| {

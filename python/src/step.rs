@@ -79,7 +79,7 @@ impl Stepper {
     }
 
     /// Resets all teams, or the chosen ones, to the world's start or to the given starts `[teams, agents, 2]`, or
-    /// `[teams, agents + pois, 2]` with POI positions.
+    /// `[teams, agents + pois, 2]` with POI positions, or `[teams, agents + pois + agents, 2]` with headings.
     fn reset(
         &self,
         py: Python<'_>,

@@ -16,8 +16,8 @@ const CHECKED_TOGETHER: usize = 1 << 16;
 pub struct Group<'a> {
     /// The world.
     pub world: &'a World,
-    /// Start positions, `[agents]`, leaders first, optionally followed by POI positions, `[pois]`, that replace the
-    /// world's.
+    /// Start positions, `[agents]`, leaders first, optionally followed by POI positions, `[pois]`, and these by headings,
+    /// unit vectors, `[agents]`, that replace the world's.
     pub starts: &'a [Vec2],
     /// The policies.
     pub weights: Weights<'a>,
@@ -40,7 +40,18 @@ impl<'a> Group<'a> {
 
     /// Returns the POI positions, if they are not the world's.
     pub fn moved_pois(&self) -> Option<&'a [Vec2]> {
-        Some(&self.starts[self.world.agents()..]).filter(|pois| !pois.is_empty())
+        let agents = self.world.agents();
+        self.starts.get(agents..agents + self.world.pois.len())
+    }
+
+    /// Returns the headings at the start, `[agents]`.
+    pub(crate) fn headings(&self) -> &'a [Vec2] {
+        match &self.starts[self.world.agents()..] {
+            [] => &self.world.headings,
+            others => {
+                Some(&others[self.world.pois.len()..]).filter(|drawn| !drawn.is_empty()).unwrap_or(&self.world.headings)
+            }
+        }
     }
 
     /// Returns the POI positions.
@@ -73,7 +84,8 @@ impl<'a> Group<'a> {
         let Group { world, starts, weights, policies, teams, .. } = *self;
         let invalid = |text: String| Err(BackendError::InvalidInput(text));
         let (agents, leaders) = (world.agents(), world.leaders());
-        if starts.len() != agents && starts.len() != agents + world.pois.len() {
+        let pois = world.pois.len();
+        if ![agents, agents + pois, agents + pois + agents].contains(&starts.len()) {
             return invalid(format!("{} start positions for {agents} agents", starts.len()));
         }
         if !teams.len().is_multiple_of(leaders) {

@@ -4,12 +4,9 @@
 //! least as many POIs. The first round draws random teams.
 
 use fearless_simd::Level;
-use glam::Vec2;
 
-use crate::backend::BackendError;
 use crate::config::{Learning, Mutation};
 use crate::evolve::{self, Key, Purpose};
-use crate::stepping::{Recording, Stepper};
 use crate::world::{OUTPUTS, World};
 
 /// Number of segments of an open-loop team's episode, of equal length. In each, every leader makes one turn, as fast as
@@ -156,48 +153,13 @@ pub(super) fn by_population(climber: &Climber, parameters: usize, weights: &mut 
     }
 }
 
-/// Plays open-loop teams, `[teams][leaders][segments][2]`, each from all of its starts. Returns the POIs that each
-/// observes over all starts.
-///
-/// # Errors
-/// There is too little memory.
-pub(super) fn play_segments(world: &World, teams: &[(&[f32], &[Vec<Vec2>])]) -> Result<Vec<u64>, BackendError> {
-    let failed = |error: crate::stepping::StepError| BackendError::InvalidInput(error.to_string());
-    let mut observed = vec![0; teams.len()];
-    let Some((_, starts)) = teams.first() else { return Ok(observed) };
-    let recording = if world.paths.is_some() { Recording::Sets } else { Recording::None };
-    let mut stepper = Stepper::new(world.clone(), teams.len(), recording).map_err(failed)?;
-    let (steps, mut actions) = (world.steps(), Vec::new());
-    // The largest turn per step of each leader, as a fraction of a half turn.
-    let most = |leader: usize| world.class_of(leader).constants.motion.max_turn / std::f32::consts::PI;
-    let most: Vec<f32> = (0..world.leaders()).map(most).collect();
-    for episode in 0..starts.len() {
-        let starts: Vec<f32> =
-            teams.iter().flat_map(|(_, starts)| &starts[episode]).flat_map(|place| place.to_array()).collect();
-        stepper.reset_to(&starts).map_err(failed)?;
-        for step in 0..steps {
-            let segment = step * SEGMENTS / steps;
-            let turns = (step - (segment * steps).div_ceil(SEGMENTS)) as f32;
-            actions.clear();
-            let leaders = teams.iter().flat_map(|(team, _)| team.chunks_exact(SEGMENTS * OUTPUTS).zip(&most));
-            for (leader, most) in leaders {
-                let turned = most * turns;
-                let [turn, speed] = [0, 1].map(|output| leader[segment * OUTPUTS + output]);
-                actions.extend([turn.signum() * (turn.abs() - turned).max(0.0), speed]);
-            }
-            stepper.step(&actions).map_err(failed)?;
-        }
-        if world.paths.is_some() {
-            for (team, total) in observed.iter_mut().enumerate() {
-                *total += u64::from(stepper.scores(team).map_err(failed)?.observed);
-            }
-            continue;
-        }
-        let all = stepper.observed().chunks_exact(world.pois.len());
-        for (total, pois) in observed.iter_mut().zip(all) {
-            let observed = pois.iter().zip(&world.worth).filter(|(observed, _)| **observed);
-            *total += observed.map(|(_, &worth)| u64::from(worth)).sum::<u64>();
-        }
-    }
-    Ok(observed)
+/// Returns the action of a leader of an open-loop team, `[leaders][segments][2]`, at a step.
+pub(super) fn segment_action(world: &World, team: &[f32], leader: usize, step: usize) -> [f32; OUTPUTS] {
+    let steps = world.steps();
+    let segment = step * SEGMENTS / steps;
+    // What is left of the segment's turn, as a fraction of a half turn.
+    let turned = world.class_of(leader).constants.motion.max_turn / std::f32::consts::PI
+        * (step - (segment * steps).div_ceil(SEGMENTS)) as f32;
+    let [turn, speed] = [0, 1].map(|output| team[(leader * SEGMENTS + segment) * OUTPUTS + output]);
+    [turn.signum() * (turn.abs() - turned).max(0.0), speed]
 }

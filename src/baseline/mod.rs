@@ -12,11 +12,12 @@ mod climb;
 
 pub use climb::SEGMENTS;
 
-use climb::{Climber, Genome, ROUND, by_population, play_segments};
+use climb::{Climber, Genome, ROUND, by_population, segment_action};
 use fearless_simd::Level;
 use glam::Vec2;
 
-use crate::backend::{Backend, BackendError, Group};
+use crate::backend::cpu::Cpu;
+use crate::backend::{Backend, BackendError, Group, GroupScores};
 use crate::config::{Actions, Config, Learning, ValidConfig};
 use crate::evaluate::Starts;
 use crate::evolve::{self, Episodes, Key, MIN_WEIGHT, Purpose};
@@ -227,7 +228,7 @@ impl Baselines {
                 let teams = setting.teams(generation).min(first + DRAWN_TOGETHER).saturating_sub(first);
                 rounds.extend(setting.trials.iter().filter(|_| teams > 0).map(|trial| setting.round(trial, teams)));
             }
-            let mut observed = play(backend, &rounds)?.into_iter();
+            let mut observed = play(&rounds, |groups| backend.play(groups))?.into_iter();
             for setting in &mut playing {
                 let playing = setting.teams(generation) > first;
                 setting.trials.iter_mut().filter(|_| playing).zip(&mut observed).for_each(|(trial, observed)| {
@@ -292,15 +293,12 @@ fn climb(
         let teams = setting.round_size(first);
         let climbing = setting.trials.iter().filter_map(|trial| Some((trial, trial.climbers.as_ref()?)));
         let climbing: Vec<_> = climbing.filter(|_| teams > 0).collect();
+        let first = rounds.len();
         rounds.extend(climbing.iter().map(|(trial, _)| setting.round(trial, teams)));
-        let open_loop = climbing
-            .iter()
-            .flat_map(|(trial, climbers)| climbers.segments.teams().map(|team| (team, &trial.starts[..])));
-        observed.extend(
-            play_segments(&setting.world, &open_loop.collect::<Vec<_>>())?.chunks(teams.max(1)).map(<[u64]>::to_vec),
-        );
+        let open_loop: Vec<_> = climbing.iter().flat_map(|(_, climbers)| climbers.segments.teams()).collect();
+        observed.extend(play_segments(&rounds[first..], &open_loop)?);
     }
-    let networks = play(backend, &rounds)?;
+    let networks = play(&rounds, |groups| backend.play(groups))?;
     let climbers = playing.iter_mut().filter(|setting| setting.round_size(first) > 0);
     let climbers = climbers.flat_map(|setting| &mut setting.trials).filter_map(|trial| trial.climbers.as_mut());
     for (climbers, (networks, segments)) in climbers.zip(networks.iter().zip(&observed)) {
@@ -311,6 +309,7 @@ fn climb(
 }
 
 /// Teams to play from some starts.
+#[derive(Clone, Copy)]
 struct Round<'a> {
     world: &'a World,
     teams: usize,
@@ -319,9 +318,23 @@ struct Round<'a> {
     starts: &'a [Vec<Vec2>],
 }
 
+/// Plays open-loop teams, `[rounds][teams]`, in place of those of some rounds of one size in one world. Returns what
+/// [`play`] does.
+fn play_segments(rounds: &[Round<'_>], open_loop: &[&[f32]]) -> Result<Vec<Vec<u64>>, BackendError> {
+    let Some(&Round { world, teams, starts, .. }) = rounds.first() else { return Ok(vec![]) };
+    let actions = |index: usize, leader, step| {
+        let team = index / (starts.len() * teams) * teams + index % teams;
+        segment_action(world, open_loop[team], leader, step)
+    };
+    play(rounds, |groups| Cpu::default().drive(groups, &actions))
+}
+
 /// Plays all teams from all their starts as one batch. Returns the summed worth of the POIs that each team of each round
 /// observes over all starts, `[rounds][teams]`.
-fn play(backend: &mut dyn Backend, rounds: &[Round<'_>]) -> Result<Vec<Vec<u64>>, BackendError> {
+fn play(
+    rounds: &[Round<'_>],
+    backend: impl FnOnce(&[Group<'_>]) -> Result<Vec<GroupScores>, BackendError>,
+) -> Result<Vec<Vec<u64>>, BackendError> {
     let teams = |round: &Round<'_>| evolve::aligned_teams(round.teams, round.world.leaders());
     let teams: Vec<Vec<u32>> = rounds.iter().map(teams).collect();
     let mut groups = Vec::new();
@@ -336,7 +349,7 @@ fn play(backend: &mut dyn Backend, rounds: &[Round<'_>]) -> Result<Vec<Vec<u64>>
             fitnesses: &[],
         }));
     }
-    let mut scores = backend.play(&groups)?.into_iter();
+    let mut scores = backend(&groups)?.into_iter();
     let of_round = |round: &Round<'_>| {
         let mut observed = vec![0; round.teams];
         for scores in scores.by_ref().take(round.starts.len()) {
@@ -553,9 +566,8 @@ impl Setting {
         let (world, mut weights) = (&self.world, Vec::new());
         let mut played = |teams: &[Team], starts: &[Vec<Vec2>]| {
             self.write_policies(trial, teams, &mut weights);
-            Ok::<_, BackendError>(
-                play(backend, &[Round { world, teams: teams.len(), weights: &weights, starts }])?.concat(),
-            )
+            let round = Round { world, teams: teams.len(), weights: &weights, starts };
+            Ok::<_, BackendError>(play(&[round], |groups| backend.play(groups))?.concat())
         };
         let best_constant = first_largest(&played(&all, &starts)?);
         let mut chosen = all.clone();
@@ -570,7 +582,11 @@ impl Setting {
         let whole = (self.world.total_worth as usize * starts.len()) as f64;
         let mut g: Vec<f64> = played(&chosen, &starts)?.into_iter().map(|count| count as f64 / whole).collect();
         let open_loop = match &trial.climbers {
-            Some(climbers) => play_segments(world, &[(climbers.segments.best(), &starts)])?[0] as f64 / whole,
+            Some(climbers) => {
+                let weights = &vec![0.0; self.config.populations() * world.parameters()];
+                let round = Round { world, teams: 1, weights, starts: &starts };
+                play_segments(&[round], &[climbers.segments.best()])?[0][0] as f64 / whole
+            }
             None => 0.0,
         };
         let others = g.split_off(all.len());

@@ -114,14 +114,14 @@ impl Config {
         world
     }
 
-    /// Reports whether starts or POIs are drawn from regions, so that the config has no start of its own.
-    pub fn has_regions(&self) -> bool {
-        self.agents.iter().any(|class| class.region.is_some()) || self.pois.iter().any(|group| group.region.is_some())
+    /// Reports whether starts or POIs are drawn, so that the config has no start of its own.
+    pub fn draws_starts(&self) -> bool {
+        self.agents.iter().any(AgentClass::is_drawn) || self.pois.iter().any(|group| group.region.is_some())
     }
 
-    /// Reports whether agents start elsewhere in every episode.
+    /// Reports whether agents start elsewhere, or with other headings, in every episode.
     pub fn starts_move(&self) -> bool {
-        self.learning.start_jitter > 0.0 || self.agents.iter().any(|class| class.region.is_some())
+        self.learning.start_jitter > 0.0 || self.agents.iter().any(AgentClass::is_drawn)
     }
 
     /// Reports whether POIs are elsewhere in every episode.
@@ -236,10 +236,10 @@ impl Config {
         let headings = world.headings();
         let class = |name: &str, at: Vec<[f64; 2]>, first: usize, control: Control| AgentClass {
             name: name.into(),
-            heading: match world.heading {
+            heading: Some(match world.heading {
                 Heading::Same(heading) => OneOrEach::Same(heading),
                 Heading::Each(_) => OneOrEach::Each(headings[first..first + at.len()].to_vec()),
-            },
+            }),
             at,
             count: None,
             region: None,

@@ -126,7 +126,7 @@ fn notes(config: &Config) -> Vec<String> {
             Mobility::Steered(motion) => motion.too_short(&format!("{name}.motion"), dt, map),
             Mobility::Free { .. } => None,
         };
-        let degrees = class.heading.likely_degrees(&format!("{name}.heading"));
+        let degrees = class.heading.as_ref().and_then(|heading| heading.likely_degrees(&format!("{name}.heading")));
         let blind = class.senses.iter().enumerate().filter(|(_, channel)| channel.is_blind(class, &classes));
         let blind = blind.map(|(channel, _)| format!("{name}.senses[{channel}] never senses anything in this world"));
         too_short.into_iter().chain(degrees).chain(blind).collect::<Vec<_>>()

@@ -176,12 +176,17 @@ impl PathCredit {
             }
             lead(&Strided::contiguous(&self.sights), agents, leaders, world.led, &mut self.led);
             let size = world.leader_words();
-            for (place, &word) in self.led.iter().enumerate() {
-                let (moment, agent) = (place / size / agents, place / size % agents);
-                for leader in each_bit(word).map(|bit| place % size * 32 + bit) {
-                    let (row, bit) = (leader * words + agent / 32, 1 << (agent % 32));
-                    self.taken[row * width + moment] |= bit;
-                    self.ever_taken[row] |= bit;
+            for (moment, led) in self.led.chunks_exact(agents * size).enumerate() {
+                for (agent, led) in led.chunks_exact(size).enumerate() {
+                    for leader in led
+                        .iter()
+                        .zip((0..).step_by(32))
+                        .flat_map(|(&led, first)| each_bit(led).map(move |bit| first + bit))
+                    {
+                        let (row, bit) = (leader * words + agent / 32, 1 << (agent % 32));
+                        self.taken[row * width + moment] |= bit;
+                        self.ever_taken[row] |= bit;
+                    }
                 }
             }
         }
@@ -237,25 +242,21 @@ impl PathCredit {
         let first = first.max(usize::from(!rule.start_counts));
         self.observers.clear();
         self.near.clear();
-        let radius2 = splat(simd, world.radii2[poi]);
+        let (radius2, lanes) = (splat(simd, world.radii2[poi]), S::u32s::from_fn(simd, |lane| lane as u32));
         for agent in (0..agents).filter(|&agent| world.rule.counts_at(poi, agent)) {
             let start = self.near.len();
             self.near.resize(start + width, f32::INFINITY);
             let mut ever = false;
             for chunk in (0..width).step_by(S::f32s::LEN) {
                 let [x, y] = self.at(simd, agents, agent, chunk);
-                let (dx, dy) = (x - at.x, y - at.y);
-                let is_near = observes::<S>(radius2, dx, dy);
-                if is_near.to_bitmask() != 0 {
+                let (dx, dy, moments) = (x - at.x, y - at.y, lanes + chunk as u32);
+                let counts = moments.simd_ge(first as u32) & moments.simd_le(last as u32);
+                let is_near = observes::<S>(radius2, dx, dy) & counts;
+                if is_near.any_true() {
                     let near = select::<S>(splat(simd, f32::INFINITY), dx * dx + dy * dy, is_near);
                     near.store_slice(&mut self.near[start + chunk..][..S::f32s::LEN]);
+                    ever = true;
                 }
-            }
-            for (moment, near) in self.near[start..].iter_mut().enumerate() {
-                if moment < first || moment > last {
-                    *near = f32::INFINITY;
-                }
-                ever |= near.is_finite();
             }
             if ever {
                 self.observers.push(agent);

@@ -8,7 +8,8 @@ use glam::{DVec2, Vec2};
 use super::random::{Key, Purpose, index_below};
 use super::selection::Selection;
 use crate::config::{Learning, Method, Region, Teams, population_count};
-use crate::world::{World, on_grid};
+use crate::model::classes::turn;
+use crate::world::{World, on_grid, unit};
 
 /// Returns the teams of contemporaries in one generation of a trial, `[teams][leaders]`, round by round. `populations`
 /// are the leaders'. If there is only one, team `t` is policy `t`; otherwise see [`order_policies`], with a fitness of 0.
@@ -145,7 +146,7 @@ impl Episodes {
 }
 
 /// Writes the positions of one episode of a trial's generation, as [`Group::starts`](crate::backend::Group::starts) has
-/// them: the agents' starts, then the POIs if they move.
+/// them: the agents' starts, then the POIs if they move, then headings if any are drawn.
 pub fn episode_positions(
     learning: &Learning,
     trial: usize,
@@ -157,6 +158,7 @@ pub fn episode_positions(
     let [starts, pois] = episodes.purposes().map(|purpose| Key::new(learning.seed, trial, purpose));
     jitter_starts(starts, generation, episode, world, learning.start_jitter, positions);
     jitter_pois(pois, generation, episode, world, learning.poi_jitter, positions);
+    draw_headings(starts, generation, episode, world, positions);
 }
 
 /// Writes the start positions of one episode, `[agents]`: the world's, or drawn from its regions, each moved by a uniform
@@ -178,6 +180,22 @@ pub fn jitter_pois(key: Key, generation: usize, episode: usize, world: &World, j
         positions.extend(&world.pois);
         spawn(key.at(generation, episode, 1), world.map(), &world.poi_regions, &mut positions[first..]);
         scatter(key.at(generation, episode, 0), world.map(), jitter, &mut positions[first..]);
+    }
+}
+
+/// Appends the headings of one episode, `[agents]`: the world's, or drawn. POIs come before them. Appends nothing if no
+/// heading is drawn. `key` is that of [`jitter_starts`].
+pub fn draw_headings(key: Key, generation: usize, episode: usize, world: &World, positions: &mut Vec<Vec2>) {
+    if world.drawn_headings.is_empty() {
+        return;
+    }
+    if positions.len() == world.agents() {
+        positions.extend(&world.pois);
+    }
+    let (key, first) = (key.at(generation, episode, 2), positions.len());
+    positions.extend(&world.headings);
+    for agent in world.drawn_headings.iter().cloned().flatten() {
+        positions[first + agent] = unit(turn(key.draw(agent as u32)[0]));
     }
 }
 

@@ -55,7 +55,11 @@ impl StageBytes {
         let [leaders, teams, episodes] = [leaders, teams, episodes].map(|size| size as u64);
         let tests = learning.test_episodes as u64;
         let (slots, parameters) = (learning.slots() as u64, config.parameters() as u64);
-        let moved = if config.pois_move() { world.pois.len() } else { 0 };
+        let moved = match world.drawn_headings.is_empty() {
+            true if config.pois_move() => world.pois.len(),
+            true => 0,
+            false => world.pois.len() + world.agents(),
+        };
         let starts = 4 * trials * (episodes + tests) * 2 * (world.agents() + moved) as u64;
         let schedules = 4 * trials * (populations * learning.team_count() as u64 + leaders * teams) + starts;
         // Fitness is summed in 64 bits if a policy plays in several teams.

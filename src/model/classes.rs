@@ -1,5 +1,6 @@
 //! Classes of agents and groups of POIs as configs describe them, `[[agents]]` and `[[pois]]`.
 
+use std::f64::consts::TAU;
 use std::fmt;
 use std::ops::Range;
 
@@ -9,6 +10,7 @@ use super::motion::Mobility;
 use super::region::Region;
 use super::rule::Coupling;
 use crate::config_enum::config_enum;
+use crate::kernels::math;
 use crate::reader::{OneOrEach, table};
 
 /// Maximum number of classes of agents.
@@ -52,8 +54,10 @@ table! {
         /// generation
         #[serde(skip_serializing_if = "Option::is_none")]
         region as "in": Option<Region> = "",
-        /// headings at the start, from the x axis towards the y axis: one number for all its agents, or one per agent
-        heading: OneOrEach<f64> = "rad",
+        /// headings at the start, from the x axis towards the y axis: one number for all its agents, one per agent, or
+        /// drawn anew for every episode, the same for all teams of a generation
+        #[serde(serialize_with = "or_drawn")]
+        heading: Option<OneOrEach<f64>> = "rad",
         /// speed at the start
         speed: f64 = "units/s",
         /// what decides how its agents move: a policy, which learns; its `rule`; the nearest agent of a class, to which
@@ -96,6 +100,21 @@ table! {
         #[serde(skip_serializing_if = "Option::is_none")]
         fitness: Option<Fitness> = "",
     }
+}
+
+/// The word for [headings](AgentClass::heading) that are drawn.
+pub(crate) const DRAWN: &str = "random";
+
+fn or_drawn<S: Serializer>(heading: &Option<OneOrEach<f64>>, serializer: S) -> Result<S::Ok, S::Error> {
+    match heading {
+        Some(heading) => heading.serialize(serializer),
+        None => DRAWN.serialize(serializer),
+    }
+}
+
+/// Returns the angle that a uniform random word selects, in radians.
+pub(crate) fn turn(word: u32) -> f64 {
+    TAU * f64::from(word) / (1u64 << 32) as f64
 }
 
 /// The source of an agent's decisions.
@@ -397,9 +416,19 @@ impl Classes {
         regions(self.agents.iter().map(|class| (class.size(), class.region)))
     }
 
-    /// Returns each agent's heading at the start in radians, `[agents]`.
+    /// Returns each agent's heading at the start in radians, `[agents]`: examples of those that are drawn.
     pub fn headings(&self) -> Vec<f64> {
-        self.agents.iter().flat_map(|class| class.heading.of_each(class.size())).collect()
+        let of = |class: &AgentClass| match &class.heading {
+            Some(heading) => heading.of_each(class.size()),
+            None => (0..class.size()).map(|index| turn(math::pcg4d_scalar([index as u32, 0, 1, 0])[0])).collect(),
+        };
+        self.agents.iter().flat_map(of).collect()
+    }
+
+    /// Returns the agents whose headings are drawn.
+    pub fn drawn_headings(&self) -> Vec<Range<usize>> {
+        let drawn = (0..self.agents.len()).filter(|&class| self.agents[class].heading.is_none());
+        drawn.map(|class| self.agents_of(class)).collect()
     }
 
     /// Returns the agents of a class.
@@ -508,6 +537,11 @@ impl AgentClass {
     /// Returns the number of its agents.
     pub fn size(&self) -> usize {
         self.count.unwrap_or(self.at.len())
+    }
+
+    /// Reports whether its starts or headings are drawn anew for every episode.
+    pub(crate) fn is_drawn(&self) -> bool {
+        self.region.is_some() || self.heading.is_none()
     }
 
     /// Reports whether only small teams can have it.

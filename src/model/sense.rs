@@ -193,13 +193,10 @@ impl ChannelShape {
 }
 
 impl<S: Simd> ChannelLanes<S> {
-    /// Returns the heading that the sectors of an agent with this heading turn with.
+    /// Returns the heading that the sectors of an agent with this heading turn with, none if they are fixed to the map.
     #[inline(always)]
-    pub(crate) fn heading(&self, hx: S::f32s, hy: S::f32s) -> [S::f32s; 2] {
-        match self.shape.frame == Frame::Map as u32 {
-            true => [splat(hx.token(), 1.0), splat(hx.token(), 0.0)],
-            false => [hx, hy],
-        }
+    pub(crate) fn heading(&self, hx: S::f32s, hy: S::f32s) -> Option<[S::f32s; 2]> {
+        (self.shape.frame != Frame::Map as u32).then_some([hx, hy])
     }
 }
 
@@ -247,10 +244,14 @@ pub(crate) fn measured<S: Simd>(
     (measured & within.to_vector(), within)
 }
 
-/// Returns an offset relative to a heading: along it, and to its left. What is at the same place is straight ahead.
+/// Returns an offset relative to a heading, or to the x axis: along it, and to its left. What is at the same place is
+/// straight ahead.
 #[inline(always)]
-fn turned<S: Simd>(dx: S::f32s, dy: S::f32s, hx: S::f32s, hy: S::f32s) -> (S::f32s, S::f32s) {
-    (dx * hx + dy * hy, dy * hx - dx * hy)
+fn turned<S: Simd>([dx, dy]: [S::f32s; 2], heading: Option<[S::f32s; 2]>) -> (S::f32s, S::f32s) {
+    match heading {
+        Some([hx, hy]) => (dx * hx + dy * hy, dy * hx - dx * hy),
+        None => (dx, dy),
+    }
 }
 
 /// Sums over the entities around an agent: over all, over those on the left, in front, and both.
@@ -297,8 +298,8 @@ impl<S: Simd> Quadrants<S> {
         Quadrants { sums: empty, counts: empty }
     }
 
-    /// Adds an entity with this measure at offset (`dx`, `dy`) from an agent with heading (`hx`, `hy`). `PLAIN` channels
-    /// count no entities.
+    /// Adds an entity with this measure at an offset from an agent with this [heading](ChannelLanes::heading). `PLAIN`
+    /// channels count no entities.
     ///
     /// The signs of the offset along the heading and to its left determine the quadrant. A tie goes to the
     /// counterclockwise quadrant, so that each boundary belongs to exactly one.
@@ -306,11 +307,11 @@ impl<S: Simd> Quadrants<S> {
     pub(crate) fn add<const PLAIN: bool>(
         &mut self,
         (measured, within): (S::i32s, S::mask32s),
-        [dx, dy]: [S::f32s; 2],
-        [hx, hy]: [S::f32s; 2],
+        offset: [S::f32s; 2],
+        heading: Option<[S::f32s; 2]>,
     ) {
-        let zero = splat(dx.token(), 0.0);
-        let (fx, fy) = turned::<S>(dx, dy, hx, hy);
+        let (fx, fy) = turned::<S>(offset, heading);
+        let zero = splat(fx.token(), 0.0);
         let left = (fy.simd_gt(zero) | (fy.simd_ge(zero) & fx.simd_ge(zero))).to_vector();
         let front = (fx.simd_gt(zero) | (fx.simd_ge(zero) & !fy.simd_gt(zero))).to_vector();
         self.sums.add(measured, left, front);
@@ -366,12 +367,12 @@ impl<S: Simd> Sectors<S> {
         &mut self,
         channel: &ChannelLanes<S>,
         (measured, within): (S::i32s, S::mask32s),
-        [dx, dy]: [S::f32s; 2],
-        [hx, hy]: [S::f32s; 2],
+        offset: [S::f32s; 2],
+        heading: Option<[S::f32s; 2]>,
     ) {
-        let simd = dx.token();
+        let (fx, fy) = turned::<S>(offset, heading);
+        let simd = fx.token();
         let (zero, sectors) = (splat(simd, 0.0), channel.shape.sectors as usize);
-        let (fx, fy) = turned::<S>(dx, dy, hx, hy);
         // What is at the same place is straight ahead.
         let fx = select::<S>(fx, splat(simd, 1.0), fx.simd_eq(zero) & fy.simd_eq(zero));
         let first = is_after::<S>(channel, 0, fx, fy);

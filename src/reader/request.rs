@@ -103,7 +103,13 @@ impl<'a> KeyRequest<'_, 'a> {
     /// Returns a number, or `None` if the value is this word, or the default without the key.
     pub fn number_or<T: Number>(mut self, allowed: Allowed<T>, word: &str, default: T) -> Option<T> {
         let (kind, range) = (kind::<T>(), format!("{}, or {word:?}", allowed.in_general()));
-        match self.take(|| (format!("{kind}, or a word"), range, Some(written(&default)))) {
+        let entry = self.take(|| (format!("{kind}, or a word"), range, Some(written(&default))));
+        self.number_unless(word, entry, allowed, default)
+    }
+
+    /// Reads a number, or `None` if the value is this word.
+    fn number_unless<T: Number>(self, word: &str, entry: Option<Entry>, allowed: Allowed<T>, default: T) -> Option<T> {
+        match entry {
             Some(entry) if entry.value.word() == Some(word) => None,
             Some(entry) if T::read(&entry.value).is_none() => {
                 let message = format!("found {}, allowed {}, {allowed}, or {word:?}", entry.value.found(), T::KIND);
@@ -349,6 +355,24 @@ impl<'a> KeyRequest<'_, 'a> {
         match self.take(|| (kind(), allowed.in_general(), Some(written(&default)))) {
             Some(entry) if entry.value.list().is_some() => OneOrEach::Each(self.reader.numbers(entry, counts, allowed)),
             entry => OneOrEach::Same(self.reader.number(self.name, entry, allowed, default)),
+        }
+    }
+
+    /// Returns one number or a list of numbers, or `None` if the value is this word. The default is one number.
+    pub fn one_or_each_or<T: Number>(
+        mut self,
+        allowed: Allowed<T>,
+        counts: RangeInclusive<usize>,
+        word: &str,
+        default: T,
+    ) -> Option<OneOrEach<T>> {
+        let kind = || format!("{}, a list of them, or a word", kind::<T>());
+        let range = || format!("{}, or {word:?}", allowed.in_general());
+        match self.take(|| (kind(), range(), Some(written(&default)))) {
+            Some(entry) if entry.value.list().is_some() => {
+                Some(OneOrEach::Each(self.reader.numbers(entry, counts, allowed)))
+            }
+            entry => self.number_unless(word, entry, allowed, default).map(OneOrEach::Same),
         }
     }
 }

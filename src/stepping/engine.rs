@@ -36,8 +36,8 @@ pub(super) struct Observations {
 /// A command to all vectors of teams.
 #[derive(Clone, Copy)]
 pub(super) enum Command<'a> {
-    /// Resets the `chosen` teams, `[teams]`, or all, to `starts`, `[teams][agents]`, or to the world's.
-    Reset { chosen: Option<&'a [bool]>, starts: Option<&'a [Vec2]> },
+    /// Resets the `chosen` teams, `[teams]`, or all, to `starts` and `headings`, `[teams][agents]`, or to the world's.
+    Reset { chosen: Option<&'a [bool]>, starts: Option<&'a [Vec2]>, headings: Option<&'a [Vec2]> },
     /// Plays a step with actions, `[teams][leaders][2]`.
     Step(&'a [f32]),
     /// Puts all teams into a saved state. Of the observations, only the inputs change.
@@ -223,7 +223,7 @@ impl<S: Simd> Workspace<S> {
         self.move_pois(simd, world, moved, block.first, block.teams);
         self.block.swap(&mut block.state);
         let has_changed = match command {
-            Command::Reset { chosen, starts } => self.reset(world, block, chosen, starts, slices),
+            Command::Reset { chosen, starts, headings } => self.reset(world, block, chosen, [starts, headings], slices),
             Command::Step(actions) => self.step(simd, world, block, actions, slices),
             Command::Restore(saved) => self.restore(world, block, saved),
             Command::Show => {
@@ -267,7 +267,7 @@ impl<S: Simd> Workspace<S> {
         world: &World,
         block: &mut TeamBlock<S>,
         chosen: Option<&[bool]>,
-        starts: Option<&[Vec2]>,
+        [starts, headings]: [Option<&[Vec2]>; 2],
         Slices { arrays, newly, observed, steps }: &mut Slices<'_>,
     ) -> bool {
         let (agents, pois, words) = (world.agents(), world.pois.len(), world.words_per_step());
@@ -283,7 +283,8 @@ impl<S: Simd> Workspace<S> {
         for (lane, team) in lanes::<S>(teams).filter(|&(_, team)| is_chosen(first + team)) {
             let at = (first + team) * agents;
             let starts = starts.map_or(&world.starts[..], |starts| &starts[at..at + agents]);
-            self.block.place(lane, starts, &world.headings);
+            let headings = headings.map_or(&world.headings[..], |headings| &headings[at..at + agents]);
+            self.block.place(lane, starts, headings);
             if !all {
                 self.block.start_lane(lane);
             }

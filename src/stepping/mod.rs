@@ -118,6 +118,16 @@ pub enum StepError {
         /// The position, in units.
         at: [f32; 2],
     },
+    /// A heading is no unit vector.
+    #[error("agent {agent} of team {team} would have the heading ({}, {}), which is no unit vector", heading[0], heading[1])]
+    Heading {
+        /// The team, from 0.
+        team: usize,
+        /// The agent in its team, leaders first.
+        agent: usize,
+        /// The heading.
+        heading: [f32; 2],
+    },
     /// A POI is off the map.
     #[error("POI {poi} of team {team} would be at ({}, {}), which is not on the map", at[0], at[1])]
     Poi {
@@ -214,19 +224,20 @@ impl Stepper {
     /// Resets all teams to the world's start.
     pub fn reset(&mut self) {
         self.moved.clear();
-        self.run(Command::Reset { chosen: None, starts: None });
+        self.run(Command::Reset { chosen: None, starts: None, headings: None });
     }
 
     /// Resets all teams to given start positions, `[teams][agents][2]`, or `[teams][agents + pois][2]` with POI
-    /// positions that replace the world's. Each is rounded to the kernels' grid (within 2^-19).
+    /// positions that replace the world's, or `[teams][agents + pois + agents][2]` with headings, unit vectors, that
+    /// do. Each position is rounded to the kernels' grid (within 2^-19).
     /// [`crate::evaluate::Starts`] draws such positions.
     ///
     /// # Errors
-    /// The length is wrong, or a position is off the map.
+    /// The length is wrong, a position is off the map, or a heading is no unit vector.
     pub fn reset_to(&mut self, starts: &[f32]) -> Result<(), StepError> {
-        let (starts, pois) = self.checked(starts, None)?;
-        self.moved = pois;
-        self.run(Command::Reset { chosen: None, starts: Some(&starts) });
+        let given = self.checked(starts, None)?;
+        self.moved = given.pois;
+        self.run(Command::Reset { chosen: None, starts: Some(&given.starts), headings: given.headings.as_deref() });
         Ok(())
     }
 
@@ -234,11 +245,11 @@ impl Stepper {
     /// other teams, and their positions in `starts`, are ignored.
     ///
     /// # Errors
-    /// A length is wrong, or a position is off the map.
+    /// A length is wrong, a position is off the map, or a heading is no unit vector.
     pub fn reset_some(&mut self, chosen: &[bool], starts: Option<&[f32]>) -> Result<(), StepError> {
         self.check_length("choices", "[teams]", self.teams(), chosen.len())?;
-        let starts = starts.map(|starts| self.checked(starts, Some(chosen))).transpose()?;
-        let given = starts.as_ref().map_or(&[][..], |(_, pois)| pois);
+        let all = starts.map(|starts| self.checked(starts, Some(chosen))).transpose()?;
+        let given = all.as_ref().map_or(&[][..], |all| &all.pois);
         if self.moved.is_empty() && !given.is_empty() {
             self.moved = self.world.pois.repeat(self.teams());
         }
@@ -246,8 +257,9 @@ impl Stepper {
         for (team, moved) in self.moved.chunks_exact_mut(pois).enumerate().filter(|&(team, _)| chosen[team]) {
             moved.copy_from_slice(given.get(team * pois..(team + 1) * pois).unwrap_or(&self.world.pois));
         }
-        let starts = starts.as_ref().map(|(starts, _)| &starts[..]);
-        self.run(Command::Reset { chosen: Some(chosen), starts });
+        let starts = all.as_ref().map(|all| &all.starts[..]);
+        let headings = all.as_ref().and_then(|all| all.headings.as_deref());
+        self.run(Command::Reset { chosen: Some(chosen), starts, headings });
         Ok(())
     }
 
@@ -381,30 +393,51 @@ impl Stepper {
         if found == expected { Ok(()) } else { Err(StepError::Length { what, shape, expected, found }) }
     }
 
-    /// Returns the start positions of the chosen teams, `[teams][agents]`, and their POI positions, `[teams][pois]`,
-    /// which are empty unless given; all rounded to the grid.
-    fn checked(&self, starts: &[f32], chosen: Option<&[bool]>) -> Result<(Vec<Vec2>, Vec<Vec2>), StepError> {
+    /// Returns the starts of the chosen teams, with positions rounded to the grid.
+    fn checked(&self, starts: &[f32], chosen: Option<&[bool]>) -> Result<Given, StepError> {
         let (teams, agents, pois) = (self.teams(), self.world.agents(), self.world.pois.len());
-        let each = if starts.len() == teams * (agents + pois) * 2 { agents + pois } else { agents };
+        let shapes = [agents + pois + agents, agents + pois];
+        let each = shapes.into_iter().find(|each| starts.len() == teams * each * 2).unwrap_or(agents);
         self.check_length("coordinates", "[teams][agents][2]", teams * each * 2, starts.len())?;
         let map = self.world.map();
-        let (mut placed, mut moved) = (Vec::with_capacity(teams * agents), Vec::with_capacity(teams * (each - agents)));
+        let mut given = Given { starts: Vec::with_capacity(teams * agents), pois: vec![], headings: None };
+        if each > agents + pois {
+            given.headings = Some(Vec::with_capacity(teams * agents));
+        }
         for (index, &[x, y]) in starts.as_chunks::<2>().0.iter().enumerate() {
-            let (team, agent) = (index / each, index % each);
+            let (team, place) = (index / each, index % each);
+            let (ignored, at) = (chosen.is_some_and(|chosen| !chosen[team]), Vec2::new(x, y));
             let on_map = (0.0..=map.x).contains(&x) && (0.0..=map.y).contains(&y);
-            let to = if agent < agents { &mut placed } else { &mut moved };
-            if chosen.is_some_and(|chosen| !chosen[team]) {
-                to.push(Vec2::ZERO);
-            } else if on_map {
-                to.push(settled(Vec2::new(x, y), map));
-            } else if agent < agents {
-                return Err(StepError::Start { team, agent, at: [x, y] });
+            let settled = || if ignored { Vec2::ZERO } else { settled(at, map) };
+            if let (Some(headings), Some(agent)) = (&mut given.headings, place.checked_sub(agents + pois)) {
+                if !ignored && !((at.length_squared() - 1.0).abs() < 1e-3) {
+                    return Err(StepError::Heading { team, agent, heading: [x, y] });
+                }
+                headings.push(at);
+            } else if let Some(poi) = place.checked_sub(agents) {
+                if !ignored && !on_map {
+                    return Err(StepError::Poi { team, poi, at: [x, y] });
+                }
+                given.pois.push(settled());
             } else {
-                return Err(StepError::Poi { team, poi: agent - agents, at: [x, y] });
+                if !ignored && !on_map {
+                    return Err(StepError::Start { team, agent: place, at: [x, y] });
+                }
+                given.starts.push(settled());
             }
         }
-        Ok((placed, moved))
+        Ok(given)
     }
+}
+
+/// Given starts of all teams.
+struct Given {
+    /// `[teams][agents]`
+    starts: Vec<Vec2>,
+    /// `[teams][pois]`; empty unless given.
+    pois: Vec<Vec2>,
+    /// Unit vectors, `[teams][agents]`.
+    headings: Option<Vec<Vec2>>,
 }
 
 /// Rounds a position to the grid. A coordinate on a wall stays.

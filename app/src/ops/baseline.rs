@@ -7,7 +7,7 @@ use super::{BackendSource, ConfigText, Context, Error, ProcessorInfo};
 use crate::choice::Work;
 use flotilla::backend::Backend;
 use flotilla::baseline::{self, Baselines, SPEEDS};
-use flotilla::config::{Actions, MAX_LEARNERS, Paradigm, ValidConfig};
+use flotilla::config::{Actions, Paradigm, ValidConfig};
 use flotilla::statistics;
 
 /// BaselineRequest of baselines.
@@ -151,11 +151,6 @@ pub fn play(
     backend: &mut dyn Backend,
     context: Context<'_>,
 ) -> Result<Vec<baseline::Outcome>, Error> {
-    let agents = config.agent_count();
-    if agents > MAX_LEARNERS {
-        let text = format!("teams of {agents} agents: baselines step teams, of up to {MAX_LEARNERS} agents; use fewer");
-        return Err(Error::Usage(text.into()));
-    }
     let generations = config.learning.generations + 1;
     let mut outcomes = Vec::new();
     for seed in 0..seeds {

@@ -125,7 +125,7 @@ impl RolloutRequest {
     /// Returns where episodes of a config start. Without own starts, an episode is drawn.
     fn starts(&self, config: &Config) -> Result<Starts, Error> {
         let Learning { start_jitter: jitter, poi_jitter, .. } = config.learning;
-        let episodes = self.episodes.or(config.has_regions().then_some(1));
+        let episodes = self.episodes.or(config.draws_starts().then_some(1));
         let (Some(episodes), seed) = (episodes, self.seed.unwrap_or(0)) else { return Ok(Starts::Own) };
         if !config.starts_move() && !config.pois_move() && (episodes > 1 || self.seed.is_some()) {
             return Err(Error::Usage(with_remedy(

@@ -85,7 +85,7 @@ impl<S: Simd> EpisodeBlock<S> {
         places.clear();
         places.extend((0..S::f32s::LEN).map(|lane| batch.locate(first + if lane < teams { lane } else { 0 })));
         for (lane, &(group, _)) in places.iter().enumerate() {
-            block.place(lane, batch.groups[group].starts, &batch.world.headings);
+            block.place(lane, batch.groups[group].starts, batch.groups[group].headings());
         }
         load_pois(
             block.simd,

@@ -10,6 +10,7 @@ use crate::config::{
     MAX_HIDDEN_UNITS, MAX_INPUTS, MAX_LEARNERS, MAX_POIS, MAX_SECTORS, MAX_TERMS, Measure, Mobility, Motion, POIS,
     PoiGroup, Region, Score, Sectors, Term, When,
 };
+use crate::model::classes::DRAWN;
 use crate::model::rule::cycle;
 use crate::model::sense::MOST_MEASURED;
 use crate::model::{LEAST, LONGEST, MAX_RANGES};
@@ -293,7 +294,7 @@ impl AgentClass {
         let (at, count, region) = places(r, keys, ["agents.at", "agents.count", "agents.in"], sides, limits);
         let size = count.unwrap_or(at.len());
         let counts = if size == 0 { 0..=usize::MAX } else { size..=size };
-        let heading = AgentClass::heading(r).one_or_each(between(-1e3, 1e3), counts, FRAC_PI_2);
+        let heading = AgentClass::heading(r).one_or_each_or(between(-1e3, 1e3), counts, DRAWN, FRAC_PI_2);
         let control = control(r, summary);
         let learns = control.learns();
         // If the control is wrong, what it needs is unknown.

@@ -167,7 +167,7 @@ impl<S: Simd> Swarm<S> {
         self.pois.clear();
         self.pois.extend(group.pois());
         for (cells, class) in self.cells.iter_mut().zip(&self.constants) {
-            cells.start(group.starts, &batch.world.headings, class.constants.motion.speed);
+            cells.start(group.starts, group.headings(), class.constants.motion.speed);
         }
         [&mut self.sets, &mut self.counts, &mut self.sights].into_iter().for_each(|record| record.fill(0));
         watch.started(self);
@@ -577,7 +577,7 @@ struct Sensing<'a, S: Simd> {
     channel: &'a ChannelLanes<S>,
     agent: Agent<S>,
     /// The heading that sectors turn with.
-    heading: [S::f32s; 2],
+    heading: Option<[S::f32s; 2]>,
     in_quadrants: bool,
     quadrants: sense::Quadrants<S>,
     sectors: sense::Sectors<S>,

@@ -303,12 +303,10 @@ impl BatchPlan {
     fn store(&mut self, plan: &GroupPlan<'_>) -> Task {
         let Group { world, starts, .. } = *plan.group;
         let (index, first) = (self.worlds.len() as u32, self.places.len() as u32);
-        self.places.extend(starts);
-        if plan.group.moved_pois().is_none() {
-            self.places.extend(&world.pois);
-        }
+        self.places.extend(&starts[..world.agents()]);
+        self.places.extend(plan.group.pois());
         // The shader finds headings behind the POIs, and then more about these.
-        self.places.extend(&world.headings);
+        self.places.extend(plan.group.headings());
         self.places.extend(world.radii2.iter().zip(&world.values).map(|(&radius2, &value)| Vec2::new(radius2, value)));
         if plan.template.shape.is_large() {
             for (class, word) in world.classes.iter().zip(cell_words(world).0) {
