@@ -482,6 +482,25 @@ fn the_page_on_swarms_agrees_with_its_files() {
     assert!(p("fitness G,", "fitness D,")[2..].iter().all(|&p| p < 0.05));
 }
 
+#[test]
+fn the_page_on_herding_agrees_with_its_file() {
+    let folder = crate::support::root("docs/results");
+    let page = fs::read_to_string(folder.join("herding.md")).unwrap();
+    let trials = read_csv(folder.join("herding/test_g.csv"));
+    assert_eq!(trials.len(), 250);
+    for dogs in ["1", "2", "4", "8", "16"] {
+        let cells = ["5", "10", "20", "40", "80"].map(|sheep| {
+            let of_cell = trials.iter().filter(|row| row["dogs"] == dogs && row["sheep"] == sheep);
+            let g: Vec<f64> = of_cell.map(|row| row["test_g"].parse().unwrap()).collect();
+            format!("{:.2}", g.iter().sum::<f64>() / g.len() as f64)
+        });
+        let line = format!("| {dogs} | {} |", cells.join(" | "));
+        assert!(page.contains(&line), "{line}");
+    }
+    let best = trials.iter().map(|row| row["test_g"].parse::<f64>().unwrap()).fold(0.0, f64::max);
+    assert!(page.contains(&format!("the best of 250 trained teams reaches {best:.2}")), "{best}");
+}
+
 /// Every cell of the tables on rovers and UAVs is in the published files. No pair of credits differs at fixed places, and all of
 /// four do where POIs are drawn anew.
 #[test]
