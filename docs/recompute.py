@@ -5,7 +5,8 @@
 
 Means, intervals and tests use only the runs' metrics.csv and SciPy. Of a published mean, the standard deviation is derived
 from its interval. A mean agrees if Welch's test of both finds no difference (p at least 0.05). A contrast agrees if it has
-the same sign and is below 0.05 in both or in none, after Holm's correction if the page corrects.
+the same sign and is below 0.05 in both or in none, after Holm's correction if the page corrects. Counts over whole studies
+use their tables.
 """
 
 import csv
@@ -163,12 +164,35 @@ def recomputed(runs, page, file, columns, values, folders):
     return [page, name, *numbers, test, f"{p:.2g}", *notes, "agrees" if agrees else "differs"]
 
 
+def studies(runs, page, files):
+    """Prints how many champions' means of a study are within the published interval, and how many verdicts are the same."""
+    means = within = contrasts = same = turned = 0
+    for file in files:
+        old, new = (list(csv.DictReader((root / page / file).open())) for root in (RESULTS, runs))
+        for was, now in zip(old, new, strict=True):
+            name = "value" if "value" in was else "g"
+            keys = [key for key in was if key not in (name, *"low high p p_holm a reached trials other_trials".split())]
+            assert all(was[key] == now[key] for key in keys), (file, was, now)
+            if was["measure"] not in ("champion", "champion_g", "fixed_pois_g", "moved_pois_g"):
+                continue
+            if was.get("p_holm"):
+                before, after = float(was["p_holm"]) < 0.05, float(now["p_holm"]) < 0.05
+                contrasts, same = contrasts + 1, same + (before == after)
+                turned += before and after and float(was[name]) * float(now[name]) < 0
+            else:
+                means, within = means + 1, within + (float(was["low"]) <= float(now[name]) <= float(was["high"]))
+    print(f"{page}: {within} of {means} means within, {same} of {contrasts} contrasts with the same verdict, {turned} turned")
+
+
 def main(runs):
     header = "page,cell,published,published_low,published_high,recomputed,low,high,test,p,published_p,decided_p,verdict"
     rows = [recomputed(runs, *cell) for cell in CELLS]
     with (RESULTS / "recomputed.csv").open("w", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows([header.split(","), *rows])
     print(f"{sum(row[-1] == 'agrees' for row in rows)} of {len(rows)} cells agree")
+    studies(runs, "populations", ["cells.csv", "pairs.csv"])
+    files = "asymmetry behaviours curricula groups observers places relay relay_forced relay_led relay_order relay_twice warm"
+    studies(runs, "questions", [f"{name}.csv" for name in files.split()])
 
 
 main(Path(sys.argv[1]))

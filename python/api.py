@@ -87,7 +87,7 @@ def signature(name: str, thing: object) -> str:
 
 # Default arguments that are strings.
 DEFAULTS = {
-    "auto", "last", "Df", "G", "generally_forward", "leader-follower", "best_g", "the config", "paper", "next_step", "champion"
+    "auto", "last", "Df", "G", "generally_forward", "leader-follower", "champion_g", "the config", "paper", "next_step", "champion"
 }
 
 

@@ -1027,8 +1027,11 @@ fn a_paper_is_overwritten_only_with_force() {
         assert_eq!(run["digest"], arm["digest"]);
         let metrics = fs::read_to_string(folder.join("metrics.csv")).unwrap();
         let rows = metrics.lines().map(|line| line.split(',').collect::<Vec<_>>()).filter(|row| row[1] == "4");
-        let best: Vec<f64> = rows.map(|row| row[2].parse().unwrap()).collect();
-        assert_eq!(arm["best_g"].as_f64(), Some((best[0] + best[1]) / 2.0), "{arm}");
+        let rows: Vec<_> = rows.collect();
+        for (name, column) in [("champion_g", 4), ("best_g", 2)] {
+            let [first, second] = [0, 1].map(|trial| rows[trial][column].parse::<f64>().unwrap());
+            assert_eq!(arm[name].as_f64(), Some((first + second) / 2.0), "{name}: {arm}");
+        }
     }
     let original = outcome(&out);
     refused(&out, &["--generations", "4"], &["holds a paper already", "--resume", "--force"]);

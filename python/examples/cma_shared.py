@@ -21,7 +21,7 @@ import flotilla
 
 
 def main(generations: int = 60) -> None:
-    # Four groups have to meet. No constant speed solves this task.
+    # Four groups have to meet. No baseline solves this task (docs/results/tasks.md).
     config = flotilla.Config.load(pathlib.Path(__file__).parents[2] / "configs/tasks/merge.toml")
     strategy = cma.CMAEvolutionStrategy(config.parameters * [0.0], 1.0, {"seed": 1, "popsize": 64, "verbose": -9})
     start, best = time.perf_counter(), 0.0

@@ -3,7 +3,7 @@
 Example:
     >>> config = flotilla.Config.paper("generally_forward").replace(learning={"generations": 20})
     >>> run = flotilla.train(config, seed=7)
-    >>> run.metrics["best_g"].shape
+    >>> run.metrics["champion_g"].shape
     (5, 21)
 """
 

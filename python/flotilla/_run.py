@@ -58,7 +58,7 @@ class Run:
     Example:
         >>> config = flotilla.Config.paper("chaotic").replace(learning={"generations": 3, "trials": 2})
         >>> run = flotilla.train(config, seed=7)
-        >>> run.metrics["best_g"].shape, run.policies[0].shape
+        >>> run.metrics["champion_g"].shape, run.policies[0].shape
         ((2, 4), (4, 50, 112))
     """
 
@@ -232,14 +232,14 @@ class Run:
         self._show_arrays()
 
     def __repr__(self) -> str:
-        best = self.metrics["best_g"][:, -1]
+        g = self.metrics["champion_g"]
+        last = g[:, -1]
         where = f", in {self._folder}" if self._folder is not None and not self._temporary else ""
         where += ", unverified" if self.unverified else ""
         where += ", by a fitness that is not the config's" if self.own_fitness else ""
-        last = self.metrics["best_g"].shape[1] - 1
         return (
-            f"<flotilla.Run: {len(best)} trials, {last} generations, best G {best.mean():.3f} "
-            f"({best.min():.3f} to {best.max():.3f}){where}, digest {self.digest[:12]}…>"
+            f"<flotilla.Run: {len(last)} trials, {g.shape[1] - 1} generations, champion's G {last.mean():.3f} "
+            f"({last.min():.3f} to {last.max():.3f}){where}, digest {self.digest[:12]}…>"
         )
 
 

@@ -55,7 +55,7 @@ class Sweep:
     def __iter__(self) -> Iterator[Point]:
         return iter(self.points)
 
-    def metric(self, name: str = "best_g") -> NDArray[np.float64]:
+    def metric(self, name: str = "champion_g") -> NDArray[np.float64]:
         """A metric of the last generation, float64 `[points, trials]`, NaN for missing trials."""
         rows = [point.run.metrics[name][:, -1] for point in self.points]
         table = np.full((len(rows), max(map(len, rows), default=0)), np.nan)

@@ -64,7 +64,7 @@ def test_metrics_and_policies_have_the_documented_shapes(config):
     assert run.digest != train(config, seed=4).digest
     unpickled = pickle.loads(pickle.dumps(run))
     assert unpickled.digest == run.digest and unpickled.config == run.config
-    assert repr(run).startswith("<flotilla.Run: 2 trials, 6 generations, best G ")
+    assert repr(run).startswith("<flotilla.Run: 2 trials, 6 generations, champion's G ")
 
 
 def test_the_program_resumes_runs_of_the_package(config, program):

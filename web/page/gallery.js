@@ -11,7 +11,7 @@ import { forget, train } from "./train.js";
 const GALLERY = [
   {
     name: "two_groups", title: "Two groups must meet", compare: { key: "learning.paradigm", values: ["leader-follower", "all-leaders"] },
-    says: "Six agents must be at one POI at once. Leader-follower teams learn it; teams in which all twelve agents learn do not.",
+    says: "Six agents must be at one POI at once. Leader-follower teams learn it. Teams in which all twelve agents learn, each with a population of its own, do not.",
   },
   {
     name: "population", config: "two_groups", title: "Few policies or many", compare: { key: "learning.population", values: ["20", "100", "500"] },
@@ -28,7 +28,7 @@ const GALLERY = [
   },
   {
     name: "eight_followers", title: "Eight followers per leader", compare: { key: "learning.paradigm", values: ["leader-follower", "all-leaders"] },
-    says: "Two policies are enough to steer eighteen agents. Eighteen policies, one per agent, hardly learn it.",
+    says: "Two policies are enough to steer eighteen agents. Teams in which all eighteen agents learn, each with a population of its own, hardly do it.",
   },
   {
     name: "relay", title: "A relay", compare: { key: "learning.fitness", values: ["D", "Df", "Dt"] },

@@ -48,7 +48,7 @@ const STEPS = [
     of: "groups", watch: () => exhibit("groups", { trains: true }),
     asks: "Do followers make the difference? Take them away, and let the three agents of a group share one population instead. What do such teams observe?",
     choices: ["Nothing", "Less than half", "Most POIs"], right: 2,
-    why: "Most of the difference was the number of populations, not the followers. In 30 trials of the paper's first layout, champions without followers reach G = 0.18 with a population per agent and 0.77 with one per group. With followers they reach 0.91. But somebody has to say who belongs to a group. Followers find their leader themselves.",
+    why: "Here, most of the difference was the number of populations, not the followers. In 30 trials of the paper's first layout, with the same sensors, champions without followers reach G = 0.18 with a population per agent and 0.77 with one per group. With followers they reach 0.91. But somebody has to say who belongs to a group. Followers find their leader themselves.",
   },
 ];
 

@@ -82,12 +82,15 @@ pub struct ExperimentOutcome {
     pub pois: usize,
     /// The run's digest.
     pub digest: Option<String>,
-    /// The mean over trials of the last generation's best team, as G.
+    /// The mean over trials of G of the last generation's champion.
+    pub champion_g: f64,
+    /// The same of the last generation's best team.
     pub best_g: f64,
 }
 
 impl ExperimentOutcome {
     fn of(experiment: &Experiment, folder: &Path, digest: Option<String>) -> ExperimentOutcome {
+        let last = |trials: &[Vec<f64>]| trials.iter().filter_map(|trial| trial.last()).sum::<f64>() / trials.len() as f64;
         ExperimentOutcome {
             name: folder_name(experiment),
             folder: folder.escaped().to_string(),
@@ -97,7 +100,8 @@ impl ExperimentOutcome {
             fitness: experiment.fitness,
             pois: experiment.pois(),
             digest,
-            best_g: experiment.best.iter().filter_map(|trial| trial.last()).sum::<f64>() / experiment.best.len() as f64,
+            champion_g: last(&experiment.champion),
+            best_g: last(&experiment.best),
         }
     }
 }
