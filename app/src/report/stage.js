@@ -332,14 +332,15 @@ const stage = (() => {
     }
     // Labels come last: all counts if they fit, and that of the POI under the pointer; then the leaders' numbers.
     draw.font = "600 12px system-ui, sans-serif";
-    const told = counts.map(([text], poi) => when(data, poi) ? `${poi}: ${text}${when(data, poi)}` : text);
+    // On a small canvas, values and windows would hide agents. The POI under the pointer has them.
+    const told = counts.map(([text], poi) => wide >= 480 && when(data, poi) ? `${poi}: ${text}${when(data, poi)}` : text);
     const areas = counts.map((count, poi) => {
       const [, x, y] = count, half = draw.measureText(told[poi]).width / 2;
       count[1] = Math.max(half, Math.min(wide - half, x));
       return [count[1] - half - 2, y - 11, count[1] + half + 2, y + 3];
     });
     const clear = areas.every((area, index) => areas.slice(0, index).every(other => !overlap(area, other)));
-    if (clear && labelled) counts.forEach(([, x, y], poi) => { if (poi !== look.over) label(told[poi], x, y); });
+    if (clear && labelled && (fit === 1 || wide * tall > 5000 * pois)) counts.forEach(([, x, y], poi) => { if (poi !== look.over) label(told[poi], x, y); });
     if (look.over !== null) {
       const [text, x, y] = counts[look.over];
       const words = `POI ${look.over}: ${text}${when(data, look.over)}${who(data, look.over)}`, half = Math.max(40, draw.measureText(words).width / 2 + 4);
