@@ -194,6 +194,8 @@ def check_slow_network(tab, page):
     assert tab.evaluate("page.state.views[0].place") == 9
     tab.click("[data-mode=arrange]")
     assert tab.text("#views h2") == "Where everyone starts"
+    assert tab.evaluate("page.state.views[0].data.episodes[0].headings.length") == 24
+    assert tab.evaluate("page.state.views[0].data.episodes[0].coupling.join()") == "6,6,6,6"
     tab.set("#layout", "chaotic")
     rest.set()
     tab.wait(f"{READY} && document.querySelector('#layout').value === 'chaotic'")
