@@ -194,6 +194,8 @@ def check_slow_network(tab, page):
     assert tab.evaluate("page.state.views[0].place") == 9
     tab.click("[data-mode=arrange]")
     assert tab.text("#views h2") == "Where everyone starts"
+    assert tab.evaluate("page.state.views[0].data.episodes[0].headings.length") == 24
+    assert tab.evaluate("page.state.views[0].data.episodes[0].coupling.join()") == "6,6,6,6"
     tab.set("#layout", "chaotic")
     rest.set()
     tab.wait(f"{READY} && document.querySelector('#layout').value === 'chaotic'")
@@ -238,6 +240,16 @@ def check_map_in_view(tab, page):
         tab.window(width, height, dark=False)
         tab.load(page)
         look("the opening", width)
+        # Settings are in one row.
+        boxes = "[...document.querySelectorAll('#setup > :not([hidden])')].map(e => e.getBoundingClientRect())"
+        row = tab.evaluate(f"Math.max(...{boxes}.map(b => b.top)) < Math.min(...{boxes}.map(b => b.bottom))")
+        assert row or width < 640, (width, "settings")
+        # An agent that strays widens the map a little.
+        stray = "(() => { const { data } = page.state.views[0], [own] = data.episodes, positions = own.positions.slice();"
+        stray += " positions.fill(50, -2 * own.agents); const crops = [data, { ...data, episodes: [{ ...own, positions }] }];"
+        stray += " return crops.map(page.stage.busy).map(([left, below, right, above]) => [right - left, above - below]); })()"
+        (wide, tall), (wider, taller) = tab.evaluate(stray)
+        assert wide < wider < 1.25 * wide and tall < taller < 1.4 * tall, (wide, wider, tall, taller)
         # There is no empty chart before a training.
         empty = "['curves', 'legend', 'scrub'].filter(id => document.getElementById(id).checkVisibility())"
         assert tab.evaluate(empty) == [], (width, tab.evaluate(empty))
@@ -356,8 +368,8 @@ def check_classes(tab, page, native):
     choose = f"{view}.chosen = {{}}; dispatchEvent(new Event('resize')); 0".format
     texts = "element => [element.textContent.trim(), element.querySelector('polygon').outerHTML]"
     for name, classes, unit in [
-        ("rovers", ["4 rover", "2 drone"], "share of the POIs' value"),
-        ("herd", ["3 dog", "6 sheep"], "POIs"),
+        ("rovers", ["4 × rover", "2 × drone"], "share of the POIs' value"),
+        ("herd", ["3 × dog", "6 × sheep"], "POIs"),
     ]:
         tab.load(page)
         config = CONFIGS / f"{name}.toml"
@@ -376,7 +388,7 @@ def check_classes(tab, page, native):
         tab.set("#pace", "full")
         flags = ("--generations", "3", "--trials", "2", "--population", "12")
         ((label, digest),) = tab.train().items()
-        assert label == " and ".join(own.split()[1] for own in classes), label
+        assert label == " and ".join(own.split()[-1] for own in classes), label
         assert digest == native(f"classes-{name}", config, *flags), name
         tab.wait(f"{view}.data && !{view}.playing")
         assert f"{unit} observed by the best team" in tab.text("#legend"), tab.text("#legend")

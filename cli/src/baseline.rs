@@ -1,12 +1,13 @@
 //! `flotilla baseline`: plays teams that do not learn.
 
 use super::console::Console;
-use super::{ConfigFile, Error, Overrides, Printed, RunOptions, SetKeys, between, number};
+use super::{ConfigFile, Error, Overrides, Printed, RunOptions, SetKeys, between, number, weighted};
 use clap::builder::PossibleValuesParser as Words;
 use flotilla::baseline::{SEGMENTS, SPEEDS};
 use flotilla::config::{Actions, Choice, Paradigm};
 use flotilla::evaluate::MAX_EPISODES;
 use flotilla_app::ops::baseline::{self, BaselineOutcome, BaselineRequest};
+use flotilla_app::report::map::counted;
 use flotilla_app::report::table::markdown;
 
 #[derive(clap::Args)]
@@ -47,8 +48,9 @@ pub fn run(args: Args) -> Result<(), Error> {
 }
 
 fn in_words(found: &BaselineOutcome) -> String {
-    let &BaselineOutcome { pois, seeds, teams, paradigm, actions, .. } = found;
-    let head = [&format!("POIs observed, of {pois}"), "mean [95 % interval]", "lowest", "highest"];
+    let &BaselineOutcome { pois, seeds, teams, ref learners, by_value, actions, .. } = found;
+    let head =
+        [&format!("POIs observed, of {pois}{}", weighted(by_value)), "mean [95 % interval]", "lowest", "highest"];
     let mut rows = vec![head.map(|head| head.to_string()).to_vec()];
     let constants = match actions {
         Actions::Direct => format!("best of {SPEEDS} constant speeds, straight ahead"),
@@ -72,8 +74,9 @@ fn in_words(found: &BaselineOutcome) -> String {
     };
     let all: Vec<bool> = found.constants.iter().map(|constant| constant.pois >= pois as f64).collect();
     format!(
-        "{paradigm}, {seeds} seeds. Each search plays {teams} teams per seed, as many as one trial of training. \
+        "{learners}, {}. Each search plays {teams} teams per seed, as many as one trial of training. \
          {played}\n\n{}\n{}\n",
+        counted(seeds, "seed"),
         markdown(&rows),
         solved(actions, &all)
     )

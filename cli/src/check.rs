@@ -2,7 +2,8 @@
 
 use std::path::PathBuf;
 
-use super::{ConfigArgs, Error, backend, console, print, print_json};
+use super::{ConfigArgs, Error, backend, console, print, print_json, say};
+use flotilla::escape::PathExt;
 use flotilla_app::ops::check::{self, CheckOutcome, CheckRequest, Cost};
 use flotilla_app::ops::output;
 
@@ -31,8 +32,13 @@ pub fn run(args: Args) -> Result<(), Error> {
         let found = console::run_without_backend(false, |context| check::expand(&text, context))?;
         return print(&found.to_toml());
     }
+    let replaces = out.as_ref().is_some_and(|out| out.is_file());
     let request = CheckRequest { name: config.name(), config: config.text(vec![])?, out };
     let found = console::run_without_backend(false, |context| check::run(&request, context))?;
+    if let Some(out) = &request.out {
+        let replaced = if replaces { ", in place of the file that was there" } else { "" };
+        say(format_args!("the layout is drawn in {}{replaced}", out.escaped()));
+    }
     if json {
         return print_json(&found);
     }

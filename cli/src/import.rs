@@ -2,8 +2,8 @@
 
 use std::path::PathBuf;
 
-use super::{Error, print, say};
-use flotilla::config;
+use super::{Error, print, say, with_remedy};
+use flotilla::config::{self, ConfigError};
 use flotilla::escape::PathExt;
 use flotilla_app::import;
 use flotilla_app::ops::output;
@@ -24,7 +24,14 @@ pub struct Args {
 pub fn run(args: Args) -> Result<(), Error> {
     let Args { file, out, force } = args;
     output::check(&[("--out", out.as_deref())], &[&file])?;
-    let found = import::translate(&config::read_file(&file)?, &config::name(&file))?;
+    let text = config::read_file(&file).map_err(|error| match error {
+        // Other commands advise `flotilla init`, which writes no YAML.
+        ConfigError::Unreadable { is_missing: true, .. } => {
+            Error::Missing(with_remedy(error.to_string(), "check the path"))
+        }
+        error => error.into(),
+    })?;
+    let found = import::translate(&text, &config::name(&file))?;
     match &out {
         None => print(&found.text)?,
         Some(path) => {

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use super::console::Console;
 use super::recovery::{Checkpoints, quoted};
-use super::{ConfigArgs, Error, ExistingResults, Printed, RunOptions};
+use super::{ConfigArgs, Error, ExistingResults, Printed, RunOptions, weighted};
 use flotilla::escape::PathExt;
 use flotilla_app::ops::train::{self, Extremes, TrainOutcome, TrainRequest};
 use flotilla_app::record::folder::{CONFIG, METRICS, POLICIES, RUN};
@@ -72,7 +72,9 @@ fn report(found: &TrainOutcome) -> String {
     };
     // `None` if stages have different numbers of POIs.
     let pois_of_all = found.pois;
+    let by_value = weighted(found.by_value);
     let what = pois_of_all.map_or("Share of POIs observed".into(), |pois| format!("POIs observed, of {pois}"));
+    let what = what + by_value;
     let pois = pois_of_all.unwrap_or(1);
     let mut text = format!("{trained}.\n\n{what}: mean over trials (lowest to highest trial)\n");
     let last = format!("generation {}", found.generations);
@@ -104,7 +106,7 @@ fn report(found: &TrainOutcome) -> String {
     let (best, observed) = best.map_or((0, 0.0), |row| (row.trial, row.champion_g * pois as f64));
     let what = pois_of_all.map_or("share of POIs".into(), |pois| format!("of {pois} POIs"));
     let _ = match observed > 0.0 {
-        true => write!(text, "\nThe best champion is that of trial {best}: {observed:.2} {what}.\n"),
+        true => write!(text, "\nThe best champion is that of trial {best}: {observed:.2} {what}{by_value}.\n"),
         false => write!(text, "\nNo champion observed any POI. The film below shows what that of trial {best} does.\n"),
     };
     let _ = write!(

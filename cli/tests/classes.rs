@@ -119,7 +119,13 @@ radius = 3
 #[test]
 fn g_weighs_pois_by_value_in_metrics_replays_and_rollouts() {
     let place = Place::new(&[("herd.toml", HERD)]);
-    place.good("train herd.toml --out run");
+    let (report, _) = place.good("train herd.toml --out run");
+    // What is not a count of POIs says so.
+    assert!(report.contains("POIs observed, of 3, weighted by value: mean over trials"), "{report}");
+    assert!(report.contains(" of 3 POIs, weighted by value.\n"), "{report}");
+    let (text, _) = place.good("baseline herd.toml --seeds 1 --episodes 2");
+    assert!(text.starts_with("2 × rover, 1 × drone, 1 seed. "), "{text}");
+    assert!(text.contains("| POIs observed, of 3, weighted by value "), "{text}");
     let metrics = place.read("run/metrics.csv");
     let g = |row: &str| row.split(',').nth(2).unwrap().parse::<f64>().unwrap();
     let best: Vec<f64> = metrics.lines().skip(1).map(g).collect();
@@ -135,16 +141,21 @@ fn g_weighs_pois_by_value_in_metrics_replays_and_rollouts() {
     }
     let (text, _) = place.good("rollout run --scores scores.csv");
     let most = place.read("scores.csv").lines().skip(1).map(g).fold(0.0, f64::max);
+    assert!(text.contains(", POIs observed of 3, weighted by value: team 0 "), "{text}");
     assert!(most > 0.0 && text.contains(&format!("best {:.2} ", most * 3.0)), "{most}: {text}");
 }
 
 #[test]
 fn pictures_and_pages_show_classes_radii_and_values() {
     let place = Place::new(&[("herd.toml", HERD)]);
-    place.good("check herd.toml --out layout.svg");
+    let drawn = "the layout is drawn in layout.svg";
+    let (_, message) = place.good("check herd.toml --out layout.svg");
+    assert!(message.ends_with(&format!("{drawn}\n")), "{message}");
+    let (_, message) = place.good("check herd.toml --out layout.svg");
+    assert!(message.ends_with(&format!("{drawn}, in place of the file that was there\n")), "{message}");
     let layout = place.read("layout.svg");
     let labels = [
-        "2 rover, 1 drone, 2 sheep, 3 POIs",
+        "2 × rover, 1 × drone, 2 × sheep, 3 POIs",
         "rover 0 to 1, drone 2",
         "sheep",
         "2, value 2",
@@ -165,4 +176,30 @@ fn pictures_and_pages_show_classes_radii_and_values() {
     assert!(page.contains("\"classes\":[{\"count\":2,\"free\":false,\"influence\":"));
     assert!(page.contains("\"name\":\"rover\",\"senses\":[{"));
     assert!(page.contains("\"radii\":[5.0,5.0,3.0]") && page.contains("\"values\":[2.0,2.0,0.5]"));
+}
+
+#[test]
+fn a_credit_that_is_always_0_is_noted() {
+    let herd = std::fs::read_to_string(root("configs/herd.toml")).unwrap();
+    let short = "world.leaders = [[5, 5]]\nworld.followers = [[4, 4]]\nworld.pois = [[9, 9]]\nworld.coupling = 1\n";
+    let followers = format!("{short}world.observers = \"followers\"\n");
+    let place = Place::new(&[("herd.toml", &herd), ("short.toml", short), ("followers.toml", &followers)]);
+    let notes = |line: &str| place.good(line).1;
+    let is_0 = |who: &str| {
+        format!("note: {who} is always 0, because none counts at a POI: selection is random; use G, Df or Dt")
+    };
+    assert!(notes("check herd.toml --fitness D").contains(&is_0("D of every dog")));
+    assert!(
+        notes("train herd.toml --fitness D++ --generations 1 --trials 1 --population 4")
+            .contains(&is_0("D++ of every dog"))
+    );
+    assert!(notes("check followers.toml --fitness D").contains(&is_0("D of every leader")));
+    for line in [
+        "check herd.toml --fitness Df",
+        "check followers.toml --fitness D --set credit.removes=[[1]]",
+        "check short.toml --fitness D",
+        "check followers.toml --fitness Dt",
+    ] {
+        assert!(!notes(line).contains("is always 0"), "{line}");
+    }
 }

@@ -368,6 +368,8 @@ fn bad_input_is_refused_with_its_line() {
     place.good("import good.yaml --out x.toml");
     assert!(place.refused(1, "import good.yaml --out x.toml").contains("--force"));
     place.good("import good.yaml --out x.toml --force");
+    let error = place.refused(1, "import nothere.yaml");
+    assert!(error.contains("nothere.yaml") && error.contains("check the path") && !error.contains("init"), "{error}");
     assert!(place.refused(2, "import good.yaml --out good.yaml --force").contains("good.yaml"));
 }
 

@@ -19,6 +19,11 @@ ALIGNMENT = 64
 BLOCK = 16_384
 
 
+def count(number: int, what: str) -> str:
+    """Returns a number with what it counts, in the plural if needed."""
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+
+
 def aligned(shape: tuple[int, ...]) -> Floats:
     """Returns a new float32 array, aligned to 64 bytes. Its values are undefined."""
     size = 4 * math.prod(shape)

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from flotilla import _native as native
-from flotilla._arrays import number
+from flotilla._arrays import count, number
 from flotilla._errors import no_key
 
 
@@ -208,11 +208,8 @@ class Config(Mapping[str, Any]):
         sections = self.to_dict()
         world, learning = sections["world"], sections["learning"]
 
-        def count(number: int, what: str) -> str:
-            return f"{number} {what}" if number == 1 else f"{number} {what}s"
-
         if "agents" in sections:
-            agents = ", ".join(f"{len(group['at'])} {group['name']}" for group in sections["agents"])
+            agents = ", ".join(f"{len(group['at'])} × {group['name']}" for group in sections["agents"])
             who = count(self.num_learners, "learner")
         else:
             agents = f"{count(len(world['leaders']), 'leader')}, {count(len(world['followers']), 'follower')}"

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flotilla import _native
-from flotilla._arrays import Floats, floats, text, whole, word
+from flotilla._arrays import Floats, count, floats, text, whole, word
 from flotilla._config import Config, check_config
 from flotilla._errors import no_key
 from flotilla._show import Figure, Replay
@@ -238,8 +238,13 @@ class Run:
         where += ", unverified" if self.unverified else ""
         where += ", by a fitness that is not the config's" if self.own_fitness else ""
         return (
+<<<<<<< HEAD
             f"<flotilla.Run: {len(last)} trials, {g.shape[1] - 1} generations, champion's G {last.mean():.3f} "
             f"({last.min():.3f} to {last.max():.3f}){where}, digest {self.digest[:12]}…>"
+=======
+            f"<flotilla.Run: {count(len(best), 'trial')}, {count(last, 'generation')}, best G {best.mean():.3f} "
+            f"({best.min():.3f} to {best.max():.3f}){where}, digest {self.digest[:12]}…>"
+>>>>>>> a57
         )
 
 

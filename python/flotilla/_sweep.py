@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flotilla import _native
+from flotilla._arrays import count, word
 from flotilla._arrays import text as check_text
-from flotilla._arrays import word
 from flotilla._config import Config
 from flotilla._errors import Error, warn
 from flotilla._program import program
@@ -75,7 +75,7 @@ class Sweep:
         return pandas.DataFrame(rows)
 
     def __repr__(self) -> str:
-        return f"<flotilla.Sweep: {len(self)} points over {', '.join(self.axes)}>"
+        return f"<flotilla.Sweep: {count(len(self), 'point')} over {', '.join(self.axes)}>"
 
 
 def _play(config: str, backend: str) -> Run:

@@ -70,7 +70,7 @@ def test_a_config_with_classes_is_read_written_and_copied():
     assert pickle.loads(pickle.dumps(CONFIG)) == copy.deepcopy(CONFIG) == CONFIG
     assert (CONFIG.num_inputs, CONFIG.num_learners, CONFIG.parameters) == (8, 5, 9 * 6 + 7 * 2)
     assert CONFIG.replace(world={"steps": 3})["world.steps"] == 3
-    assert repr(CONFIG).startswith("<flotilla.Config: 3 rover, 2 drone, 4 sheep, 5 POIs; 5 learners by D, 8 teams")
+    assert repr(CONFIG).startswith("<flotilla.Config: 3 × rover, 2 × drone, 4 × sheep, 5 POIs; 5 learners by D, 8 teams")
     assert [group["value"] for group in CONFIG["pois"]] == [2, 0.5]
     # The widest class decides.
     wide = Config.parse(TEXT.replace("sectors = 3", "sectors = 11"))

@@ -64,6 +64,11 @@ impl Config {
         }
     }
 
+    /// Reports whether POIs have different values. If they do, G times the number of POIs is not how many are observed.
+    pub fn values_differ(&self) -> bool {
+        self.pois.windows(2).any(|pair| pair[0].value != pair[1].value)
+    }
+
     /// Returns the number of inputs of a policy: the most that the policies of any class use.
     pub fn inputs(&self) -> usize {
         let learning = self.agents.iter().filter(|class| class.learns());

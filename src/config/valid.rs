@@ -3,7 +3,7 @@
 use std::collections::HashSet;
 use std::ops::Deref;
 
-use super::{AgentClass, Config, ConfigError, Mobility, WorldConfig};
+use super::{AgentClass, Classes, Config, ConfigError, Fitness, Mobility, WorldConfig};
 
 /// A config whose every key is in its range: one that a [`World`](crate::world::World) is made from.
 #[derive(Clone, Debug, PartialEq)]
@@ -115,11 +115,12 @@ impl ValidConfig {
 /// Returns the notes about one stage.
 fn notes(config: &Config) -> Vec<String> {
     let WorldConfig { map, dt, .. } = config.world;
+    let classes = config.classes();
+    let without_credit = without_credit(config, &classes);
     if config.agents.is_empty() {
         let notes = [config.motion.too_short("motion", dt, map), config.world.heading.likely_degrees("world.heading")];
-        return notes.into_iter().flatten().collect();
+        return notes.into_iter().flatten().chain(without_credit).collect();
     }
-    let classes = config.classes();
     let of_class = |(index, class): (usize, &AgentClass)| {
         let name = format!("agents[{index}]");
         let too_short = match &class.motion {
@@ -131,7 +132,27 @@ fn notes(config: &Config) -> Vec<String> {
         let blind = blind.map(|(channel, _)| format!("{name}.senses[{channel}] never senses anything in this world"));
         too_short.into_iter().chain(degrees).chain(blind).collect::<Vec<_>>()
     };
-    config.agents.iter().enumerate().flat_map(of_class).collect()
+    config.agents.iter().enumerate().flat_map(of_class).chain(without_credit).collect()
+}
+
+/// Returns a note for each class that learns by D or D++, which are always 0 because its agents count at no POI.
+fn without_credit(config: &Config, classes: &Classes) -> Vec<String> {
+    let of_class = |(index, class): (usize, &AgentClass)| {
+        let fitness = class.fitness.unwrap_or(config.learning.fitness);
+        let is_alone = match fitness {
+            Fitness::D => config.credit.removes.is_empty(),
+            Fitness::Dpp => true,
+            _ => false,
+        };
+        let counts = (0..classes.pois.len()).any(|group| classes.observes(index, group));
+        (class.learns() && is_alone && !counts).then(|| {
+            format!(
+                "{fitness} of every {} is always 0, because none counts at a POI: selection is random; use G, Df or Dt",
+                class.name
+            )
+        })
+    };
+    classes.agents.iter().enumerate().filter_map(of_class).collect()
 }
 
 #[cfg(test)]

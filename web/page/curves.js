@@ -52,7 +52,10 @@ export function curves() {
   };
   baseline(chart.CONSTANT, "best constant action", own.map(({ constant }) => constant));
   baseline(chart.RANDOM, "best of as many random teams", own.map(({ random }) => random[Math.min(Math.max(0, at), random.length - 1)]));
-  make("span", `${many} observed by the best team${at >= 0 ? ` at generation ${at}` : ""}, mean over trials${arms.some(arm => arm.band) ? " with its 95 % interval" : ""}; thin: each trial`, $("legend"));
+  // Otherwise nobody expects an interval around a flat line.
+  const agree = own.some(({ trials }, index) => arms[index].band && trials.length > 1 && trials.every(trial => trial[at]?.best === trials[0][at]?.best));
+  const interval = arms.some(arm => arm.band) ? ` with its 95 % interval${agree ? ", which is wide even if all trials agree, because they are few" : ""}` : "";
+  make("span", `${many} observed by the best team${at >= 0 ? ` at generation ${at}` : ""}, mean over trials${interval}; thin: each trial`, $("legend"));
   $("curves").setAttribute("aria-label", `Learning curves, best team, mean over trials: ${words.join("; ")}`);
 }
 

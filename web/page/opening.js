@@ -1,12 +1,14 @@
 // The episode of a trained team with which the page opens. It was played when the page was made, so it waits for no worker.
-import { NAMES, opening } from "./state.js";
+import { NAMES, opening, state } from "./state.js";
 
 /** Name of the experiment in the gallery. */
 export const OPENING = "two_groups";
 
 /** @type {Exhibit} */
 export const OPENED = (() => {
-  const { config, trial, generation } = opening, data = stage.unpack(opening.data);
+  const { config, trial, generation } = opening, data = stage.unpack(opening.data), [{ agents, coupling, headings }] = data.episodes;
+  // Until the module has resolved a config, everyone starts as in this episode.
+  state.start = { owner: [], coupling, headings: Array.from({ length: agents }, (_, agent) => Math.atan2(headings[2 * agent + 1], headings[2 * agent])) };
   return {
     name: "opening",
     scenes: [{

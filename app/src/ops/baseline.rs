@@ -57,6 +57,12 @@ pub struct BaselineOutcome {
     /// The meaning of the policies' outputs.
     #[serde(skip)]
     pub actions: Actions,
+    /// Who learns, for people: the paradigm, or the classes that learn.
+    #[serde(skip)]
+    pub learners: String,
+    /// Whether POIs have different values, so that the POIs observed are weighted by them.
+    #[serde(skip)]
+    pub by_value: bool,
     /// Whether starts or POIs move. If they do, some episodes choose a team and others measure it.
     #[serde(skip)]
     pub moves: bool,
@@ -123,7 +129,11 @@ pub fn run(
         Actions::Direct => json!(speed(outcome.best_constant)),
         Actions::Behaviours => json!(outcome.best_constant),
     };
+    let classes = config.agents.iter().filter(|class| class.learns());
+    let classes: Vec<_> = classes.map(|class| format!("{} × {}", class.size(), class.name)).collect();
     Ok(BaselineOutcome {
+        learners: if classes.is_empty() { learning.paradigm.to_string() } else { classes.join(", ") },
+        by_value: config.values_differ(),
         paradigm: learning.paradigm,
         pois,
         teams: learning.team_count() * (learning.generations + 1),

@@ -13,6 +13,7 @@ use crate::record::digests::Verification;
 use crate::record::disk::Disk;
 use crate::record::ownership::{self, REPLAY};
 use crate::report::curves::PRINT;
+use crate::report::map;
 use crate::report::replay::{self, FPS, Film, ReplayError, Replayed, Which};
 use crate::report::runs;
 use crate::report::scene::Format;
@@ -322,7 +323,7 @@ fn described(played: &Replayed) -> String {
     let Replayed { team_g, episodes, world, which, .. } = played;
     let pois = world.pois.len();
     // With different values, G times the number of POIs is no count.
-    let by_value = if world.total_worth as usize == pois { "" } else { ", weighted by value" };
+    let by_value = if map::values_differ(world) { ", weighted by value" } else { "" };
     let digits = if *episodes > 1 || !by_value.is_empty() { 2 } else { 0 };
     format!(
         "{} of {}: observed {:.digits$} of {pois} POIs{by_value}{}{}",

@@ -106,6 +106,9 @@ pub struct RolloutOutcome {
     pub mean: Spread,
     /// Whether files were read that differ from their digests.
     pub unverified: bool,
+    /// Whether POIs have different values, so that the POIs observed are weighted by them.
+    #[serde(skip)]
+    pub by_value: bool,
     /// The processor.
     #[serde(flatten)]
     pub processor: ProcessorInfo,
@@ -223,6 +226,7 @@ pub fn run(
         best: Best { team: best, spread: evaluation.team(best) },
         mean: evaluation.mean(),
         unverified: request.unverified,
+        by_value: config.values_differ(),
         processor: ProcessorInfo::of(machine, &backend.describe()),
     })
 }

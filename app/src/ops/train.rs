@@ -93,6 +93,9 @@ pub struct TrainOutcome {
     /// Number of teams per generation.
     #[serde(skip)]
     pub teams: usize,
+    /// Whether POIs have different values, so that the POIs observed are weighted by them.
+    #[serde(skip)]
+    pub by_value: bool,
     /// The processor in words, or `None` if the run was finished before.
     #[serde(skip)]
     pub trained_on: Option<String>,
@@ -235,6 +238,7 @@ pub fn run(
         processor: ProcessorInfo::of_run(session.run(0)),
         rows: results.rows.clone(),
         teams: config.max_teams() - 1,
+        by_value: config.values_differ(),
         trained_on: (!was_done).then_some(on),
         folder,
     })

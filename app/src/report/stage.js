@@ -41,8 +41,9 @@ const stage = (() => {
     return now.map((value, index) => value + (next[index] - value) * part);
   }
 
-  // Returns the part of the map that holds all POIs and agents of all episodes. The shorter side is at least half the
-  // longer.
+  // Returns the part of the map that holds all POIs and agents of all episodes. An agent widens it by at most a sixth
+  // of what POIs and starts take, so that one that strays does not make everything small. The shorter side is at least
+  // half the longer.
   function busy(data) {
     const [width, height] = data.map;
     let [left, below, right, above] = [Infinity, Infinity, -Infinity, -Infinity];
@@ -50,10 +51,17 @@ const stage = (() => {
       left = Math.min(left, x - margin); right = Math.max(right, x + margin);
       below = Math.min(below, y - margin); above = Math.max(above, y + margin);
     };
+    const most = (value, low, high) => Math.min(high, Math.max(low, value));
     data.pois.forEach(([x, y], poi) => include(x, y, radius(data, poi) + 1));
     for (const episode of data.episodes)
-      for (let frame = 0; frame < episode.shown.length; frame++)
-        for (let agent = 0; agent < episode.agents; agent++) { const [x, y] = moment(data, episode, frame, agent); include(x, y, 2); }
+      for (let agent = 0; agent < episode.agents; agent++) { const [x, y] = moment(data, episode, 0, agent); include(x, y, 2); }
+    const beyond = Math.max(right - left, above - below) / 6, [west, south, east, north] = [left - beyond, below - beyond, right + beyond, above + beyond];
+    for (const episode of data.episodes)
+      for (let frame = 1; frame < episode.shown.length; frame++)
+        for (let agent = 0; agent < episode.agents; agent++) {
+          const [x, y] = moment(data, episode, frame, agent);
+          include(most(x, west + 2, east - 2), most(y, south + 2, north - 2), 2);
+        }
     const grow = (low, high, least, end) => {
       const more = Math.max(0, (least - (high - low)) / 2);
       low -= more; high += more;
@@ -104,7 +112,7 @@ const stage = (() => {
       first += count;
       const points = outline(data, index).map(([ahead, aside]) => `${7 * aside},${-7 * ahead}`).join(" ");
       item.innerHTML = `<svg viewBox="-9 -9 18 18" width="16" height="16"><polygon points="${points}" fill="${filled ? "currentColor" : "none"}" stroke="currentColor" stroke-width="1.5"/></svg> `;
-      item.append(`${count} ${name}`);
+      item.append(`${count} × ${name}`);
       return item;
     });
   }
@@ -167,6 +175,8 @@ const stage = (() => {
     const style = getComputedStyle(document.documentElement), tones = {};
     const color = name => tones[name] ??= style.getPropertyValue(name).trim();
     const colors = palette(data);
+    // Marks are smaller on a small canvas, where they would hide each other. The smallest ones have no room for labels.
+    const fit = Math.max(0.55, Math.min(1, wide / 240)), labelled = wide >= 150;
     const led = Array.from({ length: episode.agents }, (_, agent) => leaders_of(episode, Math.floor(place), agent));
     const dashes = agent => DASHES[Math.floor((led[agent][0] || 0) / colors.length) % DASHES.length];
     const group = agent => led[agent].length === 0 ? color("--faint") : colors[led[agent][0] % colors.length];
@@ -198,7 +208,7 @@ const stage = (() => {
 
     // POIs: a ring fills as agents arrive, and the disc changes colour once the POI is observed.
     const pois = data.pois.length, near = episode.near.slice(frame * pois, (frame + 1) * pois);
-    const ring = Math.max(7, Math.min(12, 1.3 * scale));
+    const ring = Math.max(7 * fit, Math.min(12, 1.3 * scale));
     const counts = data.pois.map(([x, y], poi) => {
       const done = episode.observed[poi] !== null && episode.observed[poi] <= step, needed = episode.coupling[poi];
       const closed = !done && !is_open(data, episode, poi, Math.max(1, step));
@@ -210,12 +220,12 @@ const stage = (() => {
       draw.globalAlpha = 1;
       if (look.radii) {
         draw.strokeStyle = tone;
-        draw.lineWidth = 1.2;
+        draw.lineWidth = 1.2 * fit;
         draw.setLineDash(done ? [] : closed ? [1.5, 6] : [5, 4]);
         draw.stroke();
         draw.setLineDash([]);
       }
-      draw.lineWidth = 4;
+      draw.lineWidth = 4 * fit;
       draw.strokeStyle = color("--line");
       draw.beginPath(); draw.arc(X(x), Y(y), ring, 0, 2 * Math.PI); draw.stroke();
       draw.strokeStyle = tone;
@@ -224,7 +234,7 @@ const stage = (() => {
         draw.beginPath(); draw.arc(X(x), Y(y), ring, -Math.PI / 2, full - Math.PI / 2); draw.stroke();
       }
       // Marks below the ring show which classes count, if not all do.
-      const observers = observers_of(data, poi) || [], small = Math.max(3, 0.45 * ring);
+      const observers = observers_of(data, poi) || [], small = Math.max(3 * fit, 0.45 * ring);
       observers.forEach((own, index) => {
         const middle = X(x) + 3 * small * (index - (observers.length - 1) / 2), base = Y(y) + ring + 2.4 * small;
         draw.beginPath();
@@ -241,7 +251,7 @@ const stage = (() => {
 
     const many = episode.agents > 100;
     if (look.trails) {
-      draw.lineWidth = 1.4;
+      draw.lineWidth = 1.4 * fit;
       draw.globalAlpha = many ? 0.3 : 0.6;
       const from = many ? Math.max(0, frame - 40) : 0;
       for (let agent = 0; agent < episode.agents; agent++) {
@@ -291,23 +301,27 @@ const stage = (() => {
       draw.globalAlpha = 1;
     }
     // Leaders are drawn last, on top of followers.
-    const size = Math.max(many ? 2.5 : 5, Math.min(9, 0.8 * scale));
+    const size = Math.max(many ? 2.5 : 5 * fit, Math.min(9, 0.8 * scale));
     for (let agent = episode.agents - 1; agent >= 0; agent--) {
       const [x, y, ahead, aside] = now[agent], leads = agent < episode.leaders, own = classes[agent];
       const free = own !== undefined && data.classes[own].free, long = Math.hypot(ahead, aside) || 1;
       const [cos, sin] = free ? [0, 1] : [ahead / long, aside / long];
-      const point = (a, b) => [X(x) + (leads ? 1.35 : 1) * size * (a * cos - b * sin), Y(y) - (leads ? 1.35 : 1) * size * (a * sin + b * cos)];
+      // An agent outside the part on show is drawn pale at its edge.
+      const strays = X(x) < 0 || X(x) > wide || Y(y) < 0 || Y(y) > tall;
+      const inside = (place, end) => strays ? Math.max(1.5 * size, Math.min(end - 1.5 * size, place)) : place;
+      const left = inside(X(x), wide), high = inside(Y(y), tall);
+      const point = (a, b) => [left + (leads ? 1.35 : 1) * size * (a * cos - b * sin), high - (leads ? 1.35 : 1) * size * (a * sin + b * cos)];
       draw.beginPath();
       for (const [a, b] of outline(data, own)) draw.lineTo(...point(a, b));
       draw.closePath();
       draw.fillStyle = leads ? group(agent) : color("--card");
       draw.strokeStyle = leads ? color("--ink") : group(agent);
-      draw.lineWidth = leads ? 1.2 : 1.6;
-      draw.globalAlpha = gone(agent) ? 0.18 : 1;
+      draw.lineWidth = (leads ? 1.2 : 1.6) * fit;
+      draw.globalAlpha = gone(agent) ? 0.18 : strays ? 0.5 : 1;
       draw.fill();
       draw.stroke();
       draw.globalAlpha = 1;
-      if (gone(agent)) continue;
+      if (gone(agent) || strays) continue;
       if (!counts_at_pois(data, episode, agent)) {
         for (const [tone, wide] of [[color("--sea"), 4], [color("--ink"), 1.6]]) {
           draw.strokeStyle = tone;
@@ -318,14 +332,15 @@ const stage = (() => {
     }
     // Labels come last: all counts if they fit, and that of the POI under the pointer; then the leaders' numbers.
     draw.font = "600 12px system-ui, sans-serif";
-    const told = counts.map(([text], poi) => when(data, poi) ? `${poi}: ${text}${when(data, poi)}` : text);
+    // On a small canvas, values and windows would hide agents. The POI under the pointer has them.
+    const told = counts.map(([text], poi) => wide >= 480 && when(data, poi) ? `${poi}: ${text}${when(data, poi)}` : text);
     const areas = counts.map((count, poi) => {
       const [, x, y] = count, half = draw.measureText(told[poi]).width / 2;
       count[1] = Math.max(half, Math.min(wide - half, x));
       return [count[1] - half - 2, y - 11, count[1] + half + 2, y + 3];
     });
     const clear = areas.every((area, index) => areas.slice(0, index).every(other => !overlap(area, other)));
-    if (clear) counts.forEach(([, x, y], poi) => { if (poi !== look.over) label(told[poi], x, y); });
+    if (clear && labelled && (fit === 1 || wide * tall > 5000 * pois)) counts.forEach(([, x, y], poi) => { if (poi !== look.over) label(told[poi], x, y); });
     if (look.over !== null) {
       const [text, x, y] = counts[look.over];
       const words = `POI ${look.over}: ${text}${when(data, look.over)}${who(data, look.over)}`, half = Math.max(40, draw.measureText(words).width / 2 + 4);
@@ -333,7 +348,7 @@ const stage = (() => {
     }
     // A leader's number is placed at the first corner of its arrow where it hides no other label, and omitted if there is none.
     const corners = [[1.5, 1.6], [1.5, -0.9], [-2.5, 1.6], [-2.5, -0.9]];
-    for (let agent = 0; agent < episode.leaders; agent++) {
+    for (let agent = 0; agent < episode.leaders && labelled; agent++) {
       const [x, y] = now[agent], text = String(agent), wide = draw.measureText(text).width;
       const hides = ([across, down]) => {
         const left = X(x) + size * across, base = Y(y) + size * down;

@@ -97,7 +97,7 @@ pub fn layout(name: &str, config: &StageConfig) -> Scene {
     let agents = match &config.agents[..] {
         [] => [counted(leaders, "leader"), counted(world.followers(), "follower")].join(", "),
         classes => {
-            classes.iter().map(|class| format!("{} {}", class.size(), class.name)).collect::<Vec<_>>().join(", ")
+            classes.iter().map(|class| format!("{} × {}", class.size(), class.name)).collect::<Vec<_>>().join(", ")
         }
     };
     let described = format!("{agents}, {}", counted(team.pois.len(), "POI"));
