@@ -238,13 +238,8 @@ class Run:
         where += ", unverified" if self.unverified else ""
         where += ", by a fitness that is not the config's" if self.own_fitness else ""
         return (
-<<<<<<< HEAD
-            f"<flotilla.Run: {len(last)} trials, {g.shape[1] - 1} generations, champion's G {last.mean():.3f} "
-            f"({last.min():.3f} to {last.max():.3f}){where}, digest {self.digest[:12]}…>"
-=======
-            f"<flotilla.Run: {count(len(best), 'trial')}, {count(last, 'generation')}, best G {best.mean():.3f} "
-            f"({best.min():.3f} to {best.max():.3f}){where}, digest {self.digest[:12]}…>"
->>>>>>> a57
+            f"<flotilla.Run: {count(len(last), 'trial')}, {count(g.shape[1] - 1, 'generation')}, champion's G "
+            f"{last.mean():.3f} ({last.min():.3f} to {last.max():.3f}){where}, digest {self.digest[:12]}…>"
         )
 
 
