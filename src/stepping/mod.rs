@@ -410,7 +410,7 @@ impl Stepper {
             let on_map = (0.0..=map.x).contains(&x) && (0.0..=map.y).contains(&y);
             let settled = || if ignored { Vec2::ZERO } else { settled(at, map) };
             if let (Some(headings), Some(agent)) = (&mut given.headings, place.checked_sub(agents + pois)) {
-                if !ignored && !((at.length_squared() - 1.0).abs() < 1e-3) {
+                if !ignored && !(-1e-3..1e-3).contains(&(at.length_squared() - 1.0)) {
                     return Err(StepError::Heading { team, agent, heading: [x, y] });
                 }
                 headings.push(at);

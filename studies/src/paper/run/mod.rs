@@ -90,7 +90,8 @@ pub struct ExperimentOutcome {
 
 impl ExperimentOutcome {
     fn of(experiment: &Experiment, folder: &Path, digest: Option<String>) -> ExperimentOutcome {
-        let last = |trials: &[Vec<f64>]| trials.iter().filter_map(|trial| trial.last()).sum::<f64>() / trials.len() as f64;
+        let last =
+            |trials: &[Vec<f64>]| trials.iter().filter_map(|trial| trial.last()).sum::<f64>() / trials.len() as f64;
         ExperimentOutcome {
             name: folder_name(experiment),
             folder: folder.escaped().to_string(),
