@@ -543,6 +543,11 @@ fn the_page_on_rovers_and_uavs_agrees_with_its_files() {
         }
     }
     assert_eq!((pairs, uncorrected), (84, 1));
+    let g: Vec<f64> =
+        read("3_rovers_3_uavs_2000.csv".into()).iter().map(|row| row["champion_g"].parse().unwrap()).collect();
+    let [least, most] = [g.iter().copied().fold(1.0, f64::min), g.iter().copied().fold(0.0, f64::max)];
+    assert!(page.contains(&format!("champions of ten trials reach {least:.2} to {most:.2}")), "{g:?}");
+    assert!(read("3_rovers_3_uavs_2000_pairs.csv".into()).iter().all(|row| row["p_holm"] == "1"));
     let page = page + &fs::read_to_string(folder.join("influence-drawn.md")).unwrap();
     let studies = ["3_rovers_3_uavs_random_pairs.csv", "random_again.csv"].map(|name| read(name.into()));
     let near = read("near.csv".into());
