@@ -65,7 +65,8 @@ def test_metrics_and_policies_have_the_documented_shapes(config):
     unpickled = pickle.loads(pickle.dumps(run))
     assert unpickled.digest == run.digest and unpickled.config == run.config
     assert repr(run).startswith("<flotilla.Run: 2 trials, 6 generations, champion's G ")
-    assert repr(train(config, trials=1, generations=1)).startswith("<flotilla.Run: 1 trial, 1 generation, champion's G ")
+    short = train(config.replace(learning={"trials": 1, "generations": 1}))
+    assert repr(short).startswith("<flotilla.Run: 1 trial, 1 generation, champion's G ")
 
 
 def test_the_program_resumes_runs_of_the_package(config, program):
