@@ -1,13 +1,13 @@
 //! `flotilla baseline`: plays teams that do not learn.
 
 use super::console::Console;
-use super::{ConfigFile, Error, Overrides, Printed, RunOptions, SetKeys, between, number, weighted};
+use super::{ConfigFile, Error, Overrides, Printed, RunOptions, SetKeys, between, number};
 use clap::builder::PossibleValuesParser as Words;
 use flotilla::baseline::{SEGMENTS, SPEEDS};
 use flotilla::config::{Actions, Choice, Paradigm};
 use flotilla::evaluate::MAX_EPISODES;
 use flotilla_app::ops::baseline::{self, BaselineOutcome, BaselineRequest};
-use flotilla_app::report::map::counted;
+use flotilla_app::report::map::{counted, weighted};
 use flotilla_app::report::table::markdown;
 
 #[derive(clap::Args)]

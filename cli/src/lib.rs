@@ -309,11 +309,6 @@ fn whole(text: &str) -> Result<usize, String> {
     text.parse().map_err(|_| "allowed a whole number, from 0".into())
 }
 
-/// Returns what follows a number of observed POIs if it is weighted by their values.
-fn weighted(by_value: bool) -> &'static str {
-    if by_value { ", weighted by value" } else { "" }
-}
-
 /// Returns a parser of whole numbers in a range.
 fn between<T>(allowed: RangeInclusive<T>) -> impl Fn(&str) -> Result<T, String> + Clone + Send + Sync
 where

@@ -5,11 +5,12 @@ use std::path::PathBuf;
 use clap::builder::PossibleValuesParser as Words;
 
 use super::console::Console;
-use super::{Error, Printed, RunOptions, SetKeys, between, canonical, real, weighted, whole};
+use super::{Error, Printed, RunOptions, SetKeys, between, canonical, real, whole};
 use flotilla::config::{Choice, Override, Paradigm};
 use flotilla::evaluate::{MAX_EPISODES, Spread};
 use flotilla_app::ops::rollout::{self, RolloutOutcome, RolloutRequest, counted};
 use flotilla_app::record::digests::UNVERIFIED;
+use flotilla_app::report::map::weighted;
 
 const HELD_OUT: &str = "Held-out starts";
 

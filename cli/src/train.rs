@@ -5,12 +5,12 @@ use std::path::PathBuf;
 
 use super::console::Console;
 use super::recovery::{Checkpoints, quoted};
-use super::{ConfigArgs, Error, ExistingResults, Printed, RunOptions, weighted};
+use super::{ConfigArgs, Error, ExistingResults, Printed, RunOptions};
 use flotilla::escape::PathExt;
 use flotilla_app::ops::train::{self, Extremes, TrainOutcome, TrainRequest};
 use flotilla_app::record::folder::{CONFIG, METRICS, POLICIES, RUN};
 use flotilla_app::record::ownership::CURVES;
-use flotilla_app::report::map::counted;
+use flotilla_app::report::map::{counted, weighted};
 use flotilla_app::report::runs::TeamKind;
 
 #[derive(clap::Args)]

@@ -196,6 +196,7 @@ fn a_credit_that_is_always_0_is_noted() {
     assert!(notes("check followers.toml --fitness D").contains(&is_0("D of every leader")));
     for line in [
         "check herd.toml --fitness Df",
+        "check herd.toml --fitness D --set credit.add_g=true",
         "check followers.toml --fitness D --set credit.removes=[[1]]",
         "check short.toml --fitness D",
         "check followers.toml --fitness Dt",

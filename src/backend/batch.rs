@@ -46,12 +46,8 @@ impl<'a> Group<'a> {
 
     /// Returns the headings at the start, `[agents]`.
     pub(crate) fn headings(&self) -> &'a [Vec2] {
-        match &self.starts[self.world.agents()..] {
-            [] => &self.world.headings,
-            others => {
-                Some(&others[self.world.pois.len()..]).filter(|drawn| !drawn.is_empty()).unwrap_or(&self.world.headings)
-            }
-        }
+        let given = self.starts.get(self.world.agents() + self.world.pois.len()..);
+        given.filter(|headings| !headings.is_empty()).unwrap_or(&self.world.headings)
     }
 
     /// Returns the POI positions.

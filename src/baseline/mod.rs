@@ -326,7 +326,7 @@ fn play_segments(rounds: &[Round<'_>], open_loop: &[&[f32]]) -> Result<Vec<Vec<u
         let team = index / (starts.len() * teams) * teams + index % teams;
         segment_action(world, open_loop[team], leader, step)
     };
-    play(rounds, |groups| Cpu::default().drive(groups, &actions))
+    play(rounds, |groups| Cpu::default().play_with(groups, Some(&actions)))
 }
 
 /// Plays all teams from all their starts as one batch. Returns the summed worth of the POIs that each team of each round

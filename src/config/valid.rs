@@ -145,7 +145,7 @@ fn without_credit(config: &Config, classes: &Classes) -> Vec<String> {
             _ => false,
         };
         let counts = (0..classes.pois.len()).any(|group| classes.observes(index, group));
-        (class.learns() && is_alone && !counts).then(|| {
+        (class.learns() && is_alone && !counts && !config.credit.add_g).then(|| {
             format!(
                 "{fitness} of every {} is always 0, because none counts at a POI: selection is random; use G, Df or Dt",
                 class.name

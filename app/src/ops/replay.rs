@@ -323,7 +323,7 @@ fn described(played: &Replayed) -> String {
     let Replayed { team_g, episodes, world, which, .. } = played;
     let pois = world.pois.len();
     // With different values, G times the number of POIs is no count.
-    let by_value = if map::values_differ(world) { ", weighted by value" } else { "" };
+    let by_value = map::weighted(map::values_differ(world));
     let digits = if *episodes > 1 || !by_value.is_empty() { 2 } else { 0 };
     format!(
         "{} of {}: observed {:.digits$} of {pois} POIs{by_value}{}{}",

@@ -15,7 +15,7 @@ use super::scores::ScoreTable;
 use super::{Backend, BackendError, Group, GroupScores, Moment, Trace};
 use crate::config::Fitness;
 use crate::parallel::*;
-use crate::world::World;
+use crate::world::{OUTPUTS, World};
 
 mod agent;
 mod batch;
@@ -120,13 +120,31 @@ pub fn level_name(level: Level) -> &'static str {
     "scalar"
 }
 
-impl Backend for Cpu {
-    fn play(&mut self, groups: &[Group<'_>]) -> Result<Vec<GroupScores>, BackendError> {
+/// The actions of a team's leader at a step, each in -1..1. Teams are counted over all groups.
+pub(crate) type Actions<'a> = dyn Fn(usize, usize, usize) -> [f32; OUTPUTS] + Sync + 'a;
+
+impl Cpu {
+    /// Plays groups as [`Backend::play`] does, with `actions` in place of those of policies if they are given. All groups are
+    /// then of one world.
+    ///
+    /// # Errors
+    /// A group is inconsistent.
+    pub(crate) fn play_with(
+        &mut self,
+        groups: &[Group<'_>],
+        actions: Option<&Actions<'_>>,
+    ) -> Result<Vec<GroupScores>, BackendError> {
         groups.iter().try_for_each(|group| group.check().and(group.weights.on_host().map(drop)))?;
         let Cpu { level, large_from, workspaces } = self;
         let (level, scores) = (*level, ScoreTable::new(groups));
-        dispatch!(level, simd => play(simd, groups, *large_from, workspaces, &scores));
+        dispatch!(level, simd => play(simd, groups, *large_from, workspaces, actions, &scores));
         Ok(scores.finish())
+    }
+}
+
+impl Backend for Cpu {
+    fn play(&mut self, groups: &[Group<'_>]) -> Result<Vec<GroupScores>, BackendError> {
+        self.play_with(groups, None)
     }
 
     fn trace(&mut self, group: &Group<'_>) -> Result<Trace, BackendError> {
@@ -154,6 +172,7 @@ fn play<S: Simd>(
     groups: &[Group<'_>],
     large_from: usize,
     workspaces: &mut Option<Box<dyn Any + Send>>,
+    actions: Option<&Actions<'_>>,
     scores: &ScoreTable<'_>,
 ) {
     let batches = world_batches(groups);
@@ -176,7 +195,7 @@ fn play<S: Simd>(
                 let swarm = workspace.swarm(simd, batch);
                 simd.vectorize(
                     #[inline(always)]
-                    || swarm.play(batch, first, &mut ()),
+                    || swarm.play(batch, first, &mut Directed { team: first, actions }),
                 );
                 swarm.score(batch, first, scores);
             } else {
@@ -191,7 +210,9 @@ fn play<S: Simd>(
                 simd.vectorize(
                     #[inline(always)]
                     || {
-                        episodes.play(batch, first, teams, &mut Prefetch { batch, teams: ahead.clone() });
+                        let playing = first..first + teams;
+                        let mut observer = Playing { batch, playing, ahead: ahead.clone(), actions };
+                        episodes.play(batch, first, teams, &mut observer);
                         episodes.score(batch, first, teams, scores);
                     },
                 );
@@ -223,17 +244,43 @@ impl<S: Simd> Workspace<S> {
     }
 }
 
-/// Prefetches the policies of the teams that play next, during the steps of those before.
-struct Prefetch<'a> {
+/// Prefetches the policies of the teams that play next, during the steps of those before, and replaces the actions of these
+/// if others are given.
+struct Playing<'a> {
     batch: &'a WorldBatch<'a>,
+    playing: Range<usize>,
     /// Empty if there are none.
-    teams: Range<usize>,
+    ahead: Range<usize>,
+    actions: Option<&'a Actions<'a>>,
 }
 
-impl<S: Simd> Observer<S> for Prefetch<'_> {
+impl<S: Simd> Observer<S> for Playing<'_> {
     #[inline(always)]
-    fn decided(&mut self, _: &mut Block<S>, step: usize) {
-        self.batch.prefetch(self.teams.clone(), step);
+    fn decided(&mut self, block: &mut Block<S>, step: usize) {
+        self.batch.prefetch(self.ahead.clone(), step);
+        let Some(actions) = self.actions else { return };
+        for (leader, outputs) in block.outputs.iter_mut().enumerate() {
+            for (lane, team) in self.playing.clone().enumerate() {
+                outputs.iter_mut().zip(actions(team, leader, step)).for_each(|(to, action)| to[lane] = action);
+            }
+        }
+    }
+}
+
+/// Replaces the actions of a large team if others are given.
+struct Directed<'a> {
+    team: usize,
+    actions: Option<&'a Actions<'a>>,
+}
+
+impl<S: Simd> Watch<S> for Directed<'_> {
+    fn decided(&mut self, swarm: &mut Swarm<S>, step: usize) {
+        let Some(actions) = self.actions else { return };
+        for leader in 0..swarm.leaders() {
+            let outputs = swarm.outputs[leader / S::f32s::LEN].iter_mut();
+            let given = actions(self.team, leader, step);
+            outputs.zip(given).for_each(|(to, action)| to[leader % S::f32s::LEN] = action);
+        }
     }
 }
 
@@ -386,4 +433,59 @@ pub(crate) fn block_bytes(world: &World, fitness: Fitness) -> u64 {
     }
     let words = 8 * agents + policies + 3 * followers + record;
     words as u64 * lanes() * 4 + (8 * world.parameters() + agents * agents.div_ceil(64) * 8 + 4 * scratch) as u64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::backend::grid;
+    use crate::config::own_populations;
+    use crate::evaluate::SCORES_AND_DT;
+    use crate::sample;
+    use crate::stepping::{Recording, Stepper};
+
+    #[test]
+    fn given_actions_score_as_in_steps_also_in_large_teams() {
+        let worlds = (0..300).map(|seed| (seed, World::new(&sample::any_world(seed).validate().unwrap())));
+        let worlds: Vec<_> = worlds.filter(|(_, world)| grid::is_large(world, 0)).take(100).collect();
+        assert_eq!(worlds.len(), 100);
+        let mut observed = 0;
+        for (seed, world) in worlds {
+            const TEAMS: usize = 3;
+            let action = |team: usize, leader: usize, step: usize| {
+                let angle = (team * 7 + leader * 3) as f32 + step as f32 * 0.1;
+                [libm::sinf(angle) * 0.3, libm::cosf(angle * 0.7)]
+            };
+            let (weights, teams) = (sample::weights(&world, 1, seed), vec![0; TEAMS * world.leaders()]);
+            let group = Group {
+                world: &world,
+                starts: &world.starts,
+                weights: weights[..].into(),
+                policies: 1,
+                populations: own_populations(world.leaders()),
+                teams: &teams,
+                fitnesses: SCORES_AND_DT,
+            };
+            let mut stepper = Stepper::new(world.clone(), TEAMS, Recording::SetsAndSights).unwrap();
+            for step in 0..world.steps() {
+                let leaders = (0..TEAMS).flat_map(|team| (0..world.leaders()).map(move |leader| (team, leader)));
+                let actions: Vec<f32> = leaders.flat_map(|(team, leader)| action(team, leader, step)).collect();
+                stepper.step(&actions).unwrap();
+            }
+            for large_from in [grid::LARGE_FROM, 0] {
+                let mut cpu = Cpu::default().with_large_from(large_from);
+                let [scores] = &cpu.play_with(std::slice::from_ref(&group), Some(&action)).unwrap()[..] else {
+                    unreachable!()
+                };
+                for (row, &fitness) in SCORES_AND_DT.iter().enumerate() {
+                    let mut stepped = vec![0.0; teams.len()];
+                    stepper.fitness(fitness, &mut stepped).unwrap();
+                    let rows = scores.scores.chunks_exact(world.leaders()).skip(row).step_by(SCORES_AND_DT.len());
+                    assert!(rows.flatten().eq(&stepped), "world {seed}, {fitness:?}, large from {large_from}");
+                }
+                observed += scores.observed.iter().filter(|&&observed| observed > 0).count();
+            }
+        }
+        assert!(observed > 50, "{observed} teams observed something");
+    }
 }

@@ -1,7 +1,5 @@
 //! Episodes whose steps are written to the caller's arrays, on all threads, with noise on the actions if wanted.
 
-use std::ops::Range;
-
 use fearless_simd::{Simd, dispatch, prelude::*};
 
 use super::agent::Agent;
@@ -58,17 +56,6 @@ pub struct Noise<'a> {
     /// The number of the first team. A team's number selects its noise.
     pub first: u32,
 }
-
-/// What happens to the outputs of policies before agents move.
-#[derive(Clone, Copy)]
-enum Change<'a> {
-    None,
-    Noise(Noise<'a>),
-    Replace(&'a Actions<'a>),
-}
-
-/// The actions of a team's leader at a step, each in -1..1.
-pub(crate) type Actions<'a> = dyn Fn(usize, usize, usize) -> [f32; OUTPUTS] + Sync + 'a;
 
 impl<'a> StepArrays<'a> {
     /// Returns the index of the first array that is neither empty nor as long as needed.
@@ -174,24 +161,6 @@ impl Cpu {
         noise: Option<Noise<'_>>,
         arrays: StepArrays<'_>,
     ) -> Result<Vec<GroupScores>, BackendError> {
-        self.steer(groups, noise.map_or(Change::None, Change::Noise), arrays)
-    }
-
-    /// Plays every team of some groups of one world with given actions instead of its policies', and scores them. The teams
-    /// of all groups follow each other.
-    ///
-    /// # Errors
-    /// A group is inconsistent.
-    pub(crate) fn drive(&self, groups: &[Group<'_>], actions: &Actions<'_>) -> Result<Vec<GroupScores>, BackendError> {
-        self.steer(groups, Change::Replace(actions), StepArrays::default())
-    }
-
-    fn steer(
-        &self,
-        groups: &[Group<'_>],
-        change: Change<'_>,
-        arrays: StepArrays<'_>,
-    ) -> Result<Vec<GroupScores>, BackendError> {
         groups.iter().try_for_each(|group| group.check().and(group.weights.on_host().map(drop)))?;
         let batches = world_batches(groups);
         let [batch] = &batches[..] else {
@@ -202,14 +171,12 @@ impl Cpu {
         {
             return Err(BackendError::InvalidInput(format!("array {index} of the steps has the wrong length")));
         }
-        if let Change::Noise(noise) = change
-            && noise.deviations.len() != batch.world.leaders()
-        {
+        if noise.is_some_and(|noise| noise.deviations.len() != batch.world.leaders()) {
             return Err(BackendError::InvalidInput("noise is of every leader".into()));
         }
         let (level, scores) = (self.level, ScoreTable::new(groups));
         let is_large = is_large(batch.world, self.large_from);
-        dispatch!(level, simd => record(simd, batch, is_large, change, arrays, &scores));
+        dispatch!(level, simd => record(simd, batch, is_large, noise, arrays, &scores));
         Ok(scores.finish())
     }
 }
@@ -219,7 +186,7 @@ fn record<S: Simd>(
     simd: S,
     batch: &WorldBatch<'_>,
     is_large: bool,
-    change: Change<'_>,
+    noise: Option<Noise<'_>>,
     mut arrays: StepArrays<'_>,
     scores: &ScoreTable<'_>,
 ) {
@@ -240,7 +207,7 @@ fn record<S: Simd>(
                 let swarm = workspace.swarm(simd, batch);
                 simd.vectorize(
                     #[inline(always)]
-                    || swarm.play(batch, first, &mut LargeRecorder { world, change, team: first, arrays }),
+                    || swarm.play(batch, first, &mut LargeRecorder { world, noise, team: first, arrays }),
                 );
                 swarm.score(batch, first, scores);
                 write_observed(world, observed_at, |_| swarm.episode());
@@ -249,12 +216,7 @@ fn record<S: Simd>(
                 simd.vectorize(
                     #[inline(always)]
                     || {
-                        block.play(
-                            batch,
-                            first,
-                            teams,
-                            &mut Recorder { world, change, teams: first..first + teams, arrays },
-                        );
+                        block.play(batch, first, teams, &mut Recorder { world, noise, first, arrays });
                         block.score(batch, first, teams, scores);
                     },
                 );
@@ -272,10 +234,10 @@ fn write_observed<'a>(world: &World, observed_at: &mut [u32], episode: impl Fn(u
     }
 }
 
-/// Writes the steps of a large team, and changes its actions.
+/// Writes the steps of a large team, and adds noise to its actions.
 struct LargeRecorder<'a, 'b> {
     world: &'a World,
-    change: Change<'a>,
+    noise: Option<Noise<'a>>,
     team: usize,
     arrays: &'a mut StepArrays<'b>,
 }
@@ -305,29 +267,18 @@ impl<S: Simd> Watch<S> for LargeRecorder<'_, '_> {
         let StepArrays { inputs, outputs, actions, .. } = &mut *self.arrays;
         swarm.write_inputs(row(inputs, step, steps));
         swarm.write_outputs(row(outputs, step, steps));
-        let (simd, lane) = (swarm.simd, |leader: usize| (leader / S::f32s::LEN, leader % S::f32s::LEN));
-        match self.change {
-            Change::None => {}
-            Change::Noise(Noise { key, deviations, first }) => {
-                let team = S::u32s::splat(simd, first.wrapping_add(self.team as u32));
-                for (leader, deviations) in deviations.iter().enumerate() {
-                    let drawn = evolve::noise::<S>(key, step, leader, team);
-                    let (vector, lane) = lane(leader);
-                    for ((output, &deviation), drawn) in swarm.outputs[vector].iter_mut().zip(deviations).zip(drawn) {
-                        output[lane] += drawn[0] * deviation;
-                    }
-                }
-            }
-            Change::Replace(actions) => {
-                for leader in 0..self.world.leaders() {
-                    let (vector, lane) = lane(leader);
-                    let to = swarm.outputs[vector].iter_mut();
-                    to.zip(actions(self.team, leader, step)).for_each(|(to, action)| to[lane] = action);
+        if let Some(Noise { key, deviations, first }) = self.noise {
+            let team = S::u32s::splat(swarm.simd, first.wrapping_add(self.team as u32));
+            for (leader, deviations) in deviations.iter().enumerate() {
+                let drawn = evolve::noise::<S>(key, step, leader, team);
+                let outputs = &mut swarm.outputs[leader / S::f32s::LEN];
+                for ((output, &deviation), drawn) in outputs.iter_mut().zip(deviations).zip(drawn) {
+                    output[leader % S::f32s::LEN] += drawn[0] * deviation;
                 }
             }
         }
         swarm.write_outputs(row(actions, step, steps));
-        if let Change::Noise(_) = self.change {
+        if self.noise.is_some() {
             for output in swarm.outputs.as_flattened_mut() {
                 *output = clamp_to::<S>(*output, splat(swarm.simd, -1.0), splat(swarm.simd, 1.0));
             }
@@ -347,11 +298,11 @@ impl<S: Simd> Watch<S> for LargeRecorder<'_, '_> {
 /// Vectors of teams per task.
 const VECTORS_PER_TASK: usize = 8;
 
-/// Writes the steps of one vector of teams, and changes their actions.
+/// Writes the steps of one vector of teams, whose first is team `first`, and adds noise to their actions.
 struct Recorder<'a, 'b> {
     world: &'a World,
-    change: Change<'a>,
-    teams: Range<usize>,
+    noise: Option<Noise<'a>>,
+    first: usize,
     arrays: &'a mut StepArrays<'b>,
 }
 
@@ -366,29 +317,17 @@ impl<S: Simd> Observer<S> for Recorder<'_, '_> {
         let (simd, arrays, row) = (block.simd, &mut *self.arrays, (step, self.world.steps()));
         arrays.write_inputs(block, row);
         write_columns(simd, block.outputs.as_flattened(), row, arrays.outputs);
-        match self.change {
-            Change::None => {}
-            Change::Noise(Noise { key, deviations, first }) => {
-                let number = |lane| first.wrapping_add((self.teams.start + lane) as u32);
-                let teams = S::u32s::from_fn(simd, number);
-                for (leader, (outputs, deviations)) in block.outputs.iter_mut().zip(deviations).enumerate() {
-                    let drawn = evolve::noise::<S>(key, step, leader, teams);
-                    for ((output, &deviation), drawn) in outputs.iter_mut().zip(deviations).zip(drawn) {
-                        *output += drawn * splat(simd, deviation);
-                    }
-                }
-            }
-            Change::Replace(actions) => {
-                for (leader, outputs) in block.outputs.iter_mut().enumerate() {
-                    for (lane, team) in self.teams.clone().enumerate() {
-                        let to = outputs.iter_mut();
-                        to.zip(actions(team, leader, step)).for_each(|(to, action)| to[lane] = action);
-                    }
+        if let Some(Noise { key, deviations, first: number }) = self.noise {
+            let teams = S::u32s::from_fn(simd, |lane| number.wrapping_add((self.first + lane) as u32));
+            for (leader, (outputs, deviations)) in block.outputs.iter_mut().zip(deviations).enumerate() {
+                let drawn = evolve::noise::<S>(key, step, leader, teams);
+                for ((output, &deviation), drawn) in outputs.iter_mut().zip(deviations).zip(drawn) {
+                    *output += drawn * splat(simd, deviation);
                 }
             }
         }
         write_columns(simd, block.outputs.as_flattened(), row, arrays.actions);
-        if let Change::Noise(_) = self.change {
+        if self.noise.is_some() {
             for output in block.outputs.as_flattened_mut() {
                 *output = clamp_to::<S>(*output, splat(simd, -1.0), splat(simd, 1.0));
             }
@@ -400,58 +339,5 @@ impl<S: Simd> Observer<S> for Recorder<'_, '_> {
         let (simd, steps) = (block.simd, self.world.steps());
         self.arrays.write_states(simd, &block.agents, (step + 1, steps + 1));
         self.arrays.write_sets(simd, sets, (step, steps));
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::backend::grid;
-    use crate::config::own_populations;
-    use crate::evaluate::SCORES_AND_DT;
-    use crate::sample;
-    use crate::stepping::{Recording, Stepper};
-
-    #[test]
-    fn given_actions_score_as_in_steps_also_in_large_teams() {
-        let worlds = (0..300).map(|seed| (seed, World::new(&sample::any_world(seed).validate().unwrap())));
-        let worlds: Vec<_> = worlds.filter(|(_, world)| grid::is_large(world, 0)).take(100).collect();
-        assert_eq!(worlds.len(), 100);
-        let mut observed = 0;
-        for (seed, world) in worlds {
-            const TEAMS: usize = 3;
-            let action = |team: usize, leader: usize, step: usize| {
-                let angle = (team * 7 + leader * 3) as f32 + step as f32 * 0.1;
-                [libm::sinf(angle) * 0.3, libm::cosf(angle * 0.7)]
-            };
-            let (weights, teams) = (sample::weights(&world, 1, seed), vec![0; TEAMS * world.leaders()]);
-            let group = Group {
-                world: &world,
-                starts: &world.starts,
-                weights: weights[..].into(),
-                policies: 1,
-                populations: own_populations(world.leaders()),
-                teams: &teams,
-                fitnesses: SCORES_AND_DT,
-            };
-            let mut stepper = Stepper::new(world.clone(), TEAMS, Recording::SetsAndSights).unwrap();
-            for step in 0..world.steps() {
-                let leaders = (0..TEAMS).flat_map(|team| (0..world.leaders()).map(move |leader| (team, leader)));
-                let actions: Vec<f32> = leaders.flat_map(|(team, leader)| action(team, leader, step)).collect();
-                stepper.step(&actions).unwrap();
-            }
-            for large_from in [grid::LARGE_FROM, 0] {
-                let cpu = Cpu::default().with_large_from(large_from);
-                let [scores] = &cpu.drive(std::slice::from_ref(&group), &action).unwrap()[..] else { unreachable!() };
-                for (row, &fitness) in SCORES_AND_DT.iter().enumerate() {
-                    let mut stepped = vec![0.0; teams.len()];
-                    stepper.fitness(fitness, &mut stepped).unwrap();
-                    let rows = scores.scores.chunks_exact(world.leaders()).skip(row).step_by(SCORES_AND_DT.len());
-                    assert!(rows.flatten().eq(&stepped), "world {seed}, {fitness:?}, large from {large_from}");
-                }
-                observed += scores.observed.iter().filter(|&&observed| observed > 0).count();
-            }
-        }
-        assert!(observed > 50, "{observed} teams observed something");
     }
 }

@@ -85,6 +85,11 @@ pub(crate) fn values_differ(world: &World) -> bool {
     world.values.windows(2).any(|pair| pair[0] != pair[1])
 }
 
+/// Returns what follows a number of observed POIs if it is weighted by their values.
+pub fn weighted(by_value: bool) -> &'static str {
+    if by_value { ", weighted by value" } else { "" }
+}
+
 /// Returns the part of a POI's label that has its value, empty if all have the same value.
 fn value_label(world: &World, poi: usize) -> String {
     if values_differ(world) { format!(", value {}", world.values[poi]) } else { String::new() }

@@ -240,6 +240,10 @@ impl<S: Simd> Swarm<S> {
         self.inputs = inputs;
     }
 
+    pub fn leaders(&self) -> usize {
+        self.world.constants.leaders as usize
+    }
+
     fn diagonal2(&self) -> f32 {
         let map = &self.world.constants.map;
         map.map_x * map.map_x + map.map_y * map.map_y
