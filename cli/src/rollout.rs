@@ -94,7 +94,7 @@ fn in_words(found: &RolloutOutcome) -> String {
         );
     }
     let from = match (found.start_jitter, found.poi_jitter, found.seed) {
-        (Some(0.0), Some(0.0), Some(seed)) => format!(", drawn from regions (seed {seed})"),
+        (Some(0.0), Some(0.0), Some(seed)) => format!(", starts drawn anew (seed {seed})"),
         (Some(jitter), Some(0.0), Some(seed)) => format!(", starts moved by up to {jitter} (seed {seed})"),
         (Some(jitter), Some(poi_jitter), Some(seed)) => {
             format!(", starts moved by up to {jitter}, POIs by up to {poi_jitter} (seed {seed})")

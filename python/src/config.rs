@@ -126,7 +126,7 @@ impl Config {
         self.0.agents.iter().any(|class| matches!(class.control, Control::Choose(_)))
     }
 
-    /// Whether starts or POIs are drawn from regions.
+    /// Whether starts, headings or POIs are drawn, so that there is no start of its own.
     #[getter]
     fn draws_starts(&self) -> bool {
         self.0.draws_starts()
