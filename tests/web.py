@@ -79,10 +79,10 @@ class Tab(Browser):
     def click(self, selector):
         self.evaluate(
             f"(() => {{ const e = document.querySelector('{selector}'); e.scrollIntoView({{ block: 'center' }});"
-            " window.clicked = false; const listen = { once: true, capture: true };"
-            " e.addEventListener('click', () => { window.clicked = true; }, listen); })()"
+            f" window.clicked = false; const note = event => {{ window.clicked ||= !!event.target.closest('{selector}'); }};"
+            " removeEventListener('click', window.noted, true); window.noted = note; addEventListener('click', note, true); })()"
         )
-        # New results may move the element before the click. Try again if it was missed.
+        # New results may move or replace the element before the click. Try again if it was missed.
         for _ in range(3):
             super().click(selector)
             if self.evaluate("window.clicked"):
