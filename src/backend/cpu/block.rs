@@ -153,8 +153,18 @@ impl<S: Simd> Block<S> {
     }
 
     /// Computes the inputs of the leaders' policies, channel by channel.
-    #[inline(always)]
+    ///
+    /// This, [`Block::step`] and [`Network::decide`](super::network::Network::decide) are most of the compiled code. They
+    /// are functions of their own, so that whole episodes, traces, records and single steps share them.
     pub fn sense(&mut self, pois: &[impl PoiPosition<S>]) {
+        self.simd.vectorize(
+            #[inline(always)]
+            || self.sense_channels(pois),
+        );
+    }
+
+    #[inline(always)]
+    fn sense_channels(&mut self, pois: &[impl PoiPosition<S>]) {
         let Block { simd, world, agents, near, bounds, reach2, plans, values, inputs, .. } = self;
         neighbours::find_near(reach2, agents, near, bounds);
         let width = world.constants.policy.inputs();
@@ -176,16 +186,24 @@ impl<S: Simd> Block<S> {
 
     /// Plays a step by the leaders' outputs. Writes which leaders each follower sees before it moves, unless `sights` is
     /// empty, and the agents at each POI after it, see [`Block::record_sightings`] and [`Block::record_poi_sets`].
-    #[inline(always)]
     pub fn step(&mut self, pois: &[impl PoiPosition<S>], sights: &mut [u32], sets: &mut [u32]) {
-        if !sights.is_empty() {
-            self.record_sightings(sights);
-        }
-        self.keep();
-        self.lead();
-        self.follow();
-        self.move_agents();
+        self.advance(sights);
         self.record_poi_sets(pois, sets);
+    }
+
+    fn advance(&mut self, sights: &mut [u32]) {
+        self.simd.vectorize(
+            #[inline(always)]
+            || {
+                if !sights.is_empty() {
+                    self.record_sightings(sights);
+                }
+                self.keep();
+                self.lead();
+                self.follow();
+                self.move_agents();
+            },
+        );
     }
 
     /// Keeps the agents of classes that move only near others, and finds out whether they move.

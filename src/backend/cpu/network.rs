@@ -87,8 +87,15 @@ impl<S: Simd> Network<S> {
     }
 
     /// Computes the leaders' outputs.
-    #[inline(always)]
     pub(super) fn decide(&mut self, inputs: &[S::f32s], outputs: &mut [[S::f32s; OUTPUTS]]) {
+        self.simd.vectorize(
+            #[inline(always)]
+            || self.answer(inputs, outputs),
+        );
+    }
+
+    #[inline(always)]
+    fn answer(&mut self, inputs: &[S::f32s], outputs: &mut [[S::f32s; OUTPUTS]]) {
         let Network { weights, hidden, choices, constants, .. } = self;
         let (leaders, &mut PolicyConstants { layers, widths, parameters, .. }) = (choices.len(), &mut *constants);
         let mut first = 0;

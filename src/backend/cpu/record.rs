@@ -35,17 +35,21 @@ impl<S: Simd> Block<S> {
     }
 
     /// Writes the agents at each POI, one bit per agent, `[pois][words][lanes]`.
-    #[inline(always)]
     pub fn record_poi_sets(&mut self, pois: &[impl PoiPosition<S>], mut sets: &mut [u32]) {
         let ((fours, rest), (radii2, last)) = (pois.as_chunks::<4>(), self.radii2.as_chunks::<4>());
         let words = self.world.constants.words as usize;
-        for (pois, radii2) in fours.iter().zip(radii2) {
-            sets = observe(self.simd, words, &self.agents, pois, radii2, sets);
-        }
-        for (poi, radius2) in rest.iter().zip(last) {
-            let (pois, radii2) = (std::array::from_ref(poi), std::array::from_ref(radius2));
-            sets = observe(self.simd, words, &self.agents, pois, radii2, sets);
-        }
+        self.simd.vectorize(
+            #[inline(always)]
+            || {
+                for (pois, radii2) in fours.iter().zip(radii2) {
+                    sets = observe(self.simd, words, &self.agents, pois, radii2, std::mem::take(&mut sets));
+                }
+                for (poi, radius2) in rest.iter().zip(last) {
+                    let (pois, radii2) = (std::array::from_ref(poi), std::array::from_ref(radius2));
+                    sets = observe(self.simd, words, &self.agents, pois, radii2, std::mem::take(&mut sets));
+                }
+            },
+        );
     }
 }
 

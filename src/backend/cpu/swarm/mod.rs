@@ -176,19 +176,29 @@ impl<S: Simd> Swarm<S> {
             self.sense();
             self.network.decide(&self.inputs, &mut self.outputs);
             watch.decided(self, step);
-            self.record_sightings(step);
-            for class in 0..self.cells.len() {
-                self.advance(class);
-            }
-            for (cells, class) in self.cells.iter_mut().zip(&self.constants) {
-                if class.constants.shape.control() != ControlKind::Still {
-                    cells.sort();
-                }
-            }
-            self.record_poi_sets(step);
-            self.record_positions(step + 1);
+            self.step(step);
             watch.moved(self, step);
         }
+    }
+
+    /// Plays a step by the leaders' outputs, and records it.
+    fn step(&mut self, step: usize) {
+        self.simd.vectorize(
+            #[inline(always)]
+            || {
+                self.record_sightings(step);
+                for class in 0..self.cells.len() {
+                    self.advance(class);
+                }
+                for (cells, class) in self.cells.iter_mut().zip(&self.constants) {
+                    if class.constants.shape.control() != ControlKind::Still {
+                        cells.sort();
+                    }
+                }
+                self.record_poi_sets(step);
+                self.record_positions(step + 1);
+            },
+        );
     }
 
     /// Scores the team of the batch that was played.
@@ -210,8 +220,15 @@ impl<S: Simd> Swarm<S> {
     }
 
     /// Computes the inputs of the leaders' policies, channel by channel.
-    #[inline(always)]
     fn sense(&mut self) {
+        self.simd.vectorize(
+            #[inline(always)]
+            || self.sense_channels(),
+        );
+    }
+
+    #[inline(always)]
+    fn sense_channels(&mut self) {
         let mut inputs = std::mem::take(&mut self.inputs);
         let width = self.world.constants.policy.inputs();
         for (index, class) in self.world.classes.iter().enumerate() {
