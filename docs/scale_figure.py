@@ -1,6 +1,6 @@
 """Draws docs/pictures/scale.svg: G of champions at coupling 6, by the number of teams played.
 
-    pip install matplotlib
+    pip install matplotlib scipy
     python3 docs/scale_figure.py                 # from docs/results/scale/coupling6-curves.csv
     python3 docs/scale_figure.py SWEEP...        # writes that file first, from equal-* of docs/results/scale-tables.md
 """
@@ -14,6 +14,8 @@ from pathlib import Path
 HERE = Path(__file__).parent
 CURVES = HERE / "results/scale/coupling6-curves.csv"
 FITNESS = "Df"
+# Trials by number of policies.
+TRIALS = {50: 5, 500: 5, 5000: 5, 50000: 10}
 TITLE = "G of the champion at coupling 6, by the number of teams played"
 DESCRIPTION = (
     "On a logarithmic axis, for 50, 500, 5000 and 50 000 policies that play equally many teams: leader-follower "
@@ -47,6 +49,16 @@ def read(sweeps):
     return rows
 
 
+def interval(mean, error, trials):
+    """Returns the 95 % interval of a mean of G, with 0 and 1 as two more values, as on the page on statistics."""
+    from scipy import stats
+
+    squares = error**2 * trials * (trials - 1) + 0.5 + (mean - 0.5) ** 2 * 2 * trials / (trials + 2)
+    middle = (mean * trials + 1) / (trials + 2)
+    half = stats.t.ppf(0.975, trials + 1) * (squares / (trials + 1) / (trials + 2)) ** 0.5
+    return max(middle - half, 0), min(middle + half, 1)
+
+
 def draw():
     import matplotlib
 
@@ -71,10 +83,12 @@ def draw():
         teams, mean, error = zip(*curve)
         label = f"{population} policies".replace("50000", "50 000")
         axes.plot(teams, mean, styles[population], color=colour, linewidth=1.8, label=label)
-        # All lines end near the same number of teams. Their standard errors stand beside each other there.
-        place = teams[-1] * (1.06 + 0.07 * list(styles).index(population))
-        axes.errorbar(place, mean[-1], error[-1], marker="o", markersize=3, color=colour, linewidth=1)
-    axes.set(xlabel="teams played (at the right: the last means with their standard errors)", ylabel="G of the champion, mean over trials", xscale="log", ylim=(-0.02, 1.02))
+        # All lines end near the same number of teams. Their intervals stand beside each other there.
+        place = teams[-1] * (1.06 + 0.14 * list(styles).index(population) + 0.07 * (paradigm == "all-leaders"))
+        low, high = interval(mean[-1], error[-1], TRIALS[population])
+        ends = [[mean[-1] - low], [high - mean[-1]]]
+        axes.errorbar(place, mean[-1], ends, marker="o", markersize=3, color=colour, linewidth=1)
+    axes.set(xlabel="teams played (at the right: the last means with their 95 % intervals)", ylabel="G of the champion, mean over trials", xscale="log", ylim=(-0.02, 1.02))
     handles, labels = axes.get_legend_handles_labels()
     for paradigm, first, place in (("all-leaders", 0, (0.22, 1.0)), ("leader-follower", 4, (0.0, 1.0))):
         legend = axes.legend(handles[first:first + 4], labels[first:first + 4], title=paradigm, loc="upper left",

@@ -2,8 +2,8 @@
 //!
 //! [`bounded`] gives the interval of a mean of scores, [`difference`] that of the difference of two arms, and [`paired`]
 //! that of pairs. They are used wherever G is shown with an interval. Trials of two arms with the same seed are pairs.
-//! They share their starts and, if sizes agree, their first populations. [`mean`] gives Student's interval, on which
-//! verdicts on claims are based. [`Average`] gives mean, deviation and standard error of any values.
+//! They share their starts and, if sizes agree, their first populations. [`Average`] gives mean, deviation and standard
+//! error of any values.
 //!
 //! [`rank_sum`] tests two samples, and [`signed_rank`] tests pairs. [`holm`] corrects for multiple tests. G takes few
 //! values, so ranks have many ties, and both tests compute exact p-values for ties here.
@@ -100,26 +100,6 @@ impl<'a> FromIterator<&'a f64> for Average {
     }
 }
 
-/// Returns the mean of a sample with its Student's t interval. None for fewer than two values.
-///
-/// A sample of equal values has no measurable spread. The half-width of its interval is then `step` times the upper
-/// bound of [`share`] for 0 of n. `step` is the smallest possible difference between two values.
-pub fn mean(values: &[f64], step: f64) -> Option<Estimate> {
-    mean_at(CONFIDENCE, values, step)
-}
-
-/// Returns the same as [`mean`], with an interval of any confidence level.
-pub fn mean_at(confidence: f64, values: &[f64], step: f64) -> Option<Estimate> {
-    let average: Average = values.iter().collect();
-    let value = average.mean();
-    let room = match average.error() {
-        _ if values.len() < 2 => return None,
-        0.0 => step * share_at(confidence, 0, values.len())?.high,
-        error => error * student((1.0 - confidence) / 2.0, (values.len() - 1) as f64),
-    };
-    Some(Estimate { value, low: value - room, high: value + room })
-}
-
 /// Returns a share with the exact interval of Clopper and Pearson. None if `of` is 0.
 pub fn share(count: usize, of: usize) -> Option<Estimate> {
     share_at(CONFIDENCE, count, of)
@@ -193,12 +173,12 @@ fn normal_above(z: f64) -> f64 {
 /// Student's interval of the sample alone and bootstrap intervals have no width for equal values. If one trial in ten
 /// fails, five trials are equal in most experiments, and such an interval misses the mean in each of these.
 pub fn bounded(average: &Average, range: [f64; 2]) -> Option<Estimate> {
-    bounded_by(bounded_factor(average.count as usize), average, range)
+    bounded_by(bounded_factor(CONFIDENCE, average.count as usize), average, range)
 }
 
-/// Returns the half-width of the interval of [`bounded`] for so many values, in standard errors.
-pub fn bounded_factor(count: usize) -> f64 {
-    student((1.0 - CONFIDENCE) / 2.0, (count + 1) as f64)
+/// Returns the half-width of the intervals of [`bounded`] and [`paired`] for so many values, in standard errors.
+pub fn bounded_factor(confidence: f64, count: usize) -> f64 {
+    student((1.0 - confidence) / 2.0, (count + 1) as f64)
 }
 
 /// Returns the same as [`bounded`], with a factor that is already known.
@@ -226,8 +206,13 @@ pub fn difference(one: &Average, other: &Average, [min, max]: [f64; 2]) -> Optio
 /// The sample gets two more pairs. Half a pair has each combination of the smallest and the largest value, as in Agresti
 /// and Min, *Simple improved confidence intervals for comparing matched proportions*, Statistics in Medicine 24 (2005).
 pub fn paired(differences: &Average, width: f64) -> Option<Estimate> {
+    paired_by(bounded_factor(CONFIDENCE, differences.count as usize), differences, width)
+}
+
+/// Returns the same as [`paired`], with a factor that is already known.
+pub fn paired_by(factor: f64, differences: &Average, width: f64) -> Option<Estimate> {
     let more = Extended::new(differences, 0.0, width * width)?;
-    let half = bounded_factor(differences.count as usize) * more.variance.sqrt();
+    let half = factor * more.variance.sqrt();
     Some(more.around(differences.mean(), more.mean, half).within(-width, width))
 }
 

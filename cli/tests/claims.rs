@@ -23,11 +23,15 @@ fn arms(trials: u32, generations: u32) -> Vec<Experiment> {
     paper::arms(&few.map(|(key, value)| Override::new(key, value, key))).unwrap()
 }
 
-/// Returns the p-value of Student's test that the mean is 0: the smallest alpha whose interval excludes 0.
-fn p_value(values: &[f64]) -> f64 {
+/// Returns the p-value of the test that the mean of differences of up to `width` is 0: the smallest alpha whose interval
+/// excludes 0.
+fn p_value(differences: &[f64], width: f64) -> f64 {
     let excludes = |Estimate { low, high, .. }| low > 0.0 || high < 0.0;
-    statistics::smallest_alpha(|confidence| statistics::mean_at(confidence, values, 0.0).is_some_and(excludes))
-        .unwrap_or(1.0)
+    let interval = |confidence| {
+        let factor = statistics::bounded_factor(confidence, differences.len());
+        statistics::paired_by(factor, &differences.iter().collect(), width)
+    };
+    statistics::smallest_alpha(|confidence| interval(confidence).is_some_and(excludes)).unwrap_or(1.0)
 }
 
 #[test]
@@ -39,16 +43,8 @@ fn intervals_and_tests_equal_those_of_scipy() {
         let theirs = theirs.as_f64().unwrap();
         assert!((ours - theirs).abs() <= 1e-9 * theirs.abs() + 1e-12, "{ours} is not {theirs}");
     };
-    let [means, shares, spreads] = ["means", "shares", "spreads"].map(list);
-    assert!(means.len() > 5 && shares.len() > 20 && spreads.len() > 3);
-    for case in means {
-        let values = numbers(&case["values"]);
-        let mean = statistics::mean(&values, 1.0).unwrap();
-        near(mean.value, &case["mean"]);
-        near(mean.low, &case["low"]);
-        near(mean.high, &case["high"]);
-        near(p_value(&values), &case["p"]);
-    }
+    let [shares, spreads] = ["shares", "spreads"].map(list);
+    assert!(shares.len() > 20 && spreads.len() > 3);
     for case in shares {
         let [count, of] = ["count", "of"].map(|key| case[key].as_u64().unwrap() as usize);
         let share = statistics::share(count, of).unwrap();
@@ -59,8 +55,8 @@ fn intervals_and_tests_equal_those_of_scipy() {
     for case in spreads {
         let [one, other] = ["one", "other"].map(|key| statistics::distances(&numbers(&case[key])));
         let differences: Vec<f64> = one.iter().zip(&other).map(|(one, other)| one - other).collect();
-        near(statistics::mean(&differences, 1.0).unwrap().value, &case["difference"]);
-        near(p_value(&differences), &case["p"]);
+        near(differences.iter().collect::<Average>().mean(), &case["difference"]);
+        near(p_value(&differences, 4.0), &case["p"]);
     }
     let [ranks, signs, intervals, corrected] = ["ranks", "signs", "intervals", "corrected"].map(list);
     assert!(ranks.len() > 8 && signs.len() > 5 && intervals.len() > 3 && corrected.len() > 2);
@@ -202,16 +198,9 @@ fn intervals_of_few_discrete_scores_cover_the_mean() {
             assert!(coverage >= least, "{coverage} of {trials} trials with chances {chances:?}");
         }
     }
-    assert_eq!(statistics::bounded(&[1.0].iter().collect(), [0.0, 1.0]), None);
-}
-
-#[test]
-fn the_mean_of_equal_values_has_an_interval_for_unseen_values() {
-    let unseen = statistics::share(0, 30).unwrap().high;
-    let mean = statistics::mean(&[4.0; 30], 1.0).unwrap();
-    assert_eq!((mean.low, mean.value, mean.high), (4.0 - unseen, 4.0, 4.0 + unseen));
-    assert_eq!(mean.within(0.0, 4.0).high, 4.0);
-    assert_eq!((statistics::mean(&[], 1.0), statistics::mean(&[1.0], 1.0)), (None, None));
+    for few in [&[][..], &[1.0]] {
+        assert_eq!(statistics::bounded(&few.iter().collect(), [0.0, 1.0]), None);
+    }
     assert_eq!((statistics::share(0, 0), statistics::share(2, 1)), (None, None));
 }
 
@@ -444,10 +433,10 @@ fn verdicts_match_the_wording_of_the_claims() {
         };
         verdict(&judged(trials, 100, course), 0, "consistently", G)
     };
-    assert_eq!(consistently(40, 4, 1.0), Verdict::Yes);
-    assert_eq!(consistently(40, 3, 0.9), Verdict::Yes, "3.9 of 4");
+    assert_eq!(consistently(200, 4, 1.0), Verdict::Yes);
+    assert_eq!(consistently(200, 3, 0.9), Verdict::Yes, "3.9 of 4");
     assert_eq!(consistently(12, 2, 0.85), Verdict::Undecided, "3.7 of 4, too few trials");
-    assert_eq!(consistently(40, 1, 0.75), Verdict::No, "3.25 of 4");
+    assert_eq!(consistently(200, 1, 0.75), Verdict::No, "3.25 of 4");
 
     let perfect = judged(200, 100, |arm, _, _| f64::from(leader_follower(arm)));
     for (layout, words, expected) in [
@@ -596,8 +585,8 @@ fn times_are_compared_by_restricted_means_and_ties_do_not_count() {
 #[test]
 fn verdicts_are_corrected_for_multiple_tests() {
     let leader_follower = |arm: &Experiment| arm.paradigm == Paradigm::LeaderFollower;
-    // 3.5 POIs with a spread in 20 trials: the 95 % interval begins above 3, which many tests would reach by chance.
-    let claims = judged(20, 100, |arm, trial, _| match leader_follower(arm) {
+    // 3.5 POIs with a spread in 40 trials: the 95 % interval begins above 3, which many tests would reach by chance.
+    let claims = judged(40, 100, |arm, trial, _| match leader_follower(arm) {
         true => [1.0, 1.0, 0.5, 1.0][trial % 4],
         false => [0.25, 0.5, 0.0, 0.75][trial % 4],
     });
@@ -606,6 +595,6 @@ fn verdicts_are_corrected_for_multiple_tests() {
     let (estimate, p) = (found.estimate.unwrap(), found.p.unwrap());
     assert!(estimate.low > 3.0 && p < 0.05, "{found:?}");
     assert!(found.p_holm.unwrap() > 0.05 && found.verdict == Verdict::Undecided, "{found:?}");
-    // Student's test of the distance to the threshold: t is 2.5166 with 19 degrees of freedom.
-    assert!((p - 0.020_991_504_670_16).abs() < 1e-12, "{p}");
+    // scipy's ttest_1samp([4, 4, 2, 4] * 10 + [0, 4], 3): t is 2.7349 with 41 degrees of freedom.
+    assert!((p - 0.009_175_102_495_957).abs() < 1e-12, "{p}");
 }

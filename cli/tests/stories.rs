@@ -73,7 +73,7 @@ fn trials_csv_agrees_with_training_and_the_page() {
     for (arm, row) in arms.iter().zip(csv::Reader::from_reader(text.as_bytes()).records().map(Result::unwrap)) {
         let [champion, best] = [&row[1], &row[2]]
             .map(|digits| -> Vec<f64> { digits.bytes().map(|digit| f64::from(digit - b'0')).collect() });
-        let mean = statistics::mean(&champion, 1.0).unwrap().within(0.0, arm.pois() as f64);
+        let mean = statistics::bounded(&champion.iter().collect(), [0.0, arm.pois() as f64]).unwrap();
         let best = best.iter().sum::<f64>() / TRIALS as f64;
         let cell = format!("{:.2} [{:.2}, {:.2}] ({best:.2})", mean.value, mean.low, mean.high);
         let name = format!("| {}, {} ", arm.layout.name, arm.paradigm);

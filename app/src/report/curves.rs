@@ -6,7 +6,7 @@ use serde::de::IntoDeserializer;
 use serde::{Deserialize, Serialize};
 
 use super::scene::{Anchor, BLACK, COLORS, Color, Fill, GREY, LIGHT, Pen, Scene, WHITE, rounded, text_width};
-use flotilla::statistics::{self, Average};
+use flotilla::statistics::{self, Average, CONFIDENCE};
 
 /// Width of a column of a two-column paper, in millimetres.
 pub(crate) const COLUMN: f64 = 85.0;
@@ -93,7 +93,7 @@ impl Curve {
         let (mut count, mut factor) = (0, 0.0);
         for (generation, average) in averages.into_iter().filter(|(_, average)| average.count() > 0) {
             if average.count() != count {
-                (count, factor) = (average.count(), statistics::bounded_factor(average.count() as usize));
+                (count, factor) = (average.count(), statistics::bounded_factor(CONFIDENCE, average.count() as usize));
             }
             let mean = average.mean();
             let interval = statistics::bounded_by(factor, average, [0.0, most]);

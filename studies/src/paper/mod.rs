@@ -316,7 +316,7 @@ pub fn figure(results: Evidence<'_>, layout: usize) -> Figure {
         y_label: "POIs observed by the champion".into(),
         y_max: PARADIGMS.into_iter().map(pois).fold(1.0, f64::max),
         shares: false,
-        band: Band::Error,
+        band: Band::Interval,
         source: None,
         warning: None,
     }

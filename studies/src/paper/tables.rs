@@ -39,7 +39,7 @@ pub fn without_learning(results: Evidence<'_>) -> String {
                 };
                 let best = curves.observed_by_best(last).filter(|_| matches!(source, Source::Evolved(_)));
                 let best = best.map(|best| format!(" ({:.2})", best.iter().collect::<Average>().mean()));
-                let champion = match statistics::mean(&observed, 1.0).map(|mean| mean.within(0.0, pois as f64)) {
+                let champion = match statistics::bounded(&observed.iter().collect(), [0.0, pois as f64]) {
                     Some(mean) if !curves.certain => format!("{:.2} [{:.2}, {:.2}]", mean.value, mean.low, mean.high),
                     _ => observed.first().map_or(String::new(), |pois| format!("{pois:.2}")),
                 };
@@ -51,8 +51,9 @@ pub fn without_learning(results: Evidence<'_>) -> String {
             race.extend(SOURCES[BASELINES..].iter().map(|&source| {
                 let evolved = curves(source).and_then(|curves| curves.observed_by_any(last)).unwrap_or_default();
                 let lead: Vec<f64> = evolved.iter().zip(&random).map(|(evolved, random)| evolved - random).collect();
-                let within = |mean: statistics::Estimate| mean.within(-(pois as f64), pois as f64);
-                let Some(mean) = statistics::mean(&lead, 1.0).map(within) else { return "open: takes 2 trials".into() };
+                let Some(mean) = statistics::paired(&lead.iter().collect(), pois as f64) else {
+                    return "open: takes 2 trials".into();
+                };
                 let word = match mean {
                     _ if mean.low > 0.0 => "ahead",
                     _ if mean.high < 0.0 => "behind",
@@ -164,8 +165,8 @@ Differences are over pairs.";
 /// Explains the table of claims.
 pub(crate) const LEGEND: &str = "\
 *yes*: the interval lies within what the words allow. *no*: it lies outside. *not decided*: it contains the threshold.
-*open*: too few generations or trials. Brackets are 95 % intervals: Student's for means and differences over pairs, Clopper
-and Pearson's for shares. p is the smallest alpha at which the interval decides, corrected by Holm's method for all verdicts
+*open*: too few generations or trials. Brackets are 95 % intervals, made for few different outcomes as in `flotilla compare`;
+those of numbers of trials are Clopper and Pearson's. p is the smallest alpha at which the interval decides, corrected by Holm's method for all verdicts
 on evolved teams at once; a verdict needs p of at most 0.05. A claim holds if it holds under every fitness, and fails if it
 fails under one. Curves are judged by averages over trials, since the paper's curves are averages. If the paper gives no
 number, *almost never* is under 1 trial in 10 and *some of the time* is 1 in 10 to 9 in 10. *All POIs* is an average of at

@@ -14,7 +14,7 @@ use serde::Serialize;
 
 use super::{BASELINES, Evidence, LAYOUTS, SOURCES, Source, TrialCurves};
 use flotilla::config::Paradigm;
-use flotilla::statistics::{self, Estimate};
+use flotilla::statistics::{self, Average, Estimate};
 
 mod list;
 
@@ -118,8 +118,7 @@ enum Criterion {
     Mean(Vec<f64>, Band),
     /// Differences per pair of trials, in POIs.
     Difference(Vec<f64>, Band),
-    /// Differences per pair of trials, in shares of the POIs. The smallest step is 0.25, because layouts have at most
-    /// four POIs.
+    /// Differences per pair of trials, in shares of the POIs.
     Shares(Vec<f64>, Band),
     /// Differences per pair of trials, in generations.
     Generations(Vec<f64>, Band),
@@ -130,20 +129,22 @@ enum Criterion {
 impl Criterion {
     /// Tests the criterion for teams that can observe `pois` POIs.
     fn find(self, column: usize, of: String, certain: bool, pois: f64) -> Option<Finding> {
-        let last = END as f64;
-        // Values are whole POIs or generations. Layouts have at most four POIs, so shares have steps of at least 0.25.
-        let (values, step, [least, most], allowed, signed) = match &self {
-            Criterion::Mean(values, allowed) => (values, 1.0, [0.0, pois], *allowed, false),
-            Criterion::Difference(values, allowed) => (values, 1.0, [-pois, pois], *allowed, true),
-            Criterion::Shares(values, allowed) => (values, 0.25, [-1.0, 1.0], *allowed, true),
-            Criterion::Generations(values, allowed) => (values, 1.0, [-last - 1.0, last + 1.0], *allowed, true),
-            Criterion::Share(_, _, allowed) => (&vec![], 0.0, [0.0, 1.0], *allowed, false),
+        // `width` is the difference between the largest and the smallest possible value of a trial.
+        let (values, width, allowed, signed) = match &self {
+            Criterion::Mean(values, allowed) => (values, pois, *allowed, false),
+            Criterion::Difference(values, allowed) => (values, pois, *allowed, true),
+            Criterion::Shares(values, allowed) => (values, 1.0, *allowed, true),
+            Criterion::Generations(values, allowed) => (values, (END + 1) as f64, *allowed, true),
+            Criterion::Share(_, _, allowed) => (&vec![], 1.0, *allowed, false),
         };
+        let average: Average = values.iter().collect();
+        let factor = |confidence| statistics::bounded_factor(confidence, values.len());
         let estimate = |confidence: f64| match (&self, certain) {
             (&Criterion::Share(count, of, _), true) => (of > 0).then(|| Estimate::exact((count > 0).into())),
             (&Criterion::Share(count, of, _), false) => statistics::share_at(confidence, count, of),
             (_, true) => values.first().copied().map(Estimate::exact),
-            (_, false) => Some(statistics::mean_at(confidence, values, step)?.within(least, most)),
+            (Criterion::Mean(..), false) => statistics::bounded_by(factor(confidence), &average, [0.0, width]),
+            (_, false) => statistics::paired_by(factor(confidence), &average, width),
         };
         let at = estimate(statistics::CONFIDENCE)?;
         let measured = match &self {
