@@ -1,4 +1,4 @@
-// Writes web/page/opening.json: the episode that the page shows first, played by the best team of the gallery's first
+// Writes web/page/opening.json: the episode that the page shows first, played by a champion of the gallery's first
 // experiment.
 //
 //     node web/opening.mjs PAGE
@@ -9,7 +9,7 @@ import { writeFileSync } from "node:fs";
 import { Player, contents } from "./player.mjs";
 
 // A generation in which the credits of the leaders differ.
-const TRIAL = 2, GENERATION = 27;
+const TRIAL = 2, GENERATION = 55;
 
 export async function opening(player, text) {
   const question = { ask: "resolve", text: text("gallery-two_groups"), name: "two_groups.toml", changes: [] };
@@ -17,7 +17,7 @@ export async function opening(player, text) {
   await player.ask({ ask: "train", runs: [{ text: words.toml, trials: [TRIAL] }] });
   const advance = { ask: "advance", generations: 1000, milliseconds: 1e6 };
   for (let done = false; !done;) done = (await player.ask(advance)).words.done;
-  const { words: data } = await player.ask({ ask: "best", run: 0, trial: TRIAL, generation: GENERATION });
+  const { words: data } = await player.ask({ ask: "champion", run: 0, trial: TRIAL, generation: GENERATION });
   return JSON.stringify({ trial: TRIAL, generation: GENERATION, config: words.config, data }) + "\n";
 }
 

@@ -45,7 +45,7 @@ pub fn run(args: Args) -> Result<(), Error> {
 }
 
 /// The scores of a row, in order.
-const SCORES: [TeamKind; 4] = [TeamKind::Best, TeamKind::Mean, TeamKind::Champion, TeamKind::Test];
+const SCORES: [TeamKind; 4] = [TeamKind::Champion, TeamKind::Best, TeamKind::Mean, TeamKind::Test];
 
 /// Returns a time in seconds, or in milliseconds if it is short.
 fn time(seconds: f64) -> String {
@@ -104,7 +104,7 @@ fn report(found: &TrainOutcome) -> String {
     let film = quoted(&folder.join("champion.gif"));
     let best = ends.last.iter().reduce(|a, b| if b.champion_g > a.champion_g { b } else { a });
     let (best, observed) = best.map_or((0, 0.0), |row| (row.trial, row.champion_g * pois as f64));
-    let what = pois_of_all.map_or("share of POIs".into(), |pois| format!("of {pois} POIs"));
+    let what = pois_of_all.map_or("share of POIs".into(), |pois| format!("of {}", counted(pois, "POI")));
     let _ = match observed > 0.0 {
         true => write!(text, "\nThe best champion is that of trial {best}: {observed:.2} {what}{by_value}.\n"),
         false => write!(text, "\nNo champion observed any POI. The film below shows what that of trial {best} does.\n"),

@@ -1,4 +1,4 @@
-// Draws learning curves: POIs observed by the best team, per arm the mean over trials, with each trial as a thin line.
+// Draws learning curves: POIs observed by the champion, per arm the mean over trials, with each trial as a thin line.
 import { pen_of } from "./dom.js";
 
 /**

@@ -17,7 +17,7 @@ export function curves() {
   const pois = training.pois ?? 1;
   // About 1000 points per curve are enough for the width of the chart.
   const every = Math.ceil(Math.max(1, training.reached) / 1000);
-  const sample = (/** @type {Row[]} */ trial) => Array.from({ length: Math.ceil(trial.length / every) }, (_, index) => trial[index * every].best * pois);
+  const sample = (/** @type {Row[]} */ trial) => Array.from({ length: Math.ceil(trial.length / every) }, (_, index) => trial[index * every].champion * pois);
   const scaled = (/** @type {Place[] | null} */ points) => points && points.map(([generation, g]) => /** @type {Place} */ ([generation, g * pois]));
   const arms = training.arms.map(({ style, trials, constant, random }, index) => {
     const found = training.found && training.found.curves[index];
@@ -38,7 +38,7 @@ export function curves() {
     make("span", ` ${text}`, place);
   };
   const words = own.map(({ label, style, trials }) => {
-    const mean = trials.reduce((sum, trial) => sum + trial[Math.min(Math.max(0, at), trial.length - 1)]?.best, 0) / trials.length * pois;
+    const mean = trials.reduce((sum, trial) => sum + trial[Math.min(Math.max(0, at), trial.length - 1)]?.champion, 0) / trials.length * pois;
     const value = at >= 0 ? `${mean.toFixed(2)} of ${pois}` : "–";
     item(TONES[style], chart.DASHES[style], `${label}: ${value}`);
     return `${label} ${value} ${many} at generation ${Math.max(0, at)}`;
@@ -53,16 +53,16 @@ export function curves() {
   baseline(chart.CONSTANT, "best constant action", own.map(({ constant }) => constant));
   baseline(chart.RANDOM, "best of as many random teams", own.map(({ random }) => random[Math.min(Math.max(0, at), random.length - 1)]));
   // Otherwise nobody expects an interval around a flat line.
-  const agree = own.some(({ trials }, index) => arms[index].band && trials.length > 1 && trials.every(trial => trial[at]?.best === trials[0][at]?.best));
+  const agree = own.some(({ trials }, index) => arms[index].band && trials.length > 1 && trials.every(trial => trial[at]?.champion === trials[0][at]?.champion));
   const interval = arms.some(arm => arm.band) ? ` with its 95 % interval${agree ? ", which is wide even if all trials agree, because they are few" : ""}` : "";
-  make("span", `${many} observed by the best team${at >= 0 ? ` at generation ${at}` : ""}, mean over trials${interval}; thin: each trial`, $("legend"));
-  $("curves").setAttribute("aria-label", `Learning curves, best team, mean over trials: ${words.join("; ")}`);
+  make("span", `${many} observed by the champion (the team of each population's best policy)${at >= 0 ? ` at generation ${at}` : ""}, mean over trials${interval}; thin: each trial`, $("legend"));
+  $("curves").setAttribute("aria-label", `Learning curves, champion, mean over trials: ${words.join("; ")}`);
 }
 
 /** Says if a constant action observes as much as what was trained, because then nothing had to be learned. @param {Training | null} training */
 function needless(training) {
   if (!training || training.state !== "done") return "";
-  const final = (/** @type {Arm} */ { trials }) => trials.reduce((sum, trial) => sum + trial[trial.length - 1].best, 0) / trials.length;
+  const final = (/** @type {Arm} */ { trials }) => trials.reduce((sum, trial) => sum + trial[trial.length - 1].champion, 0) / trials.length;
   const alike = training.arms.flatMap(arm => arm.constant !== null && arm.constant > 0 && arm.constant >= final(arm) - 1e-9 ? [{ arm, constant: arm.constant }] : []);
   if (!alike.length) return "";
   const all = training.pois ?? 1, many = (/** @type {number} */ g) => (g * all).toFixed(2);

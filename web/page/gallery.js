@@ -15,7 +15,7 @@ const GALLERY = [
   },
   {
     name: "population", config: "two_groups", title: "Few policies or many", compare: { key: "learning.population", values: ["20", "100", "500"] },
-    says: "The same task. With 20 policies per leader, the best teams observe at most one of the four POIs; with 500, three or four.",
+    says: "The same task. With 20 policies per leader, champions observe at most one of the four POIs; with 500, three on average.",
   },
   {
     name: "groups", config: "two_groups", title: "Who shares a population?", changes: [["learning.paradigm", '"all-leaders"']],

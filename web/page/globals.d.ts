@@ -41,7 +41,7 @@ interface Seen { observed: (number | null)[], near: Uint16Array }
 /** An episode. Starts and steered episodes have no scores. Very long ones have neither `senses` nor `without`. */
 interface Episode extends Seen {
   leaders: number, agents: number, coupling: number[], shown: number[], g: number, generation: number, trial: number, owner: number[],
-  led: Uint32Array, positions: Float32Array, headings: Float32Array, best_g?: number, d?: number[], df?: number[], dpp?: number[], dt?: number[],
+  led: Uint32Array, positions: Float32Array, headings: Float32Array, team_g?: number, d?: number[], df?: number[], dpp?: number[], dt?: number[],
   senses?: Float32Array, without?: { alone: Seen, group: Seen }[],
 }
 /** A channel of a class's senses, and a class of agents. Those that learn come first. */
@@ -54,7 +54,7 @@ interface Scene extends Rule, Parts {
   colors: Palettes, fitness?: string, episodes: Episode[],
 }
 /** A scene as it is sent: arrays are base64 until `stage.unpack`. */
-interface Packed { colors: Palettes, episodes: { generation: number, best_g: number }[] }
+interface Packed { colors: Palettes, episodes: { generation: number, team_g: number }[] }
 
 /** What to show of an episode. */
 interface Look {
@@ -155,7 +155,7 @@ interface Answers {
   open: Machine;
   train: {};
   advance: { next: number, played: number, done: boolean, seconds: number };
-  best: Packed;
+  champion: Packed;
   play: Packed;
   ends: Ended[];
   record: { digest: string };

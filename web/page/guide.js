@@ -34,8 +34,8 @@ const STEPS = [
   },
   {
     of: "population", watch: () => exhibit("population", { trains: true }),
-    asks: "The same task, with followers. Each leader's policy is selected from a population of policies. How many does it take until the best teams observe three of the four POIs?",
-    choices: ["20 are enough", "100", "500"], right: 1,
+    asks: "The same task, with followers. Each leader's policy is selected from a population of policies. The team of each leader's best policy is the champion. How many policies does it take until champions observe three of the four POIs?",
+    choices: ["20 are enough", "100", "500"], right: 2,
     why: "The first policies are random. Among few, hardly any two leaders meet. Among many, some do, and selection copies them.",
   },
   {

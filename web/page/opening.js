@@ -14,7 +14,7 @@ export const OPENED = (() => {
     scenes: [{
       title: "A trained team, in a task where learning matters", data,
       status: (step, observed) => `${observed} of ${data.pois.length} POIs by step ${step} · trained for ${generation} generations with population ${config.learning.population}`,
-      label: `${NAMES["leader-follower"]}: the best team of generation ${generation}, trial ${trial}`,
+      label: `${NAMES["leader-follower"]}: the champion of generation ${generation}, trial ${trial}`,
     }],
   };
 })();

@@ -92,11 +92,11 @@ export async function train() {
 /** Returns what each arm of a finished training observes. @param {Training} training */
 function found_by(training) {
   const found = training.arms.map(arm => {
-    const last = arm.trials.map(trial => trial[trial.length - 1].best), mean = last.reduce((sum, best) => sum + best, 0) / last.length;
+    const last = arm.trials.map(trial => trial[trial.length - 1].champion), mean = last.reduce((sum, champion) => sum + champion, 0) / last.length;
     return `${(mean * (arm.pois ?? 1)).toFixed(2)} of ${arm.pois ?? 1} (${arm.label})`;
   });
   const { unit } = training;
-  return `${unit[0].toUpperCase()}${unit.slice(1)} that the best team observes, on average over trials: ${found.join(", ")}.`;
+  return `${unit[0].toUpperCase()}${unit.slice(1)} that the champion observes, on average over trials: ${found.join(", ")}.`;
 }
 
 part(() => [state.training, state.training && state.training.state], () => {

@@ -170,17 +170,17 @@ export class Training {
   }
 
   /**
-   * Returns the episode of the best team of a generation of a trial, for display. A run that ended before that generation gives its last.
+   * Returns the episode of the champion of a generation of a trial, for display. A run that ended before that generation gives its last.
    * @param {number} run @param {number} trial @param {number} generation
    */
-  async best(run, trial, generation) {
+  async champion(run, trial, generation) {
     const player = this.owners.get(`${run}/${trial}`);
     if (!player) throw new Error(`there is no trial ${trial}`);
-    const { words } = await player.ask({ ask: "best", run, trial, generation });
+    const { words } = await player.ask({ ask: "champion", run, trial, generation });
     // Training here starts from random policies. A run from a file may have started from given ones, or be from another
     // version.
     const [episode] = words.episodes, recorded = this.arms[run].trials[trial][episode.generation];
-    if (recorded && recorded.best !== episode.best_g) throw new Error(`Generation ${episode.generation} cannot be replayed: it gives G = ${episode.best_g} here, and the run has ${recorded.best}. The run started from given policies, or another version made it.`);
+    if (recorded && recorded.champion !== episode.team_g) throw new Error(`Generation ${episode.generation} cannot be replayed: it gives G = ${episode.team_g} here, and the run has ${recorded.champion}. The run started from given policies, or another version made it.`);
     return words;
   }
 

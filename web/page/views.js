@@ -82,7 +82,7 @@ export function draw(view) {
   const [observed, text] = stage.say(episode, step);
   const [status, label] = view.describe ? view.describe(step, observed, text) : [
     `generation ${episode.generation}, trial ${episode.trial} · ${observed} of ${data.pois.length} POIs by step ${step}`,
-    `${NAMES[view.label] || view.label}: the best team of generation ${episode.generation}, step ${step}: ${text}`,
+    `${NAMES[view.label] || view.label}: the champion of generation ${episode.generation}, step ${step}: ${text}`,
   ];
   const missing = gone && removed ? `, without ${name_of_leader(data, removed.leader)}${removed.group ? " and its followers" : ""}` : "";
   write_text(view.status, status + missing);
@@ -295,7 +295,7 @@ function tick(time) {
   else if (running) requestAnimationFrame(tick);
 }
 
-// Requests the current best team for every view that has finished its episode.
+// Requests the newest champion for every view that has finished its episode.
 export function follow() {
   const { training } = state;
   if (!training || state.mode !== "watch" || !state.follow || training.state === "starting") return;
@@ -315,7 +315,7 @@ export async function ask(view, run, generation) {
   if (!training) return;
   view.asking = true;
   try {
-    const data = stage.unpack(await training.best(run, trial, generation));
+    const data = stage.unpack(await training.champion(run, trial, generation));
     if (state.training === training && state.views[run] === view && state.mode === "watch") show(view, data);
   } catch (thrown) {
     const { message, stopped, fatal } = failure(thrown);

@@ -55,8 +55,8 @@ enum Ask {
     Train { runs: Vec<Chosen> },
     /// Plays at least one generation, until either limit is reached. The numbers of the answer are the rows.
     Advance { generations: usize, milliseconds: f64 },
-    /// Replays the best team of a generation of a trial. Without `generation`, that is the one that plays next.
-    Best { run: usize, trial: usize, generation: Option<usize> },
+    /// Replays the champion of a generation of a trial. Without `generation`, that is the newest finished one.
+    Champion { run: usize, trial: usize, generation: Option<usize> },
     /// Returns the results of a run's finished trials. The numbers are policies and fitness.
     Ends { run: usize },
     /// Returns a finished run's folder as an archive, made from its rows, policies and fitness.
@@ -140,7 +140,7 @@ pub fn answer(session: &mut Session, text: &str, bytes: &[u8]) -> Result<Answer,
         Ask::Advance { generations, milliseconds } => {
             session.training.advance(&mut *session.backend.0, generations, milliseconds)
         }
-        Ask::Best { run, trial, generation } => words(session.training.best(run, trial, generation)?),
+        Ask::Champion { run, trial, generation } => words(session.training.champion(run, trial, generation)?),
         Ask::Ends { run } => session.training.ends(run),
         Ask::Record(recorded) => archive::write(&recorded, bytes),
         Ask::Read { text } => archive::read(text.as_deref(), bytes),

@@ -24,7 +24,7 @@ pub struct Experiment {
     lengths: Vec<usize>,
 }
 
-/// Returns the curves of the best teams with their 95 % intervals, and the tables of `flotilla compare`.
+/// Returns the curves of the champions with their 95 % intervals, and the tables of `flotilla compare`.
 ///
 /// `bytes` are G of the best team and of the champion as f64, `[experiments][trials][generations][2]`. If they cannot be
 /// compared, `refused` says why, and there are no tables.
@@ -36,11 +36,11 @@ pub fn compare(experiments: Vec<Experiment>, bytes: &[u8]) -> Result<Value, Refu
         let config = Config::parse(&text, "the config")?;
         // A training that was stopped may have played some trials further than others.
         let shared = lengths.iter().copied().min().unwrap_or(0);
-        let (mut trials, mut best) = (Vec::new(), vec![Average::default(); shared]);
+        let (mut trials, mut champions) = (Vec::new(), vec![Average::default(); shared]);
         for (trial, length) in lengths.into_iter().enumerate() {
             let (scores, rest) = pairs.split_at_checked(length).ok_or_else(|| refuse("the rows are incomplete"))?;
             pairs = rest;
-            best.iter_mut().zip(scores).for_each(|(best, [g, _])| best.add(*g));
+            champions.iter_mut().zip(scores).for_each(|(champion, [_, g])| champion.add(*g));
             let key = (config.learning.seed, trial);
             let row = |(generation, &[best_g, champion_g]): (usize, &[f64; 2])| Row {
                 experiment: 0,
@@ -53,7 +53,7 @@ pub fn compare(experiments: Vec<Experiment>, bytes: &[u8]) -> Result<Value, Refu
             };
             trials.push(Trial { key, rows: scores.iter().enumerate().map(row).collect(), from: config.last_from() });
         }
-        let (curve, _) = Curve::new(&best, 1.0).thinned();
+        let (curve, _) = Curve::new(&champions, 1.0).thinned();
         let band = curve.outline(Band::Interval, 1.0);
         curves.push(json!({ "generation": curve.generation, "mean": curve.mean, "band": band }));
         let folders = vec![PathBuf::from(&name)];

@@ -1,4 +1,4 @@
-//! Trains generation by generation, and replays the best team of any generation.
+//! Trains generation by generation, and replays the champion of any generation.
 
 use std::collections::BTreeMap;
 
@@ -132,12 +132,12 @@ impl Training {
         Ok(())
     }
 
-    /// Returns the episode of a generation's best team, as [`replay::detailed`].
+    /// Returns the episode of a generation's champion, as [`replay::detailed`].
     ///
     /// The CPU plays it, which gives the same bits as a GPU.
     ///
-    /// `generation` defaults to the one that plays next, but at most the last.
-    pub fn best(&mut self, run: usize, trial: usize, generation: Option<usize>) -> Result<Value, Refusal> {
+    /// `generation` defaults to the newest that is finished, or 0.
+    pub fn champion(&mut self, run: usize, trial: usize, generation: Option<usize>) -> Result<Value, Refusal> {
         let config = self.configs.get(run).ok_or_else(|| refuse(format!("no run {run}")))?;
         if trial >= config.learning.trials {
             return Err(refuse(format!("no trial {trial}")));
@@ -146,18 +146,20 @@ impl Training {
         let batch = self.batches.iter_mut().find_map(|batch| Some((batch.experiments.iter().position(is_of)?, batch)));
         let last = config.learning.generations;
         let at_hand = batch.as_ref().map_or(last, |(experiment, batch)| batch.trainer.generation(*experiment));
-        let generation = generation.unwrap_or(at_hand).min(last);
-        if let Some((experiment, batch)) = batch.filter(|_| at_hand == generation) {
+        let generation = generation.unwrap_or(at_hand.saturating_sub(1)).min(last);
+        // A champion is in its slot once its generation is over.
+        let wanted = generation + 1;
+        if let Some((experiment, batch)) = batch.filter(|_| at_hand == wanted) {
             batch.keep(experiment, &mut self.kept)?;
         }
         let mut trainer = Trainer::of_trial(config, trial);
-        let before = self.kept.snapshots.range((run, trial, 0)..=(run, trial, generation)).next_back();
+        let before = self.kept.snapshots.range((run, trial, 0)..=(run, trial, wanted)).next_back();
         if let Some((_, snapshot)) = before {
             // The sizes always match. If they did not, training from the start would give the same result.
             let _ = trainer.restore(0, snapshot.clone());
         }
         let mut cpu = Cpu::default();
-        while trainer.generation(0) < generation {
+        while trainer.generation(0) < wanted {
             trainer.advance(&mut cpu).map_err(refuse)?;
         }
         let config = config.at(generation);
@@ -165,7 +167,7 @@ impl Training {
         let mut timed = Config::clone(config);
         timed.learning.fitness = Fitness::Dt;
         timed.agents.iter_mut().for_each(|class| class.fitness = None);
-        let mut played = replay::best(&timed, &mut trainer, trial, &mut cpu).map_err(refuse)?;
+        let mut played = replay::champion(config, &timed, &mut trainer, trial, &mut cpu).map_err(refuse)?;
         if !config.fitnesses().contains(&Fitness::Dt) {
             // Then followers are drawn with the leader that they saw most.
             played.led.clear();

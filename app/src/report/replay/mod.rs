@@ -284,7 +284,8 @@ pub fn replay(
         }
         let (found, g) = match which {
             Which::Champion => {
-                let found = champion(config.at(generation), &mut trainer, trial, backend)?;
+                let stage = config.at(generation);
+                let found = champion(stage, stage, &mut trainer, trial, backend)?;
                 let g = found.team_g;
                 (found, g)
             }
@@ -330,16 +331,6 @@ fn nearest(
     })
 }
 
-/// Plays the current generation of a trainer with a single trial, and traces its best team.
-pub fn best(
-    config: &Config,
-    trainer: &mut Trainer,
-    trial: usize,
-    backend: &mut dyn Backend,
-) -> Result<Replayed, BackendError> {
-    Ok(team(config, trainer, trial, Which::Best, backend)?.0)
-}
-
 /// Plays the current generation of a trainer with a single trial, and traces one team. Also returns the largest G of
 /// all teams.
 fn team(
@@ -360,9 +351,10 @@ fn team(
 }
 
 /// Plays and traces the champion of the generation that a trainer with a single trial has just finished. `config` is
-/// the config of that generation.
-fn champion(
+/// the config of that generation, and `credits` the same with the credits to record.
+pub fn champion(
     config: &StageConfig,
+    credits: &Config,
     trainer: &mut Trainer,
     trial: usize,
     backend: &mut dyn Backend,
@@ -371,7 +363,7 @@ fn champion(
     let (next, world) = (trainer.generation(0), World::new(config));
     let population = config.learning.population;
     let teams = vec![population as u32; world.leaders()];
-    let episodes = Episodes::new(config, &world, trial, next, trainer.weights(0, 0)?, &teams);
+    let episodes = Episodes::new(credits, &world, trial, next, trainer.weights(0, 0)?, &teams);
     let team_g = episodes.play(backend)?[0];
     let played = episodes.trace(0, backend)?;
     Ok(Replayed { trial, generation: next - 1, which: Which::Champion, team: population, team_g, ..played })

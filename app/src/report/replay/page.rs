@@ -232,7 +232,7 @@ fn episode(played: &Replayed, shown: &[usize], exact: bool) -> serde_json::Value
         "generation": played.generation,
         "name": played.name(),
         "team": played.team,
-        "best_g": played.team_g,
+        "team_g": played.team_g,
         "means_of": played.episodes,
         "g": scores.g,
         "d": scores.d,
