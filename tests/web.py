@@ -1155,7 +1155,7 @@ def check_first_visit(tab, page, call, downloads):
     mean = "page.state.training.arms[0].trials.reduce((sum, trial) => sum + trial[{}].champion, 0) / 2 * 4".format
     for at, move in [(2, [x, y]), (6, [x, y - 100])]:
         tab.mouse("mouseMoved", *move)
-        tab.wait(f"document.querySelector('#legend').textContent.includes('at generation {at},')")
+        tab.wait(f"document.querySelector('#legend').textContent.includes('at generation {at}.')")
         assert f"leader-follower: {tab.evaluate(mean(at)):.2f} of 4" in tab.text("#legend"), tab.text("#legend")
     # The keys have the dashes that are drawn.
     dashes = "[...document.querySelectorAll('#legend line')].map(line => line.getAttribute('stroke-dasharray'))"

@@ -121,7 +121,7 @@ Files in {}:
 
 Next:
   flotilla replay {replayed}
-  flotilla replay {replayed} --trial {best} --team champion --out {film}
+  flotilla replay {replayed} --trial {best} --out {film}
   flotilla rollout {replayed} --scores scores.csv
 ",
         folder.escaped(),

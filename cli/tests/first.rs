@@ -273,7 +273,7 @@ fn commands_in_the_summary_work_for_the_best_champion() {
         text.contains(&format!("The best champion is that of trial {best}: {:.2} of 2 POIs.\n", 2.0 * best_g)),
         "{text}"
     );
-    let film = text.lines().find(|line| line.contains("--team champion")).unwrap().trim();
+    let film = text.lines().find(|line| line.contains("champion.gif")).unwrap().trim();
     assert!(place.shell(film).status.success(), "{film}");
     assert!(place.path("run/champion.gif").exists(), "{film}");
     let scores = text.lines().find(|line| line.contains("flotilla rollout")).unwrap().trim();

@@ -67,7 +67,7 @@ function sense_button(view, leader) {
   button.setAttribute("aria-pressed", String(view.selected === leader));
   button.dataset.credit = `sense ${leader}`;
   button.style.borderBottom = `4px solid ${colors[leader % colors.length]}`;
-  button.addEventListener("click", () => select(view, leader));
+  button.addEventListener("click", () => { select(view, leader); reveal(); });
   return button;
 }
 

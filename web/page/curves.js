@@ -51,11 +51,11 @@ export function curves() {
     item("--faint", dashes, `${name}: ${alike ? found[0].value : found.map(({ label, value }) => `${value} (${label})`).join(", ")}`);
   };
   baseline(chart.CONSTANT, "best constant action", own.map(({ constant }) => constant));
-  baseline(chart.RANDOM, "best of as many random teams", own.map(({ random }) => random[Math.min(Math.max(0, at), random.length - 1)]));
+  baseline(chart.RANDOM, "best of as many random teams", own.map(({ random }) => random[Math.max(0, at)]));
   // Otherwise nobody expects an interval around a flat line.
   const agree = own.some(({ trials }, index) => arms[index].band && trials.length > 1 && trials.every(trial => trial[at]?.champion === trials[0][at]?.champion));
-  const interval = arms.some(arm => arm.band) ? ` with its 95 % interval${agree ? ", which is wide even if all trials agree, because they are few" : ""}` : "";
-  make("span", `${many} observed by the champion (the team of each population's best policy)${at >= 0 ? ` at generation ${at}` : ""}, mean over trials${interval}; thin: each trial`, $("legend"));
+  const interval = arms.some(arm => arm.band) ? `, with its 95 % interval${agree ? ", wide because trials are few" : ""}` : "";
+  make("span", `${many} observed by the champion, the team of each population's best policy${at >= 0 ? `, at generation ${at}` : ""}. Thick: mean over trials${interval}. Thin: each trial.`, $("legend"));
   $("curves").setAttribute("aria-label", `Learning curves, champion, mean over trials: ${words.join("; ")}`);
 }
 

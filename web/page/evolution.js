@@ -32,7 +32,7 @@ async function make_evolution() {
     const best = ghosts.reduce((best, ghost) => ghost.episodes[0].g > best.episodes[0].g ? ghost : best), generation = GENERATIONS[run];
     exhibit.scenes.push({
       title: `Generation ${generation}`, data: best, ghosts, label: `${POPULATION} teams of generation ${generation}; the best of them`,
-      status: (step, observed) => `the best of ${POPULATION}: ${observed} of ${best.pois.length} POIs by step ${step}`,
+      status: (step, observed) => `the best of these ${POPULATION} teams: ${observed} of ${best.pois.length} POIs by step ${step}`,
     });
   }
   return exhibit;

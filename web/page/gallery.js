@@ -15,20 +15,20 @@ const GALLERY = [
   },
   {
     name: "population", config: "two_groups", title: "Few policies or many", compare: { key: "learning.population", values: ["20", "100", "500"] },
-    says: "The same task. With 20 policies per leader, champions observe at most one of the four POIs; with 500, three on average.",
+    says: "The same task. With 20 policies per leader, champions end with at most one of the four POIs; with 500, with three on average.",
   },
   {
     name: "groups", config: "two_groups", title: "Who shares a population?", changes: [["learning.paradigm", '"all-leaders"']],
     compare: { key: "learning.sharing", values: ["none", "group", "all"] },
-    says: "The same task without followers. With a population per agent, nothing is learned. With one per group of three agents, most POIs are observed.",
+    says: "The same task without followers. With a population per agent, nothing is learned. With one per group of three agents, champions observe more than half of the POIs.",
   },
   {
     name: "blind", title: "Blind leaders", compare: { key: "learning.start_jitter", values: ["0.0", "2.0", "4.0"] },
-    says: "Leaders that sense no POI learn the way by heart. If the starts are scattered, they lose half of the POIs.",
+    says: "Leaders that sense no POI learn the way by heart. If the starts are scattered, champions observe at most a quarter of the POIs.",
   },
   {
     name: "eight_followers", title: "Eight followers per leader", compare: { key: "learning.paradigm", values: ["leader-follower", "all-leaders"] },
-    says: "Two policies are enough to steer eighteen agents. Teams in which all eighteen agents learn, each with a population of its own, hardly do it.",
+    says: "Two policies are enough to steer eighteen agents. Teams in which all eighteen agents learn, each with a population of its own, observe less than half.",
   },
   {
     name: "relay", title: "A relay", compare: { key: "learning.fitness", values: ["D", "Df", "Dt"] },

@@ -28,13 +28,13 @@ const STEPS = [
   },
   {
     of: "two_groups", watch: () => exhibit("two_groups", { trains: true }),
-    asks: "Now two kinds of team start from nothing: leaders with followers, and teams in which all twelve agents learn. Which observe more POIs?",
+    asks: "Now two kinds of team start from nothing: leaders with followers, and teams in which all twelve agents learn. Each learner's policy is selected from a population of policies. The team of the best policies is the champion. Whose champions observe more POIs?",
     choices: ["Leader-follower", "All-leaders", "Both alike"], right: 0,
     why: "Six independent learners almost never coincide. If each is at a POI in 3 of 10 episodes, all six are there in 7 of 10 000. All teams then score 0, and there is nothing to select. Two leaders that bring their followers coincide in 9 of 100.",
   },
   {
     of: "population", watch: () => exhibit("population", { trains: true }),
-    asks: "The same task, with followers. Each leader's policy is selected from a population of policies. The team of each leader's best policy is the champion. How many policies does it take until champions observe three of the four POIs?",
+    asks: "The same task, with followers. How many policies per leader does it take until champions observe three of the four POIs, on average over trials at the last generation?",
     choices: ["20 are enough", "100", "500"], right: 2,
     why: "The first policies are random. Among few, hardly any two leaders meet. Among many, some do, and selection copies them.",
   },
@@ -47,7 +47,7 @@ const STEPS = [
   {
     of: "groups", watch: () => exhibit("groups", { trains: true }),
     asks: "Do followers make the difference? Take them away, and let the three agents of a group share one population instead. What do such teams observe?",
-    choices: ["Nothing", "Less than half", "Most POIs"], right: 2,
+    choices: ["Nothing", "Less than half", "More than half"], right: 2,
     why: "Here, most of the difference was the number of populations, not the followers. In 30 trials of the paper's first layout, with the same sensors, champions without followers reach G = 0.18 with a population per agent and 0.77 with one per group. With followers they reach 0.91. But somebody has to say who belongs to a group. Followers find their leader themselves.",
   },
 ];
@@ -99,6 +99,7 @@ part(() => [state.guide, state.mode, state.exhibit, state.text, state.compared, 
 async function enter(guide) {
   const had_focus = $("guide").contains(document.activeElement), { ready } = STEPS[guide.step], made = ready && ready();
   for (const button of all("button", $("guide-choices"))) button.inert = true;
+  if (made && guide.said !== null) $("guide-says").textContent = `You said: ${small(guide.said)}. The populations are being trained…`;
   if (guide.said !== null) await made;
   render({ guide });
   const watched = guide.said !== null || !is_shown(about(guide).of) ? about(guide).watch() : null;

@@ -66,7 +66,7 @@ pub fn run(request: &PlotRequest, context: Context<'_>) -> Result<PlotOutcome, E
     place.write(&content(&scene, kind, out)?)?;
     if runs::paired(runs, verification)? {
         context.note(
-            "note: these runs have one seed, so their trials are pairs: compare trial with trial, not only the means",
+            "note: these runs have one seed, so their trials are pairs; `flotilla compare RUN … --paired` compares them pair by pair",
         );
     }
     let named = runs.iter().map(|run| run.escaped().to_string()).collect();

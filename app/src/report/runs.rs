@@ -217,8 +217,11 @@ pub fn paired(folders: &[PathBuf], verification: Verification) -> Result<bool, R
     Ok(seeds.len() > 1 && seeds.iter().all(|seed| *seed == seeds[0]))
 }
 
-/// Labels runs by the config keys that differ between them, or by their directories if none differ. A fitness that is
-/// not the config's is labelled [`OWN_FITNESS`].
+/// Most config keys in the label of a run. More are not read.
+const MOST_KEYS: usize = 6;
+
+/// Labels runs by the config keys that differ between them, or by their directories if none or more than [`MOST_KEYS`]
+/// differ. A fitness that is not the config's is labelled [`OWN_FITNESS`].
 pub fn labels(folders: &[PathBuf], configs: &[Config]) -> Vec<String> {
     let values = |(config, folder): (&Config, &PathBuf)| {
         // The checkpoint interval does not affect results.
@@ -244,7 +247,7 @@ pub fn labels(folders: &[PathBuf], configs: &[Config]) -> Vec<String> {
             Some(value.trim_matches('"')).filter(|value| value.len() <= 24).map(|value| format!("{leaf} {value}"))
         };
         let parts: Vec<String> = keys.iter().filter_map(part).chain(Some(stages).filter(|_| staged)).collect();
-        if parts.is_empty() { folder.escaped().to_string() } else { parts.join(", ") }
+        if (1..=MOST_KEYS).contains(&parts.len()) { parts.join(", ") } else { folder.escaped().to_string() }
     };
     let labels: Vec<String> = folders.iter().zip(&tables).zip(configs).map(label).collect();
     // Equal labels mean that only a long value differs. Such labels also get the directory.

@@ -246,7 +246,7 @@ const stage = (() => {
       // The counts of POIs at the same place are above each other.
       const same = data.pois.flatMap(([left, low], other) => left === x && low === y ? [other] : []);
       const base = Math.max(Y(y) - ring - 6, 15 * same.length - 3) - 15 * same.indexOf(poi);
-      return [`${near[poi]}/${needed}${done ? " ✓" : dark ? " ✗ dark" : ""}`, X(x), base];
+      return [`${near[poi]}/${needed}${done ? " ✓" : dark ? wide < 300 ? " ✗" : " ✗ dark" : ""}`, X(x), base];
     });
 
     const many = episode.agents > 100;
@@ -346,13 +346,13 @@ const stage = (() => {
       const words = `POI ${look.over}: ${text}${when(data, look.over)}${who(data, look.over)}`, half = Math.max(40, draw.measureText(words).width / 2 + 4);
       label(words, Math.max(half, Math.min(wide - half, x)), Math.max(12, y));
     }
-    // A leader's number is placed at the first corner of its arrow where it hides no other label, and omitted if there is none.
+    // A leader's number is placed at the first corner of its arrow where it is on the map and hides no other label, and omitted if there is none.
     const corners = [[1.5, 1.6], [1.5, -0.9], [-2.5, 1.6], [-2.5, -0.9]];
     for (let agent = 0; agent < episode.leaders && labelled; agent++) {
-      const [x, y] = now[agent], text = String(agent), wide = draw.measureText(text).width;
+      const [x, y] = now[agent], text = String(agent), long = draw.measureText(text).width;
       const hides = ([across, down]) => {
         const left = X(x) + size * across, base = Y(y) + size * down;
-        return taken.some(other => overlap([left - 1, base - 11, left + wide + 1, base + 3], other));
+        return left < 1 || left + long + 1 > wide || taken.some(other => overlap([left - 1, base - 11, left + long + 1, base + 3], other));
       };
       const corner = corners.find(corner => !hides(corner));
       if (corner) label(text, X(x) + size * corner[0], Y(y) + size * corner[1], "left");
