@@ -1067,7 +1067,7 @@ def check_first_visit(tab, page, call, downloads):
     # not say why before the result is there.
     tab.click("#guide-next")
     assert tab.evaluate("document.activeElement.parentElement.id") == "guide-choices", "the focus is lost after Next"
-    assert "Which observe more" in tab.text("#guide-says") and not tab.evaluate("Boolean(page.state.training)")
+    assert "Whose champions observe more" in tab.text("#guide-says") and not tab.evaluate("Boolean(page.state.training)")
     tab.click(predict)
     tab.wait("page.state.training && page.state.training.state === 'training'")
     assert "coincide" not in tab.text("#guide-says"), tab.text("#guide-says")
