@@ -375,6 +375,31 @@ fn a_varied_key_is_compared_with_the_files_own_value() {
     assert_eq!(places, ["as in the file", "steps 8", "max_speed 2.0", "max_speed 5.0"]);
 }
 
+/// Arms are named after up to six keys that differ. With more, the names would be too long to read.
+#[test]
+fn many_different_keys_are_no_name() {
+    let place = Place::new(&[]);
+    let keys = [
+        "world.steps",
+        "world.dt",
+        "world.coupling",
+        "world.speed",
+        "sense.agent_range",
+        "motion.max_speed",
+        "motion.max_acceleration",
+    ];
+    let others: Vec<(&str, &str)> = keys.map(|key| (key, "1")).to_vec();
+    run(&place, "usual", &[GENERATIONS], &slices(&rising_to(&[0.5; 3])));
+    run(&place, "six", &[&[GENERATIONS], &others[..6]].concat(), &slices(&rising_to(&[0.5; 3])));
+    run(&place, "seven", &[&[GENERATIONS], &others[..]].concat(), &slices(&rising_to(&[0.5; 3])));
+    let name = |other: &str| {
+        let arm = &json(&place, &format!("compare usual {other}"))["comparisons"][0]["arms"][1];
+        arm["name"].as_str().unwrap().to_string()
+    };
+    assert!(name("six").contains("steps 1"), "{}", name("six"));
+    assert_eq!(name("seven"), "seven");
+}
+
 #[test]
 fn different_layouts_print_a_note_and_are_not_paired() {
     let place = Place::new(&[]);

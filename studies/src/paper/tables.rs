@@ -165,9 +165,9 @@ Differences are over pairs.";
 /// Explains the table of claims.
 pub(crate) const LEGEND: &str = "\
 *yes*: the interval lies within what the words allow. *no*: it lies outside. *not decided*: it contains the threshold.
-*open*: too few generations or trials. Brackets are 95 % intervals, made for few different outcomes as in `flotilla compare`;
-those of numbers of trials are Clopper and Pearson's. p is the smallest alpha at which the interval decides, corrected by Holm's method for all verdicts
-on evolved teams at once; a verdict needs p of at most 0.05. A claim holds if it holds under every fitness, and fails if it
+*open*: too few generations or trials. Brackets are the 95 % intervals of `flotilla compare`, and for a
+count of trials the exact interval of Clopper and Pearson. p is the smallest alpha at which the interval decides, corrected by
+Holm's method for all verdicts on evolved teams at once; a verdict needs p of at most 0.05. A claim holds if it holds under every fitness, and fails if it
 fails under one. Curves are judged by averages over trials, since the paper's curves are averages. If the paper gives no
 number, *almost never* is under 1 trial in 10 and *some of the time* is 1 in 10 to 9 in 10. *All POIs* is an average of at
 least nine tenths of them, and *similar*, *comparable* and *slight* are differences under a tenth. The baselines' columns
