@@ -6,6 +6,7 @@
 //   sense_agents   senses other agents
 //   obey_agents    adds other agents to the terms of a rule
 //   count_leaders  counts the leaders that a follower sees
+//   is_gone        whether nobody senses a POI any more
 //
 // The host prepends:
 //   INPUTS           room for the inputs of a policy
@@ -13,6 +14,7 @@
 //   ALIGNS           whether any rule aligns headings
 //   PURSUES          whether agents of any class move straight to others
 //   CONFINES         whether agents of any class cannot leave a part of the map, or move only near others
+//   VANISHES         whether any POI vanishes once an observer has come near
 //   TRACE            whether every stage of every step is recorded
 //   SIGHTINGS        whether the leaders that each follower sees at each step are recorded
 //   COUNTED_LEADERS  leaders that a follower counts in registers, not in the record; at least 1
@@ -162,9 +164,22 @@ fn sense_pois(
     sensed: ptr<function, Sensed>,
 ) {
     for (var poi = begin; poi < end; poi += parts) {
-        let place = places[task.pois + poi];
-        add_sensed(channel, gauge, index, poi_of(task, poi).y, place.x - (*me).x, place.y - (*me).y, me, sensed);
+        if !is_gone(task, (*me).team, poi) {
+            let place = places[task.pois + poi];
+            add_sensed(channel, gauge, index, poi_of(task, poi).y, place.x - (*me).x, place.y - (*me).y, me, sensed);
+        }
     }
+}
+
+// Returns the squared distance within which a POI vanishes, and the classes that make it, one bit each. They come after the
+// radii and values.
+fn vanishing_of(task: Task, poi: u32) -> vec2<f32> {
+    return places[task.pois + 2u * shape.pois + shape.agents + poi];
+}
+
+// Returns the index in the record of a word that tells whether a POI has vanished. They come before the status word.
+fn gone_word(task: Task, team: u32, poi: u32) -> u32 {
+    return task.status - (shape.pois - poi) * task.teams + team;
 }
 
 // Returns a POI's squared radius and value. They come after the headings.
@@ -198,6 +213,7 @@ fn sense_each(
             if channel.of_pois != 0u {
                 place = places[task.pois + index];
                 value = poi_of(task, index).y;
+                other = !is_gone(task, (*me).team, index);
             } else {
                 place = position_of(first, index);
                 other = index != (*me).agent;

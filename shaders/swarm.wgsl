@@ -49,9 +49,9 @@ fn load_task(index: u32) -> Task {
     return task;
 }
 
-// Returns the grid of a class. Grids come after the POIs' radii and values.
+// Returns the grid of a class. Grids come after all about the POIs.
 fn grid_of(task: Task, class_number: u32) -> Grid {
-    let at = task.pois + 2u * shape.pois + shape.agents + 2u * class_number;
+    let at = task.pois + select(2u, 3u, VANISHES) * shape.pois + shape.agents + 2u * class_number;
     return Grid(u32(places[at].x), u32(places[at].y), places[at + 1u].x, u32(places[at + 1u].y));
 }
 
@@ -251,16 +251,29 @@ fn count_leaders(task: Task, first: u32, me: ptr<function, Agent>) {
     }
 }
 
-// Stores an agent's state after `moment` steps, counts it in its cell, and records the POIs that it is at.
+// Whether nobody senses a POI any more. The word has the first moment at which an observer was near enough, with all bits
+// inverted, because others note the next moment in the dispatch that senses.
+fn is_gone(task: Task, team: u32, poi: u32) -> bool {
+    return VANISHES && atomicLoad(&record[gone_word(task, team, poi)]) >= ~task.first;
+}
+
+// Stores an agent's state after `moment` steps, counts it in its cell, and records the POIs that it is at or that vanish.
 fn settle(task: Task, moment: u32, me: ptr<function, Agent>) {
     states[state_of(task, moment % 2u == 1u, 0u, (*me).agent)] = current_state(me);
     atomicAdd(&record[cell_of(task, own_class, (*me).x, (*me).y) + COME], 1u);
     if TRACE {
         trace(task, moment, me);
     }
-    for (var poi = 0u; poi < shape.pois && moment > 0u; poi++) {
+    for (var poi = 0u; poi < shape.pois; poi++) {
         let place = places[task.pois + poi];
-        if observes(poi_of(task, poi).x, place.x - (*me).x, place.y - (*me).y) {
+        if VANISHES {
+            let vanishing = vanishing_of(task, poi);
+            let counts = (u32(vanishing.y) >> own_class & 1u) != 0u;
+            if counts && within(place.x - (*me).x, place.y - (*me).y, vanishing.x) {
+                atomicMax(&record[gone_word(task, 0u, poi)], ~moment);
+            }
+        }
+        if moment > 0u && observes(poi_of(task, poi).x, place.x - (*me).x, place.y - (*me).y) {
             let words = task.sets + ((moment - 1u) * shape.pois + poi) * shape.words;
             atomicOr(&record[words + (*me).agent / 32u], 1u << ((*me).agent % 32u));
         }

@@ -469,6 +469,7 @@ pub fn classes_world(seed: u64) -> Config {
             radius: lengths.draw(rng),
             observers,
             windows,
+            gone_within: 0.0,
             score: Score::Observed,
             when: When::Ever,
             after,
@@ -476,6 +477,9 @@ pub fn classes_world(seed: u64) -> Config {
         }
     };
     let mut pois: Vec<PoiGroup> = parts.into_iter().enumerate().map(group).collect();
+    if seed % 4 == 1 {
+        pois.iter_mut().for_each(|group| group.gone_within = if rng.random() { lengths.draw(rng) } else { 0.0 });
+    }
     if seed % 10 == 7 {
         let [width, height] = config.world.map;
         let middle = [width / 2.0, height / 2.0, width.min(height) / 4.0];

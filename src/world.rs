@@ -9,6 +9,7 @@ use crate::model::class::Class;
 use crate::model::motion::MapConstants;
 use crate::model::policy::PolicyConstants;
 use crate::model::rule::Rule;
+use crate::model::sense::squared_range;
 
 pub use crate::model::Constants;
 pub use crate::model::motion::{GRID, on_grid};
@@ -44,6 +45,8 @@ pub struct WorldParts {
     pub poi_regions: Vec<(Range<usize>, Region)>,
     /// The squared observation radius of each POI, `[pois]`.
     pub radii2: Vec<f32>,
+    /// The POIs that nobody senses any more once an observer has come near.
+    pub vanishing: Vec<Vanishing>,
     /// The value of each POI, `[pois]`.
     pub values: Vec<f32>,
     /// The value of each POI as a multiple of a common unit, and their sum. Scores are counted in these units.
@@ -60,6 +63,17 @@ pub struct WorldParts {
     pub paths: Option<PathRule>,
     /// The population that each leader chooses its policy from, `[leaders]`.
     pub populations: Vec<u32>,
+}
+
+/// A POI that nobody senses any more once an observer has come near. It can still be observed.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Vanishing {
+    /// Its index.
+    pub poi: usize,
+    /// The squared distance within which an observer makes it vanish.
+    pub within2: f32,
+    /// The classes whose agents observe it.
+    pub classes: Vec<usize>,
 }
 
 /// The rule by which scores are computed from [paths](crate::credit::Paths).
@@ -155,14 +169,15 @@ impl World {
             map: MapConstants::new(world.map, world.dt),
             policy: PolicyConstants::new(&config.widths(), policy.actions),
         };
-        let observers: Vec<Vec<Range<usize>>> = described
-            .group_of_each()
-            .into_iter()
-            .map(|group| {
-                let counted = (0..classes.len()).filter(|&class| described.observes(class, group));
-                counted.map(|class| classes[class].agents()).collect()
-            })
-            .collect();
+        let observing = |group: usize| (0..classes.len()).filter(|&class| described.observes(class, group)).collect();
+        let observers: Vec<Vec<usize>> = described.group_of_each().into_iter().map(observing).collect();
+        let agents_of = |of: &Vec<usize>| of.iter().map(|&class| classes[class].agents()).collect();
+        let vanishing = of_each.iter().zip(&observers).enumerate().filter(|(_, (group, _))| group.gone_within > 0.0);
+        let vanishing = vanishing.map(|(poi, (group, classes))| Vanishing {
+            poi,
+            within2: squared_range(group.gone_within),
+            classes: classes.clone(),
+        });
         World(WorldParts {
             constants,
             starts,
@@ -172,6 +187,7 @@ impl World {
             pois: described.places().into_iter().map(on_grid).collect(),
             poi_regions: described.poi_regions(),
             radii2: of_each.iter().map(|group| (group.radius * group.radius) as f32).collect(),
+            vanishing: vanishing.collect(),
             values,
             worth,
             total_worth,
@@ -179,7 +195,12 @@ impl World {
             populations: config.population_of_each(),
             led: Led { within: credit.led_within, by: credit.led_by },
             paths: by_paths.then(|| PathRule::new(config, &of_each, leaders, agents)),
-            rule: Rule::new(&observers, agents, &described.windows(world.steps), &described.after()),
+            rule: Rule::new(
+                &observers.iter().map(agents_of).collect::<Vec<_>>(),
+                agents,
+                &described.windows(world.steps),
+                &described.after(),
+            ),
             classes,
         })
     }

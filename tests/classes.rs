@@ -75,6 +75,11 @@ fn every_problem_names_key_line_found_and_allowed() {
     let [agents, groups] = ["agents", "pois"].map(replaced);
     for (from, to, expected) in [
         (
+            "coupling = 2",
+            "coupling = 2\ngone_within = 0.001",
+            "25: pois[1].gone_within: found 0.001, allowed 0 or 0.01 to 10000",
+        ),
+        (
             "range = 5,",
             "rnge = 5,",
             "9: agents[0].senses[1].range: missing, allowed 0 to 10000 with measure = \"closeness\"\n9: agents[0].senses[1].rnge: unknown key, did you mean `range`?",
@@ -460,7 +465,7 @@ fn every_problem_names_key_line_found_and_allowed() {
         (
             "after = \"a\"",
             "foo = 3",
-            "25: pois[1].foo: unknown key, allowed after, at, count, coupling, in, name, observers, radius, score, value, when, windows",
+            "25: pois[1].foo: unknown key, allowed after, at, count, coupling, gone_within, in, name, observers, radius, score, value, when, windows",
         ),
         ("name = \"b\"", "name = \"a\"", "22: pois[1].name: found \"a\" again, allowed another name"),
         (

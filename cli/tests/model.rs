@@ -822,29 +822,54 @@ impl Described {
         (0..=choices).all(is_certain).then_some(best)
     }
 
-    /// Returns the inputs of a channel that has a sector of each agent or POI, and what rounding may change.
-    fn sensed(&self, world: &World, channel: &Channel, states: &[State], agent: usize) -> Vec<(f64, bool)> {
+    /// Updates whether each POI has vanished, and whether rounding may change that, by the agents' places.
+    fn hide(&self, world: &World, states: &[State], hidden: &mut [(bool, bool)]) {
+        let classes = self.config.classes();
+        for ((poi, group), (gone, open)) in classes.group_of_each().into_iter().enumerate().zip(hidden) {
+            let within = classes.pois[group].gone_within;
+            let observes = |&agent: &usize| within > 0.0 && classes.observes(self.class_of[agent], group);
+            for agent in (0..states.len()).filter(observes) {
+                let mut borderline = false;
+                let offset = Offset::new(states[agent].position, world.pois[poi].as_dvec2());
+                *gone |= offset.within(within, &mut borderline) && !borderline;
+                *open |= borderline;
+            }
+        }
+    }
+
+    /// Returns the inputs of a channel that has a sector of each agent or POI, and what rounding may change. `hidden` is
+    /// what [`Described::hide`] found.
+    fn sensed(
+        &self,
+        world: &World,
+        channel: &Channel,
+        states: &[State],
+        hidden: &[(bool, bool)],
+        agent: usize,
+    ) -> Vec<(f64, bool)> {
         let names = |of: &str| channel.of.iter().any(|name| name == of);
         let groups = self.config.classes().group_of_each();
         let group = |poi: usize| &self.config.pois[groups[poi]];
-        let entities: Vec<(DVec2, f64, bool)> = match names("pois") {
+        // Where it is, its value, whether it is sensed in range, and whether rounding may change that.
+        let entities: Vec<(DVec2, f64, bool, bool)> = match names("pois") {
             true => (0..world.pois.len())
                 .filter(|&poi| channel.pois.is_empty() || channel.pois.contains(&group(poi).name))
-                .map(|poi| (world.pois[poi].as_dvec2(), group(poi).value, true))
+                .map(|poi| (world.pois[poi].as_dvec2(), group(poi).value, !hidden[poi].0, hidden[poi].1))
                 .collect(),
             false => (0..states.len())
                 .filter(|&other| names("agents") || names(&self.class(other).name))
-                .map(|other| (states[other].position, 1.0, other != agent))
+                .map(|other| (states[other].position, 1.0, other != agent, false))
                 .collect(),
         };
         let map = self.config.world.map;
         let share = if channel.combine == Combine::Share { entities.len() as f64 } else { 1.0 };
-        let input = |&(place, value, other): &(DVec2, f64, bool)| {
+        let input = |&(place, value, counts, open): &(DVec2, f64, bool, bool)| {
             let mut borderline = false;
             let offset = Offset::new(states[agent].position, place);
-            if !(other && channel.range > 0.0 && offset.within(channel.range, &mut borderline)) {
-                return (channel.empty, borderline && other);
+            if !(counts && channel.range > 0.0 && offset.within(channel.range, &mut borderline)) {
+                return (channel.empty, (borderline || open) && counts);
             }
+            borderline |= open;
             let near = offset.d.max(channel.nearest);
             let measure = match channel.measure {
                 Measure::Linear => 1.0 - offset.d / (2f64.sqrt() * map[0].max(map[1])),
@@ -861,12 +886,13 @@ impl Described {
 }
 
 /// Compares every step of random worlds with what the keys say: who is nearest or chosen and how an agent moves to it, who
-/// stays where it is, what a channel senses of each, and that no agent leaves its box.
+/// stays where it is, what a channel senses of each, that POIs vanish, and that no agent leaves its box.
 #[test]
 fn agents_move_to_others_and_sense_each_as_described() {
     const TEAMS: usize = 5;
-    // To the nearest, to nobody, to a chosen one; inputs, in boxes, and steps at which nobody was near; borderline.
-    let (mut counts, mut borderlines, mut wrong) = ([0; 6], 0, vec![]);
+    // To the nearest, to nobody, to a chosen one; inputs, in boxes, and steps at which nobody was near; inputs of POIs when
+    // some had vanished. Borderline.
+    let (mut counts, mut borderlines, mut wrong) = ([0; 7], 0, vec![]);
     for seed in (1..600u64).step_by(2) {
         let config = sample::classes_world(seed);
         let world = World::new(&config.validate().unwrap());
@@ -884,9 +910,14 @@ fn agents_move_to_others_and_sense_each_as_described() {
             fitnesses: &[],
         };
         let trace = Cpu::default().trace(&group).unwrap();
+        let mut hidden = vec![];
         for (team, step) in (0..TEAMS).flat_map(|team| (1..=steps).map(move |step| (team, step))) {
             let states: Vec<State> =
                 (0..world.agents()).map(|agent| State::of(trace.moment(step - 1, team, agent))).collect();
+            if step == 1 {
+                hidden = vec![(false, false); world.pois.len()];
+            }
+            described.hide(&world, &states, &mut hidden);
             for (agent, state) in states.iter().enumerate() {
                 let (class, moment) = (described.class(agent), trace.moment(step, team, agent));
                 let (now, place) = (State::of(moment), format!("seed {seed} team {team} step {step} agent {agent}"));
@@ -903,10 +934,11 @@ fn agents_move_to_others_and_sense_each_as_described() {
                 for channel in &class.senses {
                     if let Sectors::Each(count) = channel.sectors {
                         let found = &trace.inputs_of(step, team, agent)[first..first + count];
-                        let expected = described.sensed(&world, channel, &states, agent);
+                        let expected = described.sensed(&world, channel, &states, &hidden, agent);
                         assert_eq!(expected.len(), count, "{place}");
                         for (found, (expected, borderline)) in found.iter().zip(expected) {
                             counts[4] += 1;
+                            counts[6] += u32::from(channel.of == ["pois"] && hidden.iter().any(|poi| poi.0));
                             let off = (f64::from(*found) - expected).abs();
                             if !borderline && off > INPUT * (1.0 + expected.abs()) {
                                 wrong.push(format!("{place} senses {found}, expected {expected}"));

@@ -23,7 +23,9 @@ pub(super) type WeightVector = [f32; VECTOR];
 /// Returns the words of a team's record: sets, counts and, if needed, sightings.
 pub(super) fn record_words(world: &World, records: RecordRequest<'_>) -> usize {
     let sights = if records.sights() { world.sight_words() } else { 0 };
-    world.set_words() + world.leaders() * world.followers() + sights
+    // Whether each POI has vanished comes last.
+    let gone = if world.vanishing.is_empty() { 0 } else { world.pois.len() };
+    world.set_words() + world.leaders() * world.followers() + sights + gone
 }
 
 /// Returns the bytes of the record of a team that is scored by a fitness, with its trace if scores need paths.

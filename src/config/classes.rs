@@ -295,6 +295,7 @@ impl Config {
             radius: world.observation_radius,
             observers: vec![],
             windows: windows.to_vec(),
+            gone_within: 0.0,
             score: Score::Observed,
             when: When::Ever,
             after: vec![],

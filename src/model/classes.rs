@@ -367,6 +367,9 @@ table! {
         /// the first and the last step, from 1, at which each POI can be observed; one pair for all, or one per POI
         #[serde(skip_serializing_if = "Vec::is_empty")]
         windows: Vec<[usize; 2]> = "steps",
+        /// once an observer has come this near, nobody senses the POI any more, though it can still be observed; with 0 it
+        /// is always sensed
+        gone_within: f64 = "units",
         /// what it counts for at a step with enough observers within its radius: 1 if observed; if closeness, the product
         /// of 1/max(d, 1) over the distances d of as many of the nearest as it needs
         score: Score = "",

@@ -50,6 +50,8 @@ pub(super) enum Command<'a> {
 pub(super) trait Vectors: Send + Sync {
     /// Executes a command. `moved` are the POI positions, `[teams][pois]`; empty if all teams have the world's.
     fn run(&mut self, world: &World, moved: &[Vec2], command: Command<'_>, observations: &mut Observations);
+    /// Returns whether each POI that can has vanished for a team, all bits or none, `[vanishing]`.
+    fn gone(&self, team: usize) -> Vec<u32>;
     /// Returns the record of a team, if one is kept. `moved` are POI positions, as in [`Vectors::run`]. `seen` is scratch
     /// memory that holds a part of it.
     fn episode<'a>(
@@ -144,6 +146,11 @@ impl<S: Simd> Vectors for TeamBlocks<S> {
             ..=VECTORS_PER_TASK => run(&mut parts),
             _ => parts.par_chunks_mut(VECTORS_PER_TASK).for_each(run),
         }
+    }
+
+    fn gone(&self, team: usize) -> Vec<u32> {
+        let (block, lane) = (&self.blocks[team / S::f32s::LEN], team % S::f32s::LEN);
+        block.state.gone.iter().map(|gone| gone[lane]).collect()
     }
 
     fn episode<'a>(
@@ -249,6 +256,9 @@ impl<S: Simd> Workspace<S> {
                 (agent.hx[lane], agent.hy[lane]) = (saved.headings[index * 2], saved.headings[index * 2 + 1]);
                 agent.speed[lane] = saved.speeds[index];
             }
+            let kinds = self.block.gone.len();
+            let gone = &saved.gone[(first + team) * kinds..][..kinds];
+            self.block.gone.iter_mut().zip(gone).for_each(|(to, &gone)| to[lane] = gone);
             if !saved.counts.is_empty() {
                 let counts = &saved.counts[(first + team) * pairs..][..pairs];
                 self.block.counts.iter_mut().zip(counts).for_each(|(count, &saved)| count[lane] = saved);

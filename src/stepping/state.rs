@@ -18,6 +18,8 @@ pub(super) struct Saved<'a> {
     pub headings: &'a [f32],
     /// `[teams][agents]`.
     pub speeds: &'a [f32],
+    /// Whether each POI that can has vanished, all bits or none, `[teams][vanishing]`.
+    pub gone: &'a [u32],
     /// `[teams][followers][leaders]`; empty unless recorded, as are the next two.
     pub counts: &'a [u32],
     /// `[teams][steps][pois][words]`.
@@ -56,6 +58,7 @@ impl Stepper {
         }
         words.extend_from_slice(&observations.steps);
         words.extend_from_slice(bytemuck::cast_slice(&self.moved));
+        (0..self.teams()).for_each(|team| words.extend(self.vectors.gone(team)));
         let (mut seen, mut sets, mut trail) = (Vec::new(), Vec::new(), Vec::new());
         for team in 0..self.teams() {
             if let Some(episode) = self.vectors.episode(team, &self.world, &self.moved, &mut seen) {
@@ -83,8 +86,8 @@ impl Stepper {
         let header = self.header(moved);
         let [_, _, _, record, trail, _] = header.map(|size| size as usize);
         let counts = if record > 0 { world.followers() * world.leaders() } else { 0 };
-        let sets = pois * world.constants.words as usize;
-        let of_team = agents * 5 + sets + pois * 2 + 1 + moved * 2 + counts + record + trail;
+        let (sets, vanishing) = (pois * world.constants.words as usize, world.vanishing.len());
+        let of_team = agents * 5 + sets + pois * 2 + 1 + moved * 2 + vanishing + counts + record + trail;
         if words.get(..HEADER) != Some(&header) || state.len() != (HEADER + teams * of_team) * 4 {
             return Err(StepError::State("it is of another world, number of teams or kind of record"));
         }
@@ -99,12 +102,17 @@ impl Stepper {
             positions,
             headings,
             speeds,
+            gone: words.take(teams * vanishing),
             counts: words.take(teams * counts),
             record: words.take(teams * record),
             trail: words.take(teams * trail),
         };
         check(world, agents_at_poi, &saved, moved)?;
-        if newly.iter().chain(observed).any(|&flag| flag > 1) || steps.iter().any(|&step| step > world.constants.steps)
+        let is_flag = |flag: &u32| *flag <= 1;
+        let gone_or_not = saved.gone.iter().all(|&gone| gone == 0 || gone == u32::MAX);
+        if !gone_or_not
+            || !newly.iter().chain(observed).all(is_flag)
+            || steps.iter().any(|&step| step > world.constants.steps)
         {
             return Err(StepError::State("a step or flag is out of range"));
         }

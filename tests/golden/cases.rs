@@ -94,6 +94,33 @@ at = [[16, 27], [26, 31], [36, 26], [25, 12]]
 coupling = 2
 ";
 
+/// Rovers that see POIs until one of them, or a scout that sees nothing but POIs, comes near.
+const VANISHING: &str = "
+[world]
+steps = 60
+dt = 0.5
+[[agents]]
+name = \"rover\"
+at = [[20, 20], [30, 20]]
+senses = [{ of = \"pois\", measure = \"closeness\", range = 20 }, { of = \"agents\" }]
+[[agents]]
+name = \"scout\"
+at = [[25, 26]]
+motion = { kind = \"free\", max_speed = 2.0 }
+senses = [{ of = \"pois\", sectors = \"each\", measure = \"inverse\" }]
+[[pois]]
+name = \"near\"
+at = [[20, 26], [30, 26]]
+coupling = 2
+gone_within = 3.0
+[[pois]]
+name = \"far\"
+at = [[25, 34], [12, 30], [38, 30]]
+coupling = 1
+gone_within = 1.5
+observers = \"rover\"
+";
+
 /// A large team: three leaders, 1100 followers that align with each other, and walls that they reach.
 const SWARM: &str = "
 [world]
@@ -131,7 +158,7 @@ radius = 4
 pub type Case = (&'static str, &'static str, &'static str, &'static [(&'static str, &'static str)]);
 
 /// Together these cases cover every choice in a config, and sizes on both sides of every special case.
-pub const CASES: [Case; 47] = [
+pub const CASES: [Case; 48] = [
     ("generally-forward", "first layout, leader-follower, Df", GENERALLY_FORWARD, &[]),
     ("strictly-forward", "second layout, D++", STRICTLY_FORWARD, &[("learning.fitness", "'D++'")]),
     ("chaotic", "third layout, G", CHAOTIC, &[("learning.fitness", "'G'")]),
@@ -325,6 +352,7 @@ pub const CASES: [Case; 47] = [
         ],
     ),
     ("influence", "rovers under D and UAVs that lead them under Dt, scores by distance", ROVERS_AND_UAVS, &[]),
+    ("vanishing", "POIs that nobody senses once an observer has been near", VANISHING, &[]),
     (
         "truncation",
         "a fifth of each population are elites, and only they become parents",

@@ -17,7 +17,7 @@ use crate::model::class::{Class, ClassLanes};
 use crate::model::follow::{self, Sum};
 use crate::model::sense::{self, ChannelLanes};
 use crate::model::{self, Lanes, motion, policy, pursue};
-use crate::world::{OUTPUTS, World};
+use crate::world::{OUTPUTS, Vanishing, World};
 
 /// The state of one vector of teams, one team per lane, with scratch memory for a step. A step reads only the
 /// previous state.
@@ -52,6 +52,11 @@ pub(crate) struct Block<S: Simd> {
     /// The squared observation radius and the value of each POI, `[pois]`.
     pub(super) radii2: Vec<f32>,
     pub(super) values: Vec<f32>,
+    /// As in the world; and the lanes in which each of these POIs has vanished, all bits of a lane or none, `[vanishing]`.
+    pub(super) vanishing: Vec<Vanishing>,
+    pub gone: Vec<S::u32s>,
+    /// Where each POI is sensed, `[pois]`; empty unless some vanish.
+    sensed: Vec<[S::f32s; 2]>,
 }
 
 /// The part of a [`Block`] that the next step depends on, after [`Block::sense`].
@@ -60,6 +65,7 @@ pub(crate) struct BlockState<S: Simd> {
     /// Empty unless scores need them.
     pub counts: Vec<S::u32s>,
     pub(super) near: Vec<u64>,
+    pub gone: Vec<S::u32s>,
 }
 
 #[derive(Clone, Copy)]
@@ -101,13 +107,16 @@ impl<S: Simd> Block<S> {
             plans: Plan::all(world),
             radii2: world.radii2.clone(),
             values: world.values.clone(),
+            vanishing: world.vanishing.clone(),
+            gone: vec![S::u32s::splat(simd, 0); world.vanishing.len()],
+            sensed: vec![],
         }
     }
 
     /// Returns the state to keep, with the counts or without.
     pub fn into_state(self, counted: bool) -> BlockState<S> {
-        let Block { agents, counts, near, .. } = self;
-        BlockState { agents, counts: if counted { counts } else { vec![] }, near }
+        let Block { agents, counts, near, gone, .. } = self;
+        BlockState { agents, counts: if counted { counts } else { vec![] }, near, gone }
     }
 
     /// Exchanges this block's state for another.
@@ -118,6 +127,7 @@ impl<S: Simd> Block<S> {
             std::mem::swap(&mut self.counts, &mut state.counts);
         }
         std::mem::swap(&mut self.near, &mut state.near);
+        std::mem::swap(&mut self.gone, &mut state.gone);
     }
 
     /// Puts one lane's agents at their start positions, with their initial headings.
@@ -134,22 +144,22 @@ impl<S: Simd> Block<S> {
     /// Sets all lanes' agents to their initial speed.
     #[inline(always)]
     pub fn start(&mut self) {
-        let Block { simd, world, agents, counts, .. } = self;
+        let Block { simd, world, agents, counts, gone, .. } = self;
         for class in &world.classes {
             agents[class.agents()].iter_mut().for_each(|agent| agent.speed = class.constants.motion.speed);
         }
-        counts.fill(S::u32s::splat(*simd, 0));
+        [counts, gone].into_iter().for_each(|lanes| lanes.fill(S::u32s::splat(*simd, 0)));
     }
 
     /// [`Block::start`] of one lane.
     #[inline(always)]
     pub fn start_lane(&mut self, lane: usize) {
-        let Block { world, agents, counts, .. } = self;
+        let Block { world, agents, counts, gone, .. } = self;
         for class in &world.classes {
             let speed = class.constants.motion.speed[lane];
             agents[class.agents()].iter_mut().for_each(|agent| agent.speed[lane] = speed);
         }
-        counts.iter_mut().for_each(|count| count[lane] = 0);
+        counts.iter_mut().chain(gone).for_each(|lanes| lanes[lane] = 0);
     }
 
     /// Computes the inputs of the leaders' policies, channel by channel.
@@ -157,6 +167,32 @@ impl<S: Simd> Block<S> {
     /// This, [`Block::step`] and [`Network::decide`](super::network::Network::decide) are most of the compiled code. They
     /// are functions of their own, so that whole episodes, traces, records and single steps share them.
     pub fn sense(&mut self, pois: &[impl PoiPosition<S>]) {
+        if self.vanishing.is_empty() {
+            self.sense_at(pois);
+        } else {
+            self.hide(pois);
+            let sensed = std::mem::take(&mut self.sensed);
+            self.sense_at(&sensed);
+            self.sensed = sensed;
+        }
+    }
+
+    /// Finds the POIs that have vanished, and puts them out of everybody's reach.
+    fn hide(&mut self, pois: &[impl PoiPosition<S>]) {
+        let Block { simd, world, agents, vanishing, gone, sensed, .. } = self;
+        sensed.clear();
+        sensed.extend(pois.iter().map(|poi| poi.lanes(*simd)));
+        for (Vanishing { poi, within2, classes }, gone) in vanishing.iter().zip(gone) {
+            let [x, y] = sensed[*poi];
+            for agent in classes.iter().flat_map(|&class| world.classes[class].agents()) {
+                let near = within::<S>(x - agents[agent].x, y - agents[agent].y, splat(*simd, *within2));
+                *gone |= near.to_vector().bitcast::<S::u32s>();
+            }
+            sensed[*poi][0] = select::<S>(x, splat(*simd, f32::INFINITY), gone.simd_gt(S::u32s::splat(*simd, 0)));
+        }
+    }
+
+    fn sense_at(&mut self, pois: &[impl PoiPosition<S>]) {
         self.simd.vectorize(
             #[inline(always)]
             || self.sense_channels(pois),

@@ -193,10 +193,7 @@ fn play<S: Simd>(
             let following = if early { take() } else { None };
             if is_large(batch.world, large_from) {
                 let swarm = workspace.swarm(simd, batch);
-                simd.vectorize(
-                    #[inline(always)]
-                    || swarm.play(batch, first, &mut Directed { team: first, actions }),
-                );
+                swarm.play(batch, first, &mut Directed { team: first, actions });
                 swarm.score(batch, first, scores);
             } else {
                 let episodes = workspace.block(simd, batch);
@@ -297,10 +294,7 @@ fn trace<S: Simd>(simd: S, group: &Group<'_>) -> Trace {
     for first in (0..teams).step_by(S::f32s::LEN) {
         let lanes = S::f32s::LEN.min(teams - first);
         let mut observer = Moments { moments: &mut moments, inputs: &mut inputs, of_team, teams, first, lanes };
-        simd.vectorize(
-            #[inline(always)]
-            || episodes.play(&batch, first, lanes, &mut observer),
-        );
+        episodes.play(&batch, first, lanes, &mut observer);
         for lane in 0..lanes {
             let episode = episodes.episode(&batch, lane);
             sets.extend(episode.sets.iter());
@@ -328,10 +322,7 @@ fn trace_large<S: Simd>(simd: S, group: &Group<'_>) -> Trace {
     let (mut sets, mut seen, mut trail) = (Vec::new(), Vec::new(), Vec::new());
     for team in 0..teams {
         watch.team = team;
-        simd.vectorize(
-            #[inline(always)]
-            || swarm.play(&batch, team, &mut watch),
-        );
+        swarm.play(&batch, team, &mut watch);
         let episode = swarm.episode();
         sets.extend(episode.sets.iter());
         seen.extend(episode.seen.words().iter());

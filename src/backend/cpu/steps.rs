@@ -205,10 +205,7 @@ fn record<S: Simd>(
             let observed_at = std::mem::take(&mut arrays.observed_at);
             if is_large {
                 let swarm = workspace.swarm(simd, batch);
-                simd.vectorize(
-                    #[inline(always)]
-                    || swarm.play(batch, first, &mut LargeRecorder { world, noise, team: first, arrays }),
-                );
+                swarm.play(batch, first, &mut LargeRecorder { world, noise, team: first, arrays });
                 swarm.score(batch, first, scores);
                 write_observed(world, observed_at, |_| swarm.episode());
             } else {

@@ -112,12 +112,19 @@ pub struct Uses {
     pub(super) pursues: bool,
     /// Whether agents of any class cannot leave a part of the map, or move only near others.
     pub(super) confines: bool,
+    /// Whether any POI vanishes.
+    pub(super) vanishes: bool,
 }
 
 impl Uses {
     fn of(world: &World) -> Uses {
         let any = |is: fn(&ClassShape) -> bool| world.classes.iter().any(|class| is(&class.constants.shape));
-        Uses { aligns: world.aligns(), pursues: any(ClassShape::pursues), confines: any(ClassShape::is_confined) }
+        Uses {
+            aligns: world.aligns(),
+            pursues: any(ClassShape::pursues),
+            confines: any(ClassShape::is_confined),
+            vanishes: !world.vanishing.is_empty(),
+        }
     }
 }
 

@@ -552,6 +552,7 @@ impl PoiGroup {
             radius: PoiGroup::radius(r).number(between(0.01, LONGEST), 5.0),
             observers,
             windows: windows(r, steps, size),
+            gone_within: PoiGroup::gone_within(r).number(between(0.01, LONGEST).or_zero(), 0.0),
             score: PoiGroup::score(r).choice(Score::Observed),
             when: PoiGroup::when(r).choice(When::Ever),
             after,

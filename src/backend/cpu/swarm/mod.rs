@@ -24,7 +24,7 @@ use crate::model::follow::{self, SteeringForce, Sum, TermLanes};
 use crate::model::motion::MotionLanes;
 use crate::model::sense::{self, ChannelLanes};
 use crate::model::{self, Lanes, couple, motion, policy};
-use crate::world::{OUTPUTS, World};
+use crate::world::{OUTPUTS, Vanishing, World};
 
 mod cells;
 
@@ -66,12 +66,14 @@ pub(super) struct Swarm<S: Simd> {
     constants: Vec<Class>,
     radii2: Vec<f32>,
     values: Vec<f32>,
+    vanishing: Vec<Vanishing>,
     recorded: Recorded,
     /// `[classes]`.
     plans: Vec<Plan>,
     cells: Vec<Cells>,
-    /// The POI positions, `[pois]`.
+    /// The POI positions, `[pois]`, and whether they have vanished.
     pois: Vec<Vec2>,
+    gone: Vec<bool>,
     network: Network<S>,
     /// Inputs of the leaders' policies, `[vectors of leaders][inputs]`, and their outputs, `[vectors of leaders]`. A leader
     /// keeps its lane.
@@ -130,10 +132,12 @@ impl<S: Simd> Swarm<S> {
             constants: world.classes.clone(),
             radii2: world.radii2.clone(),
             values: world.values.clone(),
+            vanishing: world.vanishing.clone(),
             recorded,
             plans: world.classes.iter().map(|class| Plan::new(world, class)).collect(),
             cells: world.classes.iter().map(cells).collect(),
             pois: world.pois.clone(),
+            gone: vec![false; world.pois.len()],
             network: Network::new(simd, &world.constants.policy, vec![0; vectors]),
             inputs: vec![zero; vectors * world.inputs()],
             outputs: vec![[zero; OUTPUTS]; vectors],
@@ -150,12 +154,12 @@ impl<S: Simd> Swarm<S> {
         bytemuck::cast_slice::<_, u8>(&self.constants) == bytemuck::cast_slice::<_, u8>(&world.classes)
             && self.world.constants == world.constants
             && [&self.radii2, &self.values] == [&world.radii2, &world.values]
+            && self.vanishing == world.vanishing
             && self.recorded == recorded
             && self.paths.is_empty() == world.paths.is_none()
     }
 
     /// Plays the whole episode of a team of the batch.
-    #[inline(always)]
     pub fn play(&mut self, batch: &WorldBatch<'_>, team: usize, watch: &mut impl Watch<S>) {
         let place = batch.locate(team);
         let group = &batch.groups[place.0];
@@ -166,6 +170,7 @@ impl<S: Simd> Swarm<S> {
         );
         self.pois.clear();
         self.pois.extend(group.pois());
+        self.gone.fill(false);
         for (cells, class) in self.cells.iter_mut().zip(&self.constants) {
             cells.start(group.starts, group.headings(), class.constants.motion.speed);
         }
@@ -221,6 +226,12 @@ impl<S: Simd> Swarm<S> {
 
     /// Computes the inputs of the leaders' policies, channel by channel.
     fn sense(&mut self) {
+        let Swarm { simd, cells, pois, gone, vanishing, .. } = self;
+        for Vanishing { poi, within2, classes } in vanishing {
+            for &class in &*classes {
+                each_within(*simd, &cells[class], pois[*poi], *within2, |_| gone[*poi] = true);
+            }
+        }
         self.simd.vectorize(
             #[inline(always)]
             || self.sense_channels(),
@@ -287,7 +298,7 @@ impl<S: Simd> Swarm<S> {
         };
         if channel.shape.of_pois != 0 {
             let all = S::mask32s::splat(simd, true);
-            for poi in model::each(&channel.shape.ranges).flatten() {
+            for poi in model::each(&channel.shape.ranges).flatten().filter(|&poi| !self.gone[poi]) {
                 sensing.add(self.pois[poi], self.values[poi], all);
             }
         } else if channel.range2[0] >= 0.0 {
