@@ -148,19 +148,14 @@ def run(arguments: argparse.Namespace) -> None:
                 print(f"{task} {optimiser}: {time.perf_counter() - start:.0f} s", flush=True)
 
 
-def cell(values: list[float], pois: int) -> str:
-    """Returns the mean with Student's 95 % interval, and the number of trials that reach 0.9.
-
-    As in `flotilla tasks`, equal values get the exact interval of 0 of n, times the smallest difference of two values.
-    """
-    mean, count = np.mean(values), len(values)
-    if len(set(values)) > 1:
-        t = np.quantile(np.random.default_rng(0).standard_t(count - 1, 1_000_000), 0.975)
-        room = t * np.std(values, ddof=1) / count**0.5
-    else:
-        room = (1 - 0.025 ** (1 / count)) / pois
+def cell(values: list[float]) -> str:
+    """Returns the mean with the 95 % interval of `flotilla compare`, and the number of trials that reach 0.9."""
+    more = np.array([*values, 0.0, 1.0])
+    t = np.quantile(np.random.default_rng(0).standard_t(len(more) - 1, 1_000_000), 0.975)
+    room = t * np.std(more, ddof=1) / len(more) ** 0.5
+    low, high = max(more.mean() - room, 0), min(more.mean() + room, 1)
     solved = sum(value >= 0.9 for value in values)
-    return f"{mean:.2f} [{max(mean - room, 0):.2f}, {min(mean + room, 1):.2f}] ({solved} of {count})"
+    return f"{np.mean(values):.2f} [{low:.2f}, {high:.2f}] ({solved} of {len(values)})"
 
 
 def show(rows: list[dict[str, str]], field: str) -> None:
@@ -168,12 +163,11 @@ def show(rows: list[dict[str, str]], field: str) -> None:
     print(f"\n{field}:\n\n| task |", *(f"{OPTIMISERS[optimiser]}, {episodes} |" for episodes, optimiser in columns))
     print("|---" * (len(columns) + 1) + "|")
     for task in sorted({row["task"] for row in rows}):
-        pois = len(flotilla.Config.load(TASKS / f"{task}.toml")["world.pois"])
         print(f"| {task} |", end="")
         for episodes, optimiser in columns:
             at = (task, OPTIMISERS[optimiser], str(episodes))
             values = [float(row[field]) for row in rows if (row["task"], row["optimiser"], row["episodes"]) == at]
-            print(f" {cell(values, pois) if values else '–'} |", end="")
+            print(f" {cell(values) if values else '–'} |", end="")
         print()
 
 
