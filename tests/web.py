@@ -192,6 +192,9 @@ def check_slow_network(tab, page):
     tab.click("#replay")
     tab.set("#step", 9)
     assert tab.evaluate("page.state.views[0].place") == 9
+    assert tab.evaluate("document.querySelector('#text').value") == tab.evaluate("page.state.text") != ""
+    tab.click("[data-mode=drive]")
+    assert tab.evaluate("document.querySelector('#again').disabled"), "a leader can be steered before it is there"
     tab.click("[data-mode=arrange]")
     assert tab.text("#views h2") == "Where everyone starts"
     assert tab.evaluate("page.state.views[0].data.episodes[0].headings.length") == 24
@@ -217,9 +220,31 @@ def check_slow_network(tab, page):
         tab.train()
         time.sleep(0.5)
         assert tab.evaluate("shifts") < 0.1, (width, "training", tab.evaluate("shifts"), tab.evaluate("moved"))
+        # The guide has room for what it says after a training.
+        tab.load(page)
+        for selector in ["#guide-choices button", "#guide-next", "#guide-choices button"]:
+            tab.click(selector)
+        tab.wait("document.querySelector('#guide-says').textContent.includes('Training is finished.')")
+        time.sleep(0.5)
+        assert tab.evaluate("shifts") < 0.1, (width, "the guide", tab.evaluate("shifts"), tab.evaluate("moved"))
     tab.call("Page.removeScriptToEvaluateOnNewDocument", identifier=script)
     tab.window(1280, 900, dark=False)
     print("the opening moves before the module has arrived, and the page shifts little")
+
+
+# Controls that are alone on a line of several, and do not fill half of it.
+LONE = """[...document.querySelectorAll('.row, #setup')].flatMap(row => {
+  if (row.parentElement.closest('.row, #setup')) return [];
+  const lines = [], controls = [...row.querySelectorAll('button, label, output:not(:empty)')];
+  for (const control of controls.filter(e => e.checkVisibility())) {
+    const { top, bottom } = control.getBoundingClientRect();
+    const line = lines.find(line => top < line.bottom && bottom > line.top);
+    if (line) line.controls.push(control); else lines.push({ top, bottom, controls: [control] });
+  }
+  const lone = ({ controls: [first, ...more] }) =>
+    !more.length && first.tagName !== 'OUTPUT' && first.offsetWidth < row.clientWidth / 2;
+  return lines.filter(line => lines.length > 1 && lone(line)).map(({ controls: [{ textContent }] }) => textContent);
+})"""
 
 
 def check_map_in_view(tab, page):
@@ -236,10 +261,37 @@ def check_map_in_view(tab, page):
         train = tab.evaluate("document.querySelector('#train').getBoundingClientRect().toJSON()")
         assert train["top"] >= 0 and train["right"] <= width, (what, width, train)
 
+    def look_below(mode, width, height):
+        """Tests that the controls below a map to arrange or to steer are in view, and that no control is alone."""
+        if mode != "watch":
+            boxes = f"[...document.querySelectorAll('#{mode} button')].map(e => e.getBoundingClientRect())"
+            bottom = tab.evaluate(f"Math.max(...{boxes}.map(({{ bottom }}) => bottom))")
+            assert bottom <= height, (mode, width, bottom)
+        assert tab.evaluate(LONE) == [], (mode, width, tab.evaluate(LONE))
+
     for width, height in [(1280, 800), (1024, 768), (820, 1180), (390, 844)]:
         tab.window(width, height, dark=False)
+        # Also if settings, or a note on a damaged link, are above the map, and if classes of agents have more controls.
+        cases = [({"layout": "chaotic"}, ""), ({"learners": "lead", "compare": "x"}, ""), ({}, "rovers")]
+        for settings, name in cases:
+            tab.load(page, **settings)
+            if name:
+                tab.drop(f"{name}.toml", base64((CONFIGS / f"{name}.toml").read_bytes()))
+                tab.wait("page.state.start.classes?.length === 2")
+            tab.evaluate("document.querySelector('#more').open = true; 0")
+            for mode in ["arrange", "drive"]:
+                tab.evaluate(f"scrollTo(0, 0); {press(f'[data-mode={mode}]')}; 0")
+                look(mode, width)
+                look_below(mode, width, height)
+            # Start does not move when it is pressed.
+            place = "(({ left, top }) => [left, top])(document.querySelector('#again').getBoundingClientRect())"
+            before = tab.evaluate(place)
+            tab.evaluate(f"{press('#again')}; 0")
+            tab.wait("document.querySelector('#driven').textContent")
+            assert tab.evaluate(place) == before, (width, settings, name)
         tab.load(page)
         look("the opening", width)
+        assert tab.evaluate(LONE) == [], (width, tab.evaluate(LONE))
         # Settings are in one row.
         boxes = "[...document.querySelectorAll('#setup > :not([hidden])')].map(e => e.getBoundingClientRect())"
         row = tab.evaluate(f"Math.max(...{boxes}.map(b => b.top)) < Math.min(...{boxes}.map(b => b.bottom))")
@@ -261,13 +313,7 @@ def check_map_in_view(tab, page):
             for mode in ["arrange", "drive", "watch"]:
                 tab.evaluate(f"scrollTo(0, {scroll}); {press(f'[data-mode={mode}]')}; 0")
                 look(mode, width)
-                # Controls below a map to arrange or to steer are in view, too.
-                if mode != "watch":
-                    label, bottom = tab.evaluate(
-                        f"(() => {{ const e = document.querySelector('#{mode} button');"
-                        " return [e.textContent, e.getBoundingClientRect().bottom]; })()"
-                    )
-                    assert bottom <= height, (mode, width, label, bottom)
+                look_below(mode, width, height)
         # Answers in the guide, Next, and Train leave the maps in view. The guide's text is longest after a training.
         # A visitor can press only what is in view.
         tab.load(page)
@@ -294,6 +340,7 @@ def check_map_in_view(tab, page):
             assert len(set(tops)) == 1, (width, tops)
             chart = tab.evaluate("document.querySelector('#curves').getBoundingClientRect().top")
             assert tops[0] < chart < height, (width, tops, chart)
+        assert tab.evaluate(LONE) == [], (width, tab.evaluate(LONE))
     tab.assert_no_errors()
     tab.window(1280, 900, dark=False)
     print("the maps stay in view")
@@ -322,7 +369,34 @@ def check_consistency(tab, page, downloads):
     tab.wait("document.querySelector('#message').textContent.startsWith('run.zip: the run is complete')")
     assert "all-leaders" not in tab.text("#announced"), tab.text("#announced")
     assert "of 2 (leader-follower)" in tab.text("#announced"), tab.text("#announced")
+    # The experiment that was chosen last is trained, even if another one was being started.
+    arms = "page.state.training.arms.map(({ label }) => label).join()"
+    for first, milliseconds in [("population", 5), ("population", 20), ("population", 50), ("groups", 0)]:
+        tab.load(page, on="cpu", pace="full")
+        both = [f"document.querySelector('[data-exhibit={name}]').click()" for name in [first, "blind"]]
+        tab.evaluate(f"{both[0]}; setTimeout(() => {both[1]}, {milliseconds}); 0")
+        tab.wait("page.state.chosen?.name === 'blind' && page.state.training?.reached >= 0")
+        assert tab.evaluate(arms).startswith("start jitter 0.0,"), (first, milliseconds, tab.evaluate(arms))
+    # The guide does not return if it is left while it waits for the populations of its fourth step.
+    tab.load(page)
+    tab.evaluate(
+        "window.unpacked = 0; const { unpack } = page.stage;"
+        " page.stage.unpack = data => { unpacked += 1; return unpack(data); };"
+        " page.state.guide = { step: 3, said: null }; document.querySelector('#pace').value = 'full'; 0"
+    )
+    tab.evaluate("document.querySelector('#pace').dispatchEvent(new Event('change')); 0")
+    tab.click("#guide-next")
+    tab.wait("page.state.training?.reached >= 0")
+    tab.click("#stop")
+    tab.evaluate("document.querySelector('#guide-choices button').click(); 0")
+    assert tab.text("#guide-says").endswith(" The populations are being trained…"), tab.text("#guide-says")
+    tab.click("#guide-end")
+    tab.wait("unpacked >= 150")
+    time.sleep(0.3)
+    assert tab.evaluate("document.querySelector('#guide').hidden"), "the guide returns"
     # What was said about a file is gone with the next experiment.
+    tab.drop("mine.toml", base64(STAGED.encode()))
+    tab.wait("document.querySelector('#message').textContent.startsWith('mine.toml is the config')")
     tab.evaluate("document.querySelector('[data-exhibit=blind]').click()")
     assert tab.text("#message") == "", tab.text("#message")
     # Controls that would do nothing are disabled, or say why.
@@ -492,6 +566,31 @@ def check_history(tab, page):
     assert tab.evaluate(arms).startswith("start jitter"), tab.evaluate(arms)
     tab.wait("page.state.views.every(view => view.data)")
     tab.assert_no_errors()
+    # Two steps back at once lose no results, either.
+    tab.click("[data-exhibit=relay]")
+    tab.wait("page.state.training && page.state.training.arms[0].label === 'D' && page.state.training.reached >= 0")
+    slow = "(...words) => new Promise(done => setTimeout(done, 300)).then(() => ask.apply(player, words))"
+    tab.evaluate(
+        "window.player = page.state.players[0]; window.ask = player.ask;"
+        f" player.ask = {slow}; addEventListener('popstate', () => history.back(), {{ once: true }}); history.back(); 0"
+    )
+    tab.wait("page.state.training && page.state.training.arms.length === 2")
+    time.sleep(0.5)
+    tab.evaluate("delete player.ask; history.forward(); 0")
+    tab.wait("page.state.training && page.state.training.arms.length === 3")
+    assert tab.evaluate(arms).startswith("start jitter"), tab.evaluate(arms)
+    tab.assert_no_errors()
+    # Back within the guide returns to what the guide said.
+    tab.load(page)
+    tab.set("#pace", "full")
+    tab.click("#guide-choices button")
+    tab.click("#guide-next")
+    question = tab.text("#guide-says")
+    tab.click("#guide-choices button")
+    tab.wait("page.state.training && page.state.training.reached >= 0")
+    tab.evaluate("history.back(); 0")
+    tab.wait("page.state.exhibit && page.state.exhibit.name === 'opening'")
+    assert tab.text("#guide-says") == question, tab.text("#guide-says")
     # Back from the first experiment of the gallery returns to the opening.
     tab.load(page)
     tab.click("[data-exhibit=relay]")
@@ -515,7 +614,16 @@ def check_history(tab, page):
     tab.open(tab.evaluate("copied"))
     tab.wait(f"{READY} && {DONE}")
     assert tab.evaluate(digests) == first
-    # Space pauses what plays. Otherwise it scrolls.
+    # While a map is rearranged, a link opens this map, and not the training.
+    tab.click("[data-mode=arrange]")
+    tab.click("[data-add=pois]")
+    tab.wait("document.querySelector('#layout').value === 'own'")
+    tab.evaluate("navigator.clipboard.writeText = text => { window.copied = text; return Promise.resolve(); }; 0")
+    tab.click("#share")
+    tab.wait("window.copied")
+    assert "play=" not in tab.evaluate("copied") and "config=" in tab.evaluate("copied"), tab.evaluate("copied")
+    assert tab.text("#message") == "The link is copied: whoever opens it trains the same.", tab.text("#message")
+    # Space pauses and resumes what plays. Otherwise it scrolls.
     space = "(() => { const key = new KeyboardEvent('keydown', { key: ' ', bubbles: true, cancelable: true });"
     space += " document.body.dispatchEvent(key); return key.defaultPrevented; })()"
     tab.load(page, layout="chaotic")
@@ -523,6 +631,7 @@ def check_history(tab, page):
     tab.load(page)
     tab.wait("page.state.views[0].playing")
     assert tab.evaluate(space) and not tab.evaluate("page.state.views[0].playing")
+    assert tab.evaluate(space) and tab.evaluate("page.state.views[0].playing")
     # With reduced motion, the guide starts no motion.
     tab.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-reduced-motion", "value": "reduce"}])
     tab.load(page)
@@ -530,7 +639,7 @@ def check_history(tab, page):
     assert tab.evaluate("page.state.views[0].removed.group && !page.state.views[0].playing")
     tab.window(1280, 900, dark=False)
     tab.assert_no_errors()
-    print("Back returns to results, links open what is on show, and Space pauses only what plays")
+    print("Back returns to results, links open what is on show, and Space pauses and resumes only what plays")
 
 
 def check_links_and_devices(tab, page):
@@ -549,6 +658,11 @@ def check_links_and_devices(tab, page):
         message = tab.evaluate(trouble)
         assert "This link is damaged" in message and key in message, message
         assert tab.evaluate("location.hash").endswith(value), tab.evaluate("location.hash")
+    # An error about a file ends when another link is opened.
+    tab.drop("curves.png", base64(b"\x89PNG"))
+    tab.wait(f"{trouble}.includes('curves.png')")
+    tab.evaluate("location.hash = '#layout=chaotic&seed=5'; 0")
+    tab.wait("page.state.config.learning.seed === '5' && document.querySelector('#trouble').hidden")
     # No link is copied while the config has errors.
     tab.load(page, layout="chaotic")
     address = tab.evaluate("location.href")
@@ -1097,10 +1211,24 @@ def check_first_visit(tab, page, call, downloads):
     assert tab.text("#guide-says").startswith("You said: 20 are enough. It is: 500. "), tab.text("#guide-says")
     assert not tab.text("#needless")
     tab.assert_no_errors()
-    # The whole population of three generations is shown, as 50 faint teams each.
-    tab.click("#guide-next")
+    # The whole population of three generations is shown, as 50 faint teams each. Random teams wait meanwhile.
+    sums_random = "page.state.training.arms.reduce((sum, { random }) => sum + random.length, 0)"
+    tab.evaluate(
+        "window.randoms = []; const since = performance.now(), timer = setInterval(() => {"
+        " if (!page.state.training) return clearInterval(timer);"
+        f" if (performance.now() > since + 1000) randoms.push({sums_random});"
+        " }, 20); document.querySelector('#guide-next').click(); 0"
+    )
     tab.click(predict)
+    assert tab.text("#guide-says").endswith(" The populations are being trained…"), tab.text("#guide-says")
+    assert tab.evaluate("document.querySelector('#guide-next').disabled")
     tab.wait("page.state.views.length === 3 && page.state.views.every(view => view.ghosts.length === 50)", 100)
+    assert len(set(tab.evaluate("randoms"))) <= 1, "random teams are played before what the guide waits for"
+    # A link does not contain populations, and the page says so.
+    tab.evaluate("navigator.clipboard.writeText = text => { window.copied = text; return Promise.resolve(); }; 0")
+    tab.click("#share")
+    tab.wait("window.copied")
+    assert tab.text("#message").endswith("it has the settings, but not the teams on show."), tab.text("#message")
     # They are drawn once, so that the best team still moves. Drawing them for every picture took seconds.
     tab.wait("page.state.views.every(view => view.place >= 25)", 20)
     titles = tab.evaluate("page.state.views.map(view => view.title.textContent)")
@@ -1257,6 +1385,8 @@ def check_first_visit(tab, page, call, downloads):
     assert "compare=learning.fitness" in tab.evaluate("location.hash")
     tab.click("#undo")
     assert tab.evaluate("page.state.compared") is None
+    # Settings in which the arms differ are not given as those of all arms.
+    assert "with other settings: seed 7, population 20" in tab.text("#stale"), tab.text("#stale")
     tab.assert_no_errors()
     print("all fitnesses are compared, and each arm's command gives its digest")
 

@@ -74,7 +74,7 @@ export async function recall() {
   for (const key of ["generation", "trial", "play"]) if (words.has(key) && whole(key) === null) unknown.push(`${key}=${words.get(key)}`);
   wanted = whole("play") === 1 ? { generation: whole("generation") ?? Infinity, trial: whole("trial") ?? 0 } : null;
   const damage = unknown.length ? `This link is damaged: ${unknown.join(", ")} cannot be read. Ask for a new link; this page shows another experiment.` : "";
-  Object.assign(state, { compared, troubles: { ...state.troubles, link: damage } });
+  Object.assign(state, { compared, troubles: { link: damage } });
   const taken = await take(text, { linked: !damage });
   if (!taken && !state.views.length) {
     // Show a map even if the config in the link is invalid.
@@ -85,17 +85,21 @@ export async function recall() {
   render({ note: version !== null && version !== state.version ? `This link is from version ${version}, and this page is version ${state.version}: results may differ.` : "" });
 }
 
-/** Returns whether several opened runs are on show. No link holds them. */
-export const shows_runs = () => Boolean(state.training && state.training.arms.length > 1 && state.training.source && !state.training.source.compared);
+/** Returns the training on show, if any. */
+export const trained = () => state.mode === "watch" ? state.training : null;
+/** Returns whether several opened runs are on show. No link holds them. @param {Training | null} training */
+export const are_runs = training => Boolean(training && training.arms.length > 1 && training.source && !training.source.compared);
+/** Returns whether the opening is on show. */
+export const shows_opening = () => state.mode === "watch" && state.exhibit === OPENED;
 
 /**
  * Returns a link to what is on show: a training with its generation and trial, the opening, or otherwise the experiment. Whoever opens a
  * training trains at once. Digests depend on the version.
  */
 export async function link() {
-  const { training, exhibit, generation, trial } = state, page = location.href.split("#")[0];
-  if (exhibit === OPENED) return page;
-  const source = training && !shows_runs() ? training.source : null, old = source && (source.text !== state.text || source.compared !== state.compared);
+  const { generation, trial } = state, training = trained(), page = location.href.split("#")[0];
+  if (shows_opening()) return page;
+  const source = training && !are_runs(training) ? training.source : null, old = source && (source.text !== state.text || source.compared !== state.compared);
   const words = old && training ? await words_of(source, training.arms[0].config, "own") : new URLSearchParams(location.hash.slice(1));
   if (source) for (const [key, value] of Object.entries({ generation, trial, play: 1 })) words.set(key, String(value));
   words.set("version", state.version);

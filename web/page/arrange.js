@@ -25,7 +25,7 @@ function describe_start() {
   const { world } = state.config, chosen = start_view && start_view.chosen && name_chosen(start_view.chosen);
   const who = groups().filter(({ list, from, end }) => list !== "pois" && end > from).map(({ name, table, from, end }) => table === "world" ? count(end - from, name) : `${end - from} × ${name}`);
   $("remove").disabled = !chosen;
-  write_text($("chosen"), chosen ? `Chosen: ${chosen}` : "");
+  write_text($("chosen"), chosen ? `Chosen: ${chosen}` : "Nothing is chosen.");
   const status = `${who.join(", ")}, ${count(world.pois.length, "POI")} · ${world.steps} steps`;
   return [status, `Map of the start: ${status}${chosen ? `; chosen: ${chosen}` : ""}`];
 }

@@ -13,13 +13,14 @@ export async function constants(training) {
 
 /**
  * Plays as many random teams as the training evaluated, in slices, so that the clerk still answers other requests. They cost as much as
- * the training, and are played after it.
+ * the training, and are played after it, and after what the guide waits for.
  * @param {Training} training
  */
 export async function randoms(training) {
   for (const arm of training.arms) {
     await clerk.ask({ ask: "random", text: arm.toml });
     for (let done = false; !done;) {
+      await clerk.is_free();
       if (state.training !== training) return;
       const { words } = await clerk.ask({ ask: "more_random", milliseconds: 60 });
       arm.random = words.g;

@@ -16,6 +16,9 @@ part(() => [state.config.world.leaders.length, state.start], () => {
   if (Number(chosen) < many && chosen !== "") $("leader").value = chosen;
 });
 
+// Nobody can steer until the module has resolved a config.
+part(() => [state.toml], () => { $("again").disabled = state.toml === null; });
+
 export function drive_view() {
   const only = only_view("In your hands", reach(state.config));
   $("driven").textContent = "";
@@ -69,6 +72,7 @@ function wish(positions, headings, leader) {
 }
 
 export async function drive_on() {
+  if (state.toml === null) return;
   drive_off();
   const only = drive_view(), leader = Number($("leader").value) || 0;
   only.canvas.focus({ preventScroll: true });
@@ -76,7 +80,7 @@ export async function drive_on() {
   drive.on = true;
   $("again").textContent = "Start over";
   // Classes already say which agents learn.
-  const toml = state.start.classes ? state.toml : await edited(state.toml ?? "", [["learning.paradigm", '"leader-follower"']]);
+  const toml = state.start.classes ? state.toml : await edited(state.toml, [["learning.paradigm", '"leader-follower"']]);
   const { each, weights, of } = state.policies || { each: 0 };
   /** @type {Driven} */
   let now;

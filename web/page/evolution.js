@@ -8,7 +8,7 @@ const GENERATIONS = [0, 15, 60], POPULATION = 50;
 let made = null;
 // Trains until each generation, and plays every policy. Policy n of a leader plays with policy n of the others. Trainings with the same
 // seed are equal until one ends.
-export const evolution = () => made ??= make_evolution();
+export const evolution = () => made ??= clerk.put_first(make_evolution).catch(thrown => { made = null; throw thrown; });
 
 async function make_evolution() {
   const resolve = (/** @type {number} */ generations) => clerk.ask({

@@ -86,8 +86,9 @@ part(() => [state.training, state.text, state.compared], () => {
   const { training } = state, differs = training && training.source && (training.source.text !== state.text || JSON.stringify(training.source.compared) !== JSON.stringify(state.compared));
   $("stale").hidden = !differs;
   if (!differs) return;
-  const { fitness, seed, population, generations } = training.arms[0].config.learning;
-  $("stale").textContent = `The results below were trained with other settings: fitness ${fitness}, seed ${seed}, population ${population}, ${generations} generations. Train again to see the present ones.`;
+  const { arms } = training, alike = (/** @type {keyof Config["learning"]} */ key) => arms.every(({ config }) => config.learning[key] === arms[0].config.learning[key]);
+  const values = /** @type {const} */ (["fitness", "seed", "population", "generations"]).filter(alike).map(key => `${key} ${arms[0].config.learning[key]}`);
+  $("stale").textContent = `The results below were trained with other settings: ${values.join(", ")}. Train again to see the present ones.`;
 });
 
 // Edits are applied after a delay. `entered` applies pending ones at once, so that what follows uses them.

@@ -57,11 +57,13 @@ export const is_of = name => {
   return chosen !== null && chosen.name === name && chosen.text === text && chosen.compared === compared;
 };
 
+let turns = 0;
 /** Replaces the experiment by one of the gallery, and trains it if asked. @param {string} name */
 export async function exhibit(name, { trains = false } = {}) {
   const found = GALLERY.find(exhibit => exhibit.name === name);
   if (!found) return;
-  const own = text_of(found.config ?? name), text = found.changes ? await edited(own, found.changes) : own;
+  const turn = ++turns, own = text_of(found.config ?? name), text = found.changes ? await edited(own, found.changes) : own;
+  if (turn !== turns) return;
   keep();
   forget();
   render({ chosen: { name, text, compared: found.compare }, file: null, compared: found.compare, mode: "watch" });

@@ -99,14 +99,15 @@ type Shown = View & { data: Scene };
  * generation under the pointer. `training` has the results on
  * show, and without one `exhibit` the episode. `valid` tells whether the text is a valid config, `problems` why not, and `config`, `toml`, `pois`
  * and `start` are those of the last valid text. `linked` tells whether the address holds it. `past` has earlier texts, for undo. `chosen` is
- * the latest experiment of the gallery, `note` is about the version of the opened link, and `guide` the step of the guided start, and what the visitor predicted. `layouts` has the config of each layout. `settled` is the choice that `machine` was opened for.
+ * the latest experiment of the gallery, `note` is about the version of the opened link, and `guide` the step of the guided start, what the visitor predicted, and whether it waits for what it shows. `told` is what `guide` was when it was last about what is on show. `layouts` has the config of each layout. `settled` is the choice that `machine` was opened for.
  */
 interface State extends Past {
   valid: boolean, config: Config, toml: string | null, pois: number | null, start: Start, past: Past[], problems: Problem[], linked: boolean,
   mode: "watch" | "arrange" | "drive", training: Training | null, exhibit: Exhibit | null, follow: boolean, generation: number, over: number | null, trial: number,
-  views: View[], chosen: Picked | null, guide: { step: number, said: string | null } | null, troubles: Record<string, string>, message: string, note: string, gpu: Gpu, machine: Machine, settled: string | null,
+  views: View[], chosen: Picked | null, guide: Guide | null, told: Guide | null, troubles: Record<string, string>, message: string, note: string, gpu: Gpu, machine: Machine, settled: string | null,
   players: Player[], policies: { each: number, weights: Bytes, of?: string } | null, layouts: Record<string, Config>, version: string,
 }
+interface Guide { step: number, said: string | null, waits?: boolean }
 interface Past { text: string, file: string | null, compared: Comparison | null }
 /** An experiment of the gallery, and what it set. */
 interface Picked { name: string, text: string, compared: Comparison }

@@ -1,11 +1,11 @@
 // The guided start: each step asks for a prediction, shows what happens, and says why. Until it ends, the map is above the settings.
 import { remove_leader } from "./credit.js";
-import { $, all, make, number, still } from "./dom.js";
+import { $, all, failure, make, number, still } from "./dom.js";
 import { evolution } from "./evolution.js";
 import { exhibit, is_of } from "./gallery.js";
 import { OPENED } from "./opening.js";
-import { part, render, shown, state } from "./state.js";
-import { forget } from "./train.js";
+import { part, render, shown, state, trouble } from "./state.js";
+import { forget, found_by } from "./train.js";
 import { replay } from "./views.js";
 
 /** The leader of the opening with the largest Df, and what the team loses without it. */
@@ -71,19 +71,23 @@ function show_opening(removed) {
 
 /** Returns whether the page shows an exhibit or an experiment. @param {string} name */
 const is_shown = name => state.mode === "watch" && (state.exhibit ? state.exhibit.name === name : is_of(name));
-/** Returns what a step, or its question, is about. @param {NonNullable<State["guide"]>} at */
-const about = ({ step, said }) => STEPS[said === null ? Math.max(0, step - 1) : step];
+/** Returns what a step, or its question, is about. @param {Guide} at */
+const about = ({ step, said, waits }) => STEPS[said === null || waits ? Math.max(0, step - 1) : step];
 
 part(() => [state.guide, state.mode, state.exhibit, state.text, state.compared, state.training, state.training && state.training.state], () => {
   const { guide, training } = state;
   $("guide").hidden = guide === null;
   $(guide === null ? "guide" : "credit").after($("setup"));
-  if (!guide) return;
-  const { step, said } = guide, { asks, choices, right, why } = STEPS[step], here = is_shown(about(guide).of), last = step === STEPS.length - 1;
+  if (!guide) return void (state.told = null);
+  const { step, said, waits = false } = guide, { asks, choices, right, why } = STEPS[step], here = is_shown(about(guide).of), last = step === STEPS.length - 1;
   const watches = said !== null && training && training.state !== "done", result = training ? $("announced").textContent : "";
+  if (here && !waits) state.told = guide;
   $("guide-step").textContent = `${step + 1} of ${STEPS.length}`;
   $("guide-says").textContent = !here ? "What is on show is not part of the guide."
-    : said === null ? asks : `You said: ${small(said)}. ${watches ? "Watch the map and the chart." : `${said === choices[right] ? "That is right." : `It is: ${small(choices[right])}.`} ${result ? `${result} ` : ""}${why}`}`;
+    : said === null ? asks : `You said: ${small(said)}. ${waits ? "The populations are being trained…" : watches ? "Watch the map and the chart." : `${said === choices[right] ? "That is right." : `It is: ${small(choices[right])}.`} ${result ? `${result} ` : ""}${why}`}`;
+  // Room for the rest of the text. What is said meanwhile takes up about 30 characters of it.
+  const meanwhile = 30, found = watches ? `Training is finished. ${found_by(training)} ` : "";
+  $("guide-says").dataset.rest = here && (waits || watches) ? ` That is right. ${found}${why}`.slice(meanwhile) : "";
   const asked = here && said === null;
   $("guide-choices").replaceChildren(...(asked ? choices : []).map(choice => {
     const button = make("button", choice, null, { type: "button" });
@@ -91,16 +95,26 @@ part(() => [state.guide, state.mode, state.exhibit, state.text, state.compared, 
     return button;
   }));
   $("guide-next").hidden = asked;
+  $("guide-next").disabled = here && waits;
   $("guide-next").textContent = !here ? "Back to the guide" : last ? "Done" : "Next";
   $("guide-end").hidden = here && last && !asked;
 });
 
-/** Shows a step, and what it is about. @param {NonNullable<State["guide"]>} guide */
-async function enter(guide) {
-  const had_focus = $("guide").contains(document.activeElement), { ready } = STEPS[guide.step], made = ready && ready();
-  for (const button of all("button", $("guide-choices"))) button.inert = true;
-  if (made && guide.said !== null) $("guide-says").textContent = `You said: ${small(guide.said)}. The populations are being trained…`;
-  if (guide.said !== null) await made;
+/** Shows a step, and what it is about. @param {Guide} at */
+async function enter({ step, said }) {
+  const had_focus = $("guide").contains(document.activeElement), guide = { step, said }, made = STEPS[step].ready?.();
+  made?.catch(() => {});
+  if (made && said !== null) {
+    const waiting = { ...guide, waits: true }, here = is_shown(about(waiting).of);
+    render({ guide: waiting });
+    try { await made; } catch (thrown) {
+      trouble("run", failure(thrown).message);
+      return render({ guide: state.guide && { step, said: null } });
+    }
+    // The visitor may have left the guide, or chosen something else to show.
+    if (state.guide !== waiting) return;
+    if (here && !is_shown(about(waiting).of)) return render({ guide });
+  }
   render({ guide });
   const watched = guide.said !== null || !is_shown(about(guide).of) ? about(guide).watch() : null;
   if (had_focus) ($("guide-next").hidden ? all("button", $("guide-choices"))[0] : $("guide-next")).focus({ preventScroll: true });

@@ -1,5 +1,5 @@
 // The page's event listeners and its start.
-import { autoplay, link, recall, remember, shows_runs } from "./address.js";
+import { are_runs, autoplay, link, recall, remember, shows_opening, trained } from "./address.js";
 import { remove } from "./arrange.js";
 import { comparison } from "./compare.js";
 import { configs } from "./config.js";
@@ -19,7 +19,7 @@ import { clerk, pool } from "./pool.js";
 import { KEYS, KEY_IDS, copy, quote, render, report, save, state, trouble } from "./state.js";
 import { forget, stop, train } from "./train.js";
 import { verify } from "./verify.js";
-import { ask_all, draw, follow, pause, replay, seek, step_to, wake_up } from "./views.js";
+import { ask_all, draw, end_of, follow, moving, pause, replay, seek, step_to, wake_up } from "./views.js";
 
 function listen() {
   $("setup").addEventListener("submit", event => { event.preventDefault(); train(); });
@@ -78,11 +78,13 @@ function listen() {
   $("verify").addEventListener("click", verify);
   $("share").addEventListener("click", async () => {
     await entered();
+    if (shows_opening()) return void copy(await link(), "The link is copied: whoever opens it sees the same team.");
     if (!state.valid) return report("No link was copied: the config has problems. Correct them first.");
-    if (state.exhibit !== OPENED && !await remember()) return report("No link was copied: this browser cannot compress a config. Save config.toml instead.");
-    if (shows_runs()) return void copy(await link(), "The link is copied: it has the settings of the first run, but not the runs.");
-    const sees = state.training ? "sees the same generation of the same training" : state.exhibit === OPENED ? "sees the same team" : "trains the same";
-    copy(await link(), `The link is copied: whoever opens it ${sees}.`);
+    if (!await remember()) return report("No link was copied: this browser cannot compress a config. Save config.toml instead.");
+    const training = trained(), has = are_runs(training) ? "it has the settings of the first run, but not the runs"
+      : training ? "whoever opens it sees the same generation of the same training"
+        : state.mode === "watch" && state.exhibit ? "it has the settings, but not the teams on show" : "whoever opens it trains the same";
+    copy(await link(), `The link is copied: ${has}.`);
   });
   $("png").addEventListener("click", save_png);
   $("gif").addEventListener("click", save_gif);
@@ -106,9 +108,9 @@ function listen() {
   });
   addEventListener("keydown", event => {
     if (event.key !== " " || /** @type {Element} */ (event.target).closest("button, input, select, textarea, summary, a")) return;
-    // Where nothing plays, Space scrolls.
+    // Where nothing plays or is paused, Space scrolls.
     const { training, mode } = state, going = training && training.state === "training";
-    if (mode !== "watch" || !going && !state.views.some(view => view.playing)) return;
+    if (mode !== "watch" || !going && !moving().some(view => view.playing || view.place > 0 && view.place < end_of(view))) return;
     event.preventDefault();
     if (going) pause(); else replay();
   });
@@ -134,6 +136,7 @@ async function start() {
   listen();
   gallery();
   if (opens) {
+    $("text").value = text_of(OPENING);
     render({ text: text_of(OPENING), exhibit: OPENED });
     guide();
     appear();

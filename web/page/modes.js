@@ -25,12 +25,13 @@ part(() => [state.mode, subject()], () => {
   } else if (mode === "watch" && exhibit) {
     clear();
     const crop = exhibit.scenes.map(({ data }) => stage.busy(data)).reduce(join);
-    for (const { title, data, status, label, ghosts = [] } of exhibit.scenes) {
+    for (const { title, status, label, ghosts = [] } of exhibit.scenes) {
       const view = add_view(title, crop);
       view.describe = (step, observed, text) => [status(step, observed), `${label}, step ${step}: ${text}`];
       view.ghosts = ghosts;
-      show(view, data);
     }
+    // Their sizes depend on how many they are.
+    exhibit.scenes.forEach(({ data }, index) => show(state.views[index], data));
   } else show_start();
 });
 

@@ -100,6 +100,8 @@ export const clerk = (() => {
   let player = null;
   /** The same player, or one that is being opened. @type {Promise<Player> | null} */
   let opened = null;
+  /** Ends when all work that goes first has ended. @type {Promise<unknown>} */
+  let first = Promise.resolve();
 
   // Returns the player. Opens another one if it has failed or could not be opened.
   function working() {
@@ -115,5 +117,12 @@ export const clerk = (() => {
      * @param {{ ask: K, [key: string]: unknown }} words @param {Bytes | Bytes[]} [bytes] @param {Transferable[]} [transferred]
      */
     ask: async (words, bytes, transferred) => (await working()).ask(words, bytes, {}, transferred),
+    /** Starts work that makes many requests. Whoever awaits `is_free` makes none until the work ends. @template T @param {() => Promise<T>} work */
+    put_first: work => {
+      const made = work();
+      first = Promise.allSettled([first, made]);
+      return made;
+    },
+    is_free: () => first,
   };
 })();

@@ -18,7 +18,7 @@ export const opening = JSON.parse($("opening").textContent);
 export const state = {
   text: "", valid: false, config: opening.config, toml: null, pois: opening.config.world.pois.length, start: { owner: [], coupling: [], headings: [] },
   compared: { key: "learning.paradigm", values: ["leader-follower", "all-leaders"] }, file: null, past: [], problems: [], linked: false, mode: "watch",
-  training: null, exhibit: null, follow: true, generation: 0, over: null, trial: 0, views: [], chosen: null, guide: null, troubles: {}, message: "", note: "", gpu: {},
+  training: null, exhibit: null, follow: true, generation: 0, over: null, trial: 0, views: [], chosen: null, guide: null, told: null, troubles: {}, message: "", note: "", gpu: {},
   machine: { description: "", backend: "cpu", adapter: null, driver: null, threads: 0 }, settled: null, players: [], policies: null, layouts: {}, version: "",
 };
 

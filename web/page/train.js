@@ -12,10 +12,11 @@ import { copy, news, part, render, save, state, trouble } from "./state.js";
 import { Training } from "./training.js";
 import { follow, reveal } from "./views.js";
 
-let starting = false;
+/** The experiment whose training is being started. @type {Training["source"]} */
+let starting = null;
 export async function train() {
-  if (starting) return;
-  starting = true;
+  if (starting && starting.text === state.text && starting.compared === state.compared) return;
+  const own = starting = { text: state.text, compared: state.compared };
   const busy = state.training && ["starting", "training"].includes(state.training.state);
   if (state.training) state.training.stop();
   render({ troubles: { link: state.troubles.link }, message: "" });
@@ -28,19 +29,21 @@ export async function train() {
     await entered();
     if (!state.valid) return;
     await settle();
-    const compared = effective();
+    const source = { text: state.text, compared: state.compared }, compared = effective();
     const arms = await Promise.all((compared ? compared.values : [""]).map(async value => {
       const changes = compared ? [[compared.key, toml(value)]] : [];
-      const { words } = await clerk.ask({ ask: "resolve", text: state.text, name: "config.toml", changes });
+      const { words } = await clerk.ask({ ask: "resolve", text: source.text, name: "config.toml", changes });
       return {
         bytes: words.bytes, label: compared ? label(compared, value) : team(words.config), toml: words.toml, config: words.config, pois: words.pois, parameters: words.parameters,
         command: command(words.config, !compared || compared.key === "learning.paradigm" ? [] : [[compared.key, value]]), name: slug(name_of()), constant: null, random: [],
       };
     }));
+    // Another experiment may have replaced it meanwhile.
+    if (starting !== own) return;
     const bytes = arms.reduce((sum, arm) => sum + arm.bytes, 0);
     if (bytes > 3 * 2 ** 30) throw new Error(`This takes ${(bytes / 2 ** 30).toFixed(1)} GiB, and a tab has at most 4. Choose a smaller population, fewer trials or fewer arms, or use the command line.`);
     training = new Training(arms, state.machine);
-    training.source = { text: state.text, compared: state.compared };
+    training.source = source;
     leave();
     render({ training, exhibit: null, generation: 0, trial: 0, policies: null, follow: true });
     reveal();
@@ -48,10 +51,11 @@ export async function train() {
   } catch (thrown) {
     const { message, fatal } = failure(thrown);
     if (fatal) await renew();
+    if (starting !== own) return;
     if (state.training && state.training.state === "starting") forget();
     trouble("run", message);
     return;
-  } finally { starting = false; }
+  } finally { if (starting === own) starting = null; }
   render();
   constants(training).catch(() => {});
   // For watching, the pace is limited to `last / 8` generations per second, but at least 1. Pauses do not count.
@@ -89,10 +93,10 @@ export async function train() {
   if (training.state === "done") randoms(training).catch(() => {});
 }
 
-/** Returns what each arm of a finished training observes. @param {Training} training */
-function found_by(training) {
+/** Returns what the newest champions of each arm observe, or 0 before the first. @param {Training} training */
+export function found_by(training) {
   const found = training.arms.map(arm => {
-    const last = arm.trials.map(trial => trial[trial.length - 1].champion), mean = last.reduce((sum, champion) => sum + champion, 0) / last.length;
+    const last = arm.trials.map(trial => trial.at(-1)?.champion ?? 0), mean = last.reduce((sum, champion) => sum + champion, 0) / last.length;
     return `${(mean * (arm.pois ?? 1)).toFixed(2)} of ${arm.pois ?? 1} (${arm.label})`;
   });
   const { unit } = training;
@@ -113,8 +117,9 @@ export function stop() {
   render();
 }
 
-// Discards a training and its results.
+// Discards a training and its results, even if it has not started yet.
 export function forget() {
+  starting = null;
   if (state.training) state.training.stop();
   leave();
   render({ training: null, exhibit: null, policies: null, generation: 0, trial: 0, troubles: {}, message: "", note: "" });

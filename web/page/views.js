@@ -41,10 +41,11 @@ export function aim(view, [left, below, right, above], shape = (right - left) / 
   view.canvas.style.setProperty("--wide", String(shape));
 }
 
-/** Scrolls the maps into view if they are not, with the guide and the bar above them. */
+/** Scrolls the maps into view if they are not, with the guide and the bar above them, and what arranges or steers below them. */
 export function reveal() {
   const above = $("guide").hidden ? $("views") : $("guide"), least = above === $("views") ? $("bar").offsetHeight : 0;
-  if (above.getBoundingClientRect().top < least || $("views").getBoundingClientRect().bottom > innerHeight) above.scrollIntoView({ block: "start" });
+  const below = state.mode === "watch" ? $("views") : $(state.mode);
+  if (above.getBoundingClientRect().top < least || below.getBoundingClientRect().bottom > innerHeight) above.scrollIntoView({ block: "start" });
 }
 
 /** Shows a single view that belongs to no arm. @param {string} title @param {Crop} crop */
