@@ -6,7 +6,7 @@
 //   sense_agents   senses other agents
 //   obey_agents    adds other agents to the terms of a rule
 //   count_leaders  counts the leaders that a follower sees
-//   is_gone        whether nobody senses a POI any more
+//   is_gone        whether a POI is gone: nobody senses it any more
 //
 // The host prepends:
 //   INPUTS           room for the inputs of a policy
@@ -14,7 +14,7 @@
 //   ALIGNS           whether any rule aligns headings
 //   PURSUES          whether agents of any class move straight to others
 //   CONFINES         whether agents of any class cannot leave a part of the map, or move only near others
-//   VANISHES         whether any POI vanishes once an observer has come near
+//   GONE             whether any POI is gone once an observer has come near
 //   TRACE            whether every stage of every step is recorded
 //   SIGHTINGS        whether the leaders that each follower sees at each step are recorded
 //   COUNTED_LEADERS  leaders that a follower counts in registers, not in the record; at least 1
@@ -171,13 +171,13 @@ fn sense_pois(
     }
 }
 
-// Returns the squared distance within which a POI vanishes, and the classes that make it, one bit each. They come after the
-// radii and values.
-fn vanishing_of(task: Task, poi: u32) -> vec2<f32> {
+// Returns the squared distance within which an observer makes a POI gone, and the classes of its observers, one bit each.
+// They come after the radii and values of all POIs.
+fn gone_within_of(task: Task, poi: u32) -> vec2<f32> {
     return places[task.pois + 2u * shape.pois + shape.agents + poi];
 }
 
-// Returns the index in the record of a word that tells whether a POI has vanished. They come before the status word.
+// Returns where the record says whether a POI is gone. These words come right before the status word.
 fn gone_word(task: Task, team: u32, poi: u32) -> u32 {
     return task.status - (shape.pois - poi) * task.teams + team;
 }

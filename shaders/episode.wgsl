@@ -174,23 +174,22 @@ fn record_sightings(task: Task, step: u32, now: u32, thread: u32) {
     }
 }
 
-// Notes the POIs that an observer has come near enough to by a step, from positions that start at `now`. One thread per POI
-// and team.
-fn note_gone(task: Task, step: u32, now: u32, thread: u32) {
+// Records which POIs are gone before a step, from positions that start at `now`. One thread per POI and team.
+fn find_gone(task: Task, step: u32, now: u32, thread: u32) {
     for (var item = thread; item < shape.pois * shape.teams; item += WORKGROUP) {
         let team = item % shape.teams;
         let poi = item / shape.teams;
         if team < task.teams {
             let word = gone_word(task, team, poi);
-            let vanishing = vanishing_of(task, poi);
+            let gone_within = gone_within_of(task, poi);
             let place = places[task.pois + poi];
             var gone = step > 0u && record[word] != 0u;
             for (var index = 0u; index < shape.classes; index++) {
                 let of_class = class_shape(index);
-                let counts = (u32(vanishing.y) >> index & 1u) != 0u;
+                let counts = (u32(gone_within.y) >> index & 1u) != 0u;
                 for (var agent = of_class.first_agent; counts && agent < of_class.end_agent; agent++) {
                     let at = positions[now + agent * shape.teams + team];
-                    gone = gone || within(place.x - at.x, place.y - at.y, vanishing.x);
+                    gone = gone || within(place.x - at.x, place.y - at.y, gone_within.x);
                 }
             }
             record[word] = u32(gone);
@@ -198,9 +197,9 @@ fn note_gone(task: Task, step: u32, now: u32, thread: u32) {
     }
 }
 
-// Whether nobody senses a POI any more.
+// Reports whether a POI is gone.
 fn is_gone(task: Task, team: u32, poi: u32) -> bool {
-    return VANISHES && record[gone_word(task, team, poi)] != 0u;
+    return GONE && record[gone_word(task, team, poi)] != 0u;
 }
 
 // Counts the leaders that a follower sees. Its team's positions start at `first`.
@@ -283,8 +282,8 @@ fn episode(
         if SIGHTINGS {
             record_sightings(task, step, now, thread);
         }
-        if VANISHES {
-            note_gone(task, step, now, thread);
+        if GONE {
+            find_gone(task, step, now, thread);
             storageBarrier();
             workgroupBarrier();
         }

@@ -49,9 +49,9 @@ fn load_task(index: u32) -> Task {
     return task;
 }
 
-// Returns the grid of a class. Grids come after all about the POIs.
+// Returns the grid of a class. Grids come after the last numbers of POIs.
 fn grid_of(task: Task, class_number: u32) -> Grid {
-    let at = task.pois + select(2u, 3u, VANISHES) * shape.pois + shape.agents + 2u * class_number;
+    let at = task.pois + select(2u, 3u, GONE) * shape.pois + shape.agents + 2u * class_number;
     return Grid(u32(places[at].x), u32(places[at].y), places[at + 1u].x, u32(places[at + 1u].y));
 }
 
@@ -251,13 +251,13 @@ fn count_leaders(task: Task, first: u32, me: ptr<function, Agent>) {
     }
 }
 
-// Whether nobody senses a POI any more. The word has the first moment at which an observer was near enough, with all bits
-// inverted, because others note the next moment in the dispatch that senses.
+// Reports whether a POI is gone. Its word has the first moment at which an observer was near enough, all bits inverted, or 0.
+// A moment is needed because other workgroups already record the next one while this one senses.
 fn is_gone(task: Task, team: u32, poi: u32) -> bool {
-    return VANISHES && atomicLoad(&record[gone_word(task, team, poi)]) >= ~task.first;
+    return GONE && atomicLoad(&record[gone_word(task, team, poi)]) >= ~task.first;
 }
 
-// Stores an agent's state after `moment` steps, counts it in its cell, and records the POIs that it is at or that vanish.
+// Stores an agent's state after `moment` steps, counts it in its cell, and records the POIs that it is at or that it makes gone.
 fn settle(task: Task, moment: u32, me: ptr<function, Agent>) {
     states[state_of(task, moment % 2u == 1u, 0u, (*me).agent)] = current_state(me);
     atomicAdd(&record[cell_of(task, own_class, (*me).x, (*me).y) + COME], 1u);
@@ -266,10 +266,10 @@ fn settle(task: Task, moment: u32, me: ptr<function, Agent>) {
     }
     for (var poi = 0u; poi < shape.pois; poi++) {
         let place = places[task.pois + poi];
-        if VANISHES {
-            let vanishing = vanishing_of(task, poi);
-            let counts = (u32(vanishing.y) >> own_class & 1u) != 0u;
-            if counts && within(place.x - (*me).x, place.y - (*me).y, vanishing.x) {
+        if GONE {
+            let gone_within = gone_within_of(task, poi);
+            let counts = (u32(gone_within.y) >> own_class & 1u) != 0u;
+            if counts && within(place.x - (*me).x, place.y - (*me).y, gone_within.x) {
                 atomicMax(&record[gone_word(task, 0u, poi)], ~moment);
             }
         }

@@ -45,8 +45,8 @@ pub struct WorldParts {
     pub poi_regions: Vec<(Range<usize>, Region)>,
     /// The squared observation radius of each POI, `[pois]`.
     pub radii2: Vec<f32>,
-    /// The POIs that nobody senses any more once an observer has come near.
-    pub vanishing: Vec<Vanishing>,
+    /// The POIs that are gone once an observer has come near.
+    pub gone_within: Vec<GoneWithin>,
     /// The value of each POI, `[pois]`.
     pub values: Vec<f32>,
     /// The value of each POI as a multiple of a common unit, and their sum. Scores are counted in these units.
@@ -65,13 +65,13 @@ pub struct WorldParts {
     pub populations: Vec<u32>,
 }
 
-/// A POI that nobody senses any more once an observer has come near. It can still be observed.
+/// A POI that is gone once an observer has come near: nobody senses it any more, though it can still be observed.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Vanishing {
-    /// Its index.
+pub struct GoneWithin {
+    /// The index of the POI.
     pub poi: usize,
-    /// The squared distance within which an observer makes it vanish.
-    pub within2: f32,
+    /// The squared distance within which an observer makes it gone.
+    pub distance2: f32,
     /// The classes whose agents observe it.
     pub classes: Vec<usize>,
 }
@@ -172,10 +172,10 @@ impl World {
         let observing = |group: usize| (0..classes.len()).filter(|&class| described.observes(class, group)).collect();
         let observers: Vec<Vec<usize>> = described.group_of_each().into_iter().map(observing).collect();
         let agents_of = |of: &Vec<usize>| of.iter().map(|&class| classes[class].agents()).collect();
-        let vanishing = of_each.iter().zip(&observers).enumerate().filter(|(_, (group, _))| group.gone_within > 0.0);
-        let vanishing = vanishing.map(|(poi, (group, classes))| Vanishing {
+        let can_go = of_each.iter().zip(&observers).enumerate().filter(|(_, (group, _))| group.gone_within > 0.0);
+        let gone_within = can_go.map(|(poi, (group, classes))| GoneWithin {
             poi,
-            within2: squared_range(group.gone_within),
+            distance2: squared_range(group.gone_within),
             classes: classes.clone(),
         });
         World(WorldParts {
@@ -187,7 +187,7 @@ impl World {
             pois: described.places().into_iter().map(on_grid).collect(),
             poi_regions: described.poi_regions(),
             radii2: of_each.iter().map(|group| (group.radius * group.radius) as f32).collect(),
-            vanishing: vanishing.collect(),
+            gone_within: gone_within.collect(),
             values,
             worth,
             total_worth,

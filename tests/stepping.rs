@@ -339,9 +339,9 @@ fn a_restored_stepper_continues_with_the_same_bits() {
     }
 }
 
-/// A POI vanishes when an agent passes it, in the teams in which one does, until they are reset. Saved states say so.
+/// A POI is gone in the teams in which an agent has passed it, until they are reset. Saved states keep that.
 #[test]
-fn a_poi_that_has_vanished_stays_so_in_a_saved_state() {
+fn a_poi_that_is_gone_stays_so_in_a_saved_state() {
     let text = "[world]\nsteps = 20\ndt = 1\n[[agents]]\nname = \"a\"\nat = [[10, 10]]\n\
                 motion = { kind = \"free\", max_speed = 1 }\n\
                 senses = [{ of = \"pois\", sectors = 1, measure = \"closeness\", range = 50 }]\n\

@@ -75,6 +75,15 @@ at = [[30.0, 30.0], [10.0, 80.0]]
 coupling = [60, 12]
 radius = 5.0
 
+# Some of these are gone at the start, and others in the course of an episode.
+[[pois]]
+name = "flower"
+count = 200
+in = { box = [0.0, 0.0, 60.0, 90.0] }
+coupling = 1
+observers = ["leader", "drifter"]
+gone_within = 1.5
+
 [learning]
 population = 4
 generations = 2

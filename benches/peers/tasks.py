@@ -1,6 +1,6 @@
 """Runs standard optimisers on the tasks in `configs/tasks/`, at equal numbers of episodes.
 
-    pip install ./python cma numpy
+    pip install ./python cma numpy scipy
     python benches/peers/tasks.py --episodes 5050 --trials 10 --csv peers.csv
     python benches/peers/tasks.py --episodes 5050 --trials 5 --csv peers.csv --optimisers ppo-shared
     python benches/peers/tasks.py --csv peers.csv --episodes 0       # only prints the table
@@ -33,6 +33,7 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # Small matrices: more threads only wait for each other.
 
 import numpy as np
+from scipy import stats
 
 import flotilla
 
@@ -150,10 +151,8 @@ def run(arguments: argparse.Namespace) -> None:
 
 def cell(values: list[float]) -> str:
     """Returns the mean with the 95 % interval of `flotilla compare`, and the number of trials that reach 0.9."""
-    more = np.array([*values, 0.0, 1.0])
-    t = np.quantile(np.random.default_rng(0).standard_t(len(more) - 1, 1_000_000), 0.975)
-    room = t * np.std(more, ddof=1) / len(more) ** 0.5
-    low, high = max(more.mean() - room, 0), min(more.mean() + room, 1)
+    more = [*values, 0.0, 1.0]
+    low, high = np.clip(stats.t.interval(0.95, len(more) - 1, np.mean(more), stats.sem(more)), 0, 1)
     solved = sum(value >= 0.9 for value in values)
     return f"{np.mean(values):.2f} [{low:.2f}, {high:.2f}] ({solved} of {len(values)})"
 

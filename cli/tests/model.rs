@@ -822,10 +822,10 @@ impl Described {
         (0..=choices).all(is_certain).then_some(best)
     }
 
-    /// Updates whether each POI has vanished, and whether rounding may change that, by the agents' places.
-    fn hide(&self, world: &World, states: &[State], hidden: &mut [(bool, bool)]) {
+    /// Notes the POIs that are gone because an observer is near now, and those of which rounding may decide it.
+    fn find_gone(&self, world: &World, states: &[State], found: &mut [(bool, bool)]) {
         let classes = self.config.classes();
-        for ((poi, group), (gone, open)) in classes.group_of_each().into_iter().enumerate().zip(hidden) {
+        for ((poi, group), (gone, open)) in classes.group_of_each().into_iter().enumerate().zip(found) {
             let within = classes.pois[group].gone_within;
             let observes = |&agent: &usize| within > 0.0 && classes.observes(self.class_of[agent], group);
             for agent in (0..states.len()).filter(observes) {
@@ -837,14 +837,14 @@ impl Described {
         }
     }
 
-    /// Returns the inputs of a channel that has a sector of each agent or POI, and what rounding may change. `hidden` is
-    /// what [`Described::hide`] found.
+    /// Returns the inputs of a channel that has a sector of each agent or POI, and what rounding may change. `gone` is
+    /// what [`Described::find_gone`] found.
     fn sensed(
         &self,
         world: &World,
         channel: &Channel,
         states: &[State],
-        hidden: &[(bool, bool)],
+        gone: &[(bool, bool)],
         agent: usize,
     ) -> Vec<(f64, bool)> {
         let names = |of: &str| channel.of.iter().any(|name| name == of);
@@ -854,7 +854,7 @@ impl Described {
         let entities: Vec<(DVec2, f64, bool, bool)> = match names("pois") {
             true => (0..world.pois.len())
                 .filter(|&poi| channel.pois.is_empty() || channel.pois.contains(&group(poi).name))
-                .map(|poi| (world.pois[poi].as_dvec2(), group(poi).value, !hidden[poi].0, hidden[poi].1))
+                .map(|poi| (world.pois[poi].as_dvec2(), group(poi).value, !gone[poi].0, gone[poi].1))
                 .collect(),
             false => (0..states.len())
                 .filter(|&other| names("agents") || names(&self.class(other).name))
@@ -886,12 +886,12 @@ impl Described {
 }
 
 /// Compares every step of random worlds with what the keys say: who is nearest or chosen and how an agent moves to it, who
-/// stays where it is, what a channel senses of each, that POIs vanish, and that no agent leaves its box.
+/// stays where it is, what a channel senses of each, when POIs are gone, and that no agent leaves its box.
 #[test]
 fn agents_move_to_others_and_sense_each_as_described() {
     const TEAMS: usize = 5;
     // To the nearest, to nobody, to a chosen one; inputs, in boxes, and steps at which nobody was near; inputs of POIs when
-    // some had vanished. Borderline.
+    // some were gone. Borderline.
     let (mut counts, mut borderlines, mut wrong) = ([0; 7], 0, vec![]);
     for seed in (1..600u64).step_by(2) {
         let config = sample::classes_world(seed);
@@ -910,14 +910,14 @@ fn agents_move_to_others_and_sense_each_as_described() {
             fitnesses: &[],
         };
         let trace = Cpu::default().trace(&group).unwrap();
-        let mut hidden = vec![];
+        let mut gone = vec![];
         for (team, step) in (0..TEAMS).flat_map(|team| (1..=steps).map(move |step| (team, step))) {
             let states: Vec<State> =
                 (0..world.agents()).map(|agent| State::of(trace.moment(step - 1, team, agent))).collect();
             if step == 1 {
-                hidden = vec![(false, false); world.pois.len()];
+                gone = vec![(false, false); world.pois.len()];
             }
-            described.hide(&world, &states, &mut hidden);
+            described.find_gone(&world, &states, &mut gone);
             for (agent, state) in states.iter().enumerate() {
                 let (class, moment) = (described.class(agent), trace.moment(step, team, agent));
                 let (now, place) = (State::of(moment), format!("seed {seed} team {team} step {step} agent {agent}"));
@@ -934,11 +934,11 @@ fn agents_move_to_others_and_sense_each_as_described() {
                 for channel in &class.senses {
                     if let Sectors::Each(count) = channel.sectors {
                         let found = &trace.inputs_of(step, team, agent)[first..first + count];
-                        let expected = described.sensed(&world, channel, &states, &hidden, agent);
+                        let expected = described.sensed(&world, channel, &states, &gone, agent);
                         assert_eq!(expected.len(), count, "{place}");
                         for (found, (expected, borderline)) in found.iter().zip(expected) {
                             counts[4] += 1;
-                            counts[6] += u32::from(channel.of == ["pois"] && hidden.iter().any(|poi| poi.0));
+                            counts[6] += u32::from(channel.of == ["pois"] && gone.iter().any(|poi| poi.0));
                             let off = (f64::from(*found) - expected).abs();
                             if !borderline && off > INPUT * (1.0 + expected.abs()) {
                                 wrong.push(format!("{place} senses {found}, expected {expected}"));

@@ -23,8 +23,8 @@ pub(super) type WeightVector = [f32; VECTOR];
 /// Returns the words of a team's record: sets, counts and, if needed, sightings.
 pub(super) fn record_words(world: &World, records: RecordRequest<'_>) -> usize {
     let sights = if records.sights() { world.sight_words() } else { 0 };
-    // Whether each POI has vanished comes last.
-    let gone = if world.vanishing.is_empty() { 0 } else { world.pois.len() };
+    // One word per POI says whether it is gone.
+    let gone = if world.gone_within.is_empty() { 0 } else { world.pois.len() };
     world.set_words() + world.leaders() * world.followers() + sights + gone
 }
 

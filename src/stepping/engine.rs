@@ -50,7 +50,7 @@ pub(super) enum Command<'a> {
 pub(super) trait Vectors: Send + Sync {
     /// Executes a command. `moved` are the POI positions, `[teams][pois]`; empty if all teams have the world's.
     fn run(&mut self, world: &World, moved: &[Vec2], command: Command<'_>, observations: &mut Observations);
-    /// Returns whether each POI that can has vanished for a team, all bits or none, `[vanishing]`.
+    /// Returns whether the POIs of [`GoneWithin`](crate::world::GoneWithin) are gone in a team, all bits or none, `[gone_within]`.
     fn gone(&self, team: usize) -> Vec<u32>;
     /// Returns the record of a team, if one is kept. `moved` are POI positions, as in [`Vectors::run`]. `seen` is scratch
     /// memory that holds a part of it.
@@ -256,8 +256,7 @@ impl<S: Simd> Workspace<S> {
                 (agent.hx[lane], agent.hy[lane]) = (saved.headings[index * 2], saved.headings[index * 2 + 1]);
                 agent.speed[lane] = saved.speeds[index];
             }
-            let kinds = self.block.gone.len();
-            let gone = &saved.gone[(first + team) * kinds..][..kinds];
+            let gone = &saved.gone[(first + team) * world.gone_within.len()..];
             self.block.gone.iter_mut().zip(gone).for_each(|(to, &gone)| to[lane] = gone);
             if !saved.counts.is_empty() {
                 let counts = &saved.counts[(first + team) * pairs..][..pairs];

@@ -18,7 +18,7 @@ pub(super) struct Saved<'a> {
     pub headings: &'a [f32],
     /// `[teams][agents]`.
     pub speeds: &'a [f32],
-    /// Whether each POI that can has vanished, all bits or none, `[teams][vanishing]`.
+    /// Whether the POIs of [`GoneWithin`](crate::world::GoneWithin) are gone, all bits or none, `[teams][gone_within]`.
     pub gone: &'a [u32],
     /// `[teams][followers][leaders]`; empty unless recorded, as are the next two.
     pub counts: &'a [u32],
@@ -86,8 +86,8 @@ impl Stepper {
         let header = self.header(moved);
         let [_, _, _, record, trail, _] = header.map(|size| size as usize);
         let counts = if record > 0 { world.followers() * world.leaders() } else { 0 };
-        let (sets, vanishing) = (pois * world.constants.words as usize, world.vanishing.len());
-        let of_team = agents * 5 + sets + pois * 2 + 1 + moved * 2 + vanishing + counts + record + trail;
+        let (sets, gone_within) = (pois * world.constants.words as usize, world.gone_within.len());
+        let of_team = agents * 5 + sets + pois * 2 + 1 + moved * 2 + gone_within + counts + record + trail;
         if words.get(..HEADER) != Some(&header) || state.len() != (HEADER + teams * of_team) * 4 {
             return Err(StepError::State("it is of another world, number of teams or kind of record"));
         }
@@ -102,16 +102,14 @@ impl Stepper {
             positions,
             headings,
             speeds,
-            gone: words.take(teams * vanishing),
+            gone: words.take(teams * gone_within),
             counts: words.take(teams * counts),
             record: words.take(teams * record),
             trail: words.take(teams * trail),
         };
         check(world, agents_at_poi, &saved, moved)?;
-        let is_flag = |flag: &u32| *flag <= 1;
-        let gone_or_not = saved.gone.iter().all(|&gone| gone == 0 || gone == u32::MAX);
-        if !gone_or_not
-            || !newly.iter().chain(observed).all(is_flag)
+        if newly.iter().chain(observed).any(|&flag| flag > 1)
+            || saved.gone.iter().any(|&gone| gone != 0 && gone != u32::MAX)
             || steps.iter().any(|&step| step > world.constants.steps)
         {
             return Err(StepError::State("a step or flag is out of range"));

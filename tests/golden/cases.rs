@@ -94,8 +94,8 @@ at = [[16, 27], [26, 31], [36, 26], [25, 12]]
 coupling = 2
 ";
 
-/// Rovers that see POIs until one of them, or a scout that sees nothing but POIs, comes near.
-const VANISHING: &str = "
+/// POIs that are gone once a rover comes near, or near some of them a scout.
+const GONE: &str = "
 [world]
 steps = 60
 dt = 0.5
@@ -352,7 +352,7 @@ pub const CASES: [Case; 48] = [
         ],
     ),
     ("influence", "rovers under D and UAVs that lead them under Dt, scores by distance", ROVERS_AND_UAVS, &[]),
-    ("vanishing", "POIs that nobody senses once an observer has been near", VANISHING, &[]),
+    ("gone", "POIs that nobody senses once an observer has been near", GONE, &[]),
     (
         "truncation",
         "a fifth of each population are elites, and only they become parents",

@@ -17,7 +17,7 @@ use crate::model::class::{Class, ClassLanes};
 use crate::model::follow::{self, Sum};
 use crate::model::sense::{self, ChannelLanes};
 use crate::model::{self, Lanes, motion, policy, pursue};
-use crate::world::{OUTPUTS, Vanishing, World};
+use crate::world::{GoneWithin, OUTPUTS, World};
 
 /// The state of one vector of teams, one team per lane, with scratch memory for a step. A step reads only the
 /// previous state.
@@ -52,10 +52,11 @@ pub(crate) struct Block<S: Simd> {
     /// The squared observation radius and the value of each POI, `[pois]`.
     pub(super) radii2: Vec<f32>,
     pub(super) values: Vec<f32>,
-    /// As in the world; and the lanes in which each of these POIs has vanished, all bits of a lane or none, `[vanishing]`.
-    pub(super) vanishing: Vec<Vanishing>,
+    /// See [`WorldParts::gone_within`](crate::world::WorldParts::gone_within).
+    pub(super) gone_within: Vec<GoneWithin>,
+    /// Whether each of these POIs is gone, all bits of a lane or none, `[gone_within]`.
     pub gone: Vec<S::u32s>,
-    /// Where each POI is sensed, `[pois]`; empty unless some vanish.
+    /// Where each POI is sensed, `[pois]`; empty unless some can be gone.
     sensed: Vec<[S::f32s; 2]>,
 }
 
@@ -107,8 +108,8 @@ impl<S: Simd> Block<S> {
             plans: Plan::all(world),
             radii2: world.radii2.clone(),
             values: world.values.clone(),
-            vanishing: world.vanishing.clone(),
-            gone: vec![S::u32s::splat(simd, 0); world.vanishing.len()],
+            gone_within: world.gone_within.clone(),
+            gone: vec![S::u32s::splat(simd, 0); world.gone_within.len()],
             sensed: vec![],
         }
     }
@@ -167,25 +168,25 @@ impl<S: Simd> Block<S> {
     /// This, [`Block::step`] and [`Network::decide`](super::network::Network::decide) are most of the compiled code. They
     /// are functions of their own, so that whole episodes, traces, records and single steps share them.
     pub fn sense(&mut self, pois: &[impl PoiPosition<S>]) {
-        if self.vanishing.is_empty() {
+        if self.gone_within.is_empty() {
             self.sense_at(pois);
         } else {
-            self.hide(pois);
+            self.find_gone(pois);
             let sensed = std::mem::take(&mut self.sensed);
             self.sense_at(&sensed);
             self.sensed = sensed;
         }
     }
 
-    /// Finds the POIs that have vanished, and puts them out of everybody's reach.
-    fn hide(&mut self, pois: &[impl PoiPosition<S>]) {
-        let Block { simd, world, agents, vanishing, gone, sensed, .. } = self;
+    /// Finds the POIs that are gone, and puts them where no range reaches.
+    fn find_gone(&mut self, pois: &[impl PoiPosition<S>]) {
+        let Block { simd, world, agents, gone_within, gone, sensed, .. } = self;
         sensed.clear();
         sensed.extend(pois.iter().map(|poi| poi.lanes(*simd)));
-        for (Vanishing { poi, within2, classes }, gone) in vanishing.iter().zip(gone) {
+        for (GoneWithin { poi, distance2, classes }, gone) in gone_within.iter().zip(gone) {
             let [x, y] = sensed[*poi];
             for agent in classes.iter().flat_map(|&class| world.classes[class].agents()) {
-                let near = within::<S>(x - agents[agent].x, y - agents[agent].y, splat(*simd, *within2));
+                let near = within::<S>(x - agents[agent].x, y - agents[agent].y, splat(*simd, *distance2));
                 *gone |= near.to_vector().bitcast::<S::u32s>();
             }
             sensed[*poi][0] = select::<S>(x, splat(*simd, f32::INFINITY), gone.simd_gt(S::u32s::splat(*simd, 0)));

@@ -74,7 +74,7 @@ impl<S: Simd> EpisodeBlock<S> {
         bytemuck::cast_slice::<_, u8>(&self.classes) == bytemuck::cast_slice::<_, u8>(&world.classes)
             && self.block.world.constants == world.constants
             && [&self.block.radii2, &self.block.values] == [&world.radii2, &world.values]
-            && self.block.vanishing == world.vanishing
+            && self.block.gone_within == world.gone_within
             && self.sights.len() == sight_words(world, sighted) * S::f32s::LEN
             && self.paths.is_empty() == world.paths.is_none()
     }

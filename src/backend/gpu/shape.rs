@@ -112,8 +112,8 @@ pub struct Uses {
     pub(super) pursues: bool,
     /// Whether agents of any class cannot leave a part of the map, or move only near others.
     pub(super) confines: bool,
-    /// Whether any POI vanishes.
-    pub(super) vanishes: bool,
+    /// Whether any POI is gone once an observer has come near.
+    pub(super) gone: bool,
 }
 
 impl Uses {
@@ -123,7 +123,7 @@ impl Uses {
             aligns: world.aligns(),
             pursues: any(ClassShape::pursues),
             confines: any(ClassShape::is_confined),
-            vanishes: !world.vanishing.is_empty(),
+            gone: !world.gone_within.is_empty(),
         }
     }
 }

@@ -266,7 +266,7 @@ fn declarations() -> String {
 /// Returns the shader of episodes for a shape, of large teams or of others.
 fn episode(shape: Shape) -> String {
     let Shape { workgroup, slots, records: Recorded { trace, sightings }, sizes } = shape;
-    let (shared, in_registers, counted, Uses { aligns, pursues, confines, vanishes }) = match sizes {
+    let (shared, in_registers, counted, Uses { aligns, pursues, confines, gone }) = match sizes {
         // The agents of one large team, or of several small ones.
         Sizes::Any { uses, .. } => ((workgroup * slots).min(MAX_SHARED), false, 1, uses),
         Sizes::Fixed { teams, leaders, agents, uses, .. } => {
@@ -286,7 +286,7 @@ fn episode(shape: Shape) -> String {
         ALIGNS = aligns,
         PURSUES = pursues,
         CONFINES = confines,
-        VANISHES = vanishes,
+        GONE = gone,
         MAX_SECTORS,
         MAX_CLASSES,
         MOMENT_WORDS,
@@ -441,14 +441,14 @@ pub fn shaders() -> Vec<(&'static str, String)> {
     const SIGHTINGS: Recorded = Recorded { sightings: true, ..PLAIN };
     const TRACE: Recorded = Recorded { trace: true, sightings: true };
     let generic = |workgroup, slots, widest, records: Recorded| {
-        let [aligns, pursues, confines, vanishes] = [records.trace; 4];
-        let uses = Uses { aligns, pursues, confines, vanishes };
+        let [aligns, pursues, confines, gone] = [records.trace; 4];
+        let uses = Uses { aligns, pursues, confines, gone };
         let sizes = Sizes::Any { widest, chooses: records.trace, uses, large: false };
         Pipeline::Episode(Shape { workgroup, slots, records, sizes })
     };
     let swarm = |records: Recorded| {
-        let [aligns, confines, vanishes] = [records.trace; 3];
-        let uses = Uses { aligns, pursues: false, confines, vanishes };
+        let [aligns, confines, gone] = [records.trace; 3];
+        let uses = Uses { aligns, pursues: false, confines, gone };
         let sizes = Sizes::Any { widest: 16, chooses: records.trace, uses, large: true };
         Pipeline::Swarm(SwarmPart::Clear, Shape { workgroup: WORKGROUPS[0], slots: 1, records, sizes })
     };

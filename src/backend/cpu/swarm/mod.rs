@@ -24,7 +24,7 @@ use crate::model::follow::{self, SteeringForce, Sum, TermLanes};
 use crate::model::motion::MotionLanes;
 use crate::model::sense::{self, ChannelLanes};
 use crate::model::{self, Lanes, couple, motion, policy};
-use crate::world::{OUTPUTS, Vanishing, World};
+use crate::world::{GoneWithin, OUTPUTS, World};
 
 mod cells;
 
@@ -66,12 +66,12 @@ pub(super) struct Swarm<S: Simd> {
     constants: Vec<Class>,
     radii2: Vec<f32>,
     values: Vec<f32>,
-    vanishing: Vec<Vanishing>,
+    gone_within: Vec<GoneWithin>,
     recorded: Recorded,
     /// `[classes]`.
     plans: Vec<Plan>,
     cells: Vec<Cells>,
-    /// The POI positions, `[pois]`, and whether they have vanished.
+    /// The POI positions, `[pois]`, and whether they are gone.
     pois: Vec<Vec2>,
     gone: Vec<bool>,
     network: Network<S>,
@@ -132,7 +132,7 @@ impl<S: Simd> Swarm<S> {
             constants: world.classes.clone(),
             radii2: world.radii2.clone(),
             values: world.values.clone(),
-            vanishing: world.vanishing.clone(),
+            gone_within: world.gone_within.clone(),
             recorded,
             plans: world.classes.iter().map(|class| Plan::new(world, class)).collect(),
             cells: world.classes.iter().map(cells).collect(),
@@ -154,7 +154,7 @@ impl<S: Simd> Swarm<S> {
         bytemuck::cast_slice::<_, u8>(&self.constants) == bytemuck::cast_slice::<_, u8>(&world.classes)
             && self.world.constants == world.constants
             && [&self.radii2, &self.values] == [&world.radii2, &world.values]
-            && self.vanishing == world.vanishing
+            && self.gone_within == world.gone_within
             && self.recorded == recorded
             && self.paths.is_empty() == world.paths.is_none()
     }
@@ -226,10 +226,10 @@ impl<S: Simd> Swarm<S> {
 
     /// Computes the inputs of the leaders' policies, channel by channel.
     fn sense(&mut self) {
-        let Swarm { simd, cells, pois, gone, vanishing, .. } = self;
-        for Vanishing { poi, within2, classes } in vanishing {
+        let Swarm { simd, cells, pois, gone, gone_within, .. } = self;
+        for GoneWithin { poi, distance2, classes } in gone_within {
             for &class in &*classes {
-                each_within(*simd, &cells[class], pois[*poi], *within2, |_| gone[*poi] = true);
+                each_within(*simd, &cells[class], pois[*poi], *distance2, |_| gone[*poi] = true);
             }
         }
         self.simd.vectorize(

@@ -21,7 +21,7 @@ use crate::model::class::Class;
 use crate::model::policy::PolicyConstants;
 use crate::model::sense::{ChannelConstants, NOTHING};
 use crate::parallel::*;
-use crate::world::{Vanishing, World};
+use crate::world::{GoneWithin, World};
 
 /// Words before the others in a packed record (`struct Packed` in the shader): words used, and words available.
 pub(super) const PACKED_HEAD: usize = 2;
@@ -95,9 +95,9 @@ fn iterations_per_step(world: &World, workgroup: Workgroup, records: Recorded) -
     let agent = busiest + world.leaders() + network as usize + 20 + world.classes.len() * 4;
     let sights = if records.sightings { world.followers() * world.leader_words() } else { 0 };
     let items = |rows: usize| (rows * workgroup.teams).div_ceil(workgroup.threads);
-    let visible = items(world.vanishing.len()) * world.agents();
+    let gone = items(world.gone_within.len()) * world.agents();
     let items = items(world.pois.len() * words as usize) + items(sights);
-    workgroup.slots * agent + items * 33 + visible
+    workgroup.slots * agent + items * 33 + gone
 }
 
 /// Returns the maximum steps per dispatch, see [`MAX_ITERATIONS`].
@@ -310,12 +310,12 @@ impl BatchPlan {
         // The shader finds headings behind the POIs, and then more about these.
         self.places.extend(plan.group.headings());
         self.places.extend(world.radii2.iter().zip(&world.values).map(|(&radius2, &value)| Vec2::new(radius2, value)));
-        if !world.vanishing.is_empty() {
+        if !world.gone_within.is_empty() {
             let first = self.places.len();
             self.places.resize(first + world.pois.len(), Vec2::new(NOTHING, 0.0));
-            for Vanishing { poi, within2, classes } in &world.vanishing {
+            for GoneWithin { poi, distance2, classes } in &world.gone_within {
                 let bits = classes.iter().map(|class| 1u32 << class).sum::<u32>();
-                self.places[first + poi] = Vec2::new(*within2, bits as f32);
+                self.places[first + poi] = Vec2::new(*distance2, bits as f32);
             }
         }
         if plan.template.shape.is_large() {
