@@ -68,14 +68,6 @@ pub(crate) fn one_range(run: Range<usize>) -> Ranges {
     ranges(std::iter::once(run))
 }
 
-/// Returns the runs, unused ones as empty ranges, and the number of used ones.
-#[inline(always)]
-pub(crate) fn runs(ranges: &Ranges) -> ([Range<usize>; MAX_RANGES], usize) {
-    let runs = std::array::from_fn(|run| ranges[2 * run] as usize..ranges[2 * run + 1] as usize);
-    let used = (0..MAX_RANGES).take_while(|&run| ranges[2 * run + 1] > 0).count();
-    (runs, used)
-}
-
 /// Returns the runs that are not empty.
 pub fn each(ranges: &Ranges) -> impl Iterator<Item = Range<usize>> {
     ranges.chunks_exact(2).map(|run| run[0] as usize..run[1] as usize).filter(|run| !run.is_empty())

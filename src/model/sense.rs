@@ -193,10 +193,14 @@ impl ChannelShape {
 }
 
 impl<S: Simd> ChannelLanes<S> {
-    /// Returns the heading that the sectors of an agent with this heading turn with, none if they are fixed to the map.
+    /// Returns the heading that the sectors of an agent with this heading turn with: the x axis if they are fixed to the
+    /// map.
     #[inline(always)]
-    pub(crate) fn heading(&self, hx: S::f32s, hy: S::f32s) -> Option<[S::f32s; 2]> {
-        (self.shape.frame != Frame::Map as u32).then_some([hx, hy])
+    pub(crate) fn heading(&self, hx: S::f32s, hy: S::f32s) -> [S::f32s; 2] {
+        match self.shape.frame == Frame::Map as u32 {
+            true => [1.0, 0.0].map(|component| splat(hx.token(), component)),
+            false => [hx, hy],
+        }
     }
 }
 
@@ -244,14 +248,10 @@ pub(crate) fn measured<S: Simd>(
     (measured & within.to_vector(), within)
 }
 
-/// Returns an offset relative to a heading, or to the x axis: along it, and to its left. What is at the same place is
-/// straight ahead.
+/// Returns an offset relative to a heading: along it, and to its left. What is at the same place is straight ahead.
 #[inline(always)]
-fn turned<S: Simd>([dx, dy]: [S::f32s; 2], heading: Option<[S::f32s; 2]>) -> (S::f32s, S::f32s) {
-    match heading {
-        Some([hx, hy]) => (dx * hx + dy * hy, dy * hx - dx * hy),
-        None => (dx, dy),
-    }
+fn turned<S: Simd>([dx, dy]: [S::f32s; 2], [hx, hy]: [S::f32s; 2]) -> (S::f32s, S::f32s) {
+    (dx * hx + dy * hy, dy * hx - dx * hy)
 }
 
 /// Sums over the entities around an agent: over all, over those on the left, in front, and both.
@@ -308,7 +308,7 @@ impl<S: Simd> Quadrants<S> {
         &mut self,
         (measured, within): (S::i32s, S::mask32s),
         offset: [S::f32s; 2],
-        heading: Option<[S::f32s; 2]>,
+        heading: [S::f32s; 2],
     ) {
         let (fx, fy) = turned::<S>(offset, heading);
         let zero = splat(fx.token(), 0.0);
@@ -368,7 +368,7 @@ impl<S: Simd> Sectors<S> {
         channel: &ChannelLanes<S>,
         (measured, within): (S::i32s, S::mask32s),
         offset: [S::f32s; 2],
-        heading: Option<[S::f32s; 2]>,
+        heading: [S::f32s; 2],
     ) {
         let (fx, fy) = turned::<S>(offset, heading);
         let simd = fx.token();

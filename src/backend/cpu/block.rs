@@ -15,7 +15,7 @@ use crate::kernels::math::{on_lattice, within};
 use crate::kernels::{clamp_to, select, splat};
 use crate::model::class::{Class, ClassLanes};
 use crate::model::follow::{self, Sum};
-use crate::model::sense::{self, ChannelLanes};
+use crate::model::sense::{self, ChannelConstants, ChannelLanes};
 use crate::model::{self, Lanes, motion, policy, pursue};
 use crate::world::{GoneWithin, OUTPUTS, World};
 
@@ -71,6 +71,7 @@ pub(crate) struct BlockState<S: Simd> {
 
 #[derive(Clone, Copy)]
 pub(super) struct Follower<S: Simd> {
+    /// The sums of a [`Ring`]'s terms.
     sums: [Sum<S>; 2],
     force: follow::SteeringForce<S>,
     /// The squared size of the force, and the inverse of its size.
@@ -79,8 +80,8 @@ pub(super) struct Follower<S: Simd> {
 
 impl<S: Simd> Follower<S> {
     #[inline(always)]
-    fn new(simd: S, force: follow::SteeringForce<S>) -> Follower<S> {
-        let zero = splat(simd, 0.0);
+    fn new(force: follow::SteeringForce<S>) -> Follower<S> {
+        let (simd, zero) = (force.x.token(), splat(force.x.token(), 0.0));
         Follower { sums: [Sum::new(simd); 2], force, sizes: (zero, zero) }
     }
 }
@@ -100,7 +101,7 @@ impl<S: Simd> Block<S> {
             velocities: vec![[zero; 2]; agents],
             headings: vec![[zero; 2]; if world.aligns() { agents } else { 0 }],
             kept: vec![],
-            followers: vec![Follower::new(simd, force); followers],
+            followers: vec![Follower::new(force); followers],
             counts: vec![S::u32s::splat(simd, 0); followers * leaders],
             near: vec![0; agents.div_ceil(64) * agents],
             bounds: vec![Bounds::nowhere(simd); agents.div_ceil(S::f32s::LEN)],
@@ -207,8 +208,8 @@ impl<S: Simd> Block<S> {
         let width = world.constants.policy.inputs();
         for (class, plan) in world.classes.iter().zip(plans) {
             let shape = &class.constants.shape;
-            for (channel, others) in class.channels.iter().zip(&plan.channels) {
-                let scene = Scene { simd: *simd, channel, pois, values, agents, near, others };
+            for (channel, plan) in class.channels.iter().zip(&plan.channels) {
+                let scene = Scene { simd: *simd, channel, pois, values, agents, near, plan };
                 let (observers, inputs) = (shape.agents(), Inputs { all: &mut *inputs, width });
                 if channel.shape.each != 0 {
                     scene.sense_each(observers, inputs);
@@ -260,7 +261,7 @@ impl<S: Simd> Block<S> {
     /// Leaders turn, and set their wanted speed or their velocity, by their policies' outputs.
     #[inline(always)]
     fn lead(&mut self) {
-        let Block { simd, world, agents, outputs, wanted, velocities, headings, .. } = self;
+        let Block { world, agents, outputs, wanted, velocities, headings, .. } = self;
         headings.iter_mut().zip(&*agents).for_each(|(heading, agent)| *heading = [agent.hx, agent.hy]);
         for class in world.classes.iter().filter(|class| class.control().learns()) {
             let (shape, motion) = (&class.constants.shape, &class.constants.motion);
@@ -270,7 +271,7 @@ impl<S: Simd> Block<S> {
                 for agent in own {
                     let targets = offsets(agents, agent, shape.first_target..shape.end_target);
                     let to = pursue::chosen::<S>(pursuit, outputs[agent][0], targets);
-                    let mut one = [Follower::new(*simd, pursue::towards::<S>(pursuit, motion, to))];
+                    let mut one = [Follower::new(pursue::towards::<S>(pursuit, motion, to))];
                     let it = agent..agent + 1;
                     obey(class, &mut agents[it.clone()], &mut one, &mut wanted[it.clone()], &mut velocities[it]);
                 }
@@ -294,7 +295,7 @@ impl<S: Simd> Block<S> {
     /// overlaps iterations only if they are short.
     #[inline(always)]
     fn follow(&mut self) {
-        let Block { simd, world, agents, wanted, velocities, headings, near, followers, counts, plans, .. } = self;
+        let Block { world, agents, wanted, velocities, headings, near, followers, counts, plans, .. } = self;
         let leaders = world.constants.leaders as usize;
         let follow = world.classes.iter().zip(plans).filter(|(class, _)| class.agents().start >= leaders);
         for (class, plan) in follow {
@@ -322,22 +323,18 @@ impl<S: Simd> Block<S> {
             if shape.control() != ControlKind::Follow {
                 continue;
             }
-            for follower in &mut *followers {
-                follower.force = follow::SteeringForce::none(*simd);
-            }
             for (index, (terms, others)) in plan.terms.iter().enumerate() {
                 let counting = index == 0 && plan.leaders.is_none();
+                let is_last = index + 1 == plan.terms.len();
                 let terms = &class.terms[terms.clone()];
-                let attraction = Attraction { class, terms, agents, headings, near, others, leaders };
+                let ring =
+                    Ring { class, terms, is_first: index == 0, is_last, agents, headings, near, others, leaders };
                 match (terms.len(), counting) {
-                    (1, true) => attraction.add::<1, true>(own.clone(), followers, counts),
-                    (1, false) => attraction.add::<1, false>(own.clone(), followers, counts),
-                    (_, true) => attraction.add::<2, true>(own.clone(), followers, counts),
-                    (_, false) => attraction.add::<2, false>(own.clone(), followers, counts),
+                    (1, true) => ring.add::<1, true>(own.clone(), followers, counts),
+                    (1, false) => ring.add::<1, false>(own.clone(), followers, counts),
+                    (_, true) => ring.add::<2, true>(own.clone(), followers, counts),
+                    (_, false) => ring.add::<2, false>(own.clone(), followers, counts),
                 }
-            }
-            for (agent, follower) in agents[own.clone()].iter().zip(&mut *followers) {
-                follower.force.add_walls(&class.constants.rule, motion, agent.x, agent.y);
             }
             obey(class, &mut agents[own.clone()], followers, &mut wanted[own.clone()], &mut velocities[own]);
         }
@@ -407,14 +404,31 @@ impl<S: Simd> Block<S> {
 
 /// The order in which the agents of a class visit others.
 struct Plan {
-    /// The agents of each channel, `[channels]`.
-    channels: Vec<Masks>,
+    /// `[channels]`.
+    channels: Vec<ChannelPlan>,
     /// Terms that are added together, see [`follow::rings`], and their agents.
     terms: Vec<(Range<usize>, Masks)>,
     /// The leaders, unless the first terms count them because they visit all of them and have their radius.
     leaders: Option<Masks>,
     /// The squared distance up to which each leader leads agents of this class, `[leaders]`.
     influences2: Vec<f32>,
+}
+
+/// What the agents of a class visit for a channel.
+struct ChannelPlan {
+    agents: Masks,
+    pois: Vec<Range<usize>>,
+    /// Whether it counts no entities, and each has value 1.
+    is_plain: bool,
+}
+
+impl ChannelPlan {
+    fn new(channel: &ChannelConstants, values: &[f32]) -> ChannelPlan {
+        let shape = &channel.shape;
+        let of = |pois: bool| model::each(&shape.ranges).filter(move |_| pois == (shape.of_pois != 0));
+        let has_values = of(true).flatten().any(|poi| values[poi] != 1.0);
+        ChannelPlan { agents: masks(of(false)), pois: of(true).collect(), is_plain: shape.counts == 0 && !has_values }
+    }
 }
 
 impl Plan {
@@ -434,7 +448,7 @@ impl Plan {
             let is_led = influences2.iter().any(|&influence2| influence2 >= 0.0);
             let counted = terms.first().is_some_and(|(range, _)| visits(&class.terms()[range.end - 1]));
             Plan {
-                channels: class.channels().iter().map(|of| masks(model::each(&of.shape.ranges))).collect(),
+                channels: class.channels().iter().map(|of| ChannelPlan::new(of, &world.values)).collect(),
                 terms,
                 leaders: (!counted).then(|| masks(is_led.then(|| leaders.clone()))),
                 influences2,
@@ -476,7 +490,7 @@ struct Scene<'a, S: Simd, P> {
     values: &'a [f32],
     agents: &'a [Agent<S>],
     near: &'a [u64],
-    others: &'a Masks,
+    plan: &'a ChannelPlan,
 }
 
 impl<S: Simd, P: PoiPosition<S>> Scene<'_, S, P> {
@@ -498,32 +512,43 @@ impl<S: Simd, P: PoiPosition<S>> Scene<'_, S, P> {
         sense::measured::<S>(self.channel, const { Measure::of(MEASURE) }, value, dx, dy)
     }
 
-    /// Senses by quadrants. `PLAIN` channels count no entities, and sense POIs of value 1 only.
+    /// Senses by quadrants. `PLAIN` channels count no entities, and sense POIs of value 1 only. It is a function of its own,
+    /// so that registers hold its constants.
+    fn sense_quadrants<const MEASURE: u32, const PLAIN: bool>(
+        &self,
+        observers: Range<usize>,
+        mut inputs: Inputs<'_, S>,
+    ) {
+        self.simd.vectorize(
+            #[inline(always)]
+            || self.sense_each_quadrant::<MEASURE, PLAIN>(observers, &mut inputs),
+        );
+    }
+
     #[inline(always)]
-    fn sense_quadrants<const MEASURE: u32, const PLAIN: bool>(&self, observers: Range<usize>, inputs: Inputs<'_, S>) {
-        let &Scene { simd, channel, pois, values, agents, near, others } = self;
-        let (runs, used) = model::runs(&channel.shape.ranges);
-        let first = channel.shape.input as usize;
-        let inputs = inputs.all.chunks_exact_mut(inputs.width).skip(observers.start);
-        for ((observer, agent), inputs) in observers.clone().zip(&agents[observers]).zip(inputs) {
-            let &Agent { x, y, .. } = agent;
-            let heading = channel.heading(agent.hx, agent.hy);
+    fn sense_each_quadrant<const MEASURE: u32, const PLAIN: bool>(
+        &self,
+        observers: Range<usize>,
+        inputs: &mut Inputs<'_, S>,
+    ) {
+        let &Scene { simd, channel, pois, values, agents, near, plan } = self;
+        for observer in observers {
+            let &Agent { x, y, hx, hy, .. } = &agents[observer];
+            let heading = channel.heading(hx, hy);
             let mut quadrants = sense::Quadrants::new(simd);
-            if channel.shape.of_pois == 0 {
-                neighbours::each_near(
-                    near,
-                    agents,
-                    observer,
-                    others,
-                    #[inline(always)]
-                    |_, other| {
-                        let offset = [other.x - x, other.y - y];
-                        let measured = self.measured::<MEASURE, true>(1.0, offset);
-                        quadrants.add::<PLAIN>(measured, offset, heading);
-                    },
-                );
-            }
-            for range in &runs[..if channel.shape.of_pois == 0 { 0 } else { used }] {
+            neighbours::each_near(
+                near,
+                agents,
+                observer,
+                &plan.agents,
+                #[inline(always)]
+                |_, other| {
+                    let offset = [other.x - x, other.y - y];
+                    let measured = self.measured::<MEASURE, true>(1.0, offset);
+                    quadrants.add::<PLAIN>(measured, offset, heading);
+                },
+            );
+            for range in &plan.pois {
                 let (fours, rest) = pois[range.clone()].as_chunks::<4>();
                 let (values, last) = values[range.clone()].as_chunks::<4>();
                 for (pois, values) in fours.iter().zip(values) {
@@ -546,8 +571,8 @@ impl<S: Simd, P: PoiPosition<S>> Scene<'_, S, P> {
                     quadrants.add::<PLAIN>(self.measured::<MEASURE, PLAIN>(value, offset), offset, heading);
                 }
             }
-            let inputs = inputs[first..].first_chunk_mut().expect("a policy has the inputs of its channels");
-            quadrants.write::<PLAIN>(channel, inputs);
+            let inputs = inputs.of(observer, channel).as_chunks_mut().0;
+            quadrants.write::<PLAIN>(channel, &mut inputs[0]);
         }
     }
 
@@ -576,31 +601,28 @@ impl<S: Simd, P: PoiPosition<S>> Scene<'_, S, P> {
     /// Senses by any number of sectors.
     #[inline(always)]
     fn sense_sectors(&self, observers: Range<usize>, mut inputs: Inputs<'_, S>) {
-        let &Scene { simd, channel, pois, values, agents, near, others } = self;
+        let &Scene { simd, channel, pois, values, agents, near, plan } = self;
         let measure = Measure::of(channel.shape.measure);
         for observer in observers {
             let &Agent { x, y, .. } = &agents[observer];
             let heading = channel.heading(agents[observer].hx, agents[observer].hy);
             let mut sectors = sense::Sectors::new(simd, Combine::of(channel.shape.combine));
-            if channel.shape.of_pois == 0 {
-                neighbours::each_near(
-                    near,
-                    agents,
-                    observer,
-                    others,
-                    #[inline(always)]
-                    |_, other| {
-                        let (offset, one) = ([other.x - x, other.y - y], splat(simd, 1.0));
-                        let measured = sense::measured::<S>(channel, measure, one, offset[0], offset[1]);
-                        sectors.add(channel, measured, offset, heading);
-                    },
-                );
-            } else {
-                for poi in model::each(&channel.shape.ranges).flatten() {
-                    let (offset, value) = (self.offset(&pois[poi], x, y), splat(simd, values[poi]));
-                    let measured = sense::measured::<S>(channel, measure, value, offset[0], offset[1]);
+            neighbours::each_near(
+                near,
+                agents,
+                observer,
+                &plan.agents,
+                #[inline(always)]
+                |_, other| {
+                    let (offset, one) = ([other.x - x, other.y - y], splat(simd, 1.0));
+                    let measured = sense::measured::<S>(channel, measure, one, offset[0], offset[1]);
                     sectors.add(channel, measured, offset, heading);
-                }
+                },
+            );
+            for poi in plan.pois.iter().cloned().flatten() {
+                let (offset, value) = (self.offset(&pois[poi], x, y), splat(simd, values[poi]));
+                let measured = sense::measured::<S>(channel, measure, value, offset[0], offset[1]);
+                sectors.add(channel, measured, offset, heading);
             }
             sectors.write(channel, inputs.of(observer, channel));
         }
@@ -619,9 +641,7 @@ impl<S: Simd, P: PoiPosition<S>> ConstDispatch for Quartering<'_, '_, S, P> {
 
     #[inline(always)]
     fn with<const MEASURE: u32>(self) {
-        let Scene { channel, values, .. } = &self.scene;
-        let is_plain = channel.shape.counts == 0 && values.iter().all(|&value| value == 1.0);
-        match is_plain {
+        match self.scene.plan.is_plain {
             true => self.scene.sense_quadrants::<MEASURE, true>(self.observers, self.inputs),
             false => self.scene.sense_quadrants::<MEASURE, false>(self.observers, self.inputs),
         }
@@ -655,9 +675,11 @@ fn count_leaders<S: Simd>(
 }
 
 /// One term of a rule, or two [rings](follow::rings).
-struct Attraction<'a, S: Simd> {
+struct Ring<'a, S: Simd> {
     class: &'a ClassLanes<S>,
     terms: &'a [follow::TermLanes<S>],
+    is_first: bool,
+    is_last: bool,
     agents: &'a [Agent<S>],
     headings: &'a [[S::f32s; 2]],
     near: &'a [u64],
@@ -665,8 +687,9 @@ struct Attraction<'a, S: Simd> {
     leaders: usize,
 }
 
-impl<S: Simd> Attraction<'_, S> {
-    /// Adds so many terms to the forces on the agents of `own`, and counts the leaders they see if wanted.
+impl<S: Simd> Ring<'_, S> {
+    /// Adds so many terms to the forces on the agents of `own`, and counts the leaders they see if wanted. The first ring
+    /// starts the forces, and walls come after the last. Two loops, see [`Block::follow`].
     #[inline(always)]
     fn add<const TERMS: usize, const COUNTS: bool>(
         &self,
@@ -687,12 +710,13 @@ impl<S: Simd> Attraction<'_, S> {
         followers: &mut [Follower<S>],
         counts: &mut [S::u32s],
     ) {
-        let &Attraction { class, terms, agents, headings, near, others, leaders } = self;
-        let rule = &class.constants.rule;
+        let &Ring { class, terms, is_first, is_last, agents, headings, near, others, leaders } = self;
+        let (rule, motion) = (&class.constants.rule, &class.constants.motion);
         let terms: &[follow::TermLanes<S>; TERMS] = terms.try_into().expect("the caller counts the terms");
         let [inner, outer] = [&terms[0], &terms[TERMS - 1]];
-        for ((index, follower), counts) in own.zip(&mut *followers).zip(counts.chunks_exact_mut(leaders)) {
-            let &Agent { x, y, .. } = &agents[index];
+        let each = || own.clone().zip(&agents[own.clone()]);
+        for (((index, agent), follower), counts) in each().zip(&mut *followers).zip(counts.chunks_exact_mut(leaders)) {
+            let &Agent { x, y, .. } = agent;
             let mut sums = [Sum::new(x.token()); TERMS];
             neighbours::each_near(
                 near,
@@ -722,10 +746,15 @@ impl<S: Simd> Attraction<'_, S> {
             );
             follower.sums[..TERMS].copy_from_slice(&sums);
         }
-        for follower in followers {
+        for ((_, agent), follower) in each().zip(followers) {
+            let mut force = if is_first { follow::SteeringForce::none(agent.x.token()) } else { follower.force };
             for (term, sum) in terms.iter().zip(&follower.sums) {
-                follower.force.add(term, sum);
+                force.add(term, sum);
             }
+            if is_last {
+                force.add_walls(rule, motion, agent.x, agent.y);
+            }
+            follower.force = force;
         }
     }
 }

@@ -609,7 +609,7 @@ struct Sensing<'a, S: Simd> {
     channel: &'a ChannelLanes<S>,
     agent: Agent<S>,
     /// The heading that sectors turn with.
-    heading: Option<[S::f32s; 2]>,
+    heading: [S::f32s; 2],
     in_quadrants: bool,
     quadrants: sense::Quadrants<S>,
     sectors: sense::Sectors<S>,
