@@ -120,7 +120,7 @@ Files in {}:
   {:<22}what it ran on; digest {digest}
 
 Next:
-  flotilla replay {replayed}
+  flotilla replay {replayed} --trial {best}
   flotilla replay {replayed} --trial {best} --out {film}
   flotilla rollout {replayed} --scores scores.csv
 ",

@@ -156,7 +156,8 @@ fn pictures_and_pages_show_classes_radii_and_values() {
     let layout = place.read("layout.svg");
     let labels = [
         "2 × rover, 1 × drone, 2 × sheep, 3 POIs",
-        "rover 0 to 1, drone 2",
+        "rover 0 to 1",
+        "drone 2",
         "sheep",
         "2, value 2",
         "1, value 2",
@@ -166,6 +167,7 @@ fn pictures_and_pages_show_classes_radii_and_values() {
         assert!(layout.contains(&format!("aria-label=\"{text}\"")), "{text}");
     }
     assert!(layout.contains(" Observers: rover, drone."), "sheep do not observe");
+    assert!(layout.contains("r=\"11.2\""), "what moves freely is a disc in the legend");
     // 80 mm show 40 units, and an SVG has 10 units per millimetre.
     for radius in [5, 3] {
         assert!(layout.contains(&format!("r=\"{}\" fill=\"#", radius * 20)), "a circle of {radius} units");
@@ -203,4 +205,28 @@ fn a_credit_that_is_always_0_is_noted() {
     ] {
         assert!(!notes(line).contains("is always 0"), "{line}");
     }
+    assert!(!notes("check herd.toml --fitness Df").contains("equals D"));
+}
+
+#[test]
+fn fitness_by_led_agents_that_nobody_leads_is_noted() {
+    let herd = std::fs::read_to_string(root("configs/herd.toml")).unwrap();
+    let alone = herd.replace("leads = \"sheep\"", "");
+    assert_ne!(herd, alone);
+    let counting = alone.replace("observes = false", "");
+    let place = Place::new(&[("alone.toml", &alone), ("counting.toml", &counting)]);
+    let always_0 = "always 0, because none counts at a POI: selection is random; use G, or Df with `leads`";
+    for fitness in ["D", "Df", "Dt"] {
+        let (_, notes) = place.good(&format!("check alone.toml --fitness {fitness}"));
+        assert!(notes.contains(&format!("note: {fitness} of every dog is {always_0}")), "{notes}");
+    }
+    let (_, notes) = place.good("check counting.toml --fitness Df");
+    assert!(notes.contains("note: Df equals D here, because no class has `leads`"), "{notes}");
+    // Runs that differ in nothing but the name of their fitness.
+    for fitness in ["D", "Df"] {
+        let run = "--generations 1 --trials 2 --population 4";
+        place.good(&format!("train counting.toml --fitness {fitness} {run} --out {fitness}"));
+    }
+    let (_, notes) = place.good("compare D Df");
+    assert!(notes.contains("note: Df has the digest of D: their settings differ, and their results do not"), "{notes}");
 }

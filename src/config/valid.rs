@@ -135,24 +135,36 @@ fn notes(config: &Config) -> Vec<String> {
     config.agents.iter().enumerate().flat_map(of_class).chain(without_credit).collect()
 }
 
-/// Returns a note for each class that learns by D or D++, which are always 0 because its agents count at no POI.
+/// Returns a note for each class that learns by a fitness that is always 0, because its agents count at no POI and are taken
+/// out alone, and one for Df or Dt if no class leads another.
 fn without_credit(config: &Config, classes: &Classes) -> Vec<String> {
     let of_class = |(index, class): (usize, &AgentClass)| {
         let fitness = class.fitness.unwrap_or(config.learning.fitness);
         let is_alone = match fitness {
             Fitness::D => config.credit.removes.is_empty(),
             Fitness::Dpp => true,
-            _ => false,
+            Fitness::Df | Fitness::Dt => class.leads.is_empty(),
+            Fitness::G => false,
         };
         let counts = (0..classes.pois.len()).any(|group| classes.observes(index, group));
+        let others = if class.leads.is_empty() { "G, or Df with `leads`" } else { "G, Df or Dt" };
         (class.learns() && is_alone && !counts && !config.credit.add_g).then(|| {
             format!(
-                "{fitness} of every {} is always 0, because none counts at a POI: selection is random; use G, Df or Dt",
+                "{fitness} of every {} is always 0, because none counts at a POI: selection is random; use {others}",
                 class.name
             )
         })
     };
-    classes.agents.iter().enumerate().filter_map(of_class).collect()
+    let always_0: Vec<String> = classes.agents.iter().enumerate().filter_map(of_class).collect();
+    let by_led = |class: &AgentClass| {
+        let fitness = class.fitness.unwrap_or(config.learning.fitness);
+        (class.learns() && matches!(fitness, Fitness::Df | Fitness::Dt)).then_some(fitness)
+    };
+    let leads = classes.agents.iter().any(|class| !class.leads.is_empty());
+    let equal = classes.agents.iter().find_map(by_led).filter(|_| !leads && !config.agents.is_empty());
+    let equal = equal.filter(|_| always_0.is_empty());
+    let note = equal.map(|fitness| format!("{fitness} equals D here, because no class has `leads`"));
+    always_0.into_iter().chain(note).collect()
 }
 
 #[cfg(test)]

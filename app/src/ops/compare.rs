@@ -182,15 +182,19 @@ fn of_runs(folders: &[PathBuf], args: &CompareRequest, notes: &mut Vec<String>) 
     Ok(arms.map(read).collect::<Result<_, _>>()?)
 }
 
-/// Returns a note for each run that is a copy of another, because there is nothing to compare between them.
+/// Returns a note for each run with the results of another, because there is nothing to compare between them.
 fn copies(folders: &[PathBuf], configs: &[Config]) -> Vec<String> {
     let digest = |folder: &PathBuf| Run::read(&folder.join(RUN)).ok()?.digest;
     let runs: Vec<_> = folders.iter().zip(configs.iter().map(record::without_checkpoint)).collect();
     let digests: Vec<_> = folders.iter().map(digest).collect();
     let original = |place: usize| {
-        let first = (0..place).find(|&first| runs[first].1 == runs[place].1 && digests[first] == digests[place])?;
+        let first = (0..place).find(|&first| digests[first] == digests[place])?;
         digests[place].as_ref()?;
-        Some(format!("{} is a copy of {}: the same run", folders[place].escaped(), folders[first].escaped()))
+        let [this, other] = [place, first].map(|run| folders[run].escaped());
+        Some(match runs[first].1 == runs[place].1 {
+            true => format!("{this} is a copy of {other}: the same run"),
+            false => format!("{this} has the digest of {other}: their settings differ, and their results do not"),
+        })
     };
     (0..folders.len()).filter_map(original).collect()
 }

@@ -2,7 +2,9 @@
 
 use glam::DVec2;
 
-use super::{FAINT, Legend, Marker, Poi, Team, Viewport, counted, poi_label, radius_of, sample_note, values_differ};
+use super::{
+    FAINT, Legend, Marker, Poi, Team, Viewport, counted, heading_of, poi_label, radius_of, sample_note, values_differ,
+};
 use crate::report::scene::{Anchor, BLACK, Pen, Scene};
 use flotilla::config::{Observers, Region, StageConfig, drawn_agents};
 use flotilla::world::World;
@@ -12,7 +14,7 @@ fn team(config: &StageConfig, world: &World) -> Team {
     let leaders = world.leaders();
     let agent = |index: usize| Marker {
         place: world.starts[index].as_dvec2(),
-        heading: world.headings[index].as_dvec2(),
+        heading: heading_of(world, index, world.headings[index].as_dvec2()),
         group: (index < leaders).then_some(index),
         counts: world.rule.counts(index),
         trail: vec![],

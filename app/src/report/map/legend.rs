@@ -10,8 +10,8 @@ use flotilla::config::Config;
 /// The symbol of an entry, drawn from a place on the baseline.
 enum Symbol {
     None,
-    /// An agent's arrow of a size, its group, whether it leads, and whether it observes.
-    Agent(f64, Option<usize>, bool, bool),
+    /// An agent of a size, its heading, its group, whether it leads, and whether it observes.
+    Agent(f64, Option<DVec2>, Option<usize>, bool, bool),
     /// A POI's circle.
     Poi(Option<Fill>, Pen),
     /// A scale of a length in millimetres.
@@ -23,7 +23,7 @@ impl Symbol {
     fn width(&self) -> f64 {
         match self {
             Symbol::None => 0.0,
-            Symbol::Agent(_, _, _, false) => 3.4,
+            Symbol::Agent(_, _, _, _, false) => 3.4,
             Symbol::Agent(..) | Symbol::Poi(..) => 3.0,
             Symbol::Scale(length) => length + 1.0,
         }
@@ -32,11 +32,11 @@ impl Symbol {
     fn draw(&self, scene: &mut Scene, [x, y]: [f64; 2]) {
         match *self {
             Symbol::None => {}
-            Symbol::Agent(size, group, leads, observes) => {
+            Symbol::Agent(size, heading, group, leads, observes) => {
                 let place = [x + if observes { 1.2 } else { 1.4 }, y - 0.8];
-                arrow(scene, place, DVec2::Y, size, group, leads);
+                arrow(scene, place, heading, size, group, leads);
                 if !observes {
-                    strike(scene, place, DVec2::Y, size);
+                    strike(scene, place, heading, size);
                 }
             }
             Symbol::Poi(fill, ref pen) => scene.circle([x + 1.2, y - 0.8], 1.2, fill, Some(pen.clone())),
@@ -53,24 +53,24 @@ impl Symbol {
     }
 }
 
-/// Returns the names of leaders, of followers in the colour of their leader, and of other followers. With `[[agents]]` these
-/// are names of classes.
-fn roles(config: &Config, leaders: usize) -> [String; 3] {
+/// Returns the names of leaders, by the group of the first, of followers in the colour of their leader, and of other
+/// followers. With `[[agents]]` these are names of classes.
+fn roles(config: &Config, leaders: usize) -> (Vec<(usize, String)>, [String; 2]) {
     if config.agents.is_empty() {
         let leader = if leaders > 1 { "leader, by number" } else { "leader" };
-        return [leader, "its follower", "follower"].map(String::from);
+        return (vec![(0, leader.into())], ["its follower", "follower"].map(String::from));
     }
     let (learning, others): (Vec<_>, Vec<_>) = config.agents.iter().partition(|class| class.learns());
     let mut first = 0;
     let numbered = learning.iter().map(|class| {
         let last = first + class.size() - 1;
         let numbers = if first == last { first.to_string() } else { format!("{first} to {last}") };
-        first = last + 1;
-        if leaders > 1 { format!("{} {numbers}", class.name) } else { class.name.clone() }
+        let of_first = std::mem::replace(&mut first, last + 1);
+        (of_first, if leaders > 1 { format!("{} {numbers}", class.name) } else { class.name.clone() })
     });
-    let leader = numbered.collect::<Vec<_>>().join(", ");
+    let leader = numbered.collect();
     let follower = others.iter().map(|class| class.name.as_str()).collect::<Vec<_>>().join(" or ");
-    [leader, format!("{follower}, in its leader's colour"), follower]
+    (leader, [format!("{follower}, in its leader's colour"), follower])
 }
 
 /// The legend below a map: symbols with their texts.
@@ -91,20 +91,23 @@ impl Legend {
         let mut add = |symbol: Symbol, text: &str| entries.push((symbol, text.to_string()));
         let Some(team) = teams.first() else { return Legend::default() };
         let mut pois = teams.iter().flat_map(|team| &team.pois);
-        let [leader, its_follower, follower] = roles(config, team.leaders);
-        add(Symbol::Agent(1.6, Some(0), true, true), &leader);
+        let (leading, [its_follower, follower]) = roles(config, team.leaders);
+        let heading = |agent: usize| team.agents[agent].heading.map(|_| DVec2::Y);
+        for (first, leader) in leading {
+            add(Symbol::Agent(1.6, heading(first), Some(first), true, true), &leader);
+        }
         let followers = &team.agents[team.leaders..];
         if followers.iter().any(|agent| agent.group.is_some()) {
-            add(Symbol::Agent(1.4, Some(0), false, true), &its_follower);
+            add(Symbol::Agent(1.4, heading(team.leaders), Some(0), false, true), &its_follower);
         } else if !followers.is_empty() {
-            add(Symbol::Agent(1.4, None, false, true), &follower);
+            add(Symbol::Agent(1.4, heading(team.leaders), None, false, true), &follower);
         }
         if pois.clone().any(|poi| poi.observed) {
             let fill = Fill { color: COLORS[2], opacity: 0.22 };
             add(Symbol::Poi(Some(fill), Pen::new(COLORS[2], 0.25)), "observed POI, with its step");
         }
-        if team.agents.iter().any(|agent| !agent.counts) {
-            add(Symbol::Agent(1.5, None, !team.agents[0].counts, false), "does not observe");
+        if let Some(agent) = team.agents.iter().position(|agent| !agent.counts) {
+            add(Symbol::Agent(1.5, heading(agent), None, agent < team.leaders, false), "does not observe");
         }
         let unobserved = |dash| Symbol::Poi(None, Pen { dash, ..Pen::new(GREY, 0.25) });
         if pois.clone().any(|poi| !poi.observed && !poi.open) {

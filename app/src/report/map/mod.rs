@@ -53,8 +53,8 @@ pub(crate) const FAINT: Color = [95, 95, 95];
 pub struct Marker {
     /// Position in map units.
     pub place: DVec2,
-    /// Heading, a vector of any length except 0.
-    pub heading: DVec2,
+    /// Heading, a vector of any length except 0; none if the agent moves freely.
+    pub heading: Option<DVec2>,
     /// The leader in whose group the agent is.
     pub group: Option<usize>,
     /// Whether the agent is an observer.
@@ -364,8 +364,20 @@ pub fn counted(number: usize, what: &str) -> String {
     format!("{number} {what}{}", if number == 1 { "" } else { "s" })
 }
 
-/// Draws an agent's arrow: filled for a leader, hollow for a follower.
-fn arrow(scene: &mut Scene, [px, py]: [f64; 2], heading: DVec2, size: f64, group: Option<usize>, leads: bool) {
+/// Returns the heading to draw of an agent, none if it moves freely.
+pub(crate) fn heading_of(world: &World, agent: usize, heading: DVec2) -> Option<DVec2> {
+    (world.class_of(agent).constants.shape.free == 0).then_some(heading)
+}
+
+/// Draws an agent's arrow, or a disc without a heading: filled for a leader, hollow for a follower.
+fn arrow(scene: &mut Scene, [px, py]: [f64; 2], heading: Option<DVec2>, size: f64, group: Option<usize>, leads: bool) {
+    let Some(heading) = heading else {
+        let (fill, pen) = match leads {
+            true => (group_color(group).into(), Pen::new(BLACK, (size * 0.1).min(0.2))),
+            false => (WHITE.into(), group_pen(group, 0.35)),
+        };
+        return scene.circle([px, py], size * 0.7, Some(fill), Some(pen));
+    };
     let [x, y] = heading.normalize_or(DVec2::Y).to_array();
     let corner = |ahead: f64, aside: f64| [px + size * (x * ahead - y * aside), py - size * (y * ahead + x * aside)];
     let corners = vec![corner(1.0, 0.0), corner(-0.75, 0.7), corner(-0.4, 0.0), corner(-0.75, -0.7)];
@@ -377,8 +389,8 @@ fn arrow(scene: &mut Scene, [px, py]: [f64; 2], heading: DVec2, size: f64, group
 }
 
 /// Draws a stroke across the arrow of an agent that does not observe.
-fn strike(scene: &mut Scene, [px, py]: [f64; 2], heading: DVec2, size: f64) {
-    let [x, y] = heading.normalize_or(DVec2::Y).to_array();
+fn strike(scene: &mut Scene, [px, py]: [f64; 2], heading: Option<DVec2>, size: f64) {
+    let [x, y] = heading.unwrap_or(DVec2::Y).normalize_or(DVec2::Y).to_array();
     let end = |side: f64| [px - side * size * y, py - side * size * x];
     for (color, width) in [(WHITE, 0.32), (BLACK, 0.16)] {
         scene.line(vec![end(1.1), end(-1.1)], Pen::new(color, size * width));

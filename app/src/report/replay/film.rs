@@ -28,7 +28,8 @@ impl Replayed {
             trail.push(place);
             let group = self.group(step, agent);
             let counts = world.rule.counts(agent);
-            Marker { place, heading: toward(step, agent).lerp(toward(next, agent), part), group, counts, trail }
+            let heading = map::heading_of(world, agent, toward(step, agent).lerp(toward(next, agent), part));
+            Marker { place, heading, group, counts, trail }
         };
         // The POIs that were observed before this step decide which POIs are open.
         let before: Vec<bool> = self.observed.iter().map(|at| at.is_some_and(|at| at < step.max(1))).collect();
