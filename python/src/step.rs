@@ -242,6 +242,7 @@ fn team_of(stepper: &mut stepping::Stepper, team: usize) -> Team {
     let (step, observed) = (stepper.steps()[team].max(1), &stepper.observed()[team * pois..][..pois]);
     let agent = |(agent, (place, heading))| {
         let group = (agent < leaders).then_some(agent);
+        let heading = map::heading_of(world, agent, heading);
         Marker { place, heading, group, counts: world.rule.counts(agent), trail: vec![place] }
     };
     let poi = |(poi, place): (usize, &Vec2)| {

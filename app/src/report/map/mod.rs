@@ -365,7 +365,7 @@ pub fn counted(number: usize, what: &str) -> String {
 }
 
 /// Returns the heading to draw of an agent, none if it moves freely.
-pub(crate) fn heading_of(world: &World, agent: usize, heading: DVec2) -> Option<DVec2> {
+pub fn heading_of(world: &World, agent: usize, heading: DVec2) -> Option<DVec2> {
     (world.class_of(agent).constants.shape.free == 0).then_some(heading)
 }
 
