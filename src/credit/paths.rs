@@ -29,7 +29,7 @@ pub(super) struct PathCredit {
     taken: Vec<u32>,
     ever_taken: Vec<u32>,
     /// Agents that are ever near the POI and count there, and at each moment their squared distance, infinite unless it
-    /// is near: `[observers]`, `[observers][width]`.
+    /// is near and the moment counts: `[observers]`, `[observers][width]`.
     observers: Vec<usize>,
     near: Vec<f32>,
     /// The squared distances of the nearest observers, `[coupling][lanes]`.
@@ -128,12 +128,14 @@ impl PathCredit {
     /// Copies positions, so that the moments of an agent follow each other.
     fn load<S: Simd>(&mut self, paths: &Paths<'_>, world: &World) {
         let (agents, moments) = (world.agents(), world.steps() + 1);
-        self.width = moments.next_multiple_of(S::f32s::LEN);
-        self.positions.resize(2 * agents * self.width, 0.0);
-        for (index, row) in self.positions.chunks_exact_mut(self.width).enumerate() {
-            let (axis, agent) = (index / agents, index % agents);
-            for (moment, to) in row[..moments].iter_mut().enumerate() {
-                *to = f32::from_bits(paths.positions.get((moment * agents + agent) * 2 + axis));
+        let width = moments.next_multiple_of(S::f32s::LEN);
+        self.width = width;
+        self.positions.resize(2 * agents * width, 0.0);
+        let (x, y) = self.positions.split_at_mut(agents * width);
+        let mut from = paths.positions.iter();
+        for (moment, agent) in (0..moments).flat_map(|moment| (0..agents).map(move |agent| (moment, agent))) {
+            for axis in [&mut *x, &mut *y] {
+                axis[agent * width + moment] = f32::from_bits(from.next().expect("a path has every moment"));
             }
         }
     }
@@ -242,16 +244,15 @@ impl PathCredit {
         let first = first.max(usize::from(!rule.start_counts));
         self.observers.clear();
         self.near.clear();
-        let (radius2, lanes) = (splat(simd, world.radii2[poi]), S::u32s::from_fn(simd, |lane| lane as u32));
+        let radius2 = splat(simd, world.radii2[poi]);
         for agent in (0..agents).filter(|&agent| world.rule.counts_at(poi, agent)) {
             let start = self.near.len();
             self.near.resize(start + width, f32::INFINITY);
             let mut ever = false;
             for chunk in (0..width).step_by(S::f32s::LEN) {
                 let [x, y] = self.at(simd, agents, agent, chunk);
-                let (dx, dy, moments) = (x - at.x, y - at.y, lanes + chunk as u32);
-                let counts = moments.simd_ge(first as u32) & moments.simd_le(last as u32);
-                let is_near = observes::<S>(radius2, dx, dy) & counts;
+                let (dx, dy) = (x - at.x, y - at.y);
+                let is_near = observes::<S>(radius2, dx, dy);
                 if is_near.any_true() {
                     let near = select::<S>(splat(simd, f32::INFINITY), dx * dx + dy * dy, is_near);
                     near.store_slice(&mut self.near[start + chunk..][..S::f32s::LEN]);
@@ -259,6 +260,9 @@ impl PathCredit {
                 }
             }
             if ever {
+                let near = &mut self.near[start..];
+                near[..first].fill(f32::INFINITY);
+                near[last + 1..].fill(f32::INFINITY);
                 self.observers.push(agent);
             } else {
                 self.near.truncate(start);

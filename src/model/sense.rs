@@ -329,7 +329,8 @@ impl<S: Simd> Quadrants<S> {
         }
         // Sectors of the map begin at the x axis, which is straight ahead.
         if channel.shape.frame == Frame::Map as u32 {
-            inputs.rotate_left(2);
+            let [back_right, front_right, front_left, back_left] = *inputs;
+            *inputs = [front_left, back_left, back_right, front_right];
         }
     }
 }
