@@ -227,6 +227,24 @@ def check_slow_network(tab, page):
         tab.wait("document.querySelector('#guide-says').textContent.includes('Training is finished.')")
         time.sleep(0.5)
         assert tab.evaluate("shifts") < 0.1, (width, "the guide", tab.evaluate("shifts"), tab.evaluate("moved"))
+        if width not in [1280, 390]:
+            continue
+        # Its fourth step trains whole populations before they are shown. The third is stopped, and says so.
+        for selector in ["#guide-next", "#guide-choices button"]:
+            tab.click(selector)
+        tab.wait("page.state.training?.arms.length === 3 && page.state.training.reached >= 1")
+        tab.click("#stop")
+        tab.wait("document.querySelector('#guide-says').textContent.includes('It is: 500.')")
+        time.sleep(1)
+        reached = tab.evaluate("page.state.training.reached")
+        assert f" Stopped after generation {reached}. " in tab.text("#guide-says"), (reached, tab.text("#guide-says"))
+        tab.click("#guide-next")
+        tab.evaluate("shifts = 0; moved = []; 0")
+        tab.click("#guide-choices button")
+        assert tab.text("#guide-says").endswith(" The populations are being trained…"), tab.text("#guide-says")
+        tab.wait("page.state.exhibit?.name === 'evolution' && !page.state.exhibit.pending")
+        time.sleep(0.5)
+        assert tab.evaluate("shifts") < 0.1, (width, "populations", tab.evaluate("shifts"), tab.evaluate("moved"))
     tab.call("Page.removeScriptToEvaluateOnNewDocument", identifier=script)
     tab.window(1280, 900, dark=False)
     print("the opening moves before the module has arrived, and the page shifts little")
@@ -358,6 +376,30 @@ def check_consistency(tab, page, downloads):
     tab.click("#guide-next")
     tab.wait("page.state.views[0].title.textContent.startsWith('A trained team')")
     assert "not part of the guide" not in tab.text("#guide-says"), tab.text("#guide-says")
+    # The way back to the guide from a rearranged map does not train again.
+    tab.load(page)
+    tab.set("#pace", "full")
+    for selector in ["#guide-choices button", "#guide-next", "#guide-choices button"]:
+        tab.click(selector)
+    tab.wait(DONE)
+    tab.evaluate("window.before = page.state.training; 0")
+    tab.click("[data-mode=arrange]")
+    assert "not part of the guide" in tab.text("#guide-says"), tab.text("#guide-says")
+    tab.click("#guide-next")
+    time.sleep(0.5)
+    assert tab.evaluate("page.state.training === before && page.state.mode === 'watch'")
+    assert "almost never coincide" in tab.text("#guide-says"), tab.text("#guide-says")
+    # A view that is no longer on show asks for no episode of the next training.
+    tab.evaluate(
+        "(() => { const { training, views: [view] } = page.state, { champion } = training; window.asking = [];"
+        " training.champion = (...words) => new Promise(done => setTimeout(done, 800)).then(() => champion.apply(training, words));"
+        " for (const at of [1, 2]) page.seek(at);"
+        " Object.defineProperty(view, 'asking', { set(value) { asking.push(value); }, get: () => true }); })()"
+    )
+    tab.click("[data-exhibit=blind]")
+    tab.wait("page.state.training?.arms.length === 3 && page.state.training.reached >= 0 && asking.length > 0")
+    time.sleep(0.3)
+    assert tab.evaluate("asking.join()") == "false", tab.evaluate("asking.join()")
     # After another run is opened, the result of a former training is gone.
     tab.load(page, layout="strictly_forward", on="cpu", pace="full", learners="leader-follower", **SMALL)
     tab.train()
@@ -497,7 +539,11 @@ def check_classes(tab, page, native):
         at = f"{episode}.positions.slice({{0}} * 12 + {2 * leader}, {{0}} * 12 + {2 * leader} + 2)"
         (x0, y0), (x1, y1) = (list(tab.evaluate(f"[...{at.format(step)}]")) for step in [0, 3])
         assert (x1 - x0 > 2 and abs(y1 - y0) < 1e-6) if sideways else y1 - y0 > 0.1, (leader, x0, y0, x1, y1)
+    # The first press of a key already steers.
     tab.set("#leader", "4")
+    tab.evaluate(f"{view}.canvas.dispatchEvent(new KeyboardEvent('keydown', {{ key: 'ArrowRight' }})); 0")
+    tab.wait(f"{view}.place >= 3")
+    tab.evaluate(f"{view}.canvas.dispatchEvent(new KeyboardEvent('keyup', {{ key: 'ArrowRight' }})); 0")
     tab.click("#again")
     tab.mouse("mouseMoved", *tab.place("pois", 6))
     tab.wait(f"{episode}.observed[6] !== null", 60)
@@ -660,12 +706,25 @@ def check_links_and_devices(tab, page):
     tab.wait("window.word")
     word = tab.evaluate("window.word")
     truncated, mistyped = {"config": word[: len(word) // 2]}, {"layout": "generally_f"}
-    for settings in [truncated, mistyped, {"layout": "chaotic", "learners": "lead"}]:
+    for settings in [truncated, mistyped, {"layout": "chaotic", "learners": "lead"}, {"seeds": "3"}]:
         tab.load(page, **settings)
         key, value = list(settings.items())[-1]
         message = tab.evaluate(trouble)
         assert "This link is damaged" in message and key in message, message
         assert tab.evaluate("location.hash").endswith(value), tab.evaluate("location.hash")
+    # The note about a damaged link returns with its experiment.
+    tab.load(page, layout="generally_f", on="cpu", pace="full", **SMALL)
+    tab.train()
+    tab.click("[data-exhibit=blind]")
+    tab.wait("page.state.training?.arms.length === 3 && page.state.training.reached >= 0")
+    assert not tab.evaluate(trouble), tab.evaluate(trouble)
+    tab.evaluate("history.back(); 0")
+    tab.wait("page.state.training?.arms.length === 2")
+    assert "This link is damaged" in tab.evaluate(trouble), tab.evaluate(trouble)
+    # A link to a generation that is opened in the same tab trains, too.
+    words = "&".join(f"{key}={value}" for key, value in SMALL.items())
+    tab.evaluate(f"location.hash = '#layout=chaotic&on=cpu&learners=leader-follower&{words}&generation=2&trial=1&play=1'; 0")
+    tab.wait(f"{DONE} && page.state.training.arms.length === 1 && page.state.generation === 2 && page.state.trial === 1")
     # An error about a file ends when another link is opened.
     tab.drop("curves.png", base64(b"\x89PNG"))
     tab.wait(f"{trouble}.includes('curves.png')")
@@ -726,6 +785,11 @@ def check_links_and_devices(tab, page):
     tab.wait("!document.querySelector('#stale').hidden")
     assert "fitness Df, seed 7" in tab.text("#stale"), tab.text("#stale")
     tab.set("#fitness", "Df")
+    tab.wait("document.querySelector('#stale').hidden")
+    tab.set("#coupling", "5")
+    tab.wait("!document.querySelector('#stale').hidden")
+    assert "with another config or comparison" in tab.text("#stale"), tab.text("#stale")
+    tab.click("#undo")
     tab.wait("document.querySelector('#stale').hidden")
     # During training, other trials and generations can be shown, and configs are checked. Training can be stopped.
     tab.load(page, layout="generally_forward", on="cpu", pace="full", population=4096, generations=100000)

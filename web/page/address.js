@@ -73,10 +73,12 @@ export async function recall() {
   const whole = (/** @type {string} */ key) => /^\d{1,7}$/.test(word(key)) ? Number(word(key)) : null;
   for (const key of ["generation", "trial", "play"]) if (words.has(key) && whole(key) === null) unknown.push(`${key}=${words.get(key)}`);
   wanted = whole("play") === 1 ? { generation: whole("generation") ?? Infinity, trial: whole("trial") ?? 0 } : null;
+  const known_words = [...KEY_IDS, "on", "pace", "layout", "config", "learners", "compare", "generation", "trial", "play", "version"];
+  for (const [key, value] of words) if (!known_words.includes(key)) unknown.push(value ? `${key}=${value}` : key);
   const damage = unknown.length ? `This link is damaged: ${unknown.join(", ")} cannot be read. Ask for a new link; this page shows another experiment.` : "";
   Object.assign(state, { compared, troubles: { link: damage } });
   const taken = await take(text, { linked: !damage });
-  if (!taken && !state.views.length) {
+  if (!taken && state.toml === null) {
     // Show a map even if the config in the link is invalid.
     await take(configs.layout("generally_forward"), { linked: false });
     await take(text);

@@ -10,10 +10,14 @@ const narrow = matchMedia("(max-width: 640px)");
 narrow.addEventListener("change", () => render());
 
 // The table changes with the episodes, but not with their steps.
-part(() => [state.mode, narrow.matches, $("credited").value, ...shown().flatMap(view => [view, view.data, view.removed, view.selected])], credits);
+part(() => [state.mode, state.exhibit, narrow.matches, $("credited").value, ...shown().flatMap(view => [view, view.data, view.removed, view.selected])], credits);
 
 // Shows the credits of the view that is chosen in the list.
 function credits() {
+  // What is being made will have a table, too. Its place is kept.
+  const pending = Boolean(state.exhibit?.pending) && state.mode === "watch";
+  $("credit").style.visibility = pending ? "hidden" : "";
+  if (pending) return void ($("credit").hidden = false);
   const views = shown().filter(({ data: { episodes: [episode] } }) => episode.without && episode.shown.length > 1);
   $("credit").hidden = views.length === 0 || state.mode !== "watch";
   if ($("credit").hidden) return;

@@ -42,7 +42,7 @@ export function drive_view() {
   only.canvas.addEventListener("pointerleave", event => { if (event.pointerType !== "touch") drive.pointer = null; });
   const key = (/** @type {KeyboardEvent} */ event) => {
     if (!/^Arrow/.test(event.key)) return;
-    if (event.type === "keydown") { drive.keys.add(event.key); drive.pointer = null; if (!drive.on) drive_on(); } else drive.keys.delete(event.key);
+    if (event.type === "keydown") { drive.pointer = null; if (!drive.on) drive_on(); drive.keys.add(event.key); } else drive.keys.delete(event.key);
     event.preventDefault();
     event.stopPropagation();
   };

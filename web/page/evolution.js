@@ -1,8 +1,18 @@
 // Whole populations of the first experiment, at some generations.
 import { text_of } from "./gallery.js";
+import { OPENED } from "./opening.js";
 import { clerk } from "./pool.js";
 
 const GENERATIONS = [0, 15, 60], POPULATION = 50;
+const NAME = "evolution", title = (/** @type {number} */ generation) => `Generation ${generation}`;
+
+/** Returns what is shown until the populations are trained: where all start, in views of the final size. @returns {Exhibit} */
+export function evolution_starts() {
+  const [{ data }] = OPENED.scenes, [episode] = data.episodes;
+  const start = { ...data, episodes: [{ ...episode, shown: [0], observed: data.pois.map(() => null), senses: undefined, without: undefined }] };
+  const scene = { data: start, label: "Where all start", status: () => `training ${POPULATION} policies per leader…` };
+  return { name: NAME, pending: true, scenes: GENERATIONS.map(generation => ({ ...scene, title: title(generation) })) };
+}
 
 /** @type {Promise<Exhibit> | null} */
 let made = null;
@@ -20,7 +30,7 @@ async function make_evolution() {
   await clerk.ask({ ask: "train", runs: configs.map(({ toml }) => ({ text: toml, trials: [0] })) });
   while (!(await clerk.ask({ ask: "advance", generations: 1000, milliseconds: 60 })).words.done);
   /** @type {Exhibit} */
-  const exhibit = { name: "evolution", scenes: [] };
+  const exhibit = { name: NAME, scenes: [] };
   for (const [run, { toml, parameters }] of configs.entries()) {
     const { words: [{ policies }], bytes } = await clerk.ask({ ask: "ends", run }), weights = new Float32Array(bytes.buffer, bytes.byteOffset, policies);
     /** @type {Scene[]} */
@@ -31,7 +41,7 @@ async function make_evolution() {
     }
     const best = ghosts.reduce((best, ghost) => ghost.episodes[0].g > best.episodes[0].g ? ghost : best), generation = GENERATIONS[run];
     exhibit.scenes.push({
-      title: `Generation ${generation}`, data: best, ghosts, label: `${POPULATION} teams of generation ${generation}; the best of them`,
+      title: title(generation), data: best, ghosts, label: `${POPULATION} teams of generation ${generation}; the best of them`,
       status: (step, observed) => `the best of these ${POPULATION} teams: ${observed} of ${best.pois.length} POIs by step ${step}`,
     });
   }

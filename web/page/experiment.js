@@ -87,8 +87,10 @@ part(() => [state.training, state.text, state.compared], () => {
   $("stale").hidden = !differs;
   if (!differs) return;
   const { arms } = training, alike = (/** @type {keyof Config["learning"]} */ key) => arms.every(({ config }) => config.learning[key] === arms[0].config.learning[key]);
-  const values = /** @type {const} */ (["fitness", "seed", "population", "generations"]).filter(alike).map(key => `${key} ${arms[0].config.learning[key]}`);
-  $("stale").textContent = `The results below were trained with other settings: ${values.join(", ")}. Train again to see the present ones.`;
+  const values = /** @type {const} */ (["fitness", "seed", "population", "generations"]).filter(alike).map(key => /** @type {const} */ ([key, arms[0].config.learning[key]]));
+  const listed = values.some(([key, value]) => value !== state.config.learning[key]);
+  const which = listed ? `other settings: ${values.map(pair => pair.join(" ")).join(", ")}` : "another config or comparison";
+  $("stale").textContent = `The results below were trained with ${which}. Train again to see the present ones.`;
 });
 
 // Edits are applied after a delay. `entered` applies pending ones at once, so that what follows uses them.

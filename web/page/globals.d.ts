@@ -88,9 +88,9 @@ interface View {
 }
 /**
  * Episodes that belong to no training. `status` writes the line below a title, `label` names the episode for screen readers, and `ghosts` are
- * other teams, whose leaders' ways are drawn faintly.
+ * other teams, whose leaders' ways are drawn faintly. One that is `pending` only shows where they start, until they are made.
  */
-interface Exhibit { name: string, scenes: { title: string, data: Scene, label: string, status: (step: number, observed: number) => string, ghosts?: Scene[] }[] }
+interface Exhibit { name: string, pending?: boolean, scenes: { title: string, data: Scene, label: string, status: (step: number, observed: number) => string, ghosts?: Scene[] }[] }
 /** A view that shows an episode. */
 type Shown = View & { data: Scene };
 
@@ -174,7 +174,7 @@ type Elements =
   & Record<"train" | "stop" | "pause" | "replay" | "undo" | "again" | "remove" | "verify" | "share" | "open" | "save", HTMLButtonElement>
   & Record<"png" | "gif" | "webm" | "csv" | "guide-next" | "guide-end", HTMLButtonElement>
   & Record<"text", HTMLTextAreaElement> & Record<"curves", HTMLCanvasElement> & Record<"config" | "more", HTMLDetailsElement>
-  & Record<"setup" | "guide" | "guide-step" | "guide-says" | "guide-choices" | "bar" | "arrange" | "adds" | "drive" | "modes" | "views" | "plain-label", HTMLElement>
+  & Record<"setup" | "guide" | "guide-text" | "guide-step" | "guide-says" | "guide-choices" | "bar" | "arrange" | "adds" | "drive" | "modes" | "views" | "plain-label", HTMLElement>
   & Record<"credit" | "play" | "training" | "team" | "credits" | "lost" | "compared" | "compared-says" | "means" | "pairs" | "tests" | "gallery" | "digests", HTMLElement>
   & Record<"trouble" | "stale" | "announced" | "machine" | "version" | "legend" | "needless" | "problems" | "lines" | "marks", HTMLElement>
   & Record<"chosen" | "driven" | "generation" | "message" | "verified", HTMLElement>

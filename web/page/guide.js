@@ -1,8 +1,9 @@
 // The guided start: each step asks for a prediction, shows what happens, and says why. Until it ends, the map is above the settings.
 import { remove_leader } from "./credit.js";
 import { $, all, failure, make, number, still } from "./dom.js";
-import { evolution } from "./evolution.js";
+import { evolution, evolution_starts } from "./evolution.js";
 import { exhibit, is_of } from "./gallery.js";
+import { mode } from "./modes.js";
 import { OPENED } from "./opening.js";
 import { part, render, shown, state, trouble } from "./state.js";
 import { forget, found_by } from "./train.js";
@@ -15,9 +16,10 @@ const dearest = (() => {
 })();
 
 /**
- * A step: `of` names what `watch` shows, an exhibit or an experiment of the gallery, once `ready` has made it. `right` is the index of the
- * choice that comes true.
- * @type {{ of: string, asks: string, choices: string[], right: number, ready?: () => Promise<unknown>, watch: () => unknown, why: string }[]}
+ * A step: `of` names the exhibit that `watch` shows, once `ready` has made it, and `meanwhile` until then. A step without `watch` trains the
+ * experiment `of` of the gallery. `right` is the index of the choice that comes true.
+ * @typedef {{ of: string, asks: string, choices: string[], right: number, ready?: () => Promise<unknown>, meanwhile?: () => Exhibit, watch?: () => unknown, why: string }} Step
+ * @type {Step[]}
  */
 const STEPS = [
   {
@@ -27,25 +29,25 @@ const STEPS = [
     why: `Leader ${dearest.leader} and its followers (pale) no longer count, and ${dearest.lost} of ${dearest.pois} POIs are lost (dark). This loss, ${dearest.lost / dearest.pois}, is the leader's Df. The Df of the four leaders are ${dearest.df.map(number).join(", ")}: one score of the team, but different credits. Training with Df keeps the leaders without which the team would lose most.`,
   },
   {
-    of: "two_groups", watch: () => exhibit("two_groups", { trains: true }),
+    of: "two_groups",
     asks: "Now two kinds of team start from nothing: leaders with followers, and teams in which all twelve agents learn. Each learner's policy is selected from a population of policies. The team of the best policies is the champion. Whose champions observe more POIs?",
     choices: ["Leader-follower", "All-leaders", "Both alike"], right: 0,
     why: "Six independent learners almost never coincide. If each is at a POI in 3 of 10 episodes, all six are there in 7 of 10 000. All teams then score 0, and there is nothing to select. Two leaders that bring their followers coincide in 9 of 100.",
   },
   {
-    of: "population", watch: () => exhibit("population", { trains: true }),
+    of: "population",
     asks: "The same task, with followers. How many policies per leader does it take until champions observe three of the four POIs, on average over trials at the last generation?",
     choices: ["20 are enough", "100", "500"], right: 2,
     why: "The first policies are random. Among few, hardly any two leaders meet. Among many, some do, and selection copies them.",
   },
   {
-    of: "evolution", ready: evolution, watch: async () => show_exhibit(await evolution()),
+    of: "evolution", ready: evolution, meanwhile: evolution_starts, watch: async () => show_exhibit(await evolution()),
     asks: "Selection changes whole populations. The 50 policies of each leader start at random. Where do they go after 60 generations?",
     choices: ["Everywhere", "Most the same way"], right: 1,
     why: "Each faint line is the way of one policy, in the colour of its leader. At first they go everywhere. Selection keeps the few that meet, and their changed copies soon fill the population.",
   },
   {
-    of: "groups", watch: () => exhibit("groups", { trains: true }),
+    of: "groups",
     asks: "Do followers make the difference? Take them away, and let the three agents of a group share one population instead. What do such teams observe?",
     choices: ["Nothing", "Less than half", "More than half"], right: 2,
     why: "Here, most of the difference was the number of populations, not the followers. In 30 trials of the paper's first layout, with the same sensors, champions without followers reach G = 0.18 with a population per agent and 0.77 with one per group. With followers they reach 0.91. But somebody has to say who belongs to a group. Followers find their leader themselves.",
@@ -57,7 +59,7 @@ const small = choice => choice[0].toLowerCase() + choice.slice(1);
 
 /** Shows an exhibit instead of a training. @param {Exhibit} exhibit */
 function show_exhibit(exhibit) {
-  if (state.exhibit !== exhibit) forget();
+  if (state.exhibit?.name !== exhibit.name) forget();
   render({ mode: "watch", exhibit });
 }
 
@@ -71,23 +73,35 @@ function show_opening(removed) {
 
 /** Returns whether the page shows an exhibit or an experiment. @param {string} name */
 const is_shown = name => state.mode === "watch" && (state.exhibit ? state.exhibit.name === name : is_of(name));
-/** Returns what a step, or its question, is about. @param {Guide} at */
-const about = ({ step, said, waits }) => STEPS[said === null || waits ? Math.max(0, step - 1) : step];
+/** Returns the step that a question or an answer is about. @param {Guide} at */
+const about = ({ step, said }) => STEPS[said === null ? Math.max(0, step - 1) : step];
+/** Shows what a step is about. @param {Step} step */
+const show_step = ({ of, watch }) => watch ? watch() : exhibit(of, { trains: true });
 
-part(() => [state.guide, state.mode, state.exhibit, state.text, state.compared, state.training, state.training && state.training.state], () => {
-  const { guide, training } = state;
+/**
+ * Returns what the guide says of a prediction and, if it is too early for the answer, what it says once that is known.
+ * @param {Guide & { said: string }} at
+ */
+function answers({ step, said, waits }) {
+  const { choices, right, why, watch } = STEPS[step], { training } = state, ended = training && ["done", "stopped"].includes(training.state);
+  const says = (/** @type {string} */ text) => `You said: ${small(said)}. ${text}`, answer = said === choices[right] ? "That is right." : `It is: ${small(choices[right])}.`;
+  const whole = (/** @type {string | null} */ result) => says([answer, result, why].filter(Boolean).join(" "));
+  if (waits) return [says("The populations are being trained…"), whole("")];
+  if (!watch && !ended) return [says("Watch the map and the chart."), whole(training && `Training is finished. ${found_by(training)}`)];
+  return [whole(training && $("announced").textContent), ""];
+}
+
+part(() => [state.guide, state.mode, state.exhibit, state.text, state.compared, state.training, state.training && state.training.state, $("announced").textContent], () => {
+  const { guide } = state;
   $("guide").hidden = guide === null;
   $(guide === null ? "guide" : "credit").after($("setup"));
   if (!guide) return void (state.told = null);
-  const { step, said, waits = false } = guide, { asks, choices, right, why } = STEPS[step], here = is_shown(about(guide).of), last = step === STEPS.length - 1;
-  const watches = said !== null && training && training.state !== "done", result = training ? $("announced").textContent : "";
+  const { step, said, waits = false } = guide, { asks, choices } = STEPS[step], here = is_shown(about(guide).of), last = step === STEPS.length - 1;
+  const [says, later] = !here ? ["What is on show is not part of the guide.", ""] : said === null ? [asks, ""] : answers({ ...guide, said });
   if (here && !waits) state.told = guide;
   $("guide-step").textContent = `${step + 1} of ${STEPS.length}`;
-  $("guide-says").textContent = !here ? "What is on show is not part of the guide."
-    : said === null ? asks : `You said: ${small(said)}. ${waits ? "The populations are being trained…" : watches ? "Watch the map and the chart." : `${said === choices[right] ? "That is right." : `It is: ${small(choices[right])}.`} ${result ? `${result} ` : ""}${why}`}`;
-  // Room for the rest of the text. What is said meanwhile takes up about 30 characters of it.
-  const meanwhile = 30, found = watches ? `Training is finished. ${found_by(training)} ` : "";
-  $("guide-says").dataset.rest = here && (waits || watches) ? ` That is right. ${found}${why}`.slice(meanwhile) : "";
+  $("guide-says").textContent = says;
+  $("guide-text").dataset.later = later && `${step + 1} of ${STEPS.length} ${later}`;
   const asked = here && said === null;
   $("guide-choices").replaceChildren(...(asked ? choices : []).map(choice => {
     const button = make("button", choice, null, { type: "button" });
@@ -105,18 +119,21 @@ async function enter({ step, said }) {
   const had_focus = $("guide").contains(document.activeElement), guide = { step, said }, made = STEPS[step].ready?.();
   made?.catch(() => {});
   if (made && said !== null) {
-    const waiting = { ...guide, waits: true }, here = is_shown(about(waiting).of);
-    render({ guide: waiting });
+    const waiting = { ...guide, waits: true }, { meanwhile } = STEPS[step];
+    state.guide = waiting;
+    if (meanwhile && !is_shown(about(waiting).of)) show_exhibit(meanwhile());
+    render();
     try { await made; } catch (thrown) {
       trouble("run", failure(thrown).message);
       return render({ guide: state.guide && { step, said: null } });
     }
     // The visitor may have left the guide, or chosen something else to show.
-    if (state.guide !== waiting) return;
-    if (here && !is_shown(about(waiting).of)) return render({ guide });
+    if (!is_shown(about(waiting).of)) return state.guide === waiting ? render({ guide }) : undefined;
+    if (state.guide !== waiting) return show_step(about(waiting));
   }
-  render({ guide });
-  const watched = guide.said !== null || !is_shown(about(guide).of) ? about(guide).watch() : null;
+  state.guide = guide;
+  const watched = said !== null || !is_shown(about(guide).of) ? show_step(about(guide)) : null;
+  render();
   if (had_focus) ($("guide-next").hidden ? all("button", $("guide-choices"))[0] : $("guide-next")).focus({ preventScroll: true });
   await watched;
   render();
@@ -127,7 +144,10 @@ export function guide() {
   $("guide-next").addEventListener("click", () => {
     const { guide } = state;
     if (!guide) return;
+    const back = state.mode !== "watch";
+    if (back) mode("watch");
     if (!is_shown(about(guide).of)) return enter(guide);
+    if (back) return;
     if (guide.step + 1 === STEPS.length) return leave_guide();
     enter({ step: guide.step + 1, said: null });
   });

@@ -122,6 +122,7 @@ function listen() {
     if (arrive()) return;
     leave_guide();
     await recall();
+    await autoplay();
   });
 }
 

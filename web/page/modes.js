@@ -4,7 +4,7 @@ import { $, all } from "./dom.js";
 import { drive_off, drive_view } from "./drive.js";
 import { join } from "./scene.js";
 import { part, render, state } from "./state.js";
-import { add_view, ask_all, build, clear, follow, reveal, show } from "./views.js";
+import { add_view, aim, ask_all, build, clear, follow, reveal, shape_of, show } from "./views.js";
 
 part(() => [state.mode], () => {
   for (const button of all("[data-mode]")) button.ariaPressed = String(button.dataset.mode === state.mode);
@@ -24,11 +24,12 @@ part(() => [state.mode, subject()], () => {
     if (state.follow) follow(); else ask_all();
   } else if (mode === "watch" && exhibit) {
     clear();
-    const crop = exhibit.scenes.map(({ data }) => stage.busy(data)).reduce(join);
+    const crop = exhibit.scenes.map(({ data }) => stage.busy(data)).reduce(join), shape = exhibit.scenes.length > 1 ? shape_of(crop) : undefined;
     for (const { title, status, label, ghosts = [] } of exhibit.scenes) {
       const view = add_view(title, crop);
       view.describe = (step, observed, text) => [status(step, observed), `${label}, step ${step}: ${text}`];
       view.ghosts = ghosts;
+      aim(view, crop, shape);
     }
     // Their sizes depend on how many they are.
     exhibit.scenes.forEach(({ data }, index) => show(state.views[index], data));

@@ -12,7 +12,7 @@ let latest = 0, on_show = 0;
 /** Returns the number of the history's present entry. One that the browser made for a link has none. @returns {number | undefined} */
 const entry = () => history.state?.entry;
 
-const KEPT = /** @type {const} */ (["text", "file", "compared", "chosen", "config", "toml", "pois", "start", "valid", "problems", "linked", "training", "exhibit", "generation", "trial", "told"]);
+const KEPT = /** @type {const} */ (["text", "file", "compared", "chosen", "config", "toml", "pois", "start", "valid", "problems", "linked", "training", "exhibit", "generation", "trial", "told", "note", "troubles"]);
 // Keeps what is on show.
 function keep_results() {
   if (!state.training && !state.exhibit) return;
@@ -50,5 +50,5 @@ export async function go_back() {
     }
   } catch (thrown) { return trouble("run", failure(thrown).message); }
   $("text").value = found.text ?? "";
-  render({ ...found, guide: found.told ?? null, mode: "watch", follow: false, policies: null, troubles: {}, message: "" });
+  render({ ...found, guide: found.told ?? null, mode: "watch", follow: false, policies: null, troubles: { link: found.troubles?.link ?? "" }, message: "" });
 }

@@ -103,7 +103,8 @@ export function found_by(training) {
   return `${unit[0].toUpperCase()}${unit.slice(1)} that the champion observes, on average over trials: ${found.join(", ")}.`;
 }
 
-part(() => [state.training, state.training && state.training.state], () => {
+// A training that was stopped still reports the generation that it had begun.
+part(() => [state.training, state.training && state.training.state, state.training && state.training.state === "stopped" && state.training.reached], () => {
   const { training } = state;
   if (training && training.state === "done") $("announced").textContent = `Training is finished. ${found_by(training)}`;
   else $("announced").textContent = training && training.state === "stopped" ? `Stopped after generation ${Math.max(0, training.reached)}.` : "";

@@ -58,9 +58,12 @@ export function only_view(title, crop) {
 export function build(training) {
   clear();
   const crop = training.arms.map(({ config }) => stage.busy(start_scene(config))).reduce(join);
-  const shape = Math.max(1, Math.min(1.6, (crop[2] - crop[0]) / (crop[3] - crop[1])));
+  const shape = shape_of(crop);
   for (const { label, style } of training.arms) aim(add_view(label, crop, style), crop, shape);
 }
+
+/** Returns the shape of views that are beside each other: near that of the part of the map that they show. @param {Crop} crop */
+export const shape_of = ([left, below, right, above]) => Math.max(1, Math.min(1.6, (right - left) / (above - below)));
 
 export function clear() {
   state.views = [];
@@ -326,7 +329,7 @@ export async function ask(view, run, generation) {
   if (view.wanted !== null) {
     const wanted = view.wanted;
     view.wanted = null;
-    ask(view, run, wanted);
+    if (state.views[run] === view) ask(view, run, wanted);
   }
 }
 
