@@ -5,7 +5,7 @@ use std::sync::Mutex;
 use fearless_simd::{Simd, prelude::*};
 use glam::Vec2;
 
-use crate::backend::cpu::{Agent, Block, BlockState, StepArrays, load_pois, step_sizes, transpose_rows, with_pois};
+use crate::backend::cpu::{Agent, Block, BlockState, StepArrays, step_sizes, transpose_rows};
 use crate::credit::{Episode, Paths, Strided};
 use crate::kernels::{clamp_to, count_ones, splat};
 use crate::parallel::*;
@@ -91,8 +91,8 @@ struct Workspace<S: Simd> {
     sights: Vec<u32>,
     /// Agents and counts before a step, if some teams' episodes are over.
     kept: (Vec<Agent<S>>, Vec<S::u32s>),
-    /// The POI positions, `[pois]`; empty if every lane has the world's.
-    moved: Vec<[S::f32s; 2]>,
+    /// Whether the POIs were last elsewhere than in the world.
+    moved: bool,
 }
 
 /// All vectors of teams, and the workspaces that no thread is using.
@@ -200,20 +200,19 @@ impl<S: Simd> Workspace<S> {
     fn new(simd: S, world: &World) -> Workspace<S> {
         let sets = vec![0; world.words_per_step() * S::f32s::LEN];
         let sights = vec![0; world.followers() * world.leader_words() * S::f32s::LEN];
-        Workspace { block: Block::new(simd, world), sets, sights, kept: Default::default(), moved: vec![] }
+        Workspace { block: Block::new(simd, world), sets, sights, kept: Default::default(), moved: false }
     }
 
-    /// Loads the POI positions of a vector of teams.
-    #[inline(always)]
-    fn move_pois(&mut self, simd: S, world: &World, moved: &[Vec2], first: usize, teams: usize) {
-        let pois = world.pois.len();
-        load_pois(
-            simd,
-            world,
-            &mut self.moved,
-            #[inline(always)]
-            |lane| (!moved.is_empty()).then(|| &moved[(first + team_of(lane, teams)) * pois..][..pois]),
-        );
+    /// Puts the POIs of a vector of teams in their places.
+    fn move_pois(&mut self, world: &World, moved: &[Vec2], first: usize, teams: usize) {
+        let moves = !moved.is_empty();
+        if !std::mem::replace(&mut self.moved, moves) && !moves {
+            return;
+        }
+        for lane in 0..S::f32s::LEN {
+            let places = if moves { &moved[(first + team_of(lane, teams)) * world.pois.len()..] } else { &world.pois };
+            self.block.place_pois(lane, places);
+        }
     }
 
     /// Executes a command for one vector of teams.
@@ -227,7 +226,7 @@ impl<S: Simd> Workspace<S> {
         command: Command<'_>,
         slices: &mut Slices<'_>,
     ) {
-        self.move_pois(simd, world, moved, block.first, block.teams);
+        self.move_pois(world, moved, block.first, block.teams);
         self.block.swap(&mut block.state);
         let has_changed = match command {
             Command::Reset { chosen, starts, headings } => self.reset(world, block, chosen, [starts, headings], slices),
@@ -239,7 +238,7 @@ impl<S: Simd> Workspace<S> {
             }
         };
         if has_changed {
-            with_pois!(self.moved, world, pois => self.block.sense(pois));
+            self.block.sense();
             slices.arrays.write_inputs(&self.block, (0, 1));
         }
         self.block.swap(&mut block.state);
@@ -337,15 +336,13 @@ impl<S: Simd> Workspace<S> {
         }
         let records_sights = world.paths.is_none() && !trail.is_empty();
         let seen = if records_sights { &mut self.sights } else { &mut [][..] };
-        with_pois!(self.moved, world, pois => {
-            self.block.step(pois, seen, &mut self.sets);
-            if is_partial {
-                for (lane, _) in lanes::<S>(teams).filter(|&(_, team)| steps[team] >= last) {
-                    keep(&mut self.block, &self.kept, lane);
-                }
-                self.block.record_poi_sets(pois, &mut self.sets);
+        self.block.step(seen, &mut self.sets);
+        if is_partial {
+            for (lane, _) in lanes::<S>(teams).filter(|&(_, team)| steps[team] >= last) {
+                keep(&mut self.block, &self.kept, lane);
             }
-        });
+            self.block.record_poi_sets(&mut self.sets);
+        }
         arrays.write_sets(simd, &self.sets, (0, 1));
         if records_sights {
             self.record_sightings(world, steps, trail);

@@ -7,7 +7,6 @@ use glam::Vec2;
 
 use super::agent::Agent;
 use super::neighbours::{self, Bounds, Masks, masks};
-use super::pois::PoiPosition;
 use crate::backend::Moment;
 use crate::config::{Combine, ControlKind, Measure};
 use crate::config_enum::ConstDispatch;
@@ -56,7 +55,8 @@ pub(crate) struct Block<S: Simd> {
     pub(super) gone_within: Vec<GoneWithin>,
     /// Whether each of these POIs is gone, all bits of a lane or none, `[gone_within]`.
     pub gone: Vec<S::u32s>,
-    /// Where each POI is sensed, `[pois]`; empty unless some can be gone.
+    /// Where each POI is, and where it is sensed, `[pois]`.
+    pub(super) pois: Vec<[S::f32s; 2]>,
     sensed: Vec<[S::f32s; 2]>,
 }
 
@@ -91,6 +91,7 @@ impl<S: Simd> Block<S> {
         let zero = splat(simd, 0.0);
         let (agents, leaders, followers) = (world.agents(), world.leaders(), world.followers());
         let force = follow::SteeringForce::none(simd);
+        let pois: Vec<_> = world.pois.iter().map(|poi| [splat(simd, poi.x), splat(simd, poi.y)]).collect();
         Block {
             simd,
             world: Lanes::new(simd, world.constants, &world.classes),
@@ -111,7 +112,8 @@ impl<S: Simd> Block<S> {
             values: world.values.clone(),
             gone_within: world.gone_within.clone(),
             gone: vec![S::u32s::splat(simd, 0); world.gone_within.len()],
-            sensed: vec![],
+            pois: pois.clone(),
+            sensed: pois,
         }
     }
 
@@ -143,6 +145,15 @@ impl<S: Simd> Block<S> {
         }
     }
 
+    /// Puts one lane's POIs in their places.
+    #[inline(always)]
+    pub fn place_pois(&mut self, lane: usize, places: &[Vec2]) {
+        for (([x, y], sensed), place) in self.pois.iter_mut().zip(&mut self.sensed).zip(places) {
+            (x[lane], y[lane]) = (place.x, place.y);
+            (sensed[0][lane], sensed[1][lane]) = (place.x, place.y);
+        }
+    }
+
     /// Sets all lanes' agents to their initial speed.
     #[inline(always)]
     pub fn start(&mut self) {
@@ -168,24 +179,21 @@ impl<S: Simd> Block<S> {
     ///
     /// This, [`Block::step`] and [`Network::decide`](super::network::Network::decide) are most of the compiled code. They
     /// are functions of their own, so that whole episodes, traces, records and single steps share them.
-    pub fn sense(&mut self, pois: &[impl PoiPosition<S>]) {
-        if self.gone_within.is_empty() {
-            self.sense_at(pois);
-        } else {
-            self.find_gone(pois);
-            let sensed = std::mem::take(&mut self.sensed);
-            self.sense_at(&sensed);
-            self.sensed = sensed;
+    pub fn sense(&mut self) {
+        if !self.gone_within.is_empty() {
+            self.find_gone();
         }
+        self.simd.vectorize(
+            #[inline(always)]
+            || self.sense_channels(),
+        );
     }
 
     /// Finds the POIs that are gone, and puts them where no range reaches.
-    fn find_gone(&mut self, pois: &[impl PoiPosition<S>]) {
-        let Block { simd, world, agents, gone_within, gone, sensed, .. } = self;
-        sensed.clear();
-        sensed.extend(pois.iter().map(|poi| poi.lanes(*simd)));
+    fn find_gone(&mut self) {
+        let Block { simd, world, agents, gone_within, gone, pois, sensed, .. } = self;
         for (GoneWithin { poi, distance2, classes }, gone) in gone_within.iter().zip(gone) {
-            let [x, y] = sensed[*poi];
+            let [x, y] = pois[*poi];
             for agent in classes.iter().flat_map(|&class| world.classes[class].agents()) {
                 let near = within::<S>(x - agents[agent].x, y - agents[agent].y, splat(*simd, *distance2));
                 *gone |= near.to_vector().bitcast::<S::u32s>();
@@ -194,16 +202,9 @@ impl<S: Simd> Block<S> {
         }
     }
 
-    fn sense_at(&mut self, pois: &[impl PoiPosition<S>]) {
-        self.simd.vectorize(
-            #[inline(always)]
-            || self.sense_channels(pois),
-        );
-    }
-
     #[inline(always)]
-    fn sense_channels(&mut self, pois: &[impl PoiPosition<S>]) {
-        let Block { simd, world, agents, near, bounds, reach2, plans, values, inputs, .. } = self;
+    fn sense_channels(&mut self) {
+        let Block { simd, world, agents, near, bounds, reach2, plans, values, inputs, sensed: pois, .. } = self;
         neighbours::find_near(reach2, agents, near, bounds);
         let width = world.constants.policy.inputs();
         for (class, plan) in world.classes.iter().zip(plans) {
@@ -224,9 +225,9 @@ impl<S: Simd> Block<S> {
 
     /// Plays a step by the leaders' outputs. Writes which leaders each follower sees before it moves, unless `sights` is
     /// empty, and the agents at each POI after it, see [`Block::record_sightings`] and [`Block::record_poi_sets`].
-    pub fn step(&mut self, pois: &[impl PoiPosition<S>], sights: &mut [u32], sets: &mut [u32]) {
+    pub fn step(&mut self, sights: &mut [u32], sets: &mut [u32]) {
         self.advance(sights);
-        self.record_poi_sets(pois, sets);
+        self.record_poi_sets(sets);
     }
 
     fn advance(&mut self, sights: &mut [u32]) {
@@ -482,25 +483,24 @@ impl<S: Simd> Inputs<'_, S> {
     }
 }
 
+/// Returns the offset of a place from (`x`, `y`).
+#[inline(always)]
+fn offset<F: std::ops::Sub<Output = F>>([px, py]: [F; 2], x: F, y: F) -> [F; 2] {
+    [px - x, py - y]
+}
+
 /// The entities that one channel senses.
-struct Scene<'a, S: Simd, P> {
+struct Scene<'a, S: Simd> {
     simd: S,
     channel: &'a ChannelLanes<S>,
-    pois: &'a [P],
+    pois: &'a [[S::f32s; 2]],
     values: &'a [f32],
     agents: &'a [Agent<S>],
     near: &'a [u64],
     plan: &'a ChannelPlan,
 }
 
-impl<S: Simd, P: PoiPosition<S>> Scene<'_, S, P> {
-    /// Returns the offset of a POI from a place.
-    #[inline(always)]
-    fn offset(&self, poi: &P, x: S::f32s, y: S::f32s) -> [S::f32s; 2] {
-        let [px, py] = poi.lanes(self.simd);
-        [px - x, py - y]
-    }
-
+impl<S: Simd> Scene<'_, S> {
     /// Returns what an entity at an offset counts. `PLAIN` ones have value 1.
     #[inline(always)]
     fn measured<const MEASURE: u32, const PLAIN: bool>(
@@ -555,7 +555,7 @@ impl<S: Simd, P: PoiPosition<S>> Scene<'_, S, P> {
                     let (mut measures, mut within) =
                         ([S::i32s::splat(simd, 0); 4], [S::mask32s::splat(simd, false); 4]);
                     for index in 0..4 {
-                        let measured = self.measured::<MEASURE, PLAIN>(values[index], self.offset(&pois[index], x, y));
+                        let measured = self.measured::<MEASURE, PLAIN>(values[index], offset(pois[index], x, y));
                         measures[index] = measured.0;
                         if !PLAIN {
                             within[index] = measured.1;
@@ -563,11 +563,11 @@ impl<S: Simd, P: PoiPosition<S>> Scene<'_, S, P> {
                     }
                     for index in 0..4 {
                         let measured = (measures[index], within[index]);
-                        quadrants.add::<PLAIN>(measured, self.offset(&pois[index], x, y), heading);
+                        quadrants.add::<PLAIN>(measured, offset(pois[index], x, y), heading);
                     }
                 }
                 for (poi, &value) in rest.iter().zip(last) {
-                    let offset = self.offset(poi, x, y);
+                    let offset = offset(*poi, x, y);
                     quadrants.add::<PLAIN>(self.measured::<MEASURE, PLAIN>(value, offset), offset, heading);
                 }
             }
@@ -587,7 +587,7 @@ impl<S: Simd, P: PoiPosition<S>> Scene<'_, S, P> {
             for (input, index) in inputs.of(observer, channel).iter_mut().zip(entities) {
                 let (offset, value) = match channel.shape.of_pois {
                     0 => ([agents[index].x - x, agents[index].y - y], 1.0),
-                    _ => (self.offset(&pois[index], x, y), values[index]),
+                    _ => (offset(pois[index], x, y), values[index]),
                 };
                 let (measured, within) =
                     sense::measured::<S>(channel, measure, splat(simd, value), offset[0], offset[1]);
@@ -620,7 +620,7 @@ impl<S: Simd, P: PoiPosition<S>> Scene<'_, S, P> {
                 },
             );
             for poi in plan.pois.iter().cloned().flatten() {
-                let (offset, value) = (self.offset(&pois[poi], x, y), splat(simd, values[poi]));
+                let (offset, value) = (offset(pois[poi], x, y), splat(simd, values[poi]));
                 let measured = sense::measured::<S>(channel, measure, value, offset[0], offset[1]);
                 sectors.add(channel, measured, offset, heading);
             }
@@ -630,13 +630,13 @@ impl<S: Simd, P: PoiPosition<S>> Scene<'_, S, P> {
 }
 
 /// [`Scene::sense_quadrants`] with the measure as a constant.
-struct Quartering<'a, 'b, S: Simd, P> {
-    scene: Scene<'a, S, P>,
+struct Quartering<'a, 'b, S: Simd> {
+    scene: Scene<'a, S>,
     observers: Range<usize>,
     inputs: Inputs<'b, S>,
 }
 
-impl<S: Simd, P: PoiPosition<S>> ConstDispatch for Quartering<'_, '_, S, P> {
+impl<S: Simd> ConstDispatch for Quartering<'_, '_, S> {
     type Output = ();
 
     #[inline(always)]

@@ -6,7 +6,6 @@ use super::ScoreTable;
 use super::batch::WorldBatch;
 use super::block::Block;
 use super::network::Network;
-use super::pois::{load_pois, with_pois};
 use crate::config::Fitness;
 use crate::credit::{Episode, LaneCredit, Paths, Seen, Strided};
 use crate::model::class::Class;
@@ -35,8 +34,6 @@ pub(super) struct EpisodeBlock<S: Simd> {
     network: Network<S>,
     /// The group and team of each lane.
     places: Vec<(usize, usize)>,
-    /// The POI positions, `[pois]`; empty if every lane has the world's.
-    moved: Vec<[S::f32s; 2]>,
     /// The sets, `[steps][pois][words][lanes]`, and the final counts, `[followers][leaders][lanes]`.
     sets: Vec<u32>,
     seen: Vec<u32>,
@@ -60,7 +57,6 @@ impl<S: Simd> EpisodeBlock<S> {
             block: Block::new(simd, world),
             network: Network::new(simd, &world.constants.policy, world.choices()),
             places: Vec::with_capacity(S::f32s::LEN),
-            moved: Vec::new(),
             sets: vec![0; world.set_words() * S::f32s::LEN],
             seen: vec![0; world.followers() * world.leaders() * S::f32s::LEN],
             sights: vec![0; sight_words(world, sighted) * S::f32s::LEN],
@@ -82,19 +78,13 @@ impl<S: Simd> EpisodeBlock<S> {
     /// Puts teams at their start, see [`EpisodeBlock::play`].
     #[inline(always)]
     fn load(&mut self, batch: &WorldBatch<'_>, first: usize, teams: usize) {
-        let EpisodeBlock { block, network, places, moved, .. } = self;
+        let EpisodeBlock { block, network, places, .. } = self;
         places.clear();
         places.extend((0..S::f32s::LEN).map(|lane| batch.locate(first + if lane < teams { lane } else { 0 })));
         for (lane, &(group, _)) in places.iter().enumerate() {
             block.place(lane, batch.groups[group].starts, batch.groups[group].headings());
+            block.place_pois(lane, batch.groups[group].pois());
         }
-        load_pois(
-            block.simd,
-            batch.world,
-            moved,
-            #[inline(always)]
-            |lane| batch.groups[places[lane].0].moved_pois(),
-        );
         block.start();
         network.load(batch, places);
     }
@@ -103,22 +93,22 @@ impl<S: Simd> EpisodeBlock<S> {
     #[inline(always)]
     pub(super) fn play(&mut self, batch: &WorldBatch<'_>, first: usize, teams: usize, observer: &mut impl Observer<S>) {
         self.load(batch, first, teams);
-        let EpisodeBlock { block, network, moved, sets, seen, sights, paths, .. } = self;
+        let EpisodeBlock { block, network, sets, seen, sights, paths, .. } = self;
         let steps = batch.world.steps();
         let [sets_per_step, sights_per_step] = [sets.len() / steps, sights.len() / steps];
         let moment = (paths.len() / (steps + 1)).max(1);
         let mut moments = paths.chunks_exact_mut(moment);
         observer.started(block);
         write_positions(block, &mut moments);
-        with_pois!(moved, batch.world, pois => for step in 0..steps {
-            block.sense(pois);
+        for step in 0..steps {
+            block.sense();
             network.decide(&block.inputs, &mut block.outputs);
             observer.decided(block, step);
             let sets = &mut sets[step * sets_per_step..][..sets_per_step];
-            block.step(pois, &mut sights[step * sights_per_step..][..sights_per_step], sets);
+            block.step(&mut sights[step * sights_per_step..][..sights_per_step], sets);
             observer.moved(block, sets, step);
             write_positions(block, &mut moments);
-        });
+        }
         for (words, count) in seen.chunks_exact_mut(S::f32s::LEN).zip(&block.counts) {
             count.store_slice(words);
         }

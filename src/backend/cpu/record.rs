@@ -4,7 +4,6 @@ use fearless_simd::{Simd, prelude::*};
 
 use super::agent::Agent;
 use super::block::Block;
-use super::pois::PoiPosition;
 use crate::kernels::math::within;
 use crate::kernels::splat;
 use crate::model::couple;
@@ -35,8 +34,8 @@ impl<S: Simd> Block<S> {
     }
 
     /// Writes the agents at each POI, one bit per agent, `[pois][words][lanes]`.
-    pub fn record_poi_sets(&mut self, pois: &[impl PoiPosition<S>], mut sets: &mut [u32]) {
-        let ((fours, rest), (radii2, last)) = (pois.as_chunks::<4>(), self.radii2.as_chunks::<4>());
+    pub fn record_poi_sets(&mut self, mut sets: &mut [u32]) {
+        let ((fours, rest), (radii2, last)) = (self.pois.as_chunks::<4>(), self.radii2.as_chunks::<4>());
         let words = self.world.constants.words as usize;
         self.simd.vectorize(
             #[inline(always)]
@@ -59,18 +58,14 @@ fn observe<'a, S: Simd, const N: usize>(
     simd: S,
     words: usize,
     agents: &[Agent<S>],
-    pois: &[impl PoiPosition<S>; N],
+    pois: &[[S::f32s; 2]; N],
     radii2: &[f32; N],
     sets: &'a mut [u32],
 ) -> &'a mut [u32] {
-    let mut places = [[splat(simd, 0.0); 2]; N];
-    for (place, poi) in places.iter_mut().zip(pois) {
-        *place = poi.lanes(simd);
-    }
     for (word, agents) in agents.chunks(32).enumerate() {
         let (mut near, mut bit) = ([S::u32s::splat(simd, 0); N], S::u32s::splat(simd, 1));
         for agent in agents {
-            for ((near, &[x, y]), &radius2) in near.iter_mut().zip(&places).zip(radii2) {
+            for ((near, &[x, y]), &radius2) in near.iter_mut().zip(pois).zip(radii2) {
                 let observes = couple::observes::<S>(splat(simd, radius2), agent.x - x, agent.y - y);
                 *near |= observes.to_vector().bitcast::<S::u32s>() & bit;
             }
