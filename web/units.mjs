@@ -31,7 +31,7 @@ test("values are written as TOML, labels name arms, and slugs are safe file name
   const values = ["50", "-1.5", "inf", "D++", "all-leaders"];
   assert.deepEqual(values.map(toml), ["50", "-1.5", "inf", '"D++"', '"all-leaders"']);
   assert.equal(label({ key: "learning.start_jitter", values: ["0.0", "2.0"] }, "2.0"), "start jitter 2.0");
-  assert.equal(label({ key: "learning.fitness", values: ["G", "D"] }, "D"), "D");
+  assert.equal(label({ key: "learning.fitness", values: ["G", "D"] }, "D"), "trained with D");
   assert.equal(slug("../my config/D++ run"), "my-config-Dpp-run");
   assert.equal(slug("…"), "run");
 });
@@ -40,7 +40,7 @@ test("an arm has the same style in every order and in every comparison", () => {
   assert.deepEqual(styles(["all-leaders", "leader-follower"]), [1, 0]);
   assert.deepEqual(styles(["all-leaders"]), [1]);
   assert.deepEqual(styles(["fitness Dt", "fitness G"]), [4, 0]);
-  assert.deepEqual(styles(["population 100", "population 20", "population 500"]), [1, 0, 2]);
+  assert.deepEqual(styles(["100 policies each", "20 policies each", "500 policies each"]), [1, 0, 2]);
   assert.deepEqual(styles(["G, seed 2", "G, seed 1"]), [1, 0]);
 });
 

@@ -55,7 +55,9 @@ const SAYS = { "learning.sharing": { none: "a population per agent", group: "one
 
 /** Names an arm. @param {Comparison} compared @param {string} value */
 export function label({ key, values }, value) {
-  if (key === "learning.paradigm" || key === "learning.fitness" && values.length > 1) return value;
+  if (key === "learning.paradigm") return value;
+  if (key === "learning.fitness" && values.length > 1) return `trained with ${value}`;
+  if (key === "learning.population") return `${value} policies each`;
   return SAYS[key]?.[value] ?? `${key.split(".")[1].replaceAll("_", " ")} ${value}`;
 }
 

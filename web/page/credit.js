@@ -1,8 +1,8 @@
-// Credit of each leader, and the episode without a leader: the POIs that go dark are its credit.
+// Credit of each leader, and the episode without a leader: the POIs that are lost are its credit.
 import { $, all, count, make, number } from "./dom.js";
 import { name_of_leader } from "./senses.js";
 import { part, render, shown, state } from "./state.js";
-import { dark, draw, reveal, select } from "./views.js";
+import { draw, lost_pois, reveal, select } from "./views.js";
 
 // Most leaders in the table.
 const SHOWN = 32;
@@ -46,12 +46,12 @@ function table(view) {
   const selects = 1 + scores.findIndex(({ name }) => name === data.fitness);
   const focused = document.activeElement instanceof HTMLElement && document.activeElement.dataset.credit;
   const body = make("table"), head = make("thead", "", body), rest = make("tbody", "", body);
-  // Each list is a row. In a narrow window it is a column, because leaders are often more than measures.
-  const [high, wide] = narrow.matches ? [leaders.length + 1, lists.length] : [lists.length, leaders.length + 1];
+  // Each list is a row. In a narrow window or with many leaders it is a column.
+  const turned = narrow.matches || leaders.length > 8, [high, wide] = turned ? [leaders.length + 1, lists.length] : [lists.length, leaders.length + 1];
   for (let row = 0; row < high; row++) {
     const line = make("tr", "", row === 0 ? head : rest);
     for (let column = 0; column < wide; column++) {
-      const [list, place] = narrow.matches ? [column, row] : [row, column];
+      const [list, place] = turned ? [column, row] : [row, column];
       const cell = make(row === 0 || column === 0 ? "th" : "td", "", line, { className: list > 0 && list === selects ? "selects" : "" });
       if (row === 0 || column === 0) cell.scope = row === 0 ? "col" : "row";
       cell.append(lists[list][place]);
@@ -96,11 +96,11 @@ export function remove_leader(view, removed) {
 
 /** Says what the removal costs. @param {Shown} view */
 function lost(view) {
-  if (!view.removed) return "Remove a leader: the POIs that go dark are its credit. D removes the leader alone, Df the leader and its followers.";
-  const { leader, group } = view.removed, { data } = view, gone = dark(data, view.removed), pois = data.pois.length;
+  if (!view.removed) return "Remove a leader: the POIs that are lost are its credit. D removes the leader alone, Df the leader and its followers.";
+  const { leader, group } = view.removed, { data } = view, gone = lost_pois(data, view.removed), pois = data.pois.length;
   const who = `Without ${name_of_leader(data, leader)}${group ? " and its followers" : ""}`;
   const worth = (/** @type {number[]} */ values) => values.reduce((sum, value) => sum + value, 0), all = data.values ? worth(data.values) : pois;
   const lost = data.values ? worth(data.values.filter((_, poi) => gone.includes(poi))) : gone.length;
-  const which = gone.length ? `POI${gone.length > 1 ? "s" : ""} ${gone.join(", ")} ${gone.length > 1 ? "go" : "goes"} dark` : "no POI goes dark";
+  const which = gone.length ? `POI${gone.length > 1 ? "s" : ""} ${gone.join(", ")} ${gone.length > 1 ? "are" : "is"} lost` : "no POI is lost";
   return `${who}, ${which}: its ${group ? data.fitness === "Dt" ? "Dt" : "Df" : "D"} is ${lost} of ${data.values ? `the POIs' value ${all}` : all}, ${number(lost / all)}.`;
 }

@@ -44,18 +44,17 @@ export function curves() {
     return `${label} ${value} ${many} at generation ${Math.max(0, at)}`;
   });
   /** Adds the key of a baseline. @param {number[]} dashes @param {string} name @param {(number | null | undefined)[]} values */
-  const baseline = (dashes, name, values) => {
+  const baseline = (dashes, name, values, drawn = false) => {
     const found = own.flatMap(({ label }, index) => typeof values[index] === "number" ? [{ label, value: (values[index] * pois).toFixed(2) }] : []);
-    if (!found.length) return;
+    if (!found.length) return drawn ? item("--faint", dashes, name) : undefined;
     const alike = found.length === own.length && found.every(({ value }) => value === found[0].value);
     item("--faint", dashes, `${name}: ${alike ? found[0].value : found.map(({ label, value }) => `${value} (${label})`).join(", ")}`);
   };
   baseline(chart.CONSTANT, "best constant action", own.map(({ constant }) => constant));
-  baseline(chart.RANDOM, "best of as many random teams", own.map(({ random }) => random[Math.max(0, at)]));
+  baseline(chart.RANDOM, "best of as many random teams", own.map(({ random }) => random[Math.max(0, at)]), own.some(({ random }) => random.length));
   // Otherwise nobody expects an interval around a flat line.
-  const agree = own.some(({ trials }, index) => arms[index].band && trials.length > 1 && trials.every(trial => trial[at]?.champion === trials[0][at]?.champion));
-  const interval = arms.some(arm => arm.band) ? `, with its 95 % interval${agree ? ", wide because trials are few" : ""}` : "";
-  make("span", `${many} observed by the champion, the team of each population's best policy${at >= 0 ? `, at generation ${at}` : ""}. Thick: mean over trials${interval}. Thin: each trial.`, $("legend"));
+  const few = own.some(({ trials }) => trials.length < 10), interval = arms.some(arm => arm.band) ? `, with its 95 % interval${few ? ", wide because trials are few" : ""}` : "";
+  make("span", `${many[0].toUpperCase()}${many.slice(1)} observed by the champion, the team of each population's best policy${at >= 0 ? `, at generation ${at}` : ""}. Thick: mean over trials${interval}. Thin: each trial.`, $("legend"));
   $("curves").setAttribute("aria-label", `Learning curves, champion, mean over trials: ${words.join("; ")}`);
 }
 

@@ -58,7 +58,7 @@ interface Packed { colors: Palettes, episodes: { generation: number, team_g: num
 
 /** What to show of an episode. */
 interface Look {
-  crop: Crop, trails: boolean, radii: boolean, groups: boolean, over: number | null, heat: boolean, removed: Removed | null, dark: number[],
+  crop: Crop, trails: boolean, radii: boolean, groups: boolean, over: number | null, heat: boolean, removed: Removed | null, lost: number[],
 }
 interface Removed { leader: number, group: boolean }
 interface OnCanvas { wide: number, tall: number, scale: number, X: (x: number) => number, Y: (y: number) => number }

@@ -18,39 +18,39 @@ const dearest = (() => {
 /**
  * A step: `of` names the exhibit that `watch` shows, once `ready` has made it, and `meanwhile` until then. A step without `watch` trains the
  * experiment `of` of the gallery. `right` is the index of the choice that comes true.
- * @typedef {{ of: string, asks: string, choices: string[], right: number, ready?: () => Promise<unknown>, meanwhile?: () => Exhibit, watch?: () => unknown, why: string }} Step
+ * @typedef {{ of: string, asks: string, choices: string[], right: number, ready?: () => Promise<unknown>, meanwhile?: () => Exhibit, watch?: (answered: boolean) => unknown, why: string }} Step
  * @type {Step[]}
  */
 const STEPS = [
   {
-    of: "opening", watch: () => show_opening({ leader: dearest.leader, group: true }),
-    asks: `This team was trained: its four leaders (filled arrows) learned where to go, and eight followers (hollow arrows) follow them. A point of interest (POI, a circle) is observed once six agents are inside it at the same time, so groups have to meet. How many of the four POIs are left without leader ${dearest.leader} and its followers?`,
+    of: "opening", watch: answered => show_opening(answered ? { leader: dearest.leader, group: true } : null),
+    asks: `This team was trained. Its four leaders (filled arrows) learned where to go, and eight followers (hollow arrows) follow them. It observes all four points of interest (POIs, circles): six agents have to be inside one at the same time, so groups have to meet. How many POIs are left without leader ${dearest.leader} and its followers?`,
     choices: ["One", "Two", "Three"], right: dearest.pois - dearest.lost - 1,
-    why: `Leader ${dearest.leader} and its followers (pale) no longer count, and ${dearest.lost} of ${dearest.pois} POIs are lost (dark). This loss, ${dearest.lost / dearest.pois}, is the leader's Df. The Df of the four leaders are ${dearest.df.map(number).join(", ")}: one score of the team, but different credits. Training with Df keeps the leaders without which the team would lose most.`,
+    why: `Leader ${dearest.leader} and its followers (pale) no longer count, and ${dearest.lost} of ${dearest.pois} POIs are lost (red). This loss, ${dearest.lost / dearest.pois}, is the leader's Df. The Df of the four leaders are ${dearest.df.map(number).join(", ")}: one score of the team, but different credits. Training with Df keeps the leaders without which the team would lose most.`,
   },
   {
     of: "two_groups",
-    asks: "Now two kinds of team start from nothing: leaders with followers, and teams in which all twelve agents learn. Each learner's policy is selected from a population of policies. The team of the best policies is the champion. Whose champions observe more POIs?",
+    asks: "Now two kinds of team start from nothing: leaders with followers, and teams in which all twelve agents learn. Each learner's policy is selected from a population of its own. The team of the best policies is the champion. Whose champions observe more POIs?",
     choices: ["Leader-follower", "All-leaders", "Both alike"], right: 0,
     why: "Six independent learners almost never coincide. If each is at a POI in 3 of 10 episodes, all six are there in 7 of 10 000. All teams then score 0, and there is nothing to select. Two leaders that bring their followers coincide in 9 of 100.",
   },
   {
     of: "population",
-    asks: "The same task, with followers. How many policies per leader does it take until champions observe three of the four POIs, on average over trials at the last generation?",
+    asks: "The same task, with followers. How many policies must each leader's population have until champions observe three of the four POIs, on average over trials at the last generation?",
     choices: ["20 are enough", "100", "500"], right: 2,
-    why: "The first policies are random. Among few, hardly any two leaders meet. Among many, some do, and selection copies them.",
+    why: "The first policies are random. Among few, hardly any two leaders meet. Among many, some do, and selection copies them. Dash-dotted lines are mere luck: the best of as many random teams.",
   },
   {
     of: "evolution", ready: evolution, meanwhile: evolution_starts, watch: async () => show_exhibit(await evolution()),
     asks: "Selection changes whole populations. The 50 policies of each leader start at random. Where do they go after 60 generations?",
     choices: ["Everywhere", "Most the same way"], right: 1,
-    why: "Each faint line is the way of one policy, in the colour of its leader. At first they go everywhere. Selection keeps the few that meet, and their changed copies soon fill the population.",
+    why: "Each faint line is the way of one policy, in the colour of its leader. At first most circle near their start. Selection keeps the few that meet, and their changed copies fill the populations. By generation 15, all policies of leaders 0 and 1 go to the same POI. By generation 60, most policies of every leader go on to the next one.",
   },
   {
     of: "groups",
-    asks: "Do followers make the difference? Take them away, and let the three agents of a group share one population instead. What do such teams observe?",
-    choices: ["Nothing", "Less than half", "More than half"], right: 2,
-    why: "Here, most of the difference was the number of populations, not the followers. In 30 trials of the paper's first layout, with the same sensors, champions without followers reach G = 0.18 with a population per agent and 0.77 with one per group. With followers they reach 0.91. But somebody has to say who belongs to a group. Followers find their leader themselves.",
+    asks: "Do followers make the difference? Take them away: all twelve agents learn, from a population for each (twelve), from one for the three agents of a group (four), or from one for all. What do the champions of four populations observe?",
+    choices: ["Nothing", "About half", "Nearly all"], right: 1,
+    why: "With twelve populations, six learners have to coincide again. Agents that share a policy start side by side and go the same way, as followers do. So fewer populations make most of the difference, as in 30 trials of another layout (0.7 of 4 POIs with twelve, 3.1 with four, 3.6 with followers). But somebody has to say who shares: followers find their leader themselves.",
   },
 ];
 
@@ -75,8 +75,11 @@ function show_opening(removed) {
 const is_shown = name => state.mode === "watch" && (state.exhibit ? state.exhibit.name === name : is_of(name));
 /** Returns the step that a question or an answer is about. @param {Guide} at */
 const about = ({ step, said }) => STEPS[said === null ? Math.max(0, step - 1) : step];
-/** Shows what a step is about. @param {Step} step */
-const show_step = ({ of, watch }) => watch ? watch() : exhibit(of, { trains: true });
+/** Shows what a question or an answer is about. Only the first question is about what its own step shows. @param {Guide} at */
+function show_step(at) {
+  const { of, watch } = about(at), answered = at.step > 0 || at.said !== null;
+  return watch ? watch(answered) : exhibit(of, { trains: true });
+}
 
 /**
  * Returns what the guide says of a prediction and, if it is too early for the answer, what it says once that is known.
@@ -97,7 +100,7 @@ part(() => [state.guide, state.mode, state.exhibit, state.text, state.compared, 
   $(guide === null ? "guide" : "credit").after($("setup"));
   if (!guide) return void (state.told = null);
   const { step, said, waits = false } = guide, { asks, choices } = STEPS[step], here = is_shown(about(guide).of), last = step === STEPS.length - 1;
-  const [says, later] = !here ? ["What is on show is not part of the guide.", ""] : said === null ? [asks, ""] : answers({ ...guide, said });
+  const [says, later] = !here ? ["What is on show is not part of the guide.", ""] : said === null ? [step ? `${asks} (Below is still the last step.)` : asks, ""] : answers({ ...guide, said });
   if (here && !waits) state.told = guide;
   $("guide-step").textContent = `${step + 1} of ${STEPS.length}`;
   $("guide-says").textContent = says;
@@ -110,6 +113,7 @@ part(() => [state.guide, state.mode, state.exhibit, state.text, state.compared, 
   }));
   $("guide-next").hidden = asked;
   $("guide-next").disabled = here && waits;
+  $("guide-next").classList.toggle("main", !later);
   $("guide-next").textContent = !here ? "Back to the guide" : last ? "Done" : "Next";
   $("guide-end").hidden = here && last && !asked;
 });
@@ -129,10 +133,10 @@ async function enter({ step, said }) {
     }
     // The visitor may have left the guide, or chosen something else to show.
     if (!is_shown(about(waiting).of)) return state.guide === waiting ? render({ guide }) : undefined;
-    if (state.guide !== waiting) return show_step(about(waiting));
+    if (state.guide !== waiting) return show_step(waiting);
   }
   state.guide = guide;
-  const watched = said !== null || !is_shown(about(guide).of) ? show_step(about(guide)) : null;
+  const watched = said !== null || !is_shown(about(guide).of) ? show_step(guide) : null;
   render();
   if (had_focus) ($("guide-next").hidden ? all("button", $("guide-choices"))[0] : $("guide-next")).focus({ preventScroll: true });
   await watched;

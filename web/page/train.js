@@ -94,13 +94,12 @@ export async function train() {
 }
 
 /** Returns what the newest champions of each arm observe, or 0 before the first. @param {Training} training */
-export function found_by(training) {
-  const found = training.arms.map(arm => {
-    const last = arm.trials.map(trial => trial.at(-1)?.champion ?? 0), mean = last.reduce((sum, champion) => sum + champion, 0) / last.length;
-    return `${(mean * (arm.pois ?? 1)).toFixed(2)} of ${arm.pois ?? 1} (${arm.label})`;
+export function found_by({ arms, pois, unit }) {
+  const found = arms.map(({ label, trials }) => {
+    const sum = trials.reduce((sum, trial) => sum + (trial.at(-1)?.champion ?? 0), 0);
+    return `${(sum / trials.length * (pois ?? 1)).toFixed(2)} (${label})`;
   });
-  const { unit } = training;
-  return `${unit[0].toUpperCase()}${unit.slice(1)} that the champion observes, on average over trials: ${found.join(", ")}.`;
+  return `Champions observe on average, ${pois === null ? `as a ${unit}` : `of ${pois} POIs`}: ${found.join(", ")}.`;
 }
 
 // A training that was stopped still reports the generation that it had begun.
@@ -138,7 +137,7 @@ part(() => [state.training, state.training && state.training.state === "done"], 
     if (arm.command) make("code", arm.command, place);
     const { command, zip } = arm, { source } = training;
     const acts = make("div", "", place, { className: "row" });
-    if (zip) make("button", `Save the ${arm.label} run (.zip)`, acts, { type: "button", className: "home" }).addEventListener("click", () => save(`${arm.name}-${slug(arm.label)}.zip`, zip, "application/zip"));
+    if (zip) make("button", `Save the run (.zip): ${arm.label}`, acts, { type: "button", className: "home" }).addEventListener("click", () => save(`${arm.name}-${slug(arm.label)}.zip`, zip, "application/zip"));
     if (source && command && !command.includes(" configs/")) {
       make("button", `Save ${arm.name}.toml`, acts, { type: "button" }).addEventListener("click", () => save(`${arm.name}.toml`, source.text, "text/plain"));
     }

@@ -77,7 +77,7 @@ export function draw(view) {
   const [own] = data.episodes, gone = without(own, removed), episode = gone ? { ...own, ...gone } : own;
   const look = {
     crop: view.crop, trails: $("trails").checked, radii: $("radii").checked, groups: true, over: view.over,
-    heat: $("heat").checked, removed: gone ? removed : null, dark: dark(data, removed),
+    heat: $("heat").checked, removed: gone ? removed : null, lost: lost_pois(data, removed),
   };
   const { step, positions } = stage.paint(data, episode, view.canvas, view.place, look);
   view.drawn = positions;
@@ -100,7 +100,7 @@ export function draw(view) {
 const without = (episode, removed) => removed && episode.without ? episode.without[removed.leader][removed.group ? "group" : "alone"] : null;
 
 /** Returns the POIs that only the removed agents' presence observed. @param {Scene} data @param {Removed | null} removed */
-export function dark(data, removed) {
+export function lost_pois(data, removed) {
   const [episode] = data.episodes, gone = without(episode, removed);
   return gone ? episode.observed.flatMap((at, poi) => at !== null && gone.observed[poi] === null ? [poi] : []) : [];
 }

@@ -163,7 +163,7 @@ const stage = (() => {
 
   // Draws an episode, `place` frames from its start, at the canvas's width. `look` selects what to show: `crop` (a part
   // of the map), `trails`, `radii`, `groups`, and `over` (the POI under the pointer, or null). It may have `heat` (where
-  // agents were), `removed` (a leader, and whether its followers are removed, too) and `dark` (the POIs lost by that).
+  // agents were), `removed` (a leader, and whether its followers are removed, too) and `lost` (the POIs lost by that).
   function paint(data, episode, canvas, place, look) {
     const { wide, tall, scale, X, Y } = place_on(canvas, look.crop);
     const dots = window.devicePixelRatio || 1;
@@ -212,10 +212,10 @@ const stage = (() => {
     const counts = data.pois.map(([x, y], poi) => {
       const done = episode.observed[poi] !== null && episode.observed[poi] <= step, needed = episode.coupling[poi];
       const closed = !done && !is_open(data, episode, poi, Math.max(1, step));
-      const dark = (look.dark || []).includes(poi), tone = color(dark ? "--wrong" : done ? "--seen" : "--poi");
+      const lost = (look.lost || []).includes(poi), tone = color(lost ? "--wrong" : done ? "--seen" : "--poi");
       circle(x, y, radius(data, poi));
       draw.fillStyle = tone;
-      draw.globalAlpha = dark ? 0.16 : done ? 0.22 : closed ? 0.02 : 0.07;
+      draw.globalAlpha = lost ? 0.16 : done ? 0.22 : closed ? 0.02 : 0.07;
       draw.fill();
       draw.globalAlpha = 1;
       if (look.radii) {
@@ -246,7 +246,7 @@ const stage = (() => {
       // The counts of POIs at the same place are above each other.
       const same = data.pois.flatMap(([left, low], other) => left === x && low === y ? [other] : []);
       const base = Math.max(Y(y) - ring - 6, 15 * same.length - 3) - 15 * same.indexOf(poi);
-      return [`${near[poi]}/${needed}${done ? " ✓" : dark ? wide < 300 ? " ✗" : " ✗ dark" : ""}`, X(x), base];
+      return [`${near[poi]}/${needed}${done ? " ✓" : lost ? " ✗" : ""}`, X(x), base];
     });
 
     const many = episode.agents > 100;
