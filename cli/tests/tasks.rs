@@ -60,7 +60,8 @@ fn a_scripted_team_solves_the_relay_with_an_enforced_hand_over() {
 fn invalid_scripts_are_refused_before_training() {
     let folder = TempDir::new().unwrap();
     // Nobody reaches a POI in two steps.
-    let task = TINY.replace("pois = [[10, 9], [20, 9]]", "pois = [[10, 40], [20, 40]]").replace("steps = 8", "steps = 2");
+    let task =
+        TINY.replace("pois = [[10, 9], [20, 9]]", "pois = [[10, 40], [20, 40]]").replace("steps = 8", "steps = 2");
     fs::write(folder.path().join("task.toml"), task).unwrap();
     let head = "leader,until,x,y,speed\n";
     for (rows, message) in [
