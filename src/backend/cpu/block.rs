@@ -306,36 +306,40 @@ impl<S: Simd> Block<S> {
             if let Some(leaders) = &plan.leaders {
                 count_leaders(agents, near, own.clone(), leaders, &plan.influences2, counts);
             }
-            if shape.control() == ControlKind::Nearest {
-                let pursuit = &class.constants.pursuit;
-                for (agent, follower) in own.clone().zip(&mut *followers) {
-                    let targets = offsets(agents, agent, shape.first_target..shape.end_target);
-                    let (to, _) = pursue::nearest::<S>(agent, pursuit.reach2, targets);
-                    follower.force = pursue::towards::<S>(pursuit, motion, to);
+            match shape.control() {
+                ControlKind::Nearest => {
+                    let pursuit = &class.constants.pursuit;
+                    for (agent, follower) in own.clone().zip(&mut *followers) {
+                        let targets = offsets(agents, agent, shape.first_target..shape.end_target);
+                        let (to, _) = pursue::nearest::<S>(agent, pursuit.reach2, targets);
+                        follower.force = pursue::towards::<S>(pursuit, motion, to);
+                    }
                 }
-                obey(
-                    class,
-                    &mut agents[own.clone()],
-                    followers,
-                    &mut wanted[own.clone()],
-                    &mut velocities[own.clone()],
-                );
-            }
-            if shape.control() != ControlKind::Follow {
-                continue;
-            }
-            for (index, (terms, others)) in plan.terms.iter().enumerate() {
-                let counting = index == 0 && plan.leaders.is_none();
-                let is_last = index + 1 == plan.terms.len();
-                let terms = &class.terms[terms.clone()];
-                let ring =
-                    Ring { class, terms, is_first: index == 0, is_last, agents, headings, near, others, leaders };
-                match (terms.len(), counting) {
-                    (1, true) => ring.add::<1, true>(own.clone(), followers, counts),
-                    (1, false) => ring.add::<1, false>(own.clone(), followers, counts),
-                    (_, true) => ring.add::<2, true>(own.clone(), followers, counts),
-                    (_, false) => ring.add::<2, false>(own.clone(), followers, counts),
+                ControlKind::Follow => {
+                    for (index, (terms, others)) in plan.terms.iter().enumerate() {
+                        let counting = index == 0 && plan.leaders.is_none();
+                        let is_last = index + 1 == plan.terms.len();
+                        let terms = &class.terms[terms.clone()];
+                        let ring = Ring {
+                            class,
+                            terms,
+                            is_first: index == 0,
+                            is_last,
+                            agents,
+                            headings,
+                            near,
+                            others,
+                            leaders,
+                        };
+                        match (terms.len(), counting) {
+                            (1, true) => ring.add::<1, true>(own.clone(), followers, counts),
+                            (1, false) => ring.add::<1, false>(own.clone(), followers, counts),
+                            (_, true) => ring.add::<2, true>(own.clone(), followers, counts),
+                            (_, false) => ring.add::<2, false>(own.clone(), followers, counts),
+                        }
+                    }
                 }
+                _ => continue,
             }
             obey(class, &mut agents[own.clone()], followers, &mut wanted[own.clone()], &mut velocities[own]);
         }
