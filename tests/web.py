@@ -792,6 +792,8 @@ def check_links_and_devices(tab, page):
     assert tab.evaluate("document.activeElement.id") == "train", "the focus is lost"
     assert tab.text("#announced").startswith("Training is finished."), tab.text("#announced")
     assert tab.evaluate("document.querySelector('#stale').hidden")
+    # The page is also shown again while the new config is being read, as it is when an episode ends then.
+    tab.evaluate("setInterval(() => document.querySelector('#curves').dispatchEvent(new Event('pointerleave')), 0); 0")
     tab.set("#fitness", "D")
     tab.wait("!document.querySelector('#stale').hidden")
     assert "fitness Df, seed 7" in tab.text("#stale"), tab.text("#stale")

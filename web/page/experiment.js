@@ -81,8 +81,8 @@ part(() => [state.past.length, state.valid], () => {
   $("train").disabled = !state.valid;
 });
 
-// Shows a note if the results were trained with settings that differ from those in the form.
-part(() => [state.training, state.text, state.compared], () => {
+// Shows a note if the results were trained with settings that differ from those in the form. A new text has no config until it is read.
+part(() => [state.training, state.config, state.valid, state.compared], () => {
   const { training } = state, differs = training && training.source && (training.source.text !== state.text || JSON.stringify(training.source.compared) !== JSON.stringify(state.compared));
   $("stale").hidden = !differs;
   if (!differs) return;
