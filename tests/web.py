@@ -1280,6 +1280,7 @@ def check_first_visit(tab, page, call, downloads):
     assert guide.startswith("You said: leader-follower. That is right. "), guide
     assert "Six independent learners almost never coincide" in guide, guide
     assert sum(found[0]) >= 3 and max(found[1]) == 0, found
+    led = sum(found[0])
     assert not tab.text("#needless")
     random = tab.evaluate("page.state.training.arms[0].random")
     assert random == sorted(random) and random[-1] < sum(found[0]) / len(found[0]), random
@@ -1295,6 +1296,10 @@ def check_first_visit(tab, page, call, downloads):
     tab.wait(f"document.querySelector('#guide-says').textContent.includes('{found[2]:.2f} (500 policies each)')")
     assert tab.text("#guide-says").startswith("You said: 20 are enough. It is: 500. "), tab.text("#guide-says")
     assert not tab.text("#needless")
+    # With 20 policies, the best of as many random teams observes more, and the guide says so.
+    tab.wait("page.state.training.arms[0].random.length === 61", 100)
+    assert tab.evaluate("page.state.training.arms[0].random.at(-1) * 4") > found[0], found
+    assert "training ends below mere luck" in tab.text("#guide-says"), tab.text("#guide-says")
     tab.assert_no_errors()
     # The whole population of three generations is shown, as 50 faint teams each. Random teams wait meanwhile.
     sums_random = "page.state.training.arms.reduce((sum, { random }) => sum + random.length, 0)"
@@ -1336,9 +1341,17 @@ def check_first_visit(tab, page, call, downloads):
     tab.click(predict)
     tab.wait("page.state.training && page.state.training.arms[0].label === 'a population per agent' && " + DONE, 400)
     none, group, _ = tab.evaluate(f"page.state.training.arms.map({sums})")
-    assert none == 0 and 1.5 <= group <= 2.5, (none, group)
-    assert tab.text("#guide-says").startswith("You said: nothing. It is: about half. "), tab.text("#guide-says")
-    assert "fewer populations make most of the difference" in tab.text("#guide-says"), tab.text("#guide-says")
+    assert none == 0 and 2 <= group <= 3, (none, group)
+    assert tab.text("#guide-says").startswith("You said: nothing. It is: two or three. "), tab.text("#guide-says")
+    assert f"With followers it was {led:.2f}. " in tab.text("#guide-says"), (led, tab.text("#guide-says"))
+    assert "fewer populations do most of what followers do" in tab.text("#guide-says"), tab.text("#guide-says")
+    # Agents of one population have one colour.
+    tab.wait("page.state.views.length === 3 && page.state.views.every(view => view.data)")
+    tints = "page.state.views.map(({ data }) => Array.from({ length: 12 }, (_, agent) => page.stage.tint(data, agent)))"
+    assert [len(set(colors)) for colors in tab.evaluate(tints)] == [12, 4, 1], tab.evaluate(tints)
+    owners = tab.evaluate("page.state.start.owner")
+    of_group = tab.evaluate(tints)[1]
+    assert all(of_group[agent] == of_group[owner] for agent, owner in enumerate(owners)), (of_group, owners)
     tab.evaluate("document.querySelector('#guide-next').focus(); document.querySelector('#guide-next').click()")
     assert tab.evaluate("document.querySelector('#guide').hidden")
     assert tab.evaluate("document.activeElement.id") == "train", "the focus is lost after the guide"

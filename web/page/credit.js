@@ -66,11 +66,11 @@ function table(view) {
 /** Makes the button that shows what a leader senses. @param {Shown} view @param {number} leader */
 function sense_button(view, leader) {
   const name = name_of_leader(view.data, leader);
-  const colors = stage.palette(view.data), button = make("button", view.data.classes ? name : String(leader), null, { type: "button", title: "Show what it senses" });
+  const button = make("button", view.data.classes ? name : String(leader), null, { type: "button", title: "Show what it senses" });
   button.setAttribute("aria-label", `${name}: show what it senses`);
   button.setAttribute("aria-pressed", String(view.selected === leader));
   button.dataset.credit = `sense ${leader}`;
-  button.style.borderBottom = `4px solid ${colors[leader % colors.length]}`;
+  button.style.borderBottom = `4px solid ${stage.tint(view.data, leader)}`;
   button.addEventListener("click", () => { select(view, leader); reveal(); });
   return button;
 }

@@ -46,7 +46,7 @@ export function curves() {
   /** Adds the key of a baseline. @param {number[]} dashes @param {string} name @param {(number | null | undefined)[]} values */
   const baseline = (dashes, name, values, drawn = false) => {
     const found = own.flatMap(({ label }, index) => typeof values[index] === "number" ? [{ label, value: (values[index] * pois).toFixed(2) }] : []);
-    if (!found.length) return drawn ? item("--faint", dashes, name) : undefined;
+    if (!found.length) return drawn ? item("--faint", dashes, `${name}: being played…`) : undefined;
     const alike = found.length === own.length && found.every(({ value }) => value === found[0].value);
     item("--faint", dashes, `${name}: ${alike ? found[0].value : found.map(({ label, value }) => `${value} (${label})`).join(", ")}`);
   };

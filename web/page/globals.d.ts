@@ -47,8 +47,11 @@ interface Episode extends Seen {
 /** A channel of a class's senses, and a class of agents. Those that learn come first. */
 interface Channel { of: string | string[], sectors: number, each?: boolean, frame: "heading" | "map" }
 interface AgentClass { name: string, count: number, free: boolean, senses: Channel[], choose?: { name: string, agents: number[] } }
-/** What only full configs have: classes of agents, groups of POIs, and the radius and value of each POI if they differ. */
-interface Parts { classes?: AgentClass[], groups?: { name: string, count: number }[], radii?: number[], values?: number[] }
+/**
+ * What only some scenes have: classes of agents, groups of POIs, the radius and value of each POI if they differ, and the population of each
+ * agent if they share some and none follows.
+ */
+interface Parts { populations?: number[], classes?: AgentClass[], groups?: { name: string, count: number }[], radii?: number[], values?: number[] }
 interface Scene extends Rule, Parts {
   map: Place, pois: Place[], observation_radius: number, attraction_radius: number, dt: number, steps: number, exact: boolean,
   colors: Palettes, fitness?: string, episodes: Episode[],
@@ -70,7 +73,7 @@ declare const stage: {
   busy(data: Scene): Crop,
   whole(data: Scene): Crop,
   place_on(canvas: HTMLCanvasElement, crop: Crop): OnCanvas,
-  palette(data: Scene): string[],
+  tint(data: Scene, leader: number): string,
   paint(data: Scene, episode: Episode, canvas: HTMLCanvasElement, place: number, look: Look): { step: number, positions: Place[] },
   say(episode: Episode, step: number): [number, string],
   poi_at(data: Scene, canvas: HTMLCanvasElement, crop: Crop, x: number, y: number): number | null,

@@ -24,33 +24,33 @@ const dearest = (() => {
 const STEPS = [
   {
     of: "opening", watch: answered => show_opening(answered ? { leader: dearest.leader, group: true } : null),
-    asks: `This team was trained. Its four leaders (filled arrows) learned where to go, and eight followers (hollow arrows) follow them. It observes all four points of interest (POIs, circles): six agents have to be inside one at the same time, so groups have to meet. How many POIs are left without leader ${dearest.leader} and its followers?`,
+    asks: `This team was trained. Its four leaders (filled arrows) learned where to go. The eight followers (hollow arrows) never learn: each goes after its leader. A point of interest (POI, circle) is observed, and stays green, once six agents are inside at the same time, so groups have to meet. How many of the four POIs are still observed without leader ${dearest.leader} and its followers?`,
     choices: ["One", "Two", "Three"], right: dearest.pois - dearest.lost - 1,
-    why: `Leader ${dearest.leader} and its followers (pale) no longer count, and ${dearest.lost} of ${dearest.pois} POIs are lost (red). This loss, ${dearest.lost / dearest.pois}, is the leader's Df. The Df of the four leaders are ${dearest.df.map(number).join(", ")}: one score of the team, but different credits. Training with Df keeps the leaders without which the team would lose most.`,
+    why: `Leader ${dearest.leader} and its followers (pale) no longer count, and ${dearest.lost} of ${dearest.pois} POIs are lost (red). This loss, ${dearest.lost / dearest.pois}, is the leader's Df. The Df of the four leaders are ${dearest.df.map(number).join(", ")}: one score of the team, but different credits. Training with Df keeps those policies of each leader without which its team would lose most.`,
   },
   {
     of: "two_groups",
     asks: "Now two kinds of team start from nothing: leaders with followers, and teams in which all twelve agents learn. Each learner's policy is selected from a population of its own. The team of the best policies is the champion. Whose champions observe more POIs?",
     choices: ["Leader-follower", "All-leaders", "Both alike"], right: 0,
-    why: "Six independent learners almost never coincide. If each is at a POI in 3 of 10 episodes, all six are there in 7 of 10 000. All teams then score 0, and there is nothing to select. Two leaders that bring their followers coincide in 9 of 100.",
+    why: "Six independent learners almost never coincide. If each were at a POI in 3 of 10 episodes, all six would be there in 7 of 10 000. All teams then score 0, and there is nothing to select. Two leaders that bring their followers would coincide in 9 of 100.",
   },
   {
     of: "population",
     asks: "The same task, with followers. How many policies must each leader's population have until champions observe three of the four POIs, on average over trials at the last generation?",
     choices: ["20 are enough", "100", "500"], right: 2,
-    why: "The first policies are random. Among few, hardly any two leaders meet. Among many, some do, and selection copies them. Dash-dotted lines are mere luck: the best of as many random teams.",
+    why: "The first policies are random. Among many, some leaders meet, and selection has something to copy and change. With 20, training ends below mere luck: the best of as many random teams (dash-dotted). Four trials are too few to tell 100 from 500.",
   },
   {
     of: "evolution", ready: evolution, meanwhile: evolution_starts, watch: async () => show_exhibit(await evolution()),
     asks: "Selection changes whole populations. The 50 policies of each leader start at random. Where do they go after 60 generations?",
     choices: ["Everywhere", "Most the same way"], right: 1,
-    why: "Each faint line is the way of one policy, in the colour of its leader. At first most circle near their start. Selection keeps the few that meet, and their changed copies fill the populations. By generation 15, all policies of leaders 0 and 1 go to the same POI. By generation 60, most policies of every leader go on to the next one.",
+    why: "Each faint line is the way of one policy, in the colour of its leader. At first most circle near their start. Selection keeps the few that meet, and their changed copies fill the populations. By generation 15, all policies of leaders 0 and 1 (blue, orange) go to the second POI. By generation 60, most policies of every leader reach the third.",
   },
   {
     of: "groups",
-    asks: "Do followers make the difference? Take them away: all twelve agents learn, from a population for each (twelve), from one for the three agents of a group (four), or from one for all. What do the champions of four populations observe?",
-    choices: ["Nothing", "About half", "Nearly all"], right: 1,
-    why: "With twelve populations, six learners have to coincide again. Agents that share a policy start side by side and go the same way, as followers do. So fewer populations make most of the difference, as in 30 trials of another layout (0.7 of 4 POIs with twelve, 3.1 with four, 3.6 with followers). But somebody has to say who shares: followers find their leader themselves.",
+    asks: "Do followers make the difference? Take them away: all twelve agents learn, from a population for each (twelve), from one for the three agents of a group (four), or from one for all. How many POIs do the champions of four populations observe?",
+    choices: ["Nothing", "Two or three", "All four"], right: 1,
+    why: "With followers it was 3.00. With twelve populations, six learners have to coincide again. Agents that share a policy (one colour) start side by side and go the same way, as followers do. So fewer populations do most of what followers do. In 30 trials of another layout it was 0.7 with twelve, 3.1 with four, 3.6 with followers. Four trials cannot tell four from one.",
   },
 ];
 

@@ -13,7 +13,7 @@ export const OPENED = (() => {
     name: "opening",
     scenes: [{
       title: "A trained team, in a task where learning matters", data,
-      status: (step, observed) => `${observed} of ${data.pois.length} POIs by step ${step} · trained for ${generation} generations with population ${config.learning.population}`,
+      status: (step, observed) => `${observed} of ${data.pois.length} POIs by step ${step} · trained for ${generation} generations with ${config.learning.population} policies per leader`,
       label: `${NAMES["leader-follower"]}: the champion of generation ${generation}, trial ${trial}`,
     }],
   };

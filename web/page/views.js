@@ -123,9 +123,9 @@ function ways(canvas, crop, ghosts) {
   pen.setTransform(pen_of(canvas).getTransform());
   pen.globalAlpha = 0.2;
   for (const ghost of ghosts) {
-    const [episode] = ghost.episodes, colors = stage.palette(ghost);
+    const [episode] = ghost.episodes;
     for (let leader = 0; leader < episode.leaders; leader++) {
-      pen.strokeStyle = colors[leader % colors.length];
+      pen.strokeStyle = stage.tint(ghost, leader);
       pen.beginPath();
       for (let frame = 0; frame < episode.shown.length; frame++) {
         const [x, y] = stage.moment(ghost, episode, frame, leader);

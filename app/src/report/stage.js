@@ -141,7 +141,13 @@ const stage = (() => {
 
   const overlap = (a, b) => a[0] < b[2] && b[0] < a[2] && a[1] < b[3] && b[1] < a[3];
 
-  const palette = data => night.matches ? data.colors.dark : data.colors.light;
+  // Returns the number of a leader's colour. Without followers, agents that share a population share their colour.
+  const hue = ({ populations }, leader) => populations && leader in populations ? populations[leader] : leader;
+  // Returns the colour of a leader and its followers.
+  function tint(data, leader) {
+    const colors = night.matches ? data.colors.dark : data.colors.light;
+    return colors[hue(data, leader) % colors.length];
+  }
 
   // Draws how often agents were at a place up to a frame, in squares of one unit.
   function paint_heat(draw, data, episode, frame, { X, Y, scale }, tone) {
@@ -174,12 +180,11 @@ const stage = (() => {
     }
     const style = getComputedStyle(document.documentElement), tones = {};
     const color = name => tones[name] ??= style.getPropertyValue(name).trim();
-    const colors = palette(data);
     // Marks are smaller on a small canvas, where they would hide each other. The smallest ones have no room for labels.
     const fit = Math.max(0.55, Math.min(1, wide / 240)), labelled = wide >= 150;
     const led = Array.from({ length: episode.agents }, (_, agent) => leaders_of(episode, Math.floor(place), agent));
-    const dashes = agent => DASHES[Math.floor((led[agent][0] || 0) / colors.length) % DASHES.length];
-    const group = agent => led[agent].length === 0 ? color("--faint") : colors[led[agent][0] % colors.length];
+    const dashes = agent => DASHES[Math.floor(hue(data, led[agent][0] || 0) / data.colors.light.length) % DASHES.length];
+    const group = agent => led[agent].length === 0 ? color("--faint") : tint(data, led[agent][0]);
     const draw = canvas.getContext("2d");
     const taken = [];
     // Writes text with a pale outline.
@@ -391,5 +396,5 @@ const stage = (() => {
     return place;
   }
 
-  return { night, bytes, moment, unpack, busy, whole, place_on, palette, paint, say, poi_at, later, legend };
+  return { night, bytes, moment, unpack, busy, whole, place_on, tint, paint, say, poi_at, later, legend };
 })();

@@ -133,8 +133,9 @@ fn sensed(channel: &Channel) -> serde_json::Value {
     shown
 }
 
-/// Returns what only pages of full configs have.
+/// Returns what only some pages have.
 ///
+/// If agents share populations and none follows, there are `populations`, with that of each agent.
 /// With `[[agents]]`, they have `classes`, those that learn first: their `name`, the `count` of their agents, whether they
 /// move `free`, the class and the `agents` that they `choose` among, if any, the distance up to which they `influence` others, and the
 /// channels of their `senses`, with the number of `sectors` and whether `each` agent or POI has one. The `groups` of POIs
@@ -144,6 +145,9 @@ pub fn parts(config: &Config) -> Vec<(&'static str, serde_json::Value)> {
     let (all, mut parts) = (config.classes(), Vec::new());
     let count = all.agents.len();
     let drawn = drawn_agents(config.learners(), config.agent_count());
+    if config.agent_count() == config.learners() && config.populations() < config.learners() {
+        parts.push(("populations", json!(config.population_of_each())));
+    }
     if !config.agents.is_empty() {
         let class = |(index, class): (usize, &AgentClass)| {
             let free = matches!(class.motion, Mobility::Free { .. });
