@@ -484,11 +484,6 @@ fn every_problem_names_key_line_found_and_allowed() {
         (steps, "[learning]\nparadigm = \"all-leaders\"", &*format!("3: learning.paradigm: {agents}")),
         (
             steps,
-            "[learning]\nsharing = \"group\"",
-            "3: learning.sharing: found \"group\" with [[agents]], which needs learning.groups",
-        ),
-        (
-            steps,
             "[learning]\nsharing = \"group\"\ngroups = [[0], [2]]",
             "4: learning.groups[1][0]: found 2, allowed 0 to 1 (the last learner)",
         ),

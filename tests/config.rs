@@ -438,6 +438,13 @@ fn learners_share_the_population_of_their_group() {
         populations(&format!("{all}sharing = 'group'\ngroups = [[4], [1, 0], [3, 2]]")),
         (3, vec![1, 1, 2, 2, 0])
     );
+    // With classes, each is a group.
+    let classes = "[[agents]]\nname = 'rover'\nat = [[1, 5], [2, 5]]\nsenses = [{ of = 'pois' }]\n\
+                   [[agents]]\nname = 'drone'\nat = [[3, 5]]\nsenses = [{ of = 'pois' }]\n\
+                   [[agents]]\nname = 'sheep'\nat = [[1, 9]]\ncontrol = 'still'\n\
+                   [[pois]]\nname = 'poi'\nat = [[9, 9]]\n[learning]\nsharing = 'group'";
+    let config = Config::parse(classes, "classes.toml").unwrap();
+    assert_eq!(config.population_of_each(), [0, 0, 1]);
     let config = Config::parse(&format!("{text}{all}sharing = 'group'"), "groups.toml").unwrap();
     let of = |populations| config.populations_for(populations);
     assert_eq!([of(1), of(2), of(3), of(5)].map(|of| of.map(|of| of[2])), [Some(0), Some(1), None, Some(2)]);

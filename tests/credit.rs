@@ -5,7 +5,7 @@
 use crate::support;
 use flotilla::backend::cpu::Cpu;
 use flotilla::backend::{Backend, Group, GroupScores};
-use flotilla::config::{Choice, Coupling, Fitness, LedBy, MAX_LEARNERS, Observers, Score, When, WorldConfig};
+use flotilla::config::{Choice, Config, Coupling, Fitness, LedBy, MAX_LEARNERS, Observers, Score, When, WorldConfig};
 use flotilla::credit::{Credit, Episode, RecordRequest, Scores, Seen, Strided, owner_bits};
 use flotilla::front;
 use flotilla::sample;
@@ -739,4 +739,61 @@ fn scores_of_paths_equal_their_definition() {
         teams > 200 && kinds.len() == 12 && differ.iter().all(|&count| count > 20),
         "{teams}, {kinds:?}, {differ:?}"
     );
+}
+
+/// More than 32 leaders need several words. A leader takes out itself and, at each moment, whom it alone influences.
+#[test]
+fn dt_of_many_leaders_equals_its_definition() {
+    let mut differ = 0;
+    for start_counts in [false, true] {
+        let row = |y: f64| (0..40).map(|i| format!("[{:?}, {y:?}],", 5.0 + f64::from(i))).collect::<String>();
+        let class = |name: &str, y: f64, more: &str| {
+            format!(
+                "[[agents]]\nname = \"{name}\"\nat = [{}]\nmotion = {{ kind = \"free\", max_speed = 1.0 }}\n\
+                 senses = [{{ of = \"pois\", frame = \"map\", range = 50.0 }}]\n{more}\n",
+                row(y)
+            )
+        };
+        let text = format!(
+            "[world]\nsteps = 20\ndt = 1.0\nstart_counts = {start_counts}\n{}{}[[pois]]\nname = \"poi\"\nat = [{}]\n\
+             radius = 4.0\nscore = \"closeness\"\nwhen = \"mean\"\n[credit]\nled_by = \"alone\"\n[learning]\nfitness = \"Dt\"\n",
+            class("rover", 20.0, ""),
+            class("uav", 21.0, "observes = false\nleads = \"rover\"\ninfluence_radius = 1.5"),
+            row(25.0)
+        );
+        let config = Config::parse(&text, "many.toml").unwrap();
+        let world = World::new(&config.validate().unwrap());
+        let paths = world.paths.as_ref().unwrap();
+        let (scores, positions) = paths_of(&world, 5);
+        let (agents, leaders, later) = (world.agents(), world.leaders(), usize::from(!start_counts));
+        let size = positions.len() / 4;
+        for (scores, positions) in scores.chunks_exact(5 * leaders).zip(positions.chunks_exact(size)) {
+            let at = |moment: usize, agent: usize| {
+                let place = &positions[(moment * agents + agent) * 2..][..2];
+                [place[0], place[1]]
+            };
+            let influences = |moment: usize, uav: usize, rover: usize| {
+                let ([x, y], [to_x, to_y]) = (at(moment, uav), at(moment, rover));
+                (x - to_x) * (x - to_x) + (y - to_y) * (y - to_y) <= 1.5 * 1.5
+            };
+            let leads = |moment: usize, uav: usize, rover: usize| {
+                moment >= later && influences(moment - later, uav, rover) && {
+                    (40..80).filter(|&other| influences(moment - later, other, rover)).count() == 1
+                }
+            };
+            let of = |times: &dyn Fn(usize, usize) -> usize| worth_of_path(&world, paths, positions, times);
+            let whole = of(&|_, _| 1);
+            for uav in 40..80 {
+                let lost = whole
+                    - of(&|moment, agent| usize::from(agent != uav && (agent >= 40 || !leads(moment, uav, agent))));
+                assert_eq!(
+                    scores[4 * leaders + uav],
+                    lost as f32 / world.total_worth as f32,
+                    "{start_counts}, Dt of {uav}"
+                );
+                differ += u32::from(lost > 0 && uav >= 64);
+            }
+        }
+    }
+    assert!(differ > 20, "{differ}");
 }

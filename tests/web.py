@@ -1138,7 +1138,7 @@ STATES = [
 
 def check_contrasts(tab, dark, forced=False):
     """Tests that every text, border and mark of the page has enough contrast with its background."""
-    palette = "page.stage.palette(page.state.views[0].data)"
+    palette = f"page.state.views[0].data.colors.{'dark' if dark else 'light'}"
     colours = tab.evaluate(COLOURS.replace("replay.data.colors[scheme]", palette))
     # With forced colours, disabled controls have faint text, which is allowed.
     disabled = "[...document.querySelectorAll(':disabled')].map(e => e.textContent.trim())"

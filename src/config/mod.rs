@@ -290,6 +290,10 @@ impl Config {
         match (self.learning.sharing, &self.learning.groups[..]) {
             (Sharing::PerLeader, _) => own_populations(learners).to_vec(),
             (Sharing::Shared, _) => one_population(learners).to_vec(),
+            (Sharing::Group, []) if !self.agents.is_empty() => {
+                let sizes = self.agents.iter().filter(|class| class.learns()).map(AgentClass::size);
+                (0..).zip(sizes).flat_map(|(population, size)| vec![population; size]).collect()
+            }
             (Sharing::Group, []) => {
                 let nearest = |place: &[f64; 2]| {
                     let distance2 = |leader: usize| {
@@ -434,9 +438,6 @@ impl Config {
         {
             let key = if has_pois { POIS } else { "world.after" };
             r.report_key(key, format!("found POIs that come after others, allowed without {why}"));
-        }
-        if has_agents && config.learning.sharing == Sharing::Group && !r.has("learning.groups") {
-            r.report_key("learning.sharing", "found \"group\" with [[agents]], which needs learning.groups".into());
         }
         let Learning { population, hall_of_fame, .. } = config.learning;
         if r.error_count() == 0 && config.populations() == 1 {

@@ -52,34 +52,41 @@ pub(super) fn gather(owner: &[u32], world: &World, groups: &mut Vec<u32>) {
 /// Writes which leaders lead each follower at each step, one bit per leader, `[steps][followers][words of leaders]`.
 /// `sights` has the leaders that each follower saw, in the same shape.
 pub fn find_leading(sights: &Strided<'_>, world: &World, led: &mut Vec<u32>) {
-    lead(sights, world.followers(), world.leaders(), world.led, led);
-}
-
-/// Computes [`find_leading`] for so many followers, or other agents that are led. Only the steps that [count](Led) matter.
-pub(super) fn lead(sights: &Strided<'_>, followers: usize, leaders: usize, rule: Led, led: &mut Vec<u32>) {
-    let words = leaders.div_ceil(32);
-    let (steps, Led { within, by }) = (sights.len() / (followers * words).max(1), rule);
+    let (followers, leaders, words) = (world.followers(), world.leaders(), world.leader_words());
     led.clear();
     led.resize(sights.len(), 0);
+    if world.led.within == 1 && words == 1 {
+        led.iter_mut().enumerate().for_each(|(place, led)| *led = choose(world.led.by, sights.get(place), leaders));
+        return;
+    }
+    let place = |step: usize, follower: usize, word: usize| (step * followers + follower) * words + word;
+    let steps = sights.len() / (followers * words).max(1);
+    lead(|place| sights.get(place), led, [steps, followers, leaders], world.led, place);
+}
+
+/// Computes [`find_leading`] for so many steps, followers, or other agents that are led, and leaders. `place` returns where
+/// `seen` and `led` have a step, a follower and a word of leaders. Only the steps that [count](Led) matter.
+pub(super) fn lead(
+    seen: impl Fn(usize) -> u32,
+    led: &mut [u32],
+    [steps, followers, leaders]: [usize; 3],
+    Led { within, by }: Led,
+    place: impl Fn(usize, usize, usize) -> usize,
+) {
+    let (words, seen_at, place) = (leaders.div_ceil(32), &seen, &place);
     let mut counts = vec![0u32; leaders];
     for follower in 0..followers {
         counts.fill(0);
         for step in 0..steps {
-            let place = |step: usize| (step * followers + follower) * words;
-            let leading = &mut led[place(step)..][..words];
-            if within == 1 && words == 1 {
-                leading[0] = choose(by, sights.get(place(step)), leaders);
-                continue;
-            }
             let seen = |step: usize| {
-                (0..words)
-                    .flat_map(move |word| each_bit(sights.get(place(step) + word)).map(move |bit| word * 32 + bit))
+                let of_word = move |word| (word, seen_at(place(step, follower, word)));
+                (0..words).map(of_word).flat_map(|(word, seen)| each_bit(seen).map(move |bit| word * 32 + bit))
             };
             seen(step).for_each(|leader| counts[leader] += 1);
             if within > 0 && step >= within {
                 seen(step - within).for_each(|leader| counts[leader] -= 1);
             }
-            let mut lead = |leader: usize| leading[leader / 32] |= 1 << (leader % 32);
+            let mut lead = |leader: usize| led[place(step, follower, leader / 32)] |= 1 << (leader % 32);
             let mut counted = counts.iter().enumerate().filter(|(_, count)| **count > 0);
             match by {
                 LedBy::AnySeen => counted.for_each(|(leader, _)| lead(leader)),
@@ -98,7 +105,7 @@ pub(super) fn lead(sights: &Strided<'_>, followers: usize, leaders: usize, rule:
 }
 
 /// Returns who leads, of up to 32 leaders that were seen at the one step that counts.
-fn choose(by: LedBy, seen: u32, leaders: usize) -> u32 {
+pub(super) fn choose(by: LedBy, seen: u32, leaders: usize) -> u32 {
     match by {
         LedBy::AnySeen => seen,
         LedBy::MostSeen | LedBy::First => seen & seen.wrapping_neg(),

@@ -3,8 +3,8 @@
 use fearless_simd::{Level, Simd, dispatch, prelude::*};
 use glam::Vec2;
 
-use super::assignment::{first_most, lead};
-use super::{Paths, Strided, each_bit, share, stepping_stone};
+use super::assignment::{choose, first_most, lead};
+use super::{Paths, each_bit, share, stepping_stone};
 use crate::config::{Fitness, Score, When};
 use crate::kernels::math::within;
 use crate::kernels::{larger, select, smaller, splat};
@@ -19,14 +19,13 @@ pub(super) struct PathCredit {
     width: usize,
     /// `[2][agents][width]`.
     positions: Vec<f32>,
-    /// The learners that influence each agent, and those that lead it, `[moments][agents][words of leaders]`.
+    /// The learners that influence each agent, and those that lead it, `[words of leaders][agents][width + 1]`: a vector may
+    /// be written one moment later. Empty if those that are taken out are the same at all moments.
     sights: Vec<u32>,
     led: Vec<u32>,
     /// The number of moments at which each agent was influenced by each learner, `[agents][leaders]`.
     counts: Vec<u32>,
-    /// The agents that are taken out for each learner, `[leaders][words][width]`, and at any moment, `[leaders][words]`. The
-    /// first is empty if they are the same at all moments.
-    taken: Vec<u32>,
+    /// The agents that are taken out for each learner at any moment, `[leaders][words]`.
     ever_taken: Vec<u32>,
     /// Agents that are ever near the POI and count there, and at each moment their squared distance, infinite unless it
     /// is near and the moment counts: `[observers]`, `[observers][width]`.
@@ -156,40 +155,46 @@ impl PathCredit {
             Fitness::D if !rule.removes.is_empty() => self.ever_taken.copy_from_slice(&rule.removes),
             _ => (0..leaders).for_each(|leader| self.ever_taken[leader * words + leader / 32] |= 1 << (leader % 32)),
         }
-        if matches!(fitness, Fitness::Df | Fitness::Dt) {
-            simd.vectorize(
-                #[inline(always)]
-                || self.find_influences(simd, world, rule),
-            );
+        self.sights.clear();
+        self.led.clear();
+        if !matches!(fitness, Fitness::Df | Fitness::Dt) {
+            return;
         }
-        if fitness == Fitness::Df {
-            for (agent, counts) in self.counts.chunks_exact(leaders).enumerate() {
-                if let Some(leader) = first_most(counts.iter().copied()) {
-                    self.ever_taken[leader * words + agent / 32] |= 1 << (agent % 32);
-                }
-            }
-        }
-        self.taken.clear();
         if fitness == Fitness::Dt {
-            let width = self.width;
-            self.taken.resize(leaders * words * width, 0);
-            for (row, &agents) in self.taken.chunks_exact_mut(width).zip(&self.ever_taken) {
-                row.fill(agents);
+            let places = world.leader_words() * agents * (self.width + 1);
+            self.sights.resize(places, 0);
+            self.led.resize(places, 0);
+        }
+        simd.vectorize(
+            #[inline(always)]
+            || self.find_influences(simd, world, rule),
+        );
+        if fitness == Fitness::Dt {
+            return self.find_leading(world);
+        }
+        for (agent, counts) in self.counts.chunks_exact(leaders).enumerate() {
+            if let Some(leader) = first_most(counts.iter().copied()) {
+                self.ever_taken[leader * words + agent / 32] |= 1 << (agent % 32);
             }
-            lead(&Strided::contiguous(&self.sights), agents, leaders, world.led, &mut self.led);
-            let size = world.leader_words();
-            for (moment, led) in self.led.chunks_exact(agents * size).enumerate() {
-                for (agent, led) in led.chunks_exact(size).enumerate() {
-                    for leader in led
-                        .iter()
-                        .zip((0..).step_by(32))
-                        .flat_map(|(&led, first)| each_bit(led).map(move |bit| first + bit))
-                    {
-                        let (row, bit) = (leader * words + agent / 32, 1 << (agent % 32));
-                        self.taken[row * width + moment] |= bit;
-                        self.ever_taken[row] |= bit;
-                    }
-                }
+        }
+    }
+
+    /// Finds which learners lead each agent at each moment.
+    fn find_leading(&mut self, world: &World) {
+        let (leaders, agents, words) = (world.leaders(), world.agents(), world.constants.words as usize);
+        let (row, moments) = (self.width + 1, world.steps() + 1);
+        if world.led.within == 1 && leaders <= 32 {
+            let led = self.led.iter_mut().zip(&self.sights);
+            led.for_each(|(led, &seen)| *led = choose(world.led.by, seen, leaders));
+        } else {
+            let place = |moment: usize, agent: usize, word: usize| (word * agents + agent) * row + moment;
+            let sights = &self.sights;
+            lead(|place| sights[place], &mut self.led, [moments, agents, leaders], world.led, place);
+        }
+        for (place, led) in self.led.chunks_exact(row).enumerate() {
+            let (word, agent) = (place / agents, place % agents);
+            for bit in each_bit(led[..moments].iter().fold(0, |ever, led| ever | led)) {
+                self.ever_taken[(word * 32 + bit) * words + agent / 32] |= 1 << (agent % 32);
             }
         }
     }
@@ -200,11 +205,9 @@ impl PathCredit {
     /// move, as the leaders that followers see.
     #[inline(always)]
     fn find_influences<S: Simd>(&mut self, simd: S, world: &World, rule: &PathRule) {
-        let (leaders, agents, size) = (world.leaders(), world.agents(), world.leader_words());
+        let (leaders, agents, row) = (world.leaders(), world.agents(), self.width + 1);
         let later = usize::from(!rule.start_counts);
         let counted = world.steps() + 1 - later;
-        self.sights.clear();
-        self.sights.resize((world.steps() + 1) * agents * size, 0);
         self.counts.clear();
         self.counts.resize(agents * leaders, 0);
         for (class, led) in world.classes.iter().enumerate() {
@@ -218,15 +221,15 @@ impl PathCredit {
                     for first in (0..counted).step_by(S::f32s::LEN) {
                         let ([x, y], [led_x, led_y]) =
                             (self.at(simd, agents, leader, first), self.at(simd, agents, agent, first));
-                        let sees = within::<S>(x - led_x, y - led_y, splat(simd, influence2)).to_bitmask();
+                        let sees = within::<S>(x - led_x, y - led_y, splat(simd, influence2));
                         let all = (counted - first).min(S::f32s::LEN);
-                        let sees = sees & (u64::MAX >> (64 - all));
-                        self.counts[agent * leaders + leader] += sees.count_ones();
-                        let mut left = sees;
-                        while left != 0 {
-                            let moment = first + left.trailing_zeros() as usize + later;
-                            self.sights[(moment * agents + agent) * size + leader / 32] |= 1 << (leader % 32);
-                            left &= left - 1;
+                        let counts = sees.to_bitmask() & (u64::MAX >> (64 - all));
+                        self.counts[agent * leaders + leader] += counts.count_ones();
+                        let place = (leader / 32 * agents + agent) * row + first + later;
+                        if let Some(sights) = self.sights.get_mut(place..place + S::f32s::LEN) {
+                            let bit = S::u32s::splat(simd, 1 << (leader % 32));
+                            let seen = sees.to_vector().bitcast::<S::u32s>() & bit;
+                            (S::u32s::from_slice(simd, sights) | seen).store_slice(sights);
                         }
                     }
                 }
@@ -314,13 +317,16 @@ impl PathCredit {
         let near = S::f32s::from_slice(simd, &self.near[index * self.width + first..][..S::f32s::LEN]);
         match change {
             Change::Without(leader) => {
-                let row = leader * world.constants.words as usize + agent / 32;
-                if self.taken.is_empty() {
-                    let is_taken = self.ever_taken[row] >> (agent % 32) & 1 != 0;
-                    return (if is_taken { splat(simd, f32::INFINITY) } else { near }, 1);
+                let of_leader = &self.ever_taken[leader * world.constants.words as usize..];
+                if of_leader[agent / 32] >> (agent % 32) & 1 == 0 {
+                    return (near, 1);
                 }
-                let taken = S::u32s::from_slice(simd, &self.taken[row * self.width + first..][..S::f32s::LEN]);
-                let stays = (taken & S::u32s::splat(simd, 1 << (agent % 32))).simd_eq(0);
+                if self.led.is_empty() || agent == leader {
+                    return (splat(simd, f32::INFINITY), 1);
+                }
+                let place = (leader / 32 * world.agents() + agent) * (self.width + 1) + first;
+                let led = S::u32s::from_slice(simd, &self.led[place..][..S::f32s::LEN]);
+                let stays = (led & S::u32s::splat(simd, 1 << (leader % 32))).simd_eq(0);
                 (select::<S>(splat(simd, f32::INFINITY), near, stays), 1)
             }
             Change::With(leader, copies) if leader == agent => (near, 1 + copies),

@@ -20,7 +20,7 @@ const GALLERY = [
   {
     name: "groups", config: "two_groups", title: "Who shares a population?", changes: [["learning.paradigm", '"all-leaders"']],
     compare: { key: "learning.sharing", values: ["none", "group", "all"] },
-    says: "The same task without followers. With a population per agent, nothing is learned. With one per group of three agents, champions observe about half of the POIs.",
+    says: "The same task without followers. With a population per agent, nothing is learned. With one per group of three agents, champions observe two or three of the four POIs on average.",
   },
   {
     name: "blind", title: "Blind leaders", compare: { key: "learning.start_jitter", values: ["0.0", "2.0", "4.0"] },

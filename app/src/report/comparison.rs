@@ -474,7 +474,7 @@ pub fn legend(all: &[Comparison], options: &Question) -> String {
          Generations are medians over trials. The interval of a median takes six trials.\n\
          Differences are the first arm minus the second.\n\
          A is the probability that {a} has the larger value; 0.5 means no difference.\n\
-         p is two-sided, by {test}. Holm's correction is for the number of pairs.\n"
+         p is two-sided, by {test}. Holm's correction is for the number of pairs. Decide by p, and use the interval for the size.\n"
     );
     let never = |measured: &Measured, all: &Comparison| {
         measured.arms.iter().zip(&all.arms).any(|(mean, arm)| mean.reached.is_some_and(|reached| reached < arm.trials))
