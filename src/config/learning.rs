@@ -26,8 +26,8 @@ section! {
         /// leaders that share a policy: none, those of a group, or all; they share a population, whose policies are
         /// selected by the mean of their leaders' scores
         sharing: Sharing = "", "2.1",
-        /// for sharing = "group": the learners of each group, counted from 0; without them, a group is a class, or
-        /// without [[agents]] a leader and the learners in followers' places that start nearest to it
+        /// for sharing = "group": the learners of each group, counted from 0; without them, a group is a class,
+        /// or without classes a leader and the learners in followers' places that start nearest to it
         groups: Vec<Vec<usize>> = "", "",
         /// what policies are selected by: the team's score G, D without a leader, Df without a leader and its
         /// followers, D++ with copies of a leader, or Dt without a leader and, at each step, the followers that it

@@ -30,7 +30,7 @@ const STEPS = [
   },
   {
     of: "two_groups",
-    asks: "Now two kinds of team start from nothing: leaders with followers, and teams in which all twelve agents learn. Each learner's policy is selected from a population of its own. The team of the best policies is the champion. Whose champions observe more POIs?",
+    asks: "Now two kinds of team start from nothing: leaders with followers, and teams in which all twelve agents learn. Each learner has a population: many candidate policies, of which selection keeps the best. The team of the best policies is the champion. Whose champions observe more POIs?",
     choices: ["Leader-follower", "All-leaders", "Both alike"], right: 0,
     why: "Six independent learners almost never coincide. If each were at a POI in 3 of 10 episodes, all six would be there in 7 of 10 000. All teams then score 0, and there is nothing to select. Two leaders that bring their followers would coincide in 9 of 100.",
   },
@@ -50,7 +50,7 @@ const STEPS = [
     of: "groups",
     asks: "Do followers make the difference? Take them away: all twelve agents learn, from a population for each (twelve), from one for the three agents of a group (four), or from one for all. How many POIs do the champions of four populations observe?",
     choices: ["Nothing", "Two or three", "All four"], right: 1,
-    why: "With followers it was 3.00. With twelve populations, six learners have to coincide again. Agents that share a policy (one colour) start side by side and go the same way, as followers do. So fewer populations do most of what followers do. In 30 trials of another layout it was 0.7 with twelve, 3.1 with four, 3.6 with followers. Four trials cannot tell four from one.",
+    why: "With followers it was 3.00. With twelve populations, six learners have to coincide again. Agents that share a policy (one colour) start side by side and go much the same way, as followers do. So fewer populations do most of what followers do. In 30 trials of another layout it was 0.7 with twelve, 3.1 with four, 3.6 with followers. Four trials cannot tell four from one.",
   },
 ];
 
@@ -100,7 +100,7 @@ part(() => [state.guide, state.mode, state.exhibit, state.text, state.compared, 
   $(guide === null ? "guide" : "credit").after($("setup"));
   if (!guide) return void (state.told = null);
   const { step, said, waits = false } = guide, { asks, choices } = STEPS[step], here = is_shown(about(guide).of), last = step === STEPS.length - 1;
-  const [says, later] = !here ? ["What is on show is not part of the guide.", ""] : said === null ? [step ? `${asks} (Below is still the last step.)` : asks, ""] : answers({ ...guide, said });
+  const [says, later] = !here ? ["What is on show is not part of the guide.", ""] : said === null ? [step ? `${asks} (Below is still the previous step.)` : asks, ""] : answers({ ...guide, said });
   if (here && !waits) state.told = guide;
   $("guide-step").textContent = `${step + 1} of ${STEPS.length}`;
   $("guide-says").textContent = says;
