@@ -132,7 +132,13 @@ fn paired_trials_print_a_note_and_are_compared_with_paired() {
     let (df_ends, g_ends) = ([1.0, 0.75, 0.5, 1.0, 0.25], [0.75, 0.5, 0.25, 0.75, 0.0]);
     run(&place, "df", &[GENERATIONS], &slices(&rising_to(&df_ends)));
     run(&place, "g", &[GENERATIONS, FITNESS_G], &slices(&rising_to(&g_ends)));
+    // Five pairs cannot give a p-value below 0.05, so that pairs are no advice.
     let (_, stderr) = place.good("compare df g");
+    assert!(stderr.is_empty(), "{stderr}");
+    let with_sixth = |ends: [f64; 5], sixth: f64| rising_to(&[&ends[..], &[sixth]].concat());
+    run(&place, "df6", &[GENERATIONS], &slices(&with_sixth(df_ends, 0.5)));
+    run(&place, "g6", &[GENERATIONS, FITNESS_G], &slices(&with_sixth(g_ends, 0.25)));
+    let (_, stderr) = place.good("compare df6 g6");
     assert!(stderr.contains("note: these arms have the same seeds") && stderr.contains("--paired"), "{stderr}");
     let (text, stderr) = place.good("compare df g --paired");
     assert!(stderr.is_empty() && text.contains("Wilcoxon's signed-rank test"), "{stderr}{text}");
