@@ -402,9 +402,10 @@ fn every_fitness_equals_its_definition() {
 
 #[test]
 fn every_fitness_equals_its_definition_with_a_thousand_agents() {
-    // With another seed, a single case may take half a minute.
-    (0..18).into_par_iter().for_each(|case| {
-        let mut rng = ChaCha8Rng::seed_from_u64(1011 + case);
+    // One of the first cases takes half a minute.
+    let first = if support::is_long() { 0 } else { 11 };
+    (first..30).into_par_iter().for_each(|case| {
+        let mut rng = ChaCha8Rng::seed_from_u64(1000 + case);
         let record = random(&mut rng, 1000);
         let record = if case % 2 == 0 { record } else { with_random_rule(&mut rng, record) };
         compare(&record, &mut Credit::default(), &mut rng, [1, 8, 16][case as usize % 3]);

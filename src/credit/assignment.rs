@@ -55,17 +55,13 @@ pub fn find_leading(sights: &Strided<'_>, world: &World, led: &mut Vec<u32>) {
     let (followers, leaders, words) = (world.followers(), world.leaders(), world.leader_words());
     led.clear();
     led.resize(sights.len(), 0);
-    if world.led.within == 1 && words == 1 {
-        led.iter_mut().enumerate().for_each(|(place, led)| *led = choose(world.led.by, sights.get(place), leaders));
-        return;
-    }
     let place = |step: usize, follower: usize, word: usize| (step * followers + follower) * words + word;
     let steps = sights.len() / (followers * words).max(1);
     lead(|place| sights.get(place), led, [steps, followers, leaders], world.led, place);
 }
 
-/// Computes [`find_leading`] for so many steps, followers, or other agents that are led, and leaders. `place` returns where
-/// `seen` and `led` have a step, a follower and a word of leaders. Only the steps that [count](Led) matter.
+/// Computes [`find_leading`] in any layout. The numbers are of steps, of followers or other agents that are led, and of
+/// leaders. `place` returns where `seen` and `led` have a word of leaders, by step and follower.
 pub(super) fn lead(
     seen: impl Fn(usize) -> u32,
     led: &mut [u32],
@@ -74,6 +70,9 @@ pub(super) fn lead(
     place: impl Fn(usize, usize, usize) -> usize,
 ) {
     let (words, seen_at, place) = (leaders.div_ceil(32), &seen, &place);
+    if within == 1 && words == 1 {
+        return led.iter_mut().enumerate().for_each(|(place, led)| *led = choose(by, seen_at(place), leaders));
+    }
     let mut counts = vec![0u32; leaders];
     for follower in 0..followers {
         counts.fill(0);
@@ -105,7 +104,7 @@ pub(super) fn lead(
 }
 
 /// Returns who leads, of up to 32 leaders that were seen at the one step that counts.
-pub(super) fn choose(by: LedBy, seen: u32, leaders: usize) -> u32 {
+fn choose(by: LedBy, seen: u32, leaders: usize) -> u32 {
     match by {
         LedBy::AnySeen => seen,
         LedBy::MostSeen | LedBy::First => seen & seen.wrapping_neg(),

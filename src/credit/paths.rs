@@ -3,7 +3,7 @@
 use fearless_simd::{Level, Simd, dispatch, prelude::*};
 use glam::Vec2;
 
-use super::assignment::{choose, first_most, lead};
+use super::assignment::{first_most, lead};
 use super::{Paths, each_bit, share, stepping_stone};
 use crate::config::{Fitness, Score, When};
 use crate::kernels::math::within;
@@ -183,14 +183,9 @@ impl PathCredit {
     fn find_leading(&mut self, world: &World) {
         let (leaders, agents, words) = (world.leaders(), world.agents(), world.constants.words as usize);
         let (row, moments) = (self.width + 1, world.steps() + 1);
-        if world.led.within == 1 && leaders <= 32 {
-            let led = self.led.iter_mut().zip(&self.sights);
-            led.for_each(|(led, &seen)| *led = choose(world.led.by, seen, leaders));
-        } else {
-            let place = |moment: usize, agent: usize, word: usize| (word * agents + agent) * row + moment;
-            let sights = &self.sights;
-            lead(|place| sights[place], &mut self.led, [moments, agents, leaders], world.led, place);
-        }
+        let place = |moment: usize, agent: usize, word: usize| (word * agents + agent) * row + moment;
+        let sights = &self.sights;
+        lead(|place| sights[place], &mut self.led, [moments, agents, leaders], world.led, place);
         for (place, led) in self.led.chunks_exact(row).enumerate() {
             let (word, agent) = (place / agents, place % agents);
             for bit in each_bit(led[..moments].iter().fold(0, |ever, led| ever | led)) {
