@@ -600,22 +600,68 @@ fn classes_and_groups_have_their_limits() {
 }
 
 #[test]
-fn flags_and_stages_cannot_set_tables() {
-    for (key, value, expected) in [
-        ("agents", "3", "--set: [[agents]] can only be set in a config file"),
-        ("agents[0].speed", "3", "--set: [[agents]] can only be set in a config file"),
-        ("pois.radius", "3", "--set: [[pois]] can only be set in a config file"),
-        (
-            "learning.paradigm",
-            "'all-leaders'",
+fn flags_set_keys_of_classes_and_groups() {
+    let set = |key: &str, value: &str| {
+        let set = Override::of_text(key, value, "--set");
+        let of_text = Config::read(TEXT, "x.toml", &[], std::slice::from_ref(&set));
+        // A config that was read can be changed, too.
+        assert_eq!(parse(TEXT).with(std::slice::from_ref(&set)).is_ok(), of_text.is_ok(), "{key}");
+        of_text
+    };
+    for (key, value, from, to) in [
+        ("agents.uav.motion.max_speed", "2.5", "max_speed = 1.0", "max_speed = 2.5"),
+        ("agents.uav.senses[1].range", "7", "range = 5,", "range = 7,"),
+        ("agents[1].rule[0].gain", "-2", "gain = -1", "gain = -2"),
+        ("agents.dog.at", "[[1, 1], [2, 2]]", "[[20, 25]]", "[[1, 1], [2, 2]]"),
+        ("agents.dog.observes", "false", "name = \"dog\"", "name = \"dog\"\nobserves = false"),
+        ("pois.b.coupling", "3", "coupling = 2", "coupling = 3"),
+    ] {
+        assert_eq!(set(key, value).unwrap(), parse(&with(from, to)), "{key}");
+    }
+    let problems: Vec<String> = [
+        ("agents", "3"),
+        ("agents[9].speed", "3"),
+        ("agents.wolf.speed", "3"),
+        ("agents.dog", "3"),
+        ("agents.dog.speed", "-3"),
+        ("agents.dog.sped", "3"),
+        ("agents.dog.name.x", "3"),
+        (&format!("agents{}", ".x".repeat(200_000)), "3"),
+        ("agents.dog.at[0][1]", "'x'"),
+        ("learning.paradigm", "'all-leaders'"),
+    ]
+    .map(|(key, value)| {
+        let error = set(key, value).unwrap_err();
+        assert!(error.is_usage(), "{error}");
+        error.to_string()
+    })
+    .into();
+    assert_eq!(
+        problems,
+        [
+            "--set: found 3, allowed a list of 1 to 8 tables [[agents]]",
+            "--set: found no 9, allowed uav, dog",
+            "--set: found no wolf, allowed uav, dog",
+            "--set: found 3, allowed a table",
+            "--set: found -3, allowed 0 to 3 (motion.min_speed to motion.max_speed)",
+            "--set: unknown key, did you mean `speed`?",
+            "--set: found \"dog\", which has no key x",
+            "--set: found 200000 parts after `agents`, allowed up to 8",
+            "--set: found 'x', allowed a number, 0 to 50 (the map)",
             "--set: found in a config with [[agents]], which replaces this key; to write a config in full, use `flotilla \
              check --expand`",
-        ),
-    ] {
-        let set = Override::of_text(key, value, "--set");
-        let error = Config::read(TEXT, "x.toml", &[], &[set]).unwrap_err();
-        assert_eq!((error.to_string().as_str(), error.is_usage()), (expected, true));
-    }
+        ]
+    );
+    let set = Override::of_text("agents.leader.speed", "3", "--set");
+    let short = "[world]\nleaders = [[1, 1]]\npois = [[9, 9]]\ncoupling = 1\n";
+    assert_eq!(
+        Config::read(short, "x.toml", &[], &[set]).unwrap_err().to_string(),
+        "--set: found a config without [[agents]]; `flotilla check --expand` writes them"
+    );
+}
+
+#[test]
+fn stages_keep_tables() {
     let set = Override::new("learning.population", 7, "--population");
     let config = parse(TEXT);
     assert_eq!(config.with(&[set]).unwrap().learning.population, 7);

@@ -511,7 +511,7 @@ pub struct Overrides {
 /// The flag that sets any key of a config.
 #[derive(clap::Args, Clone, Default)]
 pub struct SetKeys {
-    /// Set any config key, for example world.steps=60; can be repeated
+    /// Set any config key, for example world.steps=60 or agents.uav.speed=2; can be repeated
     #[arg(long, help_heading = IN_CONFIG, value_name = "KEY=VALUE", value_parser = assignment)]
     pub set: Vec<Override>,
 }

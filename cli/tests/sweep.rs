@@ -1038,3 +1038,36 @@ fn the_limit_of_open_files_is_raised_if_possible_and_reported_otherwise() {
     succeed(run("-S -n", "hard", "--resume"));
     assert_eq!(policies(&folder.path().join("hard")), policies(&folder.path().join("soft")));
 }
+
+#[test]
+fn keys_of_classes_are_axes_flags_and_varied() {
+    let own = include_str!("../../configs/rovers.toml");
+    let axes = "[grid]\n\"pois.pair.coupling\" = [1, 3]\n[vary]\nagents.rover.motion.max_speed = [1.5]\n";
+    let flag = Override::of_text("agents.drone.senses[1].sectors", "6", "--set agents.drone.senses[1].sectors");
+    let sweep = Sweep::read(&format!("{own}{axes}"), "x.toml", &[flag], false).unwrap();
+    let points = sweep.points.iter().map(|point| (sweep.describe(point), (*point.config).clone()));
+    let edited = |coupling: &str, speed: &str| {
+        let text = [
+            ("coupling = 2", coupling),
+            ("max_speed = 2.0", speed),
+            ("\"rover\", sectors = 8", "\"rover\", sectors = 6"),
+        ];
+        let text = text.iter().fold(own.to_string(), |text, (old, new)| {
+            assert_eq!(text.matches(old).count(), 1, "{old}");
+            text.replace(old, new)
+        });
+        Config::parse(&text, "rovers.toml").unwrap()
+    };
+    let [one, three] = [1, 3].map(|coupling| format!("pois.pair.coupling = {coupling}"));
+    let varied = "agents.rover.motion.max_speed = 1.5";
+    let expected = [
+        (one.clone(), edited("coupling = 1", "max_speed = 2.0")),
+        (format!("{one}, {varied}"), edited("coupling = 1", "max_speed = 1.5")),
+        (three.clone(), edited("coupling = 3", "max_speed = 2.0")),
+        (format!("{three}, {varied}"), edited("coupling = 3", "max_speed = 1.5")),
+    ];
+    assert_eq!(points.collect::<Vec<_>>(), expected);
+    assert_eq!(sweep.axes[1].values[0].to_string(), "2.0");
+    // The recorded file is the same sweep.
+    assert_eq!(parse(&sweep.text), sweep);
+}

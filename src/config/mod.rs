@@ -30,7 +30,7 @@ pub use crate::model::region::Region;
 pub use crate::model::rule::{Coupling, Observers};
 pub use crate::model::sense::{Density, Sense};
 pub use crate::model::start::Heading;
-pub use crate::reader::{Definition, Override, Problem};
+pub use crate::reader::{Definition, Override, Problem, key_path};
 
 pub use classes::{drawn_agents, drawn_every};
 pub use credit::{CreditConfig, LedBy};

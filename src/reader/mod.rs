@@ -26,6 +26,9 @@ pub(crate) const MAX_LISTED: usize = 50;
 /// Maximum number of unknown keys for which similar keys are searched. A text with more is not a config.
 const MAX_HINTS: usize = 256;
 
+/// Maximum number of names and indices in a key after the name of its list.
+const MAX_PARTS: usize = 8;
+
 /// The description of one key: a row of `docs/reference/config.md` and a comment of every commented config.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Definition {
@@ -202,7 +205,13 @@ struct Entry<'a> {
     name: String,
 }
 
-impl Entry<'_> {
+impl<'a> Entry<'a> {
+    /// A value in a list or a table, which may be from `outside` the file, by its place there.
+    fn within(outside: bool, value: Value<'a>, place: impl FnOnce() -> String) -> Entry<'a> {
+        let name = value.set_by.map_or_else(place, Into::into);
+        Entry { outside: outside || value.set_by.is_some(), value, name }
+    }
+
     fn place(&self) -> Place {
         self.value.written.filter(|_| !self.outside).map_or(Place::Outside, |(offset, _)| Place::Offset(offset))
     }
@@ -409,21 +418,36 @@ impl<'a> Reader<'a> {
         self.entries.insert(key.into(), Entry { value, outside: true, name });
     }
 
-    /// Sets some keys.
-    ///
-    /// Lists of tables cannot be set: a flag would have to write out all of them.
+    /// Sets some keys. Keys of the tables of these lists have the table's name or index in their own, and that of an item:
+    /// `agents.uav.senses[2].range`.
     pub fn set_all(&mut self, overrides: &'a [Override], lists: &[&str]) {
         for Override { key, text, name } in overrides {
-            if let Some(list) = lists.iter().find(|list| section_of(key).split('[').next() == Some(**list)) {
-                let message = format!("[[{list}]] can only be set in a config file");
-                self.report(Place::Outside, name, message);
-                continue;
-            }
             let (value, errors) = DeValue::parse_recoverable(text);
             if let Some(error) = errors.first() {
                 self.report(Place::Outside, name, format!("found {}: {}", shorten(text), error.message().trim()));
             }
-            self.set(key, Value::of_text(value, text), name.clone());
+            let value = Value::of_text(value, text);
+            let path: Vec<&str> = key_path(key).collect();
+            match &path[..] {
+                [list, path @ ..] if !path.is_empty() && lists.contains(list) => {
+                    let stray = self.strays.iter_mut().find(|entry| entry.name == *list);
+                    let set = match stray.or_else(|| self.entries.get_mut(*list)) {
+                        // Tables would be nested as deeply.
+                        _ if path.len() > MAX_PARTS => {
+                            Err(format!("found {} parts after `{list}`, allowed up to {MAX_PARTS}", path.len()))
+                        }
+                        Some(entry) => entry.value.set(path, Value { set_by: Some(name), ..value }),
+                        None => {
+                            Err(format!("found a config without [[{list}]]; `flotilla check --expand` writes them"))
+                        }
+                    };
+                    set.unwrap_or_else(|message| self.report(Place::Outside, name, message));
+                }
+                _ => {
+                    self.strays.retain(|entry| entry.name != *key);
+                    self.set(key, value, name.clone());
+                }
+            }
         }
     }
 
@@ -466,11 +490,10 @@ impl<'a> Reader<'a> {
         has
     }
 
-    /// Returns the tables of a list of the config without requesting it, or none if it is not such a list.
-    pub(crate) fn peek(&self, list: &str) -> Vec<&[(String, Value<'a>)]> {
+    /// Returns the items of a list of the config without requesting it, or none if it is no list.
+    pub(crate) fn peek(&self, list: &str) -> &[Value<'a>] {
         let stray = self.strays.iter().find(|entry| entry.name == list).or_else(|| self.entries.get(list));
-        let items = stray.and_then(|entry| entry.value.list()).unwrap_or_default();
-        items.iter().map(|item| item.table().unwrap_or_default()).collect()
+        stray.and_then(|entry| entry.value.list()).unwrap_or_default()
     }
 
     /// Reads a list of tables of the config, `[[list]]`, if it has one. `read` gets the index of each table.
@@ -525,7 +548,7 @@ impl<'a> Reader<'a> {
             }
         };
         let named = |(key, value): (String, Value<'a>)| {
-            (format!("{table}.{key}"), Entry { value, outside, name: format!("{name}.{key}") })
+            (format!("{table}.{key}"), Entry::within(outside, value, || format!("{name}.{key}")))
         };
         let entries = std::mem::replace(&mut self.entries, items.into_iter().map(named).collect());
         let known = std::mem::take(&mut self.known);
@@ -623,7 +646,7 @@ impl<'a> Reader<'a> {
         let (place, Entry { value, outside, name }) = (entry.place(), entry);
         match value.kind {
             Kind::List(items) if lengths.contains(&items.len()) => {
-                let named = |(index, value)| Entry { value, outside, name: format!("{name}[{index}]") };
+                let named = |(index, value)| Entry::within(outside, value, || format!("{name}[{index}]"));
                 Some(items.into_iter().enumerate().map(named).collect())
             }
             _ => {
@@ -738,6 +761,11 @@ fn syntax_problem(error: &Error, text: &str) -> String {
         Some(at) => format!("{message} (at `{}`)", shorten(at)),
         None => message,
     }
+}
+
+/// Splits a key at its dots and around its indices: `agents.uav.senses[2].range`.
+pub fn key_path(key: &str) -> impl Iterator<Item = &str> {
+    key.split(['.', '[']).map(|part| part.trim_end_matches(']'))
 }
 
 /// Returns the section of a dotted key.

@@ -4,7 +4,6 @@ use std::ops::RangeInclusive;
 
 use serde::{Serialize, Serializer};
 
-use super::value::Kind;
 use super::{Allowed, Definition, Entry, MAX_HINTS, Number, Reader, Value, between};
 use crate::config_enum::Choice;
 
@@ -200,7 +199,7 @@ impl<'a> KeyRequest<'_, 'a> {
     ) -> Option<T> {
         let entry = self.take(|| ("table".into(), range.into(), Some(default.into())));
         let entry = entry.unwrap_or_else(|| {
-            let value = Value { kind: Kind::Table(vec![]), written: None };
+            let value = Value::empty_table();
             Entry { value, outside: false, name: self.reader.name_of(self.name) }
         });
         self.reader.within([self.name, table], Some(entry), read)

@@ -11,6 +11,8 @@ pub(crate) struct Value<'a> {
     pub(super) kind: Kind<'a>,
     /// The offset and the text of a value that was written.
     pub(super) written: Option<(usize, &'a str)>,
+    /// The name of the override that set it in a table of a list.
+    pub(super) set_by: Option<&'a str>,
 }
 
 /// The content of a [`Value`].
@@ -48,7 +50,7 @@ impl<'a> Value<'a> {
             DeValue::Boolean(flag) => Kind::Flag(flag),
             DeValue::Datetime(_) => Kind::Other(String::new()),
         };
-        Value { kind, written }
+        Value { kind, written, set_by: None }
     }
 
     /// Returns the value of a field. Whole numbers above the range of TOML are kept as such.
@@ -57,7 +59,51 @@ impl<'a> Value<'a> {
             Ok(value) => return value.into(),
             Err(_) => Kind::Integer(None),
         };
-        Value { kind, written: None }
+        Value { kind, written: None, set_by: None }
+    }
+
+    /// Returns a table without keys.
+    pub(super) fn empty_table() -> Value<'a> {
+        Value { kind: Kind::Table(vec![]), written: None, set_by: None }
+    }
+
+    /// Sets a value in nested lists and tables: `["uav", "senses", "2", "range"]` is a key of the third item of a list in
+    /// the table of a list whose `name` is `uav`.
+    ///
+    /// # Errors
+    /// What is found instead of such a value.
+    pub(super) fn set(&mut self, path: &[&str], value: Value<'a>) -> Result<(), String> {
+        let &[first, ref rest @ ..] = path else {
+            *self = value;
+            return Ok(());
+        };
+        let found = self.found();
+        match &mut self.kind {
+            Kind::List(items) => {
+                let name_of = |item: &Value<'_>| Some(item.key("name")?.word()?.to_string());
+                let named = items.iter().position(|item| name_of(item).is_some_and(|name| name == first));
+                let index = named.or_else(|| first.parse().ok()).filter(|&index| index < items.len());
+                let names = |(index, item): (usize, &Value<'_>)| name_of(item).unwrap_or_else(|| index.to_string());
+                let Some(index) = index else {
+                    let names: Vec<String> = items.iter().enumerate().map(names).collect();
+                    return Err(format!("found no {}, allowed {}", shorten(first), names.join(", ")));
+                };
+                items[index].set(rest, value)
+            }
+            Kind::Table(items) => {
+                let index = items.iter().position(|(key, _)| key == first).unwrap_or_else(|| {
+                    items.push((first.into(), Value { set_by: value.set_by, ..Value::empty_table() }));
+                    items.len() - 1
+                });
+                items[index].1.set(rest, value)
+            }
+            _ => Err(format!("found {found}, which has no key {}", shorten(first))),
+        }
+    }
+
+    /// Returns the value of a key of a table.
+    pub(crate) fn key(&self, key: &str) -> Option<&Value<'a>> {
+        self.table()?.iter().find(|(name, _)| name == key).map(|(_, value)| value)
     }
 
     /// Returns the items of a list.
@@ -119,7 +165,7 @@ impl From<toml::Value> for Value<'_> {
             }
             other => Kind::Other(other.to_string()),
         };
-        Value { kind, written: None }
+        Value { kind, written: None, set_by: None }
     }
 }
 

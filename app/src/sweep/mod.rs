@@ -409,11 +409,9 @@ impl Grid {
     /// Writes the sweep file in normal form.
     fn normal(&self, mut base: Table, flags: &[Override], skip: bool) -> String {
         for Override { key, text, .. } in flags {
-            let (section, leaf) = key.split_once('.').unwrap_or((key, ""));
             let value = format!("value = {text}").parse::<Table>().ok().and_then(|mut table| table.remove("value"));
-            let section = base.entry(section).or_insert_with(|| Value::Table(Table::new()));
-            if let (Some(section), Some(value)) = (section.as_table_mut(), value) {
-                section.insert(leaf.into(), value);
+            if let (Some(value), Some(place)) = (value, place(&mut base, key)) {
+                *place = value;
             }
         }
         // A shorter run has no stages that begin after its end, see `Config::read_noted`.
@@ -443,10 +441,29 @@ impl Grid {
     }
 }
 
-/// Returns the value of a dotted key in a config.
+/// Returns the value of a key in a config.
 fn value_of(config: &Config, key: &str) -> Option<Value> {
-    let (section, leaf) = key.split_once('.')?;
-    Table::try_from(config).ok()?.get(section)?.get(leaf).cloned()
+    let mut table = Table::try_from(config).ok()?;
+    let value = place(&mut table, key)?.clone();
+    (value != Value::Table(Table::new())).then_some(value)
+}
+
+/// Returns the place of a key in a config. A missing one gets an empty table.
+fn place<'t>(table: &'t mut Table, key: &str) -> Option<&'t mut Value> {
+    let mut path = config::key_path(key);
+    let mut value = table.entry(path.next()?).or_insert_with(|| Value::Table(Table::new()));
+    for part in path {
+        value = match value {
+            Value::Array(items) => {
+                let is_named = |item: &Value| item.get("name").and_then(Value::as_str) == Some(part);
+                let index = items.iter().position(is_named).or_else(|| part.parse().ok())?;
+                items.get_mut(index)?
+            }
+            Value::Table(table) => table.entry(part).or_insert_with(|| Value::Table(Table::new())),
+            _ => return None,
+        };
+    }
+    Some(value)
 }
 
 /// Returns a text that is the same for equal values only.

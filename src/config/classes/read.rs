@@ -59,44 +59,41 @@ pub(in crate::config) struct GroupSummary {
 impl Summary {
     /// Looks at the lists of a config.
     pub fn peek(r: &Reader<'_>) -> Summary {
-        fn get<'v, 'a>(table: &'v [(String, Value<'a>)], key: &str) -> Option<&'v Value<'a>> {
-            table.iter().find(|(name, _)| name == key).map(|(_, value)| value)
-        }
         let word = |value: Option<&Value<'_>>| value.and_then(Value::word).unwrap_or_default().to_string();
         let count = |value: Option<&Value<'_>>| value.and_then(Value::list).map_or(0, <[_]>::len);
-        let size = |table: &[(String, Value<'_>)]| {
-            let given = get(table, "count").and_then(usize::read).flatten().unwrap_or(0);
-            count(get(table, "at")).max(given.min(MAX_AGENTS))
+        let size = |table: &Value<'_>| {
+            let given = table.key("count").and_then(usize::read).flatten().unwrap_or(0);
+            count(table.key("at")).max(given.min(MAX_AGENTS))
         };
-        let class = |table: &[(String, Value<'_>)]| {
-            let control = get(table, "control").map_or(Some("policy"), Value::word);
+        let class = |table: &Value<'_>| {
+            let control = table.key("control").map_or(Some("policy"), Value::word);
             let control = control.and_then(Control::of);
             ClassSummary {
-                name: word(get(table, "name")),
-                has_rule: control == Some(Control::Follow) || count(get(table, "rule")) > 0,
+                name: word(table.key("name")),
+                has_rule: control == Some(Control::Follow) || count(table.key("rule")) > 0,
                 control,
                 agents: size(table),
-                observes: get(table, "observes").and_then(|value| value.flag()).unwrap_or(true),
+                observes: table.key("observes").and_then(|value| value.flag()).unwrap_or(true),
             }
         };
-        let group = |table: &[(String, Value<'_>)]| GroupSummary {
-            name: word(get(table, "name")),
+        let group = |table: &Value<'_>| GroupSummary {
+            name: word(table.key("name")),
             pois: size(table),
-            value: get(table, "value").and_then(f64::read).flatten().unwrap_or(1.0),
+            value: table.key("value").and_then(f64::read).flatten().unwrap_or(1.0),
         };
         let tables = r.peek(POIS);
-        let groups: Vec<GroupSummary> = tables.iter().map(|table| group(table)).collect();
+        let groups: Vec<GroupSummary> = tables.iter().map(group).collect();
         let index: HashMap<&str, usize> =
             groups.iter().enumerate().map(|(index, group)| (&*group.name, index)).collect();
-        let after = |table: &&[(String, Value<'_>)]| {
-            let after = get(table, "after").map(|after| after.list().unwrap_or(std::slice::from_ref(after)));
+        let after = |table: &Value<'_>| {
+            let after = table.key("after").map(|after| after.list().unwrap_or(std::slice::from_ref(after)));
             let names = after.unwrap_or_default().iter().filter_map(Value::word);
             names.filter_map(|name| index.get(name).copied()).collect()
         };
         let after: Vec<Vec<usize>> = tables.iter().take(MAX_POIS).map(after).collect();
         let is_short = |groups: &Vec<usize>| groups.iter().all(|&group| group < after.len());
         let cycle = if after.iter().all(is_short) { cycle(&after).unwrap_or_default() } else { vec![] };
-        let mut classes: Vec<ClassSummary> = r.peek(AGENTS).into_iter().map(class).collect();
+        let mut classes: Vec<ClassSummary> = r.peek(AGENTS).iter().map(class).collect();
         let names: HashSet<String> = classes.iter().map(|class| class.name.clone()).collect();
         let is_wrong = |control: &Control| control.target().is_some_and(|target| !names.contains(target));
         for class in &mut classes {
