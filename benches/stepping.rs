@@ -63,7 +63,7 @@ fn measure(config: &Config, level: Level, teams: usize, rounds: usize) -> Result
         .flat_map(|team| (0..leaders).map(move |leader| (team, leader)))
         .flat_map(|(team, leader)| trace.moment(1, team, leader).outputs)
         .collect();
-    let mut stepper = Stepper::at_level(level, world.clone(), teams, Recording::None)?;
+    let mut stepper = Stepper::at_level(level, usize::MAX, world.clone(), teams, Recording::None)?;
     let mut states = 0.0;
     let mut steps = |with_states: bool| -> Result<(), Box<dyn Error>> {
         stepper.reset();

@@ -98,14 +98,20 @@ impl Played {
     }
 }
 
+/// Returns every instruction set, and the numbers of agents from which teams are large: all that may be, or none.
+fn ways_to_step() -> Vec<(Level, usize)> {
+    Cpu::levels().into_iter().flat_map(|level| [(level, 0), (level, usize::MAX)]).collect()
+}
+
 #[test]
 fn stepping_with_traced_actions_gives_the_bits_of_the_trace() {
-    for level in Cpu::levels() {
+    for (level, large_from) in ways_to_step() {
         // Fewer teams than a vector has lanes, as many, one more, and more vectors than one thread plays.
-        for (seed, teams) in (0..40).zip([1, 3, 16, 17, 37, 150].into_iter().cycle()) {
+        let most = if large_from == 0 { 3 } else { usize::MAX };
+        for (seed, teams) in (0..40).zip([1, 3, 16, 17, 37, 150].map(|teams| most.min(teams)).into_iter().cycle()) {
             let played = Played::new(seed, teams);
-            let case = format!("seed {seed}, {teams} teams, {}", level_name(level));
-            let stepper = Stepper::at_level(level, played.world.clone(), teams, Recording::SetsAndSights);
+            let case = format!("seed {seed}, {teams} teams, {}, large from {large_from}", level_name(level));
+            let stepper = Stepper::at_level(level, large_from, played.world.clone(), teams, Recording::SetsAndSights);
             let mut stepper = stepper.unwrap_or_else(|error| panic!("{case}: {error}"));
             stepper.reset_to(&played.starts_of(teams)).expect("the starts are on the map");
             let mut observed = vec![0; teams];
@@ -143,11 +149,11 @@ fn stepping_with_traced_actions_gives_the_bits_of_the_trace() {
 /// A team that is over does not move until its reset.
 #[test]
 fn each_team_can_be_reset_at_any_step() {
-    for (seed, level) in (0..20).zip(Cpu::levels().into_iter().cycle()) {
-        let teams = 21;
+    for (seed, (level, large_from)) in (0..40).zip(ways_to_step().into_iter().cycle()) {
+        let teams = if large_from == 0 { 5 } else { 21 };
         let played = Played::new(seed, teams);
         let (last, starts) = (played.world.steps(), played.starts_of(teams));
-        let stepper = Stepper::at_level(level, played.world.clone(), teams, Recording::SetsAndSights);
+        let stepper = Stepper::at_level(level, large_from, played.world.clone(), teams, Recording::SetsAndSights);
         let mut stepper = stepper.unwrap_or_else(|error| panic!("{error}"));
         stepper.reset_to(&starts).expect("the starts are on the map");
         let mut steps = vec![0; teams];
@@ -281,11 +287,11 @@ fn a_restored_stepper_continues_with_the_same_bits() {
         let config = sample::world(seed);
         let world = World::new(&config.validate().unwrap());
         let (teams, leaders, agents, pois) = (13, world.leaders(), world.agents(), world.pois.len());
-        let make = |level| {
+        let make = |level, large_from| {
             let recording = if seed % 2 == 0 { Recording::SetsAndSights } else { Recording::Sets };
-            Stepper::at_level(level, world.clone(), teams, recording).unwrap()
+            Stepper::at_level(level, large_from, world.clone(), teams, recording).unwrap()
         };
-        let mut original = make(Level::new());
+        let mut original = make(Level::new(), if seed % 4 < 2 { 0 } else { usize::MAX });
         // In every third world, each team has its own POIs.
         let moved = if seed % 3 == 0 { pois } else { 0 };
         let starts: Vec<f32> = (0..teams * (agents + moved))
@@ -303,8 +309,8 @@ fn a_restored_stepper_continues_with_the_same_bits() {
         original.reset_some(&chosen, None).unwrap();
         original.step(&actions(99)).unwrap();
         let state = original.save();
-        for level in Cpu::levels() {
-            let (mut restored, mut reference) = (make(level), make(Level::new()));
+        for (level, large_from) in ways_to_step() {
+            let (mut restored, mut reference) = (make(level, large_from), make(Level::new(), usize::MAX));
             restored.restore(&state).unwrap();
             reference.restore(&state).unwrap();
             assert_eq!(restored.save(), state, "world {seed}");
@@ -329,7 +335,7 @@ fn a_restored_stepper_continues_with_the_same_bits() {
         }
         // The stepper that was never restored continues with the same bits.
         let mut inputs: Vec<Vec<u32>> = vec![];
-        let mut restored = make(Level::new());
+        let mut restored = make(Level::new(), usize::MAX);
         restored.restore(&state).unwrap();
         for stepper in [&mut original, &mut restored] {
             (0..world.steps()).for_each(|step| stepper.step(&actions(step)).unwrap());
@@ -347,25 +353,34 @@ fn a_poi_that_is_gone_stays_so_in_a_saved_state() {
                 senses = [{ of = \"pois\", sectors = 1, measure = \"closeness\", range = 50 }]\n\
                 [[pois]]\nname = \"p\"\nat = [[13, 10]]\ncoupling = 1\ngone_within = 1.5\n";
     let world = World::new(&Config::parse(text, "x.toml").unwrap().validate().unwrap());
-    let make = || Stepper::new(world.clone(), 3, Recording::SetsAndSights).unwrap();
-    let mut stepper = make();
-    let senses = |stepper: &Stepper| stepper.inputs().iter().map(|&input| input > 0.0).collect::<Vec<_>>();
-    // The second team stays, and the others pass the POI.
-    let actions = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0];
-    let mut seen = vec![];
-    for _ in 0..6 {
-        seen.push(senses(&stepper));
-        stepper.step(&actions).unwrap();
+    for (level, large_from) in ways_to_step() {
+        let make = || Stepper::at_level(level, large_from, world.clone(), 3, Recording::SetsAndSights).unwrap();
+        let mut stepper = make();
+        let senses = |stepper: &Stepper| stepper.inputs().iter().map(|&input| input > 0.0).collect::<Vec<_>>();
+        // The second team stays, and the others pass the POI.
+        let actions = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0];
+        let mut seen = vec![];
+        for _ in 0..6 {
+            seen.push(senses(&stepper));
+            stepper.step(&actions).unwrap();
+        }
+        assert_eq!(
+            seen,
+            [
+                [true; 3],
+                [true; 3],
+                [false, true, false],
+                [false, true, false],
+                [false, true, false],
+                [false, true, false]
+            ]
+        );
+        let mut restored = make();
+        restored.restore(&stepper.save()).unwrap();
+        assert_eq!((senses(&restored), restored.save()), (vec![false, true, false], stepper.save()));
+        restored.reset_some(&[true, false, false], None).unwrap();
+        assert_eq!(senses(&restored), [true, true, false]);
     }
-    assert_eq!(
-        seen,
-        [[true; 3], [true; 3], [false, true, false], [false, true, false], [false, true, false], [false, true, false]]
-    );
-    let mut restored = make();
-    restored.restore(&stepper.save()).unwrap();
-    assert_eq!((senses(&restored), restored.save()), (vec![false, true, false], stepper.save()));
-    restored.reset_some(&[true, false, false], None).unwrap();
-    assert_eq!(senses(&restored), [true, true, false]);
 }
 
 #[test]

@@ -166,7 +166,7 @@ fn pictures_and_pages_show_classes_radii_and_values() {
     for text in labels.into_iter().chain(["at a POI: agents it needs within its circle, and its value"]) {
         assert!(layout.contains(&format!("aria-label=\"{text}\"")), "{text}");
     }
-    assert!(layout.contains(" Observers: rover, drone."), "sheep do not observe");
+    assert!(layout.contains(" rover or drone observes near and far."), "sheep do not observe");
     assert!(layout.contains("r=\"11.2\""), "what moves freely is a disc in the legend");
     // 80 mm show 40 units, and an SVG has 10 units per millimetre.
     for radius in [5, 3] {

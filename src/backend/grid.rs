@@ -11,11 +11,11 @@ const MOST_CELLS_PER_SIDE: f32 = 8192.0;
 
 /// Smaller teams are faster in vectors of teams, where all pairs are visited: on a CPU with 256 agents 15 times, with 512 eight
 /// times, if a third of them learns.
-pub(super) const LARGE_FROM: usize = MAX_LEARNERS + 1;
+pub(crate) const LARGE_FROM: usize = MAX_LEARNERS + 1;
 
 /// Reports whether teams of a world play one at a time, in cells: those of at least so many agents, with everything but
 /// pursuit, senses of each agent, and motion near others only.
-pub(super) fn is_large(world: &World, from: usize) -> bool {
+pub(crate) fn is_large(world: &World, from: usize) -> bool {
     world.agents() >= from
         && world.classes.iter().all(|class| {
             let shape = &class.constants.shape;

@@ -23,7 +23,7 @@ pub mod cpu;
 mod error;
 #[cfg(feature = "gpu")]
 pub mod gpu;
-mod grid;
+pub(crate) mod grid;
 mod scores;
 mod size;
 mod trace;

@@ -23,15 +23,19 @@ use std::cell::RefCell;
 use fearless_simd::{Level, dispatch};
 use glam::Vec2;
 
-use crate::config::{Fitness, MAX_LEARNERS, MAX_POPULATION};
+use crate::backend::cpu::block_bytes;
+use crate::backend::grid::{LARGE_FROM, is_large};
+use crate::config::{Fitness, MAX_POPULATION};
 use crate::credit::{Credit, Scores};
 use crate::parallel::*;
 use crate::world::{GRID, OUTPUTS, World, on_grid};
 
 mod engine;
+mod large;
 mod state;
 
 use engine::{Command, Observations, VECTORS_PER_TASK, Vectors, vectors};
+use large::large_teams;
 
 /// Teams of one world, each at its own step.
 ///
@@ -73,9 +77,6 @@ pub enum StepError {
     /// The number of teams is 0 or too large.
     #[error("{0} teams; there may be 1 to {MAX_POPULATION}")]
     Teams(usize),
-    /// A team has too many agents.
-    #[error("teams of {0} agents; those that are stepped may have up to {MAX_LEARNERS}")]
-    Agents(usize),
     /// The system has too little memory.
     #[error("not enough memory for {teams} teams, {bytes} bytes")]
     Memory {
@@ -165,19 +166,22 @@ impl Stepper {
     /// # Errors
     /// The number of teams is 0 or above [`MAX_POPULATION`], or there is too little memory.
     pub fn new(world: World, teams: usize, recording: Recording) -> Result<Stepper, StepError> {
-        Stepper::at_level(Level::new(), world, teams, recording)
+        Stepper::at_level(Level::new(), LARGE_FROM, world, teams, recording)
     }
 
-    /// [`Stepper::new`] with a given instruction set, for tests and benchmarks.
+    /// [`Stepper::new`] with a given instruction set, and large teams of at least so many agents, for tests and benchmarks.
     ///
     /// # Errors
     /// See [`Stepper::new`].
-    pub fn at_level(level: Level, world: World, teams: usize, recording: Recording) -> Result<Stepper, StepError> {
+    pub fn at_level(
+        level: Level,
+        large_from: usize,
+        world: World,
+        teams: usize,
+        recording: Recording,
+    ) -> Result<Stepper, StepError> {
         if !(1..=MAX_POPULATION).contains(&teams) {
             return Err(StepError::Teams(teams));
-        }
-        if world.agents() > MAX_LEARNERS {
-            return Err(StepError::Agents(world.agents()));
         }
         let (agents, leaders, pois) = (world.agents(), world.leaders(), world.pois.len());
         let words = world.constants.words as usize;
@@ -189,13 +193,21 @@ impl Stepper {
             Recording::Sets => [world.set_words(), 0],
             Recording::SetsAndSights => [world.set_words(), world.sight_words()],
         };
-        let in_vectors =
-            agents * 6 + leaders * (world.inputs() + OUTPUTS) + world.followers() * (11 + leaders) + pois * words;
-        let numbers = in_vectors + sets + trail + leaders * world.inputs() + agents * 5 + pois * (words + 1) + 1;
+        let is_large = is_large(&world, large_from);
+        let state = if is_large {
+            block_bytes(&world, if sets > 0 { Fitness::Df } else { Fitness::G }) as usize / 4
+        } else {
+            agents * 6 + leaders * (world.inputs() + OUTPUTS) + world.followers() * (11 + leaders) + pois * words + sets
+        };
+        let numbers = state + trail + leaders * world.inputs() + agents * 5 + pois * (words + 1) + 1;
         let bytes = numbers as u128 * 4 * teams as u128;
         let probe = usize::try_from(bytes).ok().and_then(|bytes| Vec::<u8>::new().try_reserve_exact(bytes).ok());
         probe.ok_or(StepError::Memory { teams, bytes })?;
-        let vectors = dispatch!(level, simd => vectors(simd, &world, teams, [sets, trail]));
+        let vectors = dispatch!(level, simd => if is_large {
+            large_teams(simd, &world, teams, recording)
+        } else {
+            vectors(simd, &world, teams, [sets, trail])
+        });
         let observations = Observations {
             inputs: vec![0.0; teams * leaders * world.inputs()],
             agents_at_poi: vec![0; teams * pois * words],

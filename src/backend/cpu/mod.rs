@@ -34,11 +34,12 @@ pub(crate) use block::{Block, BlockState};
 pub use forward::forward;
 pub(crate) use steps::step_sizes;
 pub use steps::{Noise, StepArrays};
+pub(crate) use swarm::{Recorded, Swarm};
 pub(crate) use transpose::transpose_rows;
 
 use batch::{WorldBatch, world_batches};
 use episode::{EpisodeBlock, Observer, sight_words};
-use swarm::{Recorded, Swarm, Watch};
+use swarm::Watch;
 
 /// Plays episodes on the CPU, with the widest instruction set that it has, on the threads of the current rayon pool.
 pub struct Cpu {

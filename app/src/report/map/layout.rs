@@ -6,7 +6,7 @@ use super::{
     FAINT, Legend, Marker, Poi, Team, Viewport, counted, heading_of, poi_label, radius_of, sample_note, values_differ,
 };
 use crate::report::scene::{Anchor, BLACK, Pen, Scene};
-use flotilla::config::{Observers, Region, StageConfig, drawn_agents};
+use flotilla::config::{AgentClass, Classes, Observers, PoiGroup, Region, StageConfig, drawn_agents};
 use flotilla::world::World;
 
 /// Returns the team of a config before training.
@@ -79,6 +79,10 @@ pub fn layout(name: &str, config: &StageConfig) -> Scene {
         _ => format!("what each POI needs has no room here; it counts {within}"),
     };
     legend.note(needs);
+    let observers = if config.agents.is_empty() { vec![] } else { observers(&classes) };
+    if observers.len() > 1 {
+        legend.note(observers.join("; "));
+    }
     sample_note(&world).into_iter().for_each(|note| legend.note(note));
     let agents = config.agents.iter().filter_map(|class| Some((class.name.clone(), class.region?)));
     let pois = config.pois.iter().filter_map(|group| Some((format!("POIs of {}", group.name), group.region?)));
@@ -122,11 +126,7 @@ pub fn layout(name: &str, config: &StageConfig) -> Scene {
         format!("{what} at {}{more}. ", list.join(", "))
     };
     let who = match config.drawn().observers {
-        _ if !config.agents.is_empty() => {
-            let observes = |&class: &usize| (0..classes.pois.len()).any(|group| classes.observes(class, group));
-            let names = (0..classes.agents.len()).filter(observes).map(|class| classes.agents[class].name.as_str());
-            format!(" Observers: {}.", names.collect::<Vec<_>>().join(", "))
-        }
+        _ if !config.agents.is_empty() => format!(" {}.", observers.join("; ")),
         Observers::All => String::new(),
         observers => format!(" Only {observers} observe."),
     };
@@ -142,6 +142,21 @@ pub fn layout(name: &str, config: &StageConfig) -> Scene {
         places("POIs", &pois),
     );
     scene
+}
+
+/// Returns who observes which groups of POIs, each as `rover observes near and pair`.
+fn observers(classes: &Classes) -> Vec<String> {
+    let mut groups_of: Vec<(String, Vec<&str>)> = vec![];
+    for (group, PoiGroup { name, .. }) in classes.pois.iter().enumerate() {
+        let observes =
+            |(class, agents): (usize, &AgentClass)| classes.observes(class, group).then(|| agents.name.clone());
+        let who = classes.agents.iter().enumerate().filter_map(observes).collect::<Vec<_>>().join(" or ");
+        match groups_of.iter_mut().find(|(other, _)| *other == who) {
+            Some((_, groups)) => groups.push(name),
+            None => groups_of.push((who, vec![name.as_str()])),
+        }
+    }
+    groups_of.into_iter().map(|(who, groups)| format!("{who} observes {}", groups.join(" and "))).collect()
 }
 
 /// Describes when POIs can be observed, for at most 12 of them.

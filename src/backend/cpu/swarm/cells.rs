@@ -107,8 +107,8 @@ impl Cells {
         }
     }
 
-    /// Puts the agents at their start, with their headings, `[agents]` of the team, and speed.
-    pub fn start(&mut self, starts: &[Vec2], headings: &[Vec2], speed: f32) {
+    /// Puts the agents into their places, with their headings, `[agents]` of the team, and speeds.
+    pub fn place(&mut self, starts: &[Vec2], headings: &[Vec2], speed: impl Fn(usize) -> f32) {
         let own = self.agents.clone();
         for (slot, (agent, (start, heading))) in
             own.clone().zip(starts[own.clone()].iter().zip(&headings[own])).enumerate()
@@ -117,7 +117,7 @@ impl Cells {
             next.agents[slot] = agent as u32;
             (next.x[slot], next.y[slot]) = (start.x, start.y);
             (next.hx[slot], next.hy[slot]) = (heading.x, heading.y);
-            next.speed[slot] = speed;
+            next.speed[slot] = speed(agent);
         }
         self.sort();
     }

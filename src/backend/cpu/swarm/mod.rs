@@ -47,7 +47,7 @@ impl<S: Simd> Watch<S> for () {}
 
 /// The parts of a team's record besides the sets of agents at POIs.
 #[derive(Clone, Copy, PartialEq, Eq)]
-pub(super) struct Recorded {
+pub(crate) struct Recorded {
     /// The number of steps at which each follower saw each leader.
     pub counts: bool,
     /// The leaders that each follower saw at each step.
@@ -57,7 +57,7 @@ pub(super) struct Recorded {
 }
 
 /// One large team: its state, policies and record.
-pub(super) struct Swarm<S: Simd> {
+pub(crate) struct Swarm<S: Simd> {
     pub simd: S,
     /// The number of each lane.
     lanes: S::u32s,
@@ -160,7 +160,7 @@ impl<S: Simd> Swarm<S> {
     }
 
     /// Plays the whole episode of a team of the batch.
-    pub fn play(&mut self, batch: &WorldBatch<'_>, team: usize, watch: &mut impl Watch<S>) {
+    pub(super) fn play(&mut self, batch: &WorldBatch<'_>, team: usize, watch: &mut impl Watch<S>) {
         let place = batch.locate(team);
         let group = &batch.groups[place.0];
         let (leaders, steps) = (batch.world.leaders(), batch.world.steps());
@@ -168,15 +168,8 @@ impl<S: Simd> Swarm<S> {
             #[inline(always)]
             |vector, lane| batch.policy((vector * S::f32s::LEN + lane).min(leaders - 1), place),
         );
-        self.pois.clear();
-        self.pois.extend(group.pois());
-        self.gone.fill(false);
-        for (cells, class) in self.cells.iter_mut().zip(&self.constants) {
-            cells.start(group.starts, group.headings(), class.constants.motion.speed);
-        }
-        [&mut self.sets, &mut self.counts, &mut self.sights].into_iter().for_each(|record| record.fill(0));
+        self.start(group.starts, group.headings(), group.pois());
         watch.started(self);
-        self.record_positions(0);
         for step in 0..steps {
             self.sense();
             self.network.decide(&self.inputs, &mut self.outputs);
@@ -186,8 +179,52 @@ impl<S: Simd> Swarm<S> {
         }
     }
 
+    /// Puts the agents at their start, with their headings, both `[agents]`, and the POIs into their places.
+    pub fn start(&mut self, starts: &[Vec2], headings: &[Vec2], pois: &[Vec2]) {
+        self.place(starts, headings, pois, |_, initial| initial);
+        [&mut self.sets, &mut self.counts, &mut self.sights].into_iter().for_each(|record| record.fill(0));
+        // Nobody is anywhere at moments that have not come.
+        self.paths.fill(f32::NAN.to_bits());
+        self.record_positions(0);
+    }
+
+    /// Puts agents and POIs into their places, with headings, and speeds by agent and initial speed. All POIs are there.
+    pub fn place(&mut self, places: &[Vec2], headings: &[Vec2], pois: &[Vec2], speed: impl Fn(usize, f32) -> f32) {
+        self.pois.clear();
+        self.pois.extend(pois);
+        self.gone.fill(false);
+        for (cells, class) in self.cells.iter_mut().zip(&self.constants) {
+            cells.place(places, headings, |agent| speed(agent, class.constants.motion.speed));
+        }
+    }
+
+    /// Returns whether each POI of [`GoneWithin`] is gone, all bits or none, `[gone_within]`.
+    pub fn gone(&self) -> impl Iterator<Item = u32> {
+        self.gone_within.iter().map(|of| if self.gone[of.poi] { u32::MAX } else { 0 })
+    }
+
+    /// Sets which POIs are gone, as [`Swarm::gone`] returns them.
+    pub fn set_gone(&mut self, gone: &[u32]) {
+        self.gone_within.iter().zip(gone).for_each(|(of, &gone)| self.gone[of.poi] = gone != 0);
+    }
+
+    /// Returns the record: the sets, the counts, and the paths, or without these the sightings.
+    pub fn record_mut(&mut self) -> [&mut [u32]; 3] {
+        let Swarm { sets, counts, sights, paths, .. } = self;
+        [sets, counts, if paths.is_empty() { sights } else { paths }]
+    }
+
+    /// Uses actions, `[leaders][2]`, as the policies' outputs.
+    pub fn take(&mut self, actions: &[f32]) {
+        for (leader, &action) in actions.as_chunks::<OUTPUTS>().0.iter().enumerate() {
+            for (output, action) in self.outputs[leader / S::f32s::LEN].iter_mut().zip(action) {
+                output[leader % S::f32s::LEN] = action.clamp(-1.0, 1.0);
+            }
+        }
+    }
+
     /// Plays a step by the leaders' outputs, and records it.
-    fn step(&mut self, step: usize) {
+    pub fn step(&mut self, step: usize) {
         self.simd.vectorize(
             #[inline(always)]
             || {
@@ -207,7 +244,7 @@ impl<S: Simd> Swarm<S> {
     }
 
     /// Scores the team of the batch that was played.
-    pub fn score(&self, batch: &WorldBatch<'_>, team: usize, scores: &ScoreTable<'_>) {
+    pub(super) fn score(&self, batch: &WorldBatch<'_>, team: usize, scores: &ScoreTable<'_>) {
         let (group, team) = batch.locate(team);
         scores.score(batch.first + group, team, &self.episode());
     }
@@ -225,7 +262,7 @@ impl<S: Simd> Swarm<S> {
     }
 
     /// Computes the inputs of the leaders' policies, channel by channel.
-    fn sense(&mut self) {
+    pub fn sense(&mut self) {
         let Swarm { simd, cells, pois, gone, gone_within, .. } = self;
         for GoneWithin { poi, distance2, classes } in gone_within {
             for &class in &*classes {
