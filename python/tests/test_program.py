@@ -109,7 +109,8 @@ def test_a_sweep_is_compared_by_its_folder(config):
 
 
 def test_warnings_name_the_caller_s_file_and_python_s_arguments(config):
-    runs = [train(config.replace(learning={"fitness": fitness})) for fitness in ("G", "Df")]
+    # With fewer than six pairs, no test could decide.
+    runs = [train(config.replace(learning={"fitness": fitness, "trials": 6})) for fitness in ("G", "Df")]
     with pytest.warns(RuntimeWarning, match="paired=True compares pair by pair") as warned:
         notes = flotilla.compare(runs)["notes"]
     assert {each.filename for each in warned} == {__file__} and "--" not in "".join(notes)
