@@ -626,6 +626,7 @@ fn flags_set_keys_of_classes_and_groups() {
         ("agents.dog.speed", "-3"),
         ("agents.dog.sped", "3"),
         ("agents.dog.name.x", "3"),
+        ("agents.uav.senses[2].range", "3"),
         (&format!("agents{}", ".x".repeat(200_000)), "3"),
         ("agents.dog.at[0][1]", "'x'"),
         ("learning.paradigm", "'all-leaders'"),
@@ -640,12 +641,13 @@ fn flags_set_keys_of_classes_and_groups() {
         problems,
         [
             "--set: found 3, allowed a list of 1 to 8 tables [[agents]]",
-            "--set: found no 9, allowed uav, dog",
-            "--set: found no wolf, allowed uav, dog",
+            "--set: found no 9 in a list of 2, allowed uav, dog",
+            "--set: found no wolf in a list of 2, allowed uav, dog",
             "--set: found 3, allowed a table",
             "--set: found -3, allowed 0 to 3 (motion.min_speed to motion.max_speed)",
             "--set: unknown key, did you mean `speed`?",
             "--set: found \"dog\", which has no key x",
+            "--set: found no 2 in a list of 2",
             "--set: found 200000 parts after `agents`, allowed up to 8",
             "--set: found 'x', allowed a number, 0 to 50 (the map)",
             "--set: found in a config with [[agents]], which replaces this key; to write a config in full, use `flotilla \

@@ -206,7 +206,7 @@ struct Entry<'a> {
 }
 
 impl<'a> Entry<'a> {
-    /// A value in a list or a table, which may be from `outside` the file, by its place there.
+    /// Returns the entry of a value in a list or table. Its name is its place there, or the override that set it.
     fn within(outside: bool, value: Value<'a>, place: impl FnOnce() -> String) -> Entry<'a> {
         let name = value.set_by.map_or_else(place, Into::into);
         Entry { outside: outside || value.set_by.is_some(), value, name }
@@ -418,7 +418,7 @@ impl<'a> Reader<'a> {
         self.entries.insert(key.into(), Entry { value, outside: true, name });
     }
 
-    /// Sets some keys. Keys of the tables of these lists have the table's name or index in their own, and that of an item:
+    /// Sets some keys. A key of a table in one of `lists` contains the name or the index of the table:
     /// `agents.uav.senses[2].range`.
     pub fn set_all(&mut self, overrides: &'a [Override], lists: &[&str]) {
         for Override { key, text, name } in overrides {
@@ -432,7 +432,7 @@ impl<'a> Reader<'a> {
                 [list, path @ ..] if !path.is_empty() && lists.contains(list) => {
                     let stray = self.strays.iter_mut().find(|entry| entry.name == *list);
                     let set = match stray.or_else(|| self.entries.get_mut(*list)) {
-                        // Tables would be nested as deeply.
+                        // Otherwise a long key would nest tables until the stack overflows.
                         _ if path.len() > MAX_PARTS => {
                             Err(format!("found {} parts after `{list}`, allowed up to {MAX_PARTS}", path.len()))
                         }

@@ -67,11 +67,11 @@ impl<'a> Value<'a> {
         Value { kind: Kind::Table(vec![]), written: None, set_by: None }
     }
 
-    /// Sets a value in nested lists and tables: `["uav", "senses", "2", "range"]` is a key of the third item of a list in
-    /// the table of a list whose `name` is `uav`.
+    /// Sets a value in nested lists and tables. In a list, a part of the path is the `name` of a table or an index. In a table
+    /// it is a key: `["uav", "senses", "2", "range"]`.
     ///
     /// # Errors
-    /// What is found instead of such a value.
+    /// A list has no such table or item, or a value is neither a list nor a table.
     pub(super) fn set(&mut self, path: &[&str], value: Value<'a>) -> Result<(), String> {
         let &[first, ref rest @ ..] = path else {
             *self = value;
@@ -80,13 +80,12 @@ impl<'a> Value<'a> {
         let found = self.found();
         match &mut self.kind {
             Kind::List(items) => {
-                let name_of = |item: &Value<'_>| Some(item.key("name")?.word()?.to_string());
-                let named = items.iter().position(|item| name_of(item).is_some_and(|name| name == first));
+                let named = items.iter().position(|item| item.name() == Some(first));
                 let index = named.or_else(|| first.parse().ok()).filter(|&index| index < items.len());
-                let names = |(index, item): (usize, &Value<'_>)| name_of(item).unwrap_or_else(|| index.to_string());
                 let Some(index) = index else {
-                    let names: Vec<String> = items.iter().enumerate().map(names).collect();
-                    return Err(format!("found no {}, allowed {}", shorten(first), names.join(", ")));
+                    let names: Vec<&str> = items.iter().filter_map(Value::name).collect();
+                    let names = if names.is_empty() { "".into() } else { format!(", allowed {}", names.join(", ")) };
+                    return Err(format!("found no {} in {found}{names}", shorten(first)));
                 };
                 items[index].set(rest, value)
             }
@@ -99,6 +98,11 @@ impl<'a> Value<'a> {
             }
             _ => Err(format!("found {found}, which has no key {}", shorten(first))),
         }
+    }
+
+    /// Returns the name of a table in a list.
+    fn name(&self) -> Option<&str> {
+        self.key("name")?.word()
     }
 
     /// Returns the value of a key of a table.

@@ -119,17 +119,7 @@ pub(super) const VECTORS_PER_TASK: usize = 8;
 impl<S: Simd> Vectors for TeamBlocks<S> {
     fn run(&mut self, world: &World, moved: &[Vec2], command: Command<'_>, observations: &mut Observations) {
         let (simd, idle) = (self.simd, &self.idle);
-        let Observations { inputs, agents_at_poi, newly, observed, steps, positions, headings, speeds } = observations;
-        let mut all = StepArrays { positions, headings, speeds, inputs, agents_at_poi, ..StepArrays::default() };
-        let (sizes, pois) = (step_sizes(world, 1, 1), world.pois.len());
-        let flags = newly.chunks_mut(pois * S::f32s::LEN).zip(observed.chunks_mut(pois * S::f32s::LEN));
-        let flags = flags.zip(steps.chunks_mut(S::f32s::LEN));
-        let mut parts: Vec<_> = (self.blocks.iter_mut().zip(flags))
-            .map(|(block, ((newly, observed), steps))| {
-                let arrays = all.split(sizes, block.teams);
-                (block, Slices { arrays, newly, observed, steps })
-            })
-            .collect();
+        let mut parts: Vec<_> = self.blocks.iter_mut().zip(observations.split(world, S::f32s::LEN)).collect();
         let run = |parts: &mut [(&mut TeamBlock<S>, Slices<'_>)]| {
             let workspace = lock(idle).pop();
             let mut workspace = workspace.unwrap_or_else(|| Box::new(Workspace::new(simd, world)));
@@ -176,12 +166,37 @@ impl<S: Simd> Vectors for TeamBlocks<S> {
     }
 }
 
-/// The [`Observations`] of one vector of teams.
-struct Slices<'a> {
-    arrays: StepArrays<'a>,
-    newly: &'a mut [bool],
-    observed: &'a mut [bool],
-    steps: &'a mut [u32],
+/// The [`Observations`] of some teams.
+pub(super) struct Slices<'a> {
+    pub(super) arrays: StepArrays<'a>,
+    pub(super) newly: &'a mut [bool],
+    pub(super) observed: &'a mut [bool],
+    pub(super) steps: &'a mut [u32],
+}
+
+impl Observations {
+    /// Splits the arrays into those of at most `most` teams each.
+    pub(super) fn split<'o>(&'o mut self, world: &World, most: usize) -> impl Iterator<Item = Slices<'o>> {
+        let Observations { inputs, agents_at_poi, newly, observed, steps, positions, headings, speeds } = self;
+        let mut all = StepArrays { positions, headings, speeds, inputs, agents_at_poi, ..StepArrays::default() };
+        let (sizes, pois) = (step_sizes(world, 1, 1), world.pois.len());
+        let flags = newly.chunks_mut(pois * most).zip(observed.chunks_mut(pois * most));
+        flags.zip(steps.chunks_mut(most)).map(move |((newly, observed), steps)| {
+            let arrays = all.split(sizes, steps.len());
+            Slices { arrays, newly, observed, steps }
+        })
+    }
+}
+
+impl Slices<'_> {
+    /// Clears the observations of a team that is reset.
+    pub(super) fn reset(&mut self, world: &World, team: usize) {
+        let (pois, words) = (world.pois.len(), world.words_per_step());
+        self.arrays.agents_at_poi[team * words..][..words].fill(0);
+        self.newly[team * pois..][..pois].fill(false);
+        self.observed[team * pois..][..pois].fill(false);
+        self.steps[team] = 0;
+    }
 }
 
 /// Returns the team in a lane. Unused lanes repeat the first team.
@@ -276,9 +291,9 @@ impl<S: Simd> Workspace<S> {
         block: &mut TeamBlock<S>,
         chosen: Option<&[bool]>,
         [starts, headings]: [Option<&[Vec2]>; 2],
-        Slices { arrays, newly, observed, steps }: &mut Slices<'_>,
+        slices: &mut Slices<'_>,
     ) -> bool {
-        let (agents, pois, words) = (world.agents(), world.pois.len(), world.words_per_step());
+        let agents = world.agents();
         let TeamBlock { first, teams, ref mut record, ref mut trail, .. } = *block;
         let is_chosen = |team: usize| chosen.is_none_or(|chosen| chosen[team]);
         if !(first..first + teams).any(is_chosen) {
@@ -299,10 +314,7 @@ impl<S: Simd> Workspace<S> {
         }
         let (size, trailed) = (record.len() / teams, trail.len() / teams);
         for team in (0..teams).filter(|team| is_chosen(first + team)) {
-            arrays.agents_at_poi[team * words..][..words].fill(0);
-            newly[team * pois..][..pois].fill(false);
-            observed[team * pois..][..pois].fill(false);
-            steps[team] = 0;
+            slices.reset(world, team);
             record[team * size..][..size].fill(0);
             trail[team * trailed..][..trailed].fill(unrecorded(world));
             self.record_positions(world, trail, team, 0);

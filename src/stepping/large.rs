@@ -1,12 +1,12 @@
-//! The large teams behind a [`Stepper`](super::Stepper), which step one by one.
+//! Large teams behind a [`Stepper`](super::Stepper). Each steps by itself.
 
 use fearless_simd::Simd;
 use glam::Vec2;
 
 use super::Recording;
-use super::engine::{Command, Observations, Vectors};
+use super::engine::{Command, Observations, Slices, Vectors};
 use super::state::Saved;
-use crate::backend::cpu::{Recorded, StepArrays, Swarm, step_sizes};
+use crate::backend::cpu::{Recorded, StepArrays, Swarm};
 use crate::credit::Episode;
 use crate::parallel::*;
 use crate::world::{OUTPUTS, World};
@@ -17,15 +17,7 @@ struct LargeTeams<S: Simd> {
     recording: Recording,
 }
 
-/// The [`Observations`] of a team, with its actions if it steps.
-struct Slices<'a> {
-    arrays: StepArrays<'a>,
-    newly: &'a mut [bool],
-    observed: &'a mut [bool],
-    step: &'a mut u32,
-}
-
-/// Returns large teams.
+/// Returns teams without a state. A reset gives them one.
 pub(super) fn large_teams<S: Simd>(simd: S, world: &World, teams: usize, recording: Recording) -> Box<dyn Vectors> {
     let recorded = Recorded {
         counts: recording != Recording::None,
@@ -35,37 +27,29 @@ pub(super) fn large_teams<S: Simd>(simd: S, world: &World, teams: usize, recordi
     Box::new(LargeTeams { teams: (0..teams).map(|_| Swarm::new(simd, world, recorded)).collect(), recording })
 }
 
-/// Returns the numbers of a team, so many each, or none of an empty array.
-fn of_team<T>(numbers: &[T], team: usize, each: usize) -> &[T] {
-    numbers.get(team * each..(team + 1) * each).unwrap_or_default()
+/// Returns a part of an array whose parts have the same length. An empty array has empty parts.
+fn part<T>(numbers: &[T], index: usize, length: usize) -> &[T] {
+    numbers.get(index * length..(index + 1) * length).unwrap_or_default()
 }
 
 impl<S: Simd> Vectors for LargeTeams<S> {
     fn run(&mut self, world: &World, moved: &[Vec2], command: Command<'_>, observations: &mut Observations) {
-        let Observations { inputs, agents_at_poi, newly, observed, steps, positions, headings, speeds } = observations;
-        let mut all = StepArrays { positions, headings, speeds, inputs, agents_at_poi, ..StepArrays::default() };
-        let (sizes, pois) = (step_sizes(world, 1, 1), world.pois.len());
-        let flags = newly.chunks_mut(pois).zip(observed.chunks_mut(pois)).zip(steps);
-        let mut parts: Vec<_> = (self.teams.iter_mut().zip(flags))
-            .map(|(team, ((newly, observed), step))| {
-                (team, Slices { arrays: all.split(sizes, 1), newly, observed, step })
-            })
-            .collect();
-        let pois_of = |team| moved.chunks_exact(pois).nth(team).unwrap_or(&world.pois);
+        let mut parts: Vec<_> = self.teams.iter_mut().zip(observations.split(world, 1)).collect();
+        let pois_of = |team| moved.chunks_exact(world.pois.len()).nth(team).unwrap_or(&world.pois);
         parts.par_iter_mut().enumerate().for_each(|(index, (team, slices))| {
             let has_changed = match command {
                 Command::Reset { chosen, .. } if chosen.is_some_and(|chosen| !chosen[index]) => false,
                 Command::Reset { starts, headings, .. } => {
-                    let starts = starts.map_or(&world.starts[..], |starts| of_team(starts, index, world.agents()));
+                    let starts = starts.map_or(&world.starts[..], |starts| part(starts, index, world.agents()));
                     let headings =
-                        headings.map_or(&world.headings[..], |headings| of_team(headings, index, world.agents()));
+                        headings.map_or(&world.headings[..], |headings| part(headings, index, world.agents()));
                     team.start(starts, headings, pois_of(index));
-                    slices.reset();
+                    slices.reset(world, 0);
                     true
                 }
-                Command::Step(actions) => slices.step(world, team, of_team(actions, index, world.leaders() * OUTPUTS)),
+                Command::Step(actions) => step(world, team, part(actions, index, world.leaders() * OUTPUTS), slices),
                 Command::Restore(saved) => {
-                    restore(team, saved, index, [world.agents(), world.gone_within.len()], pois_of(index));
+                    restore(world, team, saved, index, pois_of(index));
                     true
                 }
                 Command::Show => {
@@ -90,51 +74,39 @@ impl<S: Simd> Vectors for LargeTeams<S> {
     }
 }
 
-impl Slices<'_> {
-    fn reset(&mut self) {
-        self.arrays.agents_at_poi.fill(0);
-        [&mut self.newly, &mut self.observed].into_iter().for_each(|flags| flags.fill(false));
-        *self.step = 0;
+/// Plays a step with the actions of a team, `[leaders][2]`. Returns false if its episode is over already.
+fn step<S: Simd>(world: &World, team: &mut Swarm<S>, actions: &[f32], slices: &mut Slices<'_>) -> bool {
+    let Slices { arrays, newly, observed, steps } = slices;
+    newly.fill(false);
+    let step = steps[0] as usize;
+    if step >= world.steps() {
+        return false;
     }
-
-    /// Plays a step with the actions of a team, `[leaders][2]`. Returns whether its episode was not over.
-    fn step<S: Simd>(&mut self, world: &World, team: &mut Swarm<S>, actions: &[f32]) -> bool {
-        self.newly.fill(false);
-        let step = *self.step as usize;
-        if step >= world.steps() {
-            return false;
-        }
-        team.take(actions);
-        team.step(step);
-        let sets = of_team(&team.sets, step, world.words_per_step());
-        self.arrays.agents_at_poi.copy_from_slice(sets);
-        *self.step += 1;
-        for (poi, set) in sets.chunks_exact(world.constants.words as usize).enumerate() {
-            self.newly[poi] = !self.observed[poi]
-                && world.rule.is_open(poi, *self.step, self.observed)
-                && world.rule.count(poi, set.iter().copied()) >= world.coupling[poi];
-        }
-        self.observed.iter_mut().zip(&*self.newly).for_each(|(observed, newly)| *observed |= *newly);
-        true
+    team.take(actions);
+    team.step(step);
+    let sets = part(&team.sets, step, world.words_per_step());
+    arrays.agents_at_poi.copy_from_slice(sets);
+    steps[0] += 1;
+    for (poi, set) in sets.chunks_exact(world.constants.words as usize).enumerate() {
+        newly[poi] = !observed[poi]
+            && world.rule.is_open(poi, steps[0], observed)
+            && world.rule.count(poi, set.iter().copied()) >= world.coupling[poi];
     }
+    observed.iter_mut().zip(&**newly).for_each(|(observed, newly)| *observed |= *newly);
+    true
 }
 
-/// Puts a team into a saved state.
-fn restore<S: Simd>(
-    team: &mut Swarm<S>,
-    saved: &Saved<'_>,
-    index: usize,
-    [agents, gone_within]: [usize; 2],
-    pois: &[Vec2],
-) {
+/// Puts a team into a saved state. `index` is its index among the saved teams.
+fn restore<S: Simd>(world: &World, team: &mut Swarm<S>, saved: &Saved<'_>, index: usize, pois: &[Vec2]) {
+    let agents = world.agents();
     let [positions, headings] = [saved.positions, saved.headings].map(bytemuck::cast_slice);
-    let speeds = of_team(saved.speeds, index, agents);
-    team.place(of_team(positions, index, agents), of_team(headings, index, agents), pois, |agent, _| speeds[agent]);
-    team.set_gone(of_team(saved.gone, index, gone_within));
+    let speeds = part(saved.speeds, index, agents);
+    team.place(part(positions, index, agents), part(headings, index, agents), pois, |agent, _| speeds[agent]);
+    team.set_gone(part(saved.gone, index, world.gone_within.len()));
     for (record, saved) in team.record_mut().into_iter().zip([saved.record, saved.counts, saved.trail]) {
         if !saved.is_empty() {
             let each = record.len();
-            record.copy_from_slice(of_team(saved, index, each));
+            record.copy_from_slice(part(saved, index, each));
         }
     }
 }

@@ -169,7 +169,8 @@ impl Stepper {
         Stepper::at_level(Level::new(), LARGE_FROM, world, teams, recording)
     }
 
-    /// [`Stepper::new`] with a given instruction set, and large teams of at least so many agents, for tests and benchmarks.
+    /// [`Stepper::new`] with a given instruction set, for tests and benchmarks. Teams of `large_from` agents or more are
+    /// large, if large teams can play the world.
     ///
     /// # Errors
     /// See [`Stepper::new`].

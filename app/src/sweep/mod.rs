@@ -448,7 +448,8 @@ fn value_of(config: &Config, key: &str) -> Option<Value> {
     (value != Value::Table(Table::new())).then_some(value)
 }
 
-/// Returns the place of a key in a config. A missing one gets an empty table.
+/// Returns the place of a key's value in a config. A missing value becomes an empty table. Returns `None` if a list of the
+/// config has no such item.
 fn place<'t>(table: &'t mut Table, key: &str) -> Option<&'t mut Value> {
     let mut path = config::key_path(key);
     let mut value = table.entry(path.next()?).or_insert_with(|| Value::Table(Table::new()));

@@ -80,7 +80,7 @@ pub fn layout(name: &str, config: &StageConfig) -> Scene {
     };
     legend.note(needs);
     let observers = if config.agents.is_empty() { vec![] } else { observers(&classes) };
-    if observers.len() > 1 {
+    if (2..=4).contains(&observers.len()) {
         legend.note(observers.join("; "));
     }
     sample_note(&world).into_iter().for_each(|note| legend.note(note));
@@ -156,7 +156,11 @@ fn observers(classes: &Classes) -> Vec<String> {
             None => groups_of.push((who, vec![name.as_str()])),
         }
     }
-    groups_of.into_iter().map(|(who, groups)| format!("{who} observes {}", groups.join(" and "))).collect()
+    let named = |groups: Vec<&str>| match groups.len() {
+        ..=6 => groups.join(" and "),
+        count => format!("{} and {} more", groups[..5].join(", "), count - 5),
+    };
+    groups_of.into_iter().map(|(who, groups)| format!("{who} observes {}", named(groups))).collect()
 }
 
 /// Describes when POIs can be observed, for at most 12 of them.

@@ -107,7 +107,8 @@ impl Cells {
         }
     }
 
-    /// Puts the agents into their places, with their headings, `[agents]` of the team, and speeds.
+    /// Puts the agents into their places, with their headings, both `[agents]` of the team. `speed` returns the speed of an
+    /// agent from its index.
     pub fn place(&mut self, starts: &[Vec2], headings: &[Vec2], speed: impl Fn(usize) -> f32) {
         let own = self.agents.clone();
         for (slot, (agent, (start, heading))) in

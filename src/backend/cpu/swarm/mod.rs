@@ -183,12 +183,13 @@ impl<S: Simd> Swarm<S> {
     pub fn start(&mut self, starts: &[Vec2], headings: &[Vec2], pois: &[Vec2]) {
         self.place(starts, headings, pois, |_, initial| initial);
         [&mut self.sets, &mut self.counts, &mut self.sights].into_iter().for_each(|record| record.fill(0));
-        // Nobody is anywhere at moments that have not come.
+        // Episodes may be scored before their end. Agents are then at no place at the moments that are left.
         self.paths.fill(f32::NAN.to_bits());
         self.record_positions(0);
     }
 
-    /// Puts agents and POIs into their places, with headings, and speeds by agent and initial speed. All POIs are there.
+    /// Puts agents and POIs into their places. No POI is gone. `speed` returns the speed of an agent from its index and its
+    /// initial speed.
     pub fn place(&mut self, places: &[Vec2], headings: &[Vec2], pois: &[Vec2], speed: impl Fn(usize, f32) -> f32) {
         self.pois.clear();
         self.pois.extend(pois);
@@ -208,7 +209,7 @@ impl<S: Simd> Swarm<S> {
         self.gone_within.iter().zip(gone).for_each(|(of, &gone)| self.gone[of.poi] = gone != 0);
     }
 
-    /// Returns the record: the sets, the counts, and the paths, or without these the sightings.
+    /// Returns the sets and counts of the record, and its paths, or its sightings if it has no paths.
     pub fn record_mut(&mut self) -> [&mut [u32]; 3] {
         let Swarm { sets, counts, sights, paths, .. } = self;
         [sets, counts, if paths.is_empty() { sights } else { paths }]
