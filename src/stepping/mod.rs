@@ -85,71 +85,12 @@ pub enum StepError {
         /// Bytes needed.
         bytes: u128,
     },
-    /// An array has the wrong length.
-    #[error("{found} {what}, but {shape} are {expected}")]
-    Length {
-        /// The name of its elements.
-        what: &'static str,
-        /// The array's shape.
-        shape: &'static str,
-        /// The length that the shape needs.
-        expected: usize,
-        /// The array's length.
-        found: usize,
-    },
-    /// An action is infinite or not a number.
-    #[error("the {} of leader {leader} in team {team} is {value}, which is no finite number", ["turn", "speed"][*.output])]
-    Action {
-        /// The team, from 0.
-        team: usize,
-        /// The leader in its team, from 0.
-        leader: usize,
-        /// 0 for the turn, 1 for the speed.
-        output: usize,
-        /// The action.
-        value: f32,
-    },
-    /// A start position is off the map.
-    #[error("agent {agent} of team {team} would start at ({}, {}), which is not on the map", at[0], at[1])]
-    Start {
-        /// The team, from 0.
-        team: usize,
-        /// The agent in its team, leaders first.
-        agent: usize,
-        /// The position, in units.
-        at: [f32; 2],
-    },
-    /// A heading is no unit vector.
-    #[error("agent {agent} of team {team} would have the heading ({}, {}), which is no unit vector", heading[0], heading[1])]
-    Heading {
-        /// The team, from 0.
-        team: usize,
-        /// The agent in its team, leaders first.
-        agent: usize,
-        /// The heading.
-        heading: [f32; 2],
-    },
-    /// A POI is off the map.
-    #[error("POI {poi} of team {team} would be at ({}, {}), which is not on the map", at[0], at[1])]
-    Poi {
-        /// The team, from 0.
-        team: usize,
-        /// The POI, from 0.
-        poi: usize,
-        /// The position, in units.
-        at: [f32; 2],
-    },
+    /// An array has the wrong length, a number in it is out of range, or the team does not exist.
+    #[error("{0}")]
+    Invalid(String),
     /// A saved state does not fit.
     #[error("the saved state does not fit: {0}")]
     State(&'static str),
-    /// The team does not exist.
-    #[error("team {team} does not exist: there are {teams}, counted from 0")]
-    NoTeam {
-        /// The team, from 0.
-        team: usize,
-        /// The number of teams.
-        teams: usize,
-    },
     /// Scores need a record, see [`Recording`].
     #[error("no record to score; create the stepper with `Recording::Sets`")]
     NotRecorded,
@@ -297,13 +238,11 @@ impl Stepper {
         // The fast test covers all actions. Only if it fails is the index searched.
         if !actions.iter().fold(true, |finite, action| finite & action.is_finite()) {
             let index = actions.iter().position(|action| !action.is_finite()).unwrap_or(0);
-            let (leader, output) = (index / OUTPUTS, index % OUTPUTS);
-            return Err(StepError::Action {
-                team: leader / leaders,
-                leader: leader % leaders,
-                output,
-                value: actions[index],
-            });
+            let (team, leader) = (index / OUTPUTS / leaders, index / OUTPUTS % leaders);
+            let (output, value) = (["turn", "speed"][index % OUTPUTS], actions[index]);
+            return Err(StepError::Invalid(format!(
+                "the {output} of leader {leader} in team {team} is {value}, which is no finite number"
+            )));
         }
         self.run(Command::Step(actions));
         Ok(())
@@ -362,7 +301,8 @@ impl Stepper {
     /// The team does not exist, or no record was kept.
     pub fn scores(&self, team: usize) -> Result<Scores, StepError> {
         if team >= self.teams() {
-            return Err(StepError::NoTeam { team, teams: self.teams() });
+            let teams = self.teams();
+            return Err(StepError::Invalid(format!("team {team} does not exist: there are {teams}, counted from 0")));
         }
         let mut seen = Vec::new();
         let episode = self.vectors.episode(team, &self.world, &self.moved, &mut seen).ok_or(StepError::NotRecorded)?;
@@ -396,14 +336,9 @@ impl Stepper {
         self.vectors.run(&self.world, &self.moved, command, &mut self.observations);
     }
 
-    fn check_length(
-        &self,
-        what: &'static str,
-        shape: &'static str,
-        expected: usize,
-        found: usize,
-    ) -> Result<(), StepError> {
-        if found == expected { Ok(()) } else { Err(StepError::Length { what, shape, expected, found }) }
+    fn check_length(&self, what: &str, shape: &str, expected: usize, found: usize) -> Result<(), StepError> {
+        let message = || StepError::Invalid(format!("{found} {what}, but {shape} are {expected}"));
+        if found == expected { Ok(()) } else { Err(message()) }
     }
 
     /// Returns the starts of the chosen teams, with positions rounded to the grid.
@@ -420,21 +355,28 @@ impl Stepper {
         for (index, &[x, y]) in starts.as_chunks::<2>().0.iter().enumerate() {
             let (team, place) = (index / each, index % each);
             let (ignored, at) = (chosen.is_some_and(|chosen| !chosen[team]), Vec2::new(x, y));
-            let on_map = (0.0..=map.x).contains(&x) && (0.0..=map.y).contains(&y);
+            let on_map = ignored || (0.0..=map.x).contains(&x) && (0.0..=map.y).contains(&y);
             let settled = || if ignored { Vec2::ZERO } else { settled(at, map) };
+            let invalid = |what: String| Err(StepError::Invalid(what));
             if let (Some(headings), Some(agent)) = (&mut given.headings, place.checked_sub(agents + pois)) {
                 if !ignored && !(-1e-3..1e-3).contains(&(at.length_squared() - 1.0)) {
-                    return Err(StepError::Heading { team, agent, heading: [x, y] });
+                    return invalid(format!(
+                        "agent {agent} of team {team} would have the heading ({x}, {y}), which is no unit vector"
+                    ));
                 }
                 headings.push(at);
             } else if let Some(poi) = place.checked_sub(agents) {
-                if !ignored && !on_map {
-                    return Err(StepError::Poi { team, poi, at: [x, y] });
+                if !on_map {
+                    return invalid(format!(
+                        "POI {poi} of team {team} would be at ({x}, {y}), which is not on the map"
+                    ));
                 }
                 given.pois.push(settled());
             } else {
-                if !ignored && !on_map {
-                    return Err(StepError::Start { team, agent: place, at: [x, y] });
+                if !on_map {
+                    return invalid(format!(
+                        "agent {place} of team {team} would start at ({x}, {y}), which is not on the map"
+                    ));
                 }
                 given.starts.push(settled());
             }
