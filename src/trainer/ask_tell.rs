@@ -5,6 +5,7 @@
 use glam::Vec2;
 
 use super::Trainer;
+use super::stages::observed;
 use crate::world::World;
 
 /// Teams that one trial plays in a generation.
@@ -48,9 +49,7 @@ impl Trainer {
         let (mut g, mut scores) = (Vec::new(), Vec::new());
         for trial in &self.experiments[0].trials {
             let all = f64::from(world.total_worth) * trial.scores.len() as f64;
-            let observed =
-                |team: usize| trial.scores.iter().map(|episode| u64::from(episode.observed[team])).sum::<u64>();
-            g.extend((0..teams).map(|team| observed(team) as f64 / all));
+            g.extend((0..teams).map(|team| observed(&trial.scores, team) as f64 / all));
             let places = (0..teams).flat_map(|team| (0..world.leaders()).map(move |leader| (team, leader)));
             scores.extend(places.map(|place| stage.mean_score(&trial.scores, place)));
         }

@@ -5,7 +5,7 @@ use std::ops::Range;
 use fearless_simd::Level;
 
 use super::residency::Residency;
-use super::schedule::{Draw, TeamSchedule};
+use super::schedule::TeamSchedule;
 use super::stages::{Stage, Stages};
 use super::{Row, Snapshot};
 use crate::backend::GroupScores;
@@ -22,7 +22,9 @@ pub(super) struct ExperimentState {
     pub schedules: Vec<TeamSchedule>,
     /// The schedules of the next generation, drawn while a backend that holds the populations plays. Otherwise empty.
     pub next_schedules: Vec<TeamSchedule>,
-    /// Where the populations are, and the generation that they play next: two past the last when all is done.
+    /// The generation that the populations play next: two past the last when all is done.
+    pub generation: usize,
+    /// Where the populations are.
     pub residency: Residency,
 }
 
@@ -55,15 +57,15 @@ pub(super) struct TrialState {
 impl ExperimentState {
     pub fn new(config: &ValidConfig, trials: Range<usize>, level: Level) -> ExperimentState {
         let stages = Stages::new(config);
-        let schedules = std::iter::repeat_with(TeamSchedule::new).take(trials.len()).collect();
+        let schedules = std::iter::repeat_with(TeamSchedule::default).take(trials.len()).collect();
         let trials = trials.into_par_iter().map(|index| TrialState::new(&stages, index, level)).collect();
-        let residency = Residency::on_host(0);
-        ExperimentState { stages, trials, schedules, next_schedules: vec![], residency }
+        let residency = Residency::Undecided;
+        ExperimentState { stages, trials, schedules, next_schedules: vec![], generation: 0, residency }
     }
 
     /// The stage that the populations are about to play in.
     pub fn stage(&self) -> &Stage {
-        self.stages.of(self.residency.generation())
+        self.stages.of(self.generation)
     }
 
     /// The last generation of the run.
@@ -73,18 +75,18 @@ impl ExperimentState {
 
     /// Reports whether the champions of the last generation have played.
     pub fn is_done(&self) -> bool {
-        self.residency.generation() > self.last() + 1
+        self.generation > self.last() + 1
     }
 
     /// Reports whether the populations are past the last generation, and only champions play.
     pub fn only_champions_left(&self) -> bool {
-        self.residency.generation() > self.last()
+        self.generation > self.last()
     }
 
     /// Teams of a trial in the generation of the populations, without the champion's.
     pub fn teams(&self) -> usize {
         let config = &self.stage().config;
-        config.learning.team_count() + config.hall_teams(self.residency.generation())
+        config.learning.team_count() + config.hall_teams(self.generation)
     }
 
     /// Numbers in the policies of one trial, without the champions' slots.
@@ -95,7 +97,7 @@ impl ExperimentState {
 
     /// Makes the schedules those of the populations' generation.
     pub fn prepare(&mut self, level: Level) {
-        let generation = self.residency.generation();
+        let generation = self.generation;
         if self.next_schedules.first().is_some_and(|next| next.is_of(generation, &self.stages)) {
             std::mem::swap(&mut self.schedules, &mut self.next_schedules);
         }
@@ -107,11 +109,11 @@ impl ExperimentState {
     /// Draws the next generation's schedules, unless they depend on the results of the generation that plays. Its
     /// schedules stay.
     pub fn prepare_next(&self, level: Level, next: &mut Vec<TeamSchedule>) {
-        let generation = self.residency.generation() + 1;
+        let generation = self.generation + 1;
         if self.only_champions_left() || self.stages.of(generation).config.learning.teams != Teams::Random {
             return;
         }
-        next.resize_with(self.trials.len(), TeamSchedule::new);
+        next.resize_with(self.trials.len(), TeamSchedule::default);
         let pairs = next.par_iter_mut().zip(&self.trials);
         pairs.for_each(|(schedule, trial)| trial.draw(level, &self.stages, generation, schedule));
     }
@@ -119,7 +121,7 @@ impl ExperimentState {
     /// Returns the experiment's state as far as the host has it.
     pub fn snapshot(&self) -> Snapshot<&[f32]> {
         Snapshot {
-            generation: self.residency.generation(),
+            generation: self.generation,
             last: self.last(),
             weights: self.trials.iter().map(|trial| &trial.weights[..]).collect(),
             fitness: self.trials.iter().map(|trial| &trial.fitness[..]).collect(),
@@ -145,17 +147,18 @@ impl ExperimentState {
             trial.pending = pending.map(|row| Row { experiment: index, ..row });
         }
         // Schedules may depend on the results and the plan of the generation before.
-        self.schedules.fill_with(TeamSchedule::new);
+        self.schedules.fill_with(TeamSchedule::default);
         self.next_schedules.clear();
+        self.residency = Residency::Undecided;
         if let Some(before) = generation.checked_sub(1).filter(|&before| before < self.last()) {
-            self.residency = Residency::on_host(before);
+            self.generation = before;
             self.plan(level);
         }
-        self.residency = Residency::on_host(generation.min(self.last() + 2));
+        self.generation = generation.min(self.last() + 2);
         if generation > last && last < self.last() {
             // The shorter run kept its last policies. This run breeds a next generation from them. The shorter run's
             // last champions may have played already; they play again, in the next generation.
-            self.residency = Residency::on_host(last);
+            self.generation = last;
             self.breed_beyond_the_last(level);
         }
         true
@@ -171,7 +174,7 @@ impl TrialState {
             let parent = self.parents[population * slots + slot] & !evolve::UNCHANGED;
             if generation == 0 { 0.0 } else { self.fitness[population * policies + parent as usize] }
         };
-        schedule.draw(level, stages, Draw { trial: self.index, generation }, fitness);
+        schedule.draw(level, stages, [self.index, generation], fitness);
     }
 
     /// Returns a trial with random policies.

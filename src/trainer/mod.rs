@@ -38,6 +38,7 @@ mod stages;
 pub use ask_tell::Candidates;
 
 use experiment::ExperimentState;
+use residency::Residency;
 use schedule::TeamSchedule;
 use stages::Stage;
 
@@ -164,15 +165,15 @@ impl Trainer {
 
     /// Returns the generation that an experiment plays next: two past its last when it is done.
     pub fn generation(&self, experiment: usize) -> usize {
-        self.experiments[experiment].residency.generation()
+        self.experiments[experiment].generation
     }
 
     /// Makes the generation that an experiment plays next its last, unless an earlier one is. Returns the last.
     ///
     /// The results are those of a config with that number of generations.
     pub fn end(&mut self, experiment: usize) -> usize {
-        let ExperimentState { stages, residency, .. } = &mut self.experiments[experiment];
-        stages.last_generation = stages.last_generation.min(residency.generation());
+        let ExperimentState { stages, generation, .. } = &mut self.experiments[experiment];
+        stages.last_generation = stages.last_generation.min(*generation);
         stages.last_generation
     }
 
@@ -318,14 +319,13 @@ impl Trainer {
     pub fn teams(&mut self, experiment: usize, trial: usize) -> &[u32] {
         let experiment = &mut self.experiments[experiment];
         experiment.prepare(self.level);
-        let Stage { config, world, .. } = experiment.stages.of(experiment.residency.generation());
+        let Stage { config, world, .. } = experiment.stage();
         &experiment.schedules[trial].teams[..config.learning.team_count() * world.leaders()]
     }
 
     /// Returns the world that an experiment's next generation plays in.
     pub fn world(&self, experiment: usize) -> &World {
-        let experiment = &self.experiments[experiment];
-        &experiment.stages.of(experiment.residency.generation()).world
+        &self.experiments[experiment].stage().world
     }
 
     /// Returns what [`Trainer::restore`] needs of an experiment, without copying it.
@@ -356,7 +356,7 @@ impl Trainer {
         let stage = experiment.stage();
         let (populations, parameters) = (stage.config.populations(), stage.world.parameters());
         let (population, slots) = (stage.config.learning.population, stage.config.learning.slots());
-        let fresh = experiment.residency.generation() == 0 && experiment.residency.is_undecided();
+        let fresh = experiment.generation == 0 && matches!(experiment.residency, Residency::Undecided);
         let Some(trial) = experiment.trials.get_mut(trial) else { return false };
         if !fresh || policies == 0 || weights.len() != populations * policies * parameters {
             return false;
@@ -395,7 +395,7 @@ fn play_and_draw_next(
         || results::play(backend, playing),
         || {
             for (next, (_, experiment)) in next.iter_mut().zip(&*playing) {
-                if experiment.residency.is_on_device() {
+                if !experiment.residency.on_device().is_empty() {
                     experiment.prepare_next(level, next);
                 }
             }

@@ -22,10 +22,10 @@ impl ExperimentState {
     /// The backend failed, or a backend has lost the populations.
     pub fn offer(&mut self, backend: &mut dyn Backend) -> Result<(), BackendError> {
         self.residency.check()?;
-        if !self.residency.is_undecided() {
+        if !matches!(self.residency, Residency::Undecided) {
             return Ok(());
         }
-        self.residency.decline();
+        self.residency = Residency::Host;
         let Stage { config, world, .. } = self.stage();
         // Devices mutate, but do not sample.
         if config.learning.method != Method::Tournament {
@@ -35,7 +35,8 @@ impl ExperimentState {
         let held: Option<Vec<_>> =
             self.trials.iter().map(|trial| backend.hold(&trial.weights, sizes).transpose()).collect();
         if let Some(held) = held {
-            self.residency.accept(held.into_iter().collect::<Result<_, _>>()?);
+            let populations = held.into_iter().collect::<Result<_, _>>()?;
+            self.residency = Residency::Device { populations, host_is_current: true };
         }
         Ok(())
     }
@@ -43,16 +44,17 @@ impl ExperimentState {
     /// Copies the populations of all trials to the host, unless the host's are current. An error copies none.
     pub fn fetch(&mut self) -> Result<(), BackendError> {
         self.residency.check()?;
-        if self.residency.host_is_current() {
+        let Residency::Device { populations, host_is_current } = &mut self.residency else { return Ok(()) };
+        if *host_is_current {
             return Ok(());
         }
-        for (held, trial) in self.residency.on_device().iter().zip(&mut self.trials) {
+        for (held, trial) in populations.iter().zip(&mut self.trials) {
             held.fetch(&mut trial.children)?;
         }
         for TrialState { weights, children, .. } in &mut self.trials {
             std::mem::swap(weights, children);
         }
-        self.residency.fetched();
+        *host_is_current = true;
         Ok(())
     }
 
@@ -63,22 +65,22 @@ impl ExperimentState {
     /// The results of this generation are already known. So if the backend that holds the populations fails, the next
     /// use of the populations returns its error.
     pub fn breed(&mut self, level: Level) {
-        if !self.residency.is_on_device() {
+        if self.residency.on_device().is_empty() {
             return self.breed_on_host(level);
         }
-        match self.breed_on_device(level) {
-            Ok(()) => self.residency.bred(),
-            Err(error) => self.residency.lose(error),
+        if let Err(error) = self.breed_on_device(level) {
+            self.residency = Residency::Lost(Some(error));
         }
+        self.generation += 1;
     }
 
     /// Plans the next generation, and lets the device breed it.
     fn breed_on_device(&mut self, level: Level) -> Result<(), BackendError> {
         self.plan(level);
-        let generation = self.residency.generation();
-        let ExperimentState { stages, trials, residency, .. } = self;
-        let Residency::Device { populations, .. } = residency else { return Ok(()) };
-        let learning = &stages.of(generation).config.learning;
+        let ExperimentState { stages, trials, residency, generation, .. } = self;
+        let Residency::Device { populations, host_is_current } = residency else { return Ok(()) };
+        *host_is_current = false;
+        let (generation, learning) = (*generation, &stages.of(*generation).config.learning);
         populations.iter_mut().zip(trials).try_for_each(|(held, trial)| {
             let key = Key::new(learning.seed, trial.index, Purpose::Mutation);
             held.breed(&Breeding { parents: &trial.parents, key, generation, learning })
@@ -87,7 +89,7 @@ impl ExperimentState {
 
     /// Plans the next generation of all populations. After the last generation, every policy is kept.
     pub fn plan(&mut self, level: Level) {
-        let (generation, last) = (self.residency.generation(), self.last());
+        let (generation, last) = (self.generation, self.last());
         let ExperimentState { stages, trials, .. } = self;
         let config = &stages.of(generation).config;
         let (learning, scores) = (&config.learning, config.populations() * config.learning.population);
@@ -115,12 +117,12 @@ impl ExperimentState {
             None => self.select(level),
             Some(strategy) => {
                 self.update_search(level, &strategy);
-                if self.residency.generation() < self.last() {
+                if self.generation < self.last() {
                     self.sample(level, &strategy);
                 }
             }
         }
-        self.residency.bred();
+        self.generation += 1;
     }
 
     /// Breeds the first additional generation of an extended run, whose champions are known.
@@ -129,7 +131,7 @@ impl ExperimentState {
             None => self.select(level),
             Some(strategy) => self.sample(level, &strategy),
         }
-        self.residency.bred();
+        self.generation += 1;
     }
 
     /// Returns the evolution strategy of the present stage. `None` means tournaments.
@@ -140,7 +142,7 @@ impl ExperimentState {
 
     /// Moves the means of all populations.
     fn update_search(&mut self, level: Level, strategy: &Strategy) {
-        let generation = self.residency.generation();
+        let generation = self.generation;
         let (population, stride) = (self.stage().config.learning.population, self.stride());
         self.trials.par_iter_mut().for_each(|TrialState { weights, fitness, .. }| {
             let populations = weights.par_chunks_exact_mut(stride).zip(fitness.par_chunks_exact(population));
@@ -151,7 +153,7 @@ impl ExperimentState {
     /// Samples the next generation around the means.
     fn sample(&mut self, level: Level, strategy: &Strategy) {
         thread_local! { static NOISE: RefCell<Vec<f32>> = const { RefCell::new(Vec::new()) }; }
-        let (generation, stride) = (self.residency.generation(), self.stride());
+        let (generation, stride) = (self.generation, self.stride());
         let Stage { config, world, .. } = self.stage();
         let (&Learning { seed, population: policies, .. }, parameters) = (&config.learning, world.parameters());
         self.trials.par_iter_mut().for_each(|trial| {
@@ -184,7 +186,7 @@ impl ExperimentState {
     fn select(&mut self, level: Level) {
         thread_local! { static SCRATCH: RefCell<Vec<u32>> = const { RefCell::new(Vec::new()) }; }
         self.plan(level);
-        let (generation, stride) = (self.residency.generation(), self.stride());
+        let (generation, stride) = (self.generation, self.stride());
         let ExperimentState { stages, trials, .. } = self;
         let Stage { config, world, .. } = stages.of(generation);
         let (learning, parameters) = (&config.learning, world.parameters());

@@ -7,8 +7,9 @@ use glam::Vec2;
 
 use super::Row;
 use super::experiment::{ExperimentState, TrialState};
+use super::residency::Residency;
 use super::schedule::{MIN_POLICIES_PER_TASK, TeamSchedule, min_populations_per_task};
-use super::stages::Stage;
+use super::stages::{Stage, observed};
 use crate::backend::{Backend, BackendError, Group, GroupScores, Weights};
 use crate::config::{Fitness, Learning, Leniency};
 use crate::parallel::*;
@@ -26,7 +27,7 @@ pub(super) fn play<'a>(
     for (_, experiment) in experiments {
         let (stage, range) = (experiment.stage(), experiment.playing());
         let (teams, leaders) = (experiment.teams(), stage.world.leaders());
-        let previous = experiment.stages.ending_before(experiment.residency.generation());
+        let previous = experiment.stages.ending_before(experiment.generation);
         let on_device = experiment.residency.on_device();
         for (index, (trial, schedule)) in experiment.trials.iter().zip(&experiment.schedules).enumerate() {
             let weights = on_device.get(index).map_or(trial.weights[..].into(), |held| Weights::OnDevice(&**held));
@@ -110,13 +111,13 @@ impl ExperimentState {
     fn playing(&self) -> Range<usize> {
         let teams = self.teams();
         let first = if self.only_champions_left() { teams } else { 0 };
-        first..teams + usize::from(self.residency.generation() > 0)
+        first..teams + usize::from(self.generation > 0)
     }
 
     /// Turns a generation's scores into fitness, and returns the rows that its champions complete. `index` is the
     /// experiment's in its trainer. `given_scores` replaces the scores, `[trials][teams][leaders]`.
     pub fn collect_results(&mut self, index: usize, given_scores: Option<&[f32]>) -> Vec<Row> {
-        let (generation, size) = (self.residency.generation(), self.teams() * self.stage().world.leaders());
+        let (generation, size) = (self.generation, self.teams() * self.stage().world.leaders());
         let ExperimentState { stages, trials, schedules, .. } = self;
         let stage = stages.of(generation);
         let Stage { config, world, .. } = stage;
@@ -159,7 +160,8 @@ impl ExperimentState {
         };
         let rows = self.trials.iter_mut().filter_map(row).collect();
         // The weights were fetched before.
-        self.residency.moved_to_host();
+        self.residency = Residency::Host;
+        self.generation += 1;
         rows
     }
 }
@@ -180,11 +182,6 @@ impl TrialState {
 fn last_g(episodes: &[GroupScores], total: u32) -> f64 {
     let observed = |episode: &GroupScores| u64::from(episode.observed.last().copied().unwrap_or(0));
     episodes.iter().map(observed).sum::<u64>() as f64 / (f64::from(total) * episodes.len() as f64)
-}
-
-/// Returns what the POIs that a team observed in some episodes are worth.
-fn observed(episodes: &[GroupScores], team: usize) -> u64 {
-    episodes.iter().map(|episode| u64::from(episode.observed[team])).sum()
 }
 
 /// Writes minus the rank of each policy's team by G, `[populations][policies]`, unless `ranks` is empty. Ties go to the

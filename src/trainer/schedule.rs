@@ -19,7 +19,8 @@ pub(super) fn min_populations_per_task(population: usize) -> usize {
     MIN_POLICIES_PER_TASK.div_ceil(population)
 }
 
-/// Who plays with whom in one generation of one trial, and from where.
+/// Who plays with whom in one generation of one trial, and from where. By default it is yet to be drawn.
+#[derive(Default)]
 pub(super) struct TeamSchedule {
     /// The generation and the index of its stage. `None` before the first draw. Ending a run early can change the
     /// stage.
@@ -37,26 +38,7 @@ pub(super) struct TeamSchedule {
     pub test_starts: Vec<Vec<Vec2>>,
 }
 
-/// The generation of a trial that a schedule is drawn for.
-#[derive(Clone, Copy)]
-pub(super) struct Draw {
-    pub trial: usize,
-    pub generation: usize,
-}
-
 impl TeamSchedule {
-    /// Returns a schedule that is yet to be drawn.
-    pub fn new() -> TeamSchedule {
-        TeamSchedule {
-            drawn_for: None,
-            orders: vec![],
-            teams: vec![],
-            starts: vec![],
-            previous_stage_starts: vec![],
-            test_starts: vec![],
-        }
-    }
-
     /// Reports whether this is the schedule of a generation.
     pub fn is_of(&self, generation: usize, stages: &Stages) -> bool {
         self.drawn_for == Some((generation, stages.index_of(generation)))
@@ -64,14 +46,19 @@ impl TeamSchedule {
 
     /// Draws the schedule of a trial's generation, unless it is that already. `fitness` returns the score in the generation
     /// before of a population's policy in a slot, or of its parent.
-    pub fn draw(&mut self, level: Level, stages: &Stages, draw: Draw, fitness: impl Fn(usize, usize) -> f32 + Sync) {
-        let Draw { trial, generation } = draw;
+    pub fn draw(
+        &mut self,
+        level: Level,
+        stages: &Stages,
+        [trial, generation]: [usize; 2],
+        fitness: impl Fn(usize, usize) -> f32 + Sync,
+    ) {
         if self.is_of(generation, stages) {
             return;
         }
         self.drawn_for = Some((generation, stages.index_of(generation)));
         let stage = stages.of(generation);
-        self.form_teams(level, stage, draw, fitness);
+        self.form_teams(level, stage, [trial, generation], fitness);
         let draw_starts = |stage: &Stage, episodes: Episodes, all: &mut Vec<Vec<Vec2>>| {
             let (learning, world) = (&stage.config.learning, &stage.world);
             let count = match episodes {
@@ -92,8 +79,13 @@ impl TeamSchedule {
     }
 
     /// Writes `teams`.
-    fn form_teams(&mut self, level: Level, stage: &Stage, draw: Draw, fitness: impl Fn(usize, usize) -> f32 + Sync) {
-        let (Stage { config, world, .. }, Draw { trial, generation }) = (stage, draw);
+    fn form_teams(
+        &mut self,
+        level: Level,
+        Stage { config, world, .. }: &Stage,
+        [trial, generation]: [usize; 2],
+        fitness: impl Fn(usize, usize) -> f32 + Sync,
+    ) {
         let (learning, populations) = (&config.learning, &world.populations);
         let (leaders, count) = (populations.len(), population_count(populations));
         let population = learning.population;

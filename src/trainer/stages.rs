@@ -71,7 +71,12 @@ impl Stage {
         if !self.config.credit.add_g || self.fitnesses[self.fitness_of_each[leader]] == Fitness::G {
             return mean;
         }
-        let observed: u64 = episodes.iter().map(|episode| u64::from(episode.observed[team])).sum();
-        mean + (observed as f64 / (f64::from(self.world.total_worth) * episodes.len() as f64)) as f32
+        let all = f64::from(self.world.total_worth) * episodes.len() as f64;
+        mean + (observed(episodes, team) as f64 / all) as f32
     }
+}
+
+/// Returns what the POIs that a team observed in some episodes are worth.
+pub(super) fn observed(episodes: &[GroupScores], team: usize) -> u64 {
+    episodes.iter().map(|episode| u64::from(episode.observed[team])).sum()
 }
