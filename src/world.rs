@@ -112,12 +112,6 @@ impl PathRule {
     }
 }
 
-impl Default for Led {
-    fn default() -> Led {
-        Led { within: 0, by: LedBy::MostSeen }
-    }
-}
-
 impl Deref for World {
     type Target = WorldParts;
 

@@ -10,7 +10,7 @@ use flotilla::backend::gpu::episode::{GpuBackend, Kernel, Records, ResidencyPoli
 use flotilla::backend::gpu::exact::{self, Pass};
 use flotilla::backend::gpu::source::{BreedJob, GatherJob, State, Task};
 use flotilla::backend::{Backend, Group, Weights};
-use flotilla::config::{Config, Coupling, Fitness, Observers, ValidConfig, one_population, own_populations};
+use flotilla::config::{Config, Coupling, Fitness, Observers, ValidConfig, own_populations};
 use flotilla::evaluate::{SCORES_AND_DT, Starts, evaluate};
 use flotilla::evolve::{Breeding, Key, Purpose};
 use flotilla::gpu_struct::GpuStruct;
@@ -285,7 +285,7 @@ fn inconsistent_input_is_an_error_on_every_backend() {
         (Group { teams: &teams[1..], ..good }, "7 choices"),
         (Group { starts: &world.starts[1..], ..good }, "11 start positions for 12 agents"),
         (Group { weights: few.into(), ..good }, "weights"),
-        (Group { populations: one_population(world.leaders()), ..good }, "1 populations of 3 have 336"),
+        (Group { populations: &vec![0; world.leaders()], ..good }, "1 populations of 3 have 336"),
         (Group { populations: &[0], ..good }, "populations of 1 leaders for"),
     ];
     let mut backends: Vec<Box<dyn Backend>> = vec![Box::new(Cpu::default())];

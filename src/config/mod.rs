@@ -15,7 +15,8 @@ use serde::ser::SerializeMap;
 use serde::{Serialize, Serializer};
 
 use crate::model::policy::parameters;
-use crate::reader::{self, Document, Keys, Reader, Section};
+use crate::model::start::nearest;
+use crate::reader::{self, Document, Reader, Value, section_of};
 use classes::Summary;
 
 pub use crate::config_enum::Choice;
@@ -40,7 +41,7 @@ pub use learning::{
 };
 pub use load::name;
 pub use load::{is_standard_input, read_file, read_text};
-pub use populations::{one_population, own_populations, population_count};
+pub use populations::{own_populations, population_count};
 pub use stages::MAX_STAGES;
 pub use stages::{GENERATIONS, STAGES, Stage};
 pub use valid::{StageConfig, ValidConfig};
@@ -289,20 +290,13 @@ impl Config {
         let (learners, leaders) = (self.learners(), &self.world.leaders);
         match (self.learning.sharing, &self.learning.groups[..]) {
             (Sharing::PerLeader, _) => own_populations(learners).to_vec(),
-            (Sharing::Shared, _) => one_population(learners).to_vec(),
+            (Sharing::Shared, _) => vec![0; learners],
             (Sharing::Group, []) if !self.agents.is_empty() => {
                 let sizes = self.agents.iter().filter(|class| class.learns()).map(AgentClass::size);
                 (0..).zip(sizes).flat_map(|(population, size)| vec![population; size]).collect()
             }
             (Sharing::Group, []) => {
-                let nearest = |place: &[f64; 2]| {
-                    let distance2 = |leader: usize| {
-                        let [x, y] = [0, 1].map(|axis| place[axis] - leaders[leader][axis]);
-                        x * x + y * y
-                    };
-                    (0..leaders.len()).min_by(|&a, &b| distance2(a).total_cmp(&distance2(b))).unwrap_or(0) as u32
-                };
-                let others = self.world.followers.iter().map(nearest);
+                let others = self.world.followers.iter().map(|place| nearest(place, leaders) as u32);
                 own_populations(leaders.len()).iter().copied().chain(others).take(learners).collect()
             }
             (Sharing::Group, groups) => {
@@ -322,7 +316,7 @@ impl Config {
         match populations {
             _ if populations == population_count(&own) => Some(own),
             _ if populations == learners => Some(own_populations(learners).to_vec()),
-            1 => Some(one_population(learners).to_vec()),
+            1 => Some(vec![0; learners]),
             _ => None,
         }
     }

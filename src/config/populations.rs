@@ -1,5 +1,7 @@
 //! Maps from the leaders of a team to the populations that their policies come from, `[leaders]`.
 
+use std::sync::LazyLock;
+
 use super::MAX_LEARNERS;
 
 /// Returns the number of populations that leaders choose from.
@@ -12,23 +14,6 @@ pub fn population_count(populations: &[u32]) -> usize {
 /// # Panics
 /// There are more than [`MAX_LEARNERS`] leaders.
 pub fn own_populations(leaders: usize) -> &'static [u32] {
-    static OWN: [u32; MAX_LEARNERS] = {
-        let mut own = [0; MAX_LEARNERS];
-        let mut leader = 0;
-        while leader < MAX_LEARNERS {
-            own[leader] = leader as u32;
-            leader += 1;
-        }
-        own
-    };
+    static OWN: LazyLock<Vec<u32>> = LazyLock::new(|| (0..MAX_LEARNERS as u32).collect());
     &OWN[..leaders]
-}
-
-/// Returns the populations of leaders that all share one.
-///
-/// # Panics
-/// There are more than [`MAX_LEARNERS`] leaders.
-pub fn one_population(leaders: usize) -> &'static [u32] {
-    static ONE: [u32; MAX_LEARNERS] = [0; MAX_LEARNERS];
-    &ONE[..leaders]
 }
