@@ -74,7 +74,7 @@ pub const VARY: &str = "vary";
 
 /// Returns every key of a config, in the order of [`Config::to_toml`].
 pub fn keys() -> Vec<Definition> {
-    let (config, Keys { sections: mut keys, .. }) = reader::keys(Config::ask);
+    let (config, reader::Keys { sections: mut keys, .. }) = reader::keys(Config::ask);
     let text = config.to_toml();
     let place = |key: &Definition| {
         let (section, leaf) = key.name.split_once('.')?;
@@ -121,7 +121,7 @@ pub struct Config {
 impl Serialize for Config {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let mut map = serializer.serialize_map(None)?;
-        self.serialize_sections(&mut map)?;
+        self.sections().iter().try_for_each(|(section, keys)| map.serialize_entry(section, &keys))?;
         if !self.agents.is_empty() {
             map.serialize_entry(AGENTS, &self.agents)?;
         }
@@ -135,23 +135,28 @@ impl Serialize for Config {
     }
 }
 
-/// A section of a config without the keys that its tables replace.
-struct Written<'c, T>(&'c T, &'c Config);
+/// The sections of a config, from the value of each dotted key.
+struct Sections(Vec<(&'static str, Value<'static>)>);
 
-impl<T: Section> Serialize for Written<'_, T> {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        self.0.serialize_some(serializer, &|key| self.1.is_written(key))
+/// The keys of one of these sections.
+struct Keys<'v>(&'v [(&'static str, Value<'static>)]);
+
+impl Sections {
+    fn iter(&self) -> impl Iterator<Item = (&'static str, Keys<'_>)> {
+        let sections = self.0.chunk_by(|(one, _), (other, _)| section_of(one) == section_of(other));
+        sections.map(|keys| (section_of(keys[0].0), Keys(keys)))
     }
 }
 
-/// The sections of a config.
-struct Sections<'c>(&'c Config);
-
-impl Serialize for Sections<'_> {
+impl Serialize for Sections {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let mut map = serializer.serialize_map(None)?;
-        self.0.serialize_sections(&mut map)?;
-        map.end()
+        serializer.collect_map(self.iter())
+    }
+}
+
+impl Serialize for Keys<'_> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_map(self.0.iter().map(|(key, value)| (&key[section_of(key).len() + 1..], value)))
     }
 }
 
@@ -185,12 +190,11 @@ impl Config {
         ignored: &[&str],
         overrides: &[Override],
     ) -> Result<(ValidConfig, Vec<String>), ConfigError> {
-        let others = reader::OtherSections {
-            ignored: &[ignored, &[stages::STAGES]].concat(),
-            refused: if ignored.contains(&GRID) { &[] } else { &[GRID, VARY] },
-            message: "this makes the file a sweep, of many configs; use `flotilla sweep`",
-        };
-        resolve(name, overrides, || Reader::of_text(document, others), || stages::unresolved(document, false))
+        let is_sweep = "this makes the file a sweep, of many configs; use `flotilla sweep`";
+        let refused: &[&str] = if ignored.contains(&GRID) { &[] } else { &[GRID, VARY] };
+        let ignored = [ignored, &[STAGES]].concat();
+        let values = || Reader::of_text(document, &ignored, refused, is_sweep);
+        resolve(name, overrides, values, || stages::unresolved(document, false))
     }
 
     /// Returns this config with some keys changed.
@@ -214,32 +218,19 @@ impl Config {
         Ok(resolve(OWN_NAME, overrides, || Ok(Reader::of_values(self.values())), stages)?.0)
     }
 
-    /// Returns the value of each dotted key, without the stages.
-    fn values(&self) -> impl Iterator<Item = (&'static str, reader::Value<'static>)> {
+    /// Returns the values of the sections, without the keys that tables replace.
+    fn sections(&self) -> Sections {
         let Config { world, motion, follow, sense, policy, learning, credit, checkpoint, .. } = self;
         let sections = [world.values(), motion.values(), follow.values(), sense.values(), policy.values()];
         let values = sections.into_iter().chain([learning.values(), credit.values(), checkpoint.values()]).flatten();
-        let agents = (!self.agents.is_empty()).then(|| (AGENTS, reader::Value::of(&self.agents)));
-        let pois = (!self.pois.is_empty()).then(|| (POIS, reader::Value::of(&self.pois)));
-        values.filter(|(key, _)| self.is_written(key)).chain(agents).chain(pois)
+        Sections(values.filter(|(key, _)| self.is_written(key)).collect())
     }
 
-    fn serialize_sections<M: SerializeMap>(&self, map: &mut M) -> Result<(), M::Error> {
-        fn section<T: Section, M: SerializeMap>(map: &mut M, section: &T, config: &Config) -> Result<(), M::Error> {
-            let mut keys = T::KEYS.iter().map(|leaf| format!("{}.{leaf}", T::NAME));
-            match keys.any(|key| config.is_written(&key)) {
-                true => map.serialize_entry(T::NAME, &Written(section, config)),
-                false => Ok(()),
-            }
-        }
-        section(map, &self.world, self)?;
-        section(map, &self.motion, self)?;
-        section(map, &self.follow, self)?;
-        section(map, &self.sense, self)?;
-        section(map, &self.policy, self)?;
-        section(map, &self.learning, self)?;
-        section(map, &self.credit, self)?;
-        section(map, &self.checkpoint, self)
+    /// Returns the value of each dotted key and of the lists of tables, without the stages.
+    fn values(&self) -> impl Iterator<Item = (&'static str, Value<'static>)> {
+        let agents = (!self.agents.is_empty()).then(|| (AGENTS, Value::of(&self.agents)));
+        let pois = (!self.pois.is_empty()).then(|| (POIS, Value::of(&self.pois)));
+        self.sections().0.into_iter().chain(agents).chain(pois)
     }
 
     /// Returns the text of a config file for this config, with every key written out.
@@ -249,7 +240,7 @@ impl Config {
     /// is invalid, see [`Config::validate`].
     pub fn to_toml(&self) -> String {
         const IS_TOML: &str = "numbers, words and lists of them under plain keys are TOML";
-        let mut parts = vec![toml::to_string(&Sections(self)).expect(IS_TOML)];
+        let mut parts = vec![toml::to_string(&self.sections()).expect(IS_TOML)];
         parts.extend(self.tables_to_toml());
         if !self.stages.is_empty() {
             parts.push(toml::to_string(&BTreeMap::from([(STAGES, &self.stages)])).expect(IS_TOML));

@@ -1,8 +1,9 @@
 //! The section `[world]`: its data and keys.
 
+use std::f64::consts::FRAC_PI_2;
+
 use super::classes::{ClassSummary, GroupSummary};
 use super::{Control, Coupling, Observers, Paradigm};
-use crate::model::couple::observation_radius;
 use crate::model::rule::{after, windows};
 use crate::model::start::Heading;
 use crate::model::{LEAST, LONGEST};
@@ -31,24 +32,27 @@ section! {
         followers: Vec<[f64; 2]> = "units", "4.1, Fig. 3",
         /// positions of the P points of interest, which do not move while teams play
         pois: Vec<[f64; 2]> = "units", "3.1, Fig. 3",
-        /// Agents needed at each POI (C).
-        coupling: Coupling,
-        /// Observation radius σ₀, in units.
-        observation_radius: f64,
-        /// The agents whose presence at a POI counts.
-        observers: Observers,
-        /// The first and the last step, from 1, at which each POI can be observed. Empty if POIs are always open.
-        windows: Vec<[usize; 2]>,
-        /// For each POI, those that must be observed before it. Empty if the order is free.
-        after: Vec<Vec<usize>>,
+        /// C: number of agents that a POI needs at the same step to be observed; one number for all POIs, or one per
+        /// POI
+        coupling: Coupling = "agents", "3.2, Eq. 2",
+        /// σ₀: distance up to which an agent observes a POI
+        observation_radius: f64 = "units", "3.2, Eq. 3",
+        /// agents that count at a POI; the coupling is at most their number
+        observers: Observers = "", "5",
+        /// the first and the last step of each POI at which it can be observed
+        windows: Vec<[usize; 2]> = "steps", "5",
+        /// for each POI, the POIs (indices into world.pois, from 0) that must have been observed at an earlier step
+        /// before it can be
+        after: Vec<Vec<usize>> = "POIs", "5",
         /// T: length of an episode
         steps: usize = "steps", "3.2, Eq. 2",
         /// whether the start counts as a step, step 0, at which agents observe and influence others
         start_counts: bool = "", "3.2, Eq. 2",
         /// duration of a step
         dt: f64 = "s", "",
-        /// Agents' headings at the start, in radians from the x axis towards the y axis.
-        heading: Heading,
+        /// headings at the start, from the x axis towards the y axis (π/2 faces the POIs of the paper's layouts): one
+        /// number for all agents, one per leader (a follower takes that of the leader nearest to it), or one per agent
+        heading: Heading = "rad", "3.1, Fig. 3",
         /// speed of every agent at the start
         speed: f64 = "units/s", "3.1",
     }
@@ -77,7 +81,7 @@ impl WorldConfig {
             let message = format!("found {agents} agents with the leaders, allowed 1 to {MAX_LEARNERS}");
             r.report_key("world.followers", message);
         }
-        let observers = Observers::read(r);
+        let observers = WorldConfig::observers(r).choice(Observers::All);
         let counted = match (leaders.as_ref(), followers.as_ref(), paradigm) {
             _ if has_pois => MAX_LEARNERS,
             _ if has_agents => observers_in_full.filter(|&count| count > 0).unwrap_or(MAX_AGENTS),
@@ -95,17 +99,21 @@ impl WorldConfig {
         let steps = WorldConfig::steps(r).number(between(1, MAX_STEPS), 25);
         let counts =
             leaders.as_ref().zip(followers.as_ref()).map(|(leaders, followers)| [leaders.len(), followers.len()]);
-        let heading = Heading::read(r, counts);
+        let heading = heading(r, counts);
         let world = WorldConfig {
             map,
-            coupling: Coupling::read(r, counted.max(1), observers.counted(), places),
+            coupling: WorldConfig::coupling(r).one_or_each(
+                between(1, counted.max(1)).because(observers.counted()),
+                places.map_or(0..=usize::MAX, |pois| pois..=pois),
+                3,
+            ),
             observers,
-            windows: windows(r, steps, places),
-            after: after(r, places),
+            windows: windows(WorldConfig::windows(r), ("world.pois", places), steps),
+            after: after(WorldConfig::after(r), places),
             leaders: leaders.unwrap_or_default(),
             followers: followers.unwrap_or_default(),
             pois: pois.unwrap_or_default(),
-            observation_radius: observation_radius(r),
+            observation_radius: WorldConfig::observation_radius(r).number(between(0.01, LONGEST), 5.0),
             steps,
             start_counts: WorldConfig::start_counts(r).flag(false),
             dt: WorldConfig::dt(r).number(between(1e-4, 10.0), 0.2),
@@ -146,4 +154,24 @@ impl WorldConfig {
     pub fn headings(&self) -> Vec<f64> {
         self.heading.of_agents(&self.leaders, &self.followers)
     }
+}
+
+/// Reads the start headings. `counts` are the numbers of leaders and followers, `None` if they are unknown.
+fn heading(r: &mut Reader<'_>, counts: Option<[usize; 2]>) -> Heading {
+    let errors_before = r.error_count();
+    let heading = WorldConfig::heading(r).one_or_each(between(-1e3, 1e3), 0..=usize::MAX, FRAC_PI_2);
+    if let (Heading::Each(headings), Some([leaders, followers])) = (&heading, counts)
+        && r.error_count() == errors_before
+        && ![leaders, leaders + followers].contains(&headings.len())
+    {
+        let per_agent = match followers {
+            0 => String::new(),
+            _ => format!(" or {} (one per agent)", leaders + followers),
+        };
+        let found = headings.len();
+        let message =
+            format!("found a list of {found}, allowed one number or a list of {leaders} (one per leader){per_agent}");
+        r.report_key("world.heading", message);
+    }
+    heading
 }

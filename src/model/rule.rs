@@ -1,26 +1,12 @@
-//! Who observes a POI, when and in what order: the [`Rule`] and its keys in `[world]`.
+//! Who observes a POI, when and in what order.
 
 use std::ops::{Range, RangeInclusive};
 
 use crate::config_enum::config_enum;
-use crate::reader::{OneOrEach, Reader, between};
+use crate::reader::{KeyRequest, OneOrEach, between};
 
 /// Agents needed at a POI at the same step: one number for all POIs, or one per POI.
 pub type Coupling = OneOrEach<usize>;
-
-impl Coupling {
-    /// Reads the coupling. Errors name the number of agents by `because`. `pois` is `None` if their list is invalid.
-    pub(crate) fn read(r: &mut Reader<'_>, agents: usize, because: &'static str, pois: Option<usize>) -> Coupling {
-        r.key(
-            "world.coupling",
-            "agents",
-            "C: number of agents that a POI needs at the same step to be observed; one number for all POIs, or one per \
-             POI",
-            "3.2, Eq. 2",
-        )
-        .one_or_each(between(1, agents).because(because), pois.map_or(0..=usize::MAX, |pois| pois..=pois), 3)
-    }
-}
 
 config_enum! {
     /// Whose presence at a POI counts.
@@ -35,12 +21,6 @@ config_enum! {
 }
 
 impl Observers {
-    /// Reads the key.
-    pub(crate) fn read(r: &mut Reader<'_>) -> Observers {
-        r.key("world.observers", "", "agents that count at a POI; the coupling is at most their number", "5")
-            .choice(Observers::All)
-    }
-
     /// Returns the agents that are observers.
     pub fn among(self, leaders: usize, followers: usize) -> Range<usize> {
         match self {
@@ -60,10 +40,8 @@ impl Observers {
     }
 }
 
-/// Reads the steps at which each POI can be observed. `pois` is `None` if their list is invalid.
-pub(crate) fn windows(r: &mut Reader<'_>, steps: usize, pois: Option<usize>) -> Vec<[usize; 2]> {
-    let asked =
-        r.key("world.windows", "steps", "the first and the last step of each POI at which it can be observed", "5");
+/// Reads the steps at which each POI can be observed, as many as the key `of` has items, see [`KeyRequest::lists`].
+pub(crate) fn windows(asked: KeyRequest<'_, '_>, of: (&str, Option<usize>), steps: usize) -> Vec<[usize; 2]> {
     let reversed = |windows: &[Vec<usize>]| {
         let wrong = windows.iter().enumerate().filter(|(_, window)| window[0] > window[1]);
         let problems = wrong.map(|(poi, window)| {
@@ -72,20 +50,15 @@ pub(crate) fn windows(r: &mut Reader<'_>, steps: usize, pois: Option<usize>) -> 
         });
         problems.collect()
     };
-    let what = "pairs [first, last]";
-    let windows = asked.lists(what, ("world.pois", pois), 2..=2, between(1, steps).because("world.steps"), reversed);
+    let windows = asked.lists(WINDOWS, of, 2..=2, between(1, steps).because("world.steps"), reversed);
     windows.into_iter().map(|window| [window[0], window[1]]).collect()
 }
 
+/// The form of windows, for errors.
+pub(crate) const WINDOWS: &str = "pairs [first, last]";
+
 /// Reads which POIs each one comes after. `pois` is `None` if their list is invalid.
-pub(crate) fn after(r: &mut Reader<'_>, pois: Option<usize>) -> Vec<Vec<usize>> {
-    let asked = r.key(
-        "world.after",
-        "POIs",
-        "for each POI, the POIs (indices into world.pois, from 0) that must have been observed at an earlier step before \
-         it can be",
-        "5",
-    );
+pub(crate) fn after(asked: KeyRequest<'_, '_>, pois: Option<usize>) -> Vec<Vec<usize>> {
     let most = pois.map_or(usize::MAX, |pois| pois - 1);
     let wrong = |after: &[Vec<usize>]| {
         if pois.is_none() {

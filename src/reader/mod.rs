@@ -6,6 +6,7 @@
 //! A module reads a key with a [`KeyRequest`], which states its [`Allowed`] values.
 
 use std::collections::{BTreeMap, HashSet};
+use std::fmt::Display;
 use std::ops::RangeInclusive;
 
 use toml::Spanned;
@@ -90,17 +91,6 @@ pub struct Problems {
     pub listed: Vec<Problem>,
     /// The number of further problems.
     pub unlisted: usize,
-}
-
-/// Sections of a text that its reader does not read.
-#[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct OtherSections<'a> {
-    /// Sections that are ignored.
-    pub ignored: &'a [&'a str],
-    /// Sections that make the text something else. They are reported alone.
-    pub refused: &'a [&'a str],
-    /// The message about such a text.
-    pub message: &'a str,
 }
 
 /// A parsed text. A sweep reads all its points from one document, because parsing takes longer than reading.
@@ -230,10 +220,8 @@ struct Scope {
 pub(crate) struct Reader<'a> {
     /// The lines of the text, if the config was written.
     lines: Option<&'a LineNumbers>,
-    /// The values by dotted key.
+    /// The values by dotted key. Values outside any section have a key without a dot.
     entries: BTreeMap<String, Entry<'a>>,
-    /// The values outside any section.
-    strays: Vec<Entry<'a>>,
     /// The start of each section.
     sections: BTreeMap<String, usize>,
     /// The requested keys, with the place and name of those in the text.
@@ -256,40 +244,26 @@ pub(crate) struct Reader<'a> {
 /// a function of the same name that requests the key from a [`Reader`].
 ///
 /// An entry consists of the meaning without a full stop, the field, the unit, and the section of the paper. Unit and
-/// section may be empty. A field without either has no function, because another module requests its key.
+/// section may be empty.
 macro_rules! section {
     ($(#[$($about:tt)*])* $name:ident = $section:literal {
-        $($(#[doc = $words:literal])+ $field:ident: $type:ty $(= $unit:tt, $paper:tt)?,)+
+        $($(#[doc = $words:literal])+ $field:ident: $type:ty = $unit:tt, $paper:tt,)+
     }) => {
         $(#[$($about)*])*
         #[derive(Clone, Debug, PartialEq, serde::Serialize)]
         pub struct $name {
             $(
                 $(#[doc = $words])+
-                $(#[doc = concat!("\n\n`", $section, ".", stringify!($field), "`", section!(@source $unit, $paper), ".")])?
+                #[doc = concat!("\n\n`", $section, ".", stringify!($field), "`", section!(@source $unit, $paper), ".")]
                 pub $field: $type,
             )+
         }
 
-        impl $crate::reader::Section for $name {
-            const NAME: &'static str = $section;
-            const KEYS: &'static [&'static str] = &[$(stringify!($field)),+];
-
-            fn serialize_some<S: serde::Serializer>(
-                &self,
-                serializer: S,
-                is_written: &dyn Fn(&str) -> bool,
-            ) -> Result<S::Ok, S::Error> {
-                let mut map = serializer.serialize_map(None)?;
-                $(if is_written(concat!($section, ".", stringify!($field))) {
-                    serde::ser::SerializeMap::serialize_entry(&mut map, stringify!($field), &self.$field)?;
-                })+
-                serde::ser::SerializeMap::end(map)
-            }
-        }
-
         impl $name {
-            $(section! { @key $section, $field { $($words),+ } $($unit, $paper)? })+
+            /// The keys without their section, in order.
+            #[allow(dead_code, reason = "only the keys of some sections are also those of tables")]
+            pub(crate) const KEYS: &[&str] = &[$(stringify!($field)),+];
+            $(section! { @key $section, $field { $($words),+ } $unit, $paper })+
 
             /// Returns the value of each dotted key.
             pub(crate) fn values(&self) -> Vec<(&'static str, $crate::reader::Value<'static>)> {
@@ -297,7 +271,6 @@ macro_rules! section {
             }
         }
     };
-    (@key $section:tt, $field:ident $(as $key:literal)? { $($words:tt)+ }) => {};
     (@key $section:tt, $field:ident $(as $key:literal)? { $($words:tt)+ } $unit:tt, $paper:tt) => {
         pub(crate) fn $field<'r, 'a>(r: &'r mut $crate::reader::Reader<'a>) -> $crate::reader::KeyRequest<'r, 'a> {
             let meaning = const { concat!($($words)+).trim_ascii() };
@@ -312,21 +285,6 @@ macro_rules! section {
     (@source $unit:tt, $paper:tt) => { concat!(", in ", $unit, "; Section ", $paper) };
 }
 pub(crate) use section;
-
-/// A section of a config, declared by [`section!`].
-pub(crate) trait Section {
-    /// The section's name.
-    const NAME: &'static str;
-    /// Keys without their section, in order.
-    const KEYS: &'static [&'static str];
-
-    /// Writes the section without some of its keys.
-    fn serialize_some<S: serde::Serializer>(
-        &self,
-        serializer: S,
-        is_written: &dyn Fn(&str) -> bool,
-    ) -> Result<S::Ok, S::Error>;
-}
 
 /// Declares a table in a list or in another table, as [`section!`] declares a section. Its keys are requested within
 /// [`KeyRequest::tables`] and the like. A field may have another name than its key, `field as "key"`.
@@ -360,11 +318,17 @@ macro_rules! table {
 pub(crate) use table;
 
 impl<'a> Reader<'a> {
-    /// Reads a text.
+    /// Reads a text without its `ignored` sections. A section in `refused` makes the text something else, which `message`
+    /// describes.
     ///
     /// # Errors
-    /// The text is not TOML, or has a section that makes it something else.
-    pub fn of_text(document: &'a Document<'a>, others: OtherSections<'_>) -> Result<Reader<'a>, Problems> {
+    /// The text is not TOML, or has a refused section, which is reported alone.
+    pub fn of_text(
+        document: &'a Document<'a>,
+        ignored: &[&str],
+        refused: &[&str],
+        message: &str,
+    ) -> Result<Reader<'a>, Problems> {
         let Document { text, table, errors, lines } = document;
         let mut reader = Reader { lines: Some(lines), ..Reader::default() };
         // Other errors follow from these: one can invalidate the rest of its line, and an unclosed list the rest of the
@@ -383,25 +347,23 @@ impl<'a> Reader<'a> {
                 reader.report(Place::Offset(start_of(&errors[0])), "", syntax_problem(&errors[0], text));
             }
         }
-        let mut refused = table.keys().filter(|key| others.refused.contains(&key.get_ref().as_ref()));
+        let mut refused = table.keys().filter(|key| refused.contains(&key.get_ref().as_ref()));
         if let (true, Some(section)) = (errors.is_empty(), refused.next()) {
-            reader.report(Place::Offset(section.span().start), section.get_ref(), others.message.into());
+            reader.report(Place::Offset(section.span().start), section.get_ref(), message.into());
         }
         if !reader.problems.is_empty() {
             return Err(reader.into_problems());
         }
-        for (section, value) in
-            table.iter().filter(|(section, _)| !others.ignored.contains(&section.get_ref().as_ref()))
-        {
+        for (section, value) in table.iter().filter(|(section, _)| !ignored.contains(&section.get_ref().as_ref())) {
             let (name, start) = (section.get_ref().to_string(), section.span().start);
             if let DeValue::Table(table) = value.get_ref() {
                 for (key, value) in table {
-                    let (name, value) = (format!("{name}.{}", key.get_ref()), Value::of_text(value.clone(), text));
-                    reader.entries.insert(name.clone(), Entry { value, outside: false, name });
+                    reader.insert(format!("{name}.{}", key.get_ref()), Value::of_text(value.clone(), text));
                 }
                 reader.sections.insert(name, start);
             } else {
-                reader.strays.push(Entry { value: Value::of_text(value.clone(), text), outside: false, name });
+                let entry = Entry { value: Value::of_text(value.clone(), text), outside: false, name };
+                reader.entries.insert(stray_key(&entry.name), entry);
             }
         }
         Ok(reader)
@@ -409,8 +371,13 @@ impl<'a> Reader<'a> {
 
     /// Reads values by dotted key.
     pub fn of_values(values: impl IntoIterator<Item = (&'static str, Value<'a>)>) -> Reader<'a> {
-        let entry = |(key, value): (&str, _)| (key.into(), Entry { value, outside: false, name: key.into() });
-        Reader { entries: values.into_iter().map(entry).collect(), ..Reader::default() }
+        let mut reader = Reader::default();
+        values.into_iter().for_each(|(key, value)| reader.insert(key.into(), value));
+        reader
+    }
+
+    fn insert(&mut self, name: String, value: Value<'a>) {
+        self.entries.insert(name.clone(), Entry { value, outside: false, name });
     }
 
     /// Sets a key. Errors call it `name`.
@@ -430,8 +397,7 @@ impl<'a> Reader<'a> {
             let path: Vec<&str> = key_path(key).collect();
             match &path[..] {
                 [list, path @ ..] if !path.is_empty() && lists.contains(list) => {
-                    let stray = self.strays.iter_mut().find(|entry| entry.name == *list);
-                    let set = match stray.or_else(|| self.entries.get_mut(*list)) {
+                    let set = match self.entries.get_mut(*list) {
                         // Otherwise a long key would nest tables until the stack overflows.
                         _ if path.len() > MAX_PARTS => {
                             Err(format!("found {} parts after `{list}`, allowed up to {MAX_PARTS}", path.len()))
@@ -443,10 +409,7 @@ impl<'a> Reader<'a> {
                     };
                     set.unwrap_or_else(|message| self.report(Place::Outside, name, message));
                 }
-                _ => {
-                    self.strays.retain(|entry| entry.name != *key);
-                    self.set(key, value, name.clone());
-                }
+                _ => self.set(key, value, name.clone()),
             }
         }
     }
@@ -481,9 +444,7 @@ impl<'a> Reader<'a> {
     /// Makes each key an error, or of each section whose name ends with a dot, because the config has a list in its
     /// place. Does nothing if it has no such list. Returns whether it has.
     pub(crate) fn replace(&mut self, list: &'static str, keys: &[&'static str]) -> bool {
-        let has = self.sections.contains_key(list)
-            || self.entries.contains_key(list)
-            || self.strays.iter().any(|entry| entry.name == list);
+        let has = self.sections.contains_key(list) || self.entries.contains_key(list);
         if has {
             self.replaced.extend(keys.iter().map(|key| (*key, list)));
         }
@@ -492,8 +453,7 @@ impl<'a> Reader<'a> {
 
     /// Returns the items of a list of the config without requesting it, or none if it is no list.
     pub(crate) fn peek(&self, list: &str) -> &[Value<'a>] {
-        let stray = self.strays.iter().find(|entry| entry.name == list).or_else(|| self.entries.get(list));
-        stray.and_then(|entry| entry.value.list()).unwrap_or_default()
+        self.entries.get(list).and_then(|entry| entry.value.list()).unwrap_or_default()
     }
 
     /// Reads a list of tables of the config, `[[list]]`, if it has one. `read` gets the index of each table.
@@ -503,8 +463,7 @@ impl<'a> Reader<'a> {
         counts: RangeInclusive<usize>,
         read: impl FnMut(&mut Reader<'a>, usize) -> T,
     ) -> Vec<T> {
-        let stray = self.strays.iter().position(|entry| entry.name == list).map(|index| self.strays.remove(index));
-        let entry = stray.or_else(|| self.entries.remove(list));
+        let entry = self.entries.remove(list);
         self.known.insert(list, entry.as_ref().map(|entry| (entry.place(), entry.name.clone())));
         if let Some(start) = self.sections.remove(list) {
             self.entries.retain(|key, _| section_of(key) != list);
@@ -636,16 +595,14 @@ impl<'a> Reader<'a> {
             Some(_) => allowed.to_string(),
             None => format!("{}, {allowed}", T::KIND),
         };
-        self.report(entry.place(), &entry.name, format!("found {}, allowed {allows}", entry.value.found()));
+        self.report_found(entry, allows);
         allowed.high
     }
 
     /// Returns the items of a list. Reports another kind of value or another length.
     fn items(&mut self, entry: Entry<'a>, lengths: RangeInclusive<usize>, what: &str) -> Option<Vec<Entry<'a>>> {
-        let found = entry.value.found();
-        let (place, Entry { value, outside, name }) = (entry.place(), entry);
-        match value.kind {
-            Kind::List(items) if lengths.contains(&items.len()) => {
+        match entry {
+            Entry { value: Value { kind: Kind::List(items), .. }, outside, name } if lengths.contains(&items.len()) => {
                 let named = |(index, value)| Entry::within(outside, value, || format!("{name}[{index}]"));
                 Some(items.into_iter().enumerate().map(named).collect())
             }
@@ -654,7 +611,7 @@ impl<'a> Reader<'a> {
                     (least, &usize::MAX) => format!("{least} or more"),
                     (&least, &most) => between(least, most).to_string(),
                 };
-                self.report(place, &name, format!("found {found}, allowed a list of {lengths} {what}"));
+                self.report_found(&entry, format_args!("a list of {lengths} {what}"));
                 None
             }
         }
@@ -679,6 +636,11 @@ impl<'a> Reader<'a> {
         self.problems.push((place, name.to_string(), message));
     }
 
+    /// Reports a value that is not among the `allowed` ones.
+    fn report_found(&mut self, entry: &Entry<'_>, allowed: impl Display) {
+        self.report(entry.place(), &entry.name, format!("found {}, allowed {allowed}", entry.value.found()));
+    }
+
     /// Reports a problem with a requested key; if the key is missing, at the start of its section.
     pub(crate) fn report_key(&mut self, key: &'static str, message: String) {
         let start = || Place::Offset(self.sections.get(section_of(key)).copied().unwrap_or(0));
@@ -694,15 +656,6 @@ impl<'a> Reader<'a> {
         let mut sections: Vec<&str> = known.iter().map(|key| section_of(key)).collect();
         sections.dedup();
         let mut unknown = HashSet::new();
-        for entry in std::mem::take(&mut self.strays) {
-            let name = &entry.name;
-            let message = if sections.contains(&name.as_str()) {
-                format!("found {}, allowed a section [{name}]", entry.value.found())
-            } else {
-                format!("unknown key{}", self.hint(name, &known, false))
-            };
-            self.report(entry.place(), &shorten(name), message);
-        }
         for (name, start) in std::mem::take(&mut self.sections) {
             if !sections.contains(&name.as_str()) {
                 let message = format!("unknown section{}", self.hint(&name, &sections, false));
@@ -711,8 +664,10 @@ impl<'a> Reader<'a> {
             }
         }
         for (key, entry) in std::mem::take(&mut self.entries) {
-            if entry.outside || !unknown.contains(section_of(&key)) {
-                let hint = self.hint(&key, &known, false);
+            if !entry.outside && sections.contains(&&*key) {
+                self.report_found(&entry, format!("a section [{key}]"));
+            } else if entry.outside || !unknown.contains(section_of(&key)) {
+                let hint = self.hint(key.trim_matches('"'), &known, false);
                 self.report(entry.place(), &shorten(&entry.name), format!("unknown key{hint}"));
             }
         }
@@ -768,8 +723,13 @@ pub fn key_path(key: &str) -> impl Iterator<Item = &str> {
     key.split(['.', '[']).map(|part| part.trim_end_matches(']'))
 }
 
+/// Returns the key of a value outside any section. A name with dots stays in quotes, because it is not a key of a section.
+fn stray_key(name: &str) -> String {
+    if name.contains('.') { format!("\"{name}\"") } else { name.into() }
+}
+
 /// Returns the section of a dotted key.
-fn section_of(key: &str) -> &str {
+pub(crate) fn section_of(key: &str) -> &str {
     key.split_once('.').map_or(key, |(section, _)| section)
 }
 

@@ -59,7 +59,7 @@ impl<'a> KeyRequest<'_, 'a> {
         let about = || ("true or false".into(), FLAGS.into(), Some(default.to_string()));
         let Some(entry) = self.take(about) else { return default };
         entry.value.flag().unwrap_or_else(|| {
-            self.reader.report(entry.place(), &entry.name, format!("found {}, allowed {FLAGS}", entry.value.found()));
+            self.reader.report_found(&entry, FLAGS);
             default
         })
     }
@@ -95,7 +95,7 @@ impl<'a> KeyRequest<'_, 'a> {
             Some(Err(allowed)) => allowed,
             None => range.into(),
         };
-        self.reader.report(entry.place(), &entry.name, format!("found {}, allowed {allowed}", entry.value.found()));
+        self.reader.report_found(&entry, allowed);
         None
     }
 
@@ -111,8 +111,7 @@ impl<'a> KeyRequest<'_, 'a> {
         match entry {
             Some(entry) if entry.value.word() == Some(word) => None,
             Some(entry) if T::read(&entry.value).is_none() => {
-                let message = format!("found {}, allowed {}, {allowed}, or {word:?}", entry.value.found(), T::KIND);
-                self.reader.report(entry.place(), &entry.name, message);
+                self.reader.report_found(&entry, format_args!("{}, {allowed}, or {word:?}", T::KIND));
                 Some(allowed.nearest(default))
             }
             entry => Some(self.reader.number(self.name, entry, allowed, default)),
@@ -226,25 +225,22 @@ impl<'a> KeyRequest<'_, 'a> {
         let kind = || format!("{}, or a percentage such as \"10%\"", kind::<usize>());
         let range = || format!("{}, or {PERCENTAGES}", allowed.in_general());
         let entry = self.take(|| (kind(), range(), Some(written(&default))));
-        let message = match entry.as_ref().map(|entry| (&entry.value, entry.value.word())) {
-            Some((value, Some(word))) => {
-                let percentage = word.strip_suffix('%').and_then(|number| number.parse().ok());
+        match entry {
+            Some(entry) if entry.value.word().is_some() => {
+                let percentage = entry.value.word().and_then(|word| word.strip_suffix('%')?.parse().ok());
                 match percentage.filter(|&percentage: &f64| 0.0 < percentage && percentage <= 100.0) {
                     Some(percentage) => return CountOrPercentage::Percentage(percentage),
-                    None => format!("found {}, allowed {allowed}, or {PERCENTAGES}", value.found()),
+                    None => self.reader.report_found(&entry, format_args!("{allowed}, or {PERCENTAGES}")),
                 }
             }
-            Some((value, None)) if usize::read(value).is_none() => {
+            Some(entry) if usize::read(&entry.value).is_none() => {
                 // A share is the usual mistake.
-                let share = f64::read(value).flatten().filter(|share| (1e-6..=1.0).contains(share));
-                let percentage = (share.unwrap_or(0.1) * 1e6).round() / 1e4;
-                let (found, kind) = (value.found(), usize::KIND);
-                format!("found {found}, allowed {kind}, {allowed}, or a percentage such as \"{percentage}%\"")
+                let share = f64::read(&entry.value).flatten().filter(|share| (1e-6..=1.0).contains(share));
+                let (percentage, kind) = ((share.unwrap_or(0.1) * 1e6).round() / 1e4, usize::KIND);
+                let allowed = format_args!("{kind}, {allowed}, or a percentage such as \"{percentage}%\"");
+                self.reader.report_found(&entry, allowed);
             }
-            _ => return CountOrPercentage::Count(self.reader.number(self.name, entry, allowed, default)),
-        };
-        if let Some(entry) = entry {
-            self.reader.report(entry.place(), &entry.name, message);
+            entry => return CountOrPercentage::Count(self.reader.number(self.name, entry, allowed, default)),
         }
         CountOrPercentage::Count(allowed.nearest(default))
     }
@@ -262,8 +258,7 @@ impl<'a> KeyRequest<'_, 'a> {
         let word = entry.value.word();
         let found = T::ALL.iter().find(|choice| Some(choice.0) == word);
         if found.is_none() {
-            let message = format!("found {}, allowed {}{}", entry.value.found(), words(), similar(word, T::names()));
-            self.reader.report(entry.place(), &entry.name, message);
+            self.reader.report_found(&entry, words() + &similar(word, T::names()));
         }
         found.map(|choice| choice.1)
     }

@@ -147,12 +147,20 @@ impl<'a> Value<'a> {
     pub(crate) fn to_toml(&self) -> Option<toml::Value> {
         match &self.kind {
             Kind::Integer(number) => i64::try_from((*number)?).ok().map(toml::Value::Integer),
-            Kind::Float(number) => number.map(toml::Value::Float),
+            Kind::Float(number) => Some(number.unwrap_or(f64::NAN).into()),
             Kind::Word(word) => Some(word.clone().into_owned().into()),
             Kind::Flag(flag) => Some((*flag).into()),
             Kind::List(items) => items.iter().map(Value::to_toml).collect::<Option<Vec<_>>>().map(toml::Value::Array),
             Kind::Table(_) | Kind::Other(_) => None,
         }
+    }
+}
+
+/// Fails for whole numbers above the range of TOML.
+impl serde::Serialize for Value<'_> {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let value = self.to_toml().ok_or_else(|| serde::ser::Error::custom(format!("{} is not TOML", self.found())))?;
+        value.serialize(serializer)
     }
 }
 

@@ -11,7 +11,7 @@ use crate::config::{
     PoiGroup, Region, Score, Sectors, Term, When,
 };
 use crate::model::classes::DRAWN;
-use crate::model::rule::cycle;
+use crate::model::rule::{WINDOWS, cycle, windows};
 use crate::model::sense::MOST_MEASURED;
 use crate::model::{LEAST, LONGEST, MAX_RANGES};
 use crate::reader::{Allowed, KeyRequest, Number, Reader, Value, between, sized};
@@ -548,7 +548,7 @@ impl PoiGroup {
             coupling,
             radius: PoiGroup::radius(r).number(between(0.01, LONGEST), 5.0),
             observers,
-            windows: windows(r, steps, size),
+            windows: windows_of_group(r, steps, size),
             gone_within: PoiGroup::gone_within(r).number(between(0.01, LONGEST).or_zero(), 0.0),
             score: PoiGroup::score(r).choice(Score::Observed),
             when: PoiGroup::when(r).choice(When::Ever),
@@ -561,24 +561,14 @@ impl PoiGroup {
 }
 
 /// Reads the windows of a group of POIs, one per POI.
-fn windows(r: &mut Reader<'_>, steps: usize, pois: usize) -> Vec<[usize; 2]> {
-    const WHAT: &str = "pairs [first, last]";
-    let step = between(1, steps).because("world.steps");
-    let windows = PoiGroup::windows(r).lists(WHAT, ("pois.at, or one for all", None), 2..=2, step, |windows| {
-        let wrong = windows.iter().enumerate().filter(|(_, window)| window[0] > window[1]);
-        let problem = |(index, window): (usize, &Vec<usize>)| {
-            let [first, last] = [window[0], window[1]];
-            (index, format!("found the steps from {first} to {last}, allowed the earlier one first"))
-        };
-        wrong.map(problem).collect()
-    });
-    let windows: Vec<[usize; 2]> = windows.into_iter().map(|window| [window[0], window[1]]).collect();
+fn windows_of_group(r: &mut Reader<'_>, steps: usize, pois: usize) -> Vec<[usize; 2]> {
+    let windows = windows(PoiGroup::windows(r), ("pois.at, or one for all", None), steps);
     match windows.len() {
         1 => vec![windows[0]; pois],
         count if count == 0 || count == pois || pois == 0 => windows,
         count => {
             let message =
-                format!("found a list of {count}, allowed a list of {pois} {WHAT}, or of one for all, or none");
+                format!("found a list of {count}, allowed a list of {pois} {WINDOWS}, or of one for all, or none");
             r.report_key("pois.windows", message);
             vec![]
         }

@@ -5,7 +5,6 @@ use toml::{Table, Value};
 
 use super::{AGENTS, AgentClass, Channel, POIS, PoiGroup, Term};
 use crate::config::{Config, Motion};
-use crate::reader::Section;
 
 impl Config {
     /// Returns the lists of tables as TOML, with nested tables in one line each.
