@@ -6,7 +6,7 @@ use flotilla::backend::BackendError;
 use flotilla::backend::gpu::device::DeviceError;
 use flotilla::backend::gpu::episode::{GpuBackend, ResidencyPolicy};
 use flotilla::config::Config;
-use flotilla::front::{self, GpuSearch, Processor};
+use flotilla::front::{self, Processor};
 
 /// Minimum agent-steps per generation for a GPU. An NVIDIA H100 and 16 threads beside it take the same time for
 /// generations of about 1000 teams of 12 agents and 25 steps: at 512 teams the threads are faster, at 4096 the GPU is
@@ -117,7 +117,7 @@ pub fn find(
     if let Some(reason) = work.and_then(Work::is_little) {
         return Ok(Chosen { reason: Some(reason), ..Chosen::default() });
     }
-    let GpuSearch { gpu, rejection: passed_over, .. } = front::find_gpu(processor, holding)?;
+    let (gpu, passed_over) = front::find_gpu(processor, holding)?;
     let reason = if gpu.is_some() { "enough work for a GPU to pay" } else { "no GPU found" };
     let reason = work.filter(|_| passed_over.is_none()).map(|_| reason);
     Ok(Chosen { gpu, reason, passed_over })

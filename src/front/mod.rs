@@ -28,7 +28,7 @@ pub use coevolution::{Coevolution, Progress};
 pub use error::Failure;
 pub use open::cpu;
 #[cfg(feature = "gpu")]
-pub use open::{GpuSearch, Processor, find_gpu, on_gpu, open};
+pub use open::{Processor, find_gpu, on_gpu, open};
 pub use play::{ActionNoise, Played, Traced, play, play_until, record, stepper, trace, with_team};
 pub use results::{Generation, Trained};
 pub use score::{Scored, score};

@@ -26,27 +26,20 @@ pub enum Processor {
     Adapter(String),
 }
 
-/// The result of the search for a GPU.
-#[cfg(feature = "gpu")]
-#[non_exhaustive]
-pub struct GpuSearch {
-    /// The opened GPU, if one is used.
-    pub gpu: Option<GpuBackend>,
-    /// The reason why an existing GPU is not used.
-    pub rejection: Option<DeviceError>,
-}
-
-/// Opens the GPU that the processor asks for, if any. `holding` selects the populations that the GPU keeps between
-/// generations; without it, the backend's default applies.
+/// Opens the GPU that the processor asks for, if any. Also returns why an existing GPU is not used, if so. `holding`
+/// selects the populations that the GPU keeps between generations; without it, the backend's default applies.
 ///
 /// With [`Processor::Auto`], a missing or unusable GPU is an error only if `holding` is [`ResidencyPolicy::Always`].
 ///
 /// # Errors
 /// The requested GPU does not exist or cannot be used.
 #[cfg(feature = "gpu")]
-pub fn find_gpu(processor: &Processor, holding: Option<ResidencyPolicy>) -> Result<GpuSearch, DeviceError> {
+pub fn find_gpu(
+    processor: &Processor,
+    holding: Option<ResidencyPolicy>,
+) -> Result<(Option<GpuBackend>, Option<DeviceError>), DeviceError> {
     let choice = match processor {
-        Processor::Cpu => return Ok(GpuSearch { gpu: None, rejection: None }),
+        Processor::Cpu => return Ok((None, None)),
         Processor::Auto | Processor::Gpu => AdapterChoice::Real,
         Processor::Adapter(name) => AdapterChoice::Named(name.clone()),
     };
@@ -57,12 +50,10 @@ pub fn find_gpu(processor: &Processor, holding: Option<ResidencyPolicy>) -> Resu
                 Some(holding) => gpu.with_residency(holding),
                 None => gpu,
             };
-            Ok(GpuSearch { gpu: Some(gpu), rejection: None })
+            Ok((Some(gpu), None))
         }
-        Err(DeviceError::NoAdapter | DeviceError::NoRealAdapter { .. }) if optional => {
-            Ok(GpuSearch { gpu: None, rejection: None })
-        }
-        Err(error) if optional => Ok(GpuSearch { gpu: None, rejection: Some(error) }),
+        Err(DeviceError::NoAdapter | DeviceError::NoRealAdapter { .. }) if optional => Ok((None, None)),
+        Err(error) if optional => Ok((None, Some(error))),
         Err(error) => Err(error),
     }
 }
@@ -73,7 +64,7 @@ pub fn find_gpu(processor: &Processor, holding: Option<ResidencyPolicy>) -> Resu
 /// The requested GPU does not exist or cannot be used.
 #[cfg(feature = "gpu")]
 pub fn open(processor: &Processor) -> Result<(OpenBackend, Option<DeviceError>), DeviceError> {
-    let GpuSearch { gpu, rejection } = find_gpu(processor, None)?;
+    let (gpu, rejection) = find_gpu(processor, None)?;
     Ok((gpu.map_or_else(cpu, on_gpu), rejection))
 }
 
