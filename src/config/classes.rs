@@ -170,21 +170,9 @@ impl Config {
     }
 
     /// Returns the config with the defaults of all keys that its tables replace, as it is read from a file.
-    pub(crate) fn without_replaced(mut self) -> Config {
-        let defaults = Config::ask(&mut Reader::default());
-        let WorldConfig { map, steps, start_counts, dt, .. } = self.world;
-        let world = WorldConfig { map, steps, start_counts, dt, ..defaults.world };
-        if !self.agents.is_empty() {
-            let WorldConfig { pois, coupling, observation_radius, windows, after, .. } = self.world;
-            self.world = WorldConfig { pois, coupling, observation_radius, windows, after, ..world.clone() };
-            (self.motion, self.follow, self.sense) = (defaults.motion, defaults.follow, defaults.sense);
-            self.learning.paradigm = defaults.learning.paradigm;
-        }
-        if !self.pois.is_empty() {
-            let WorldConfig { leaders, followers, heading, speed, .. } = self.world;
-            self.world = WorldConfig { leaders, followers, heading, speed, ..world };
-        }
-        self
+    pub(crate) fn without_replaced(self) -> Config {
+        let config = Config::ask(&mut Reader::of_values(self.values()));
+        Config { stages: self.stages, ..config }
     }
 
     /// Reports whether a key is not replaced by the tables of this config.

@@ -362,12 +362,8 @@ impl Config {
             r.report_key(AGENTS, "found no class that observes, allowed one or more with observes = true".into());
         }
         let pois = classes::read_pois(r, sides, world.steps, &summary);
-        let learners = match paradigm {
-            _ if has_agents => summary.learners(),
-            _ if world.leaders.is_empty() => 0,
-            Paradigm::LeaderFollower => world.leaders.len(),
-            Paradigm::AllLeaders => world.leaders.len() + world.followers.len(),
-        };
+        // Without leaders the list is wrong, and the number of learners is unknown.
+        let learners = if has_agents || !world.leaders.is_empty() { summary.learners() } else { 0 };
         let agent_count = match has_agents {
             true => agents.iter().map(AgentClass::size).sum(),
             false => world.leaders.len() + world.followers.len(),

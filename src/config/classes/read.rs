@@ -294,6 +294,7 @@ impl AgentClass {
         let heading = AgentClass::heading(r).one_or_each_or(between(-1e3, 1e3), counts, DRAWN, FRAC_PI_2);
         let control = control(r, summary);
         let learns = control.learns();
+        let found_with = |allowed: &str| format!("found with control = \"{control}\", allowed with {allowed}");
         // If the control is wrong, what it needs is unknown.
         let is_known = summary.classes.get(index).is_none_or(|class| class.control.is_some());
         let other = before.iter().find(|class| class.control.is_some() && !class.learns());
@@ -311,8 +312,7 @@ impl AgentClass {
             .optional_number(between(0.01, LONGEST).or_unlimited(), "inf")
             .filter(|reach| reach.is_finite());
         if r.has("agents.reach") && is_known && !matches!(control, Control::Nearest(_)) {
-            let message = format!("found with control = \"{control}\", allowed with \"nearest:CLASS\"");
-            r.report_key("agents.reach", message);
+            r.report_key("agents.reach", found_with("\"nearest:CLASS\""));
         }
         let stays_in = stays_in(r, sides, &at, region);
         let speed = AgentClass::speed(r).number(speeds, 0.0);
@@ -326,7 +326,7 @@ impl AgentClass {
         } else if learns && senses.is_empty() {
             r.report_key("agents.senses", format!("missing, allowed a list of 1 to {MAX_CHANNELS} channels"));
         } else if !learns && !senses.is_empty() {
-            r.report_key("agents.senses", format!("found with control = \"{control}\", allowed with {LEARNS}"));
+            r.report_key("agents.senses", found_with(LEARNS));
         } else if inputs > MAX_INPUTS {
             r.report_key(
                 "agents.senses",
@@ -345,14 +345,13 @@ impl AgentClass {
         } else if control == Control::Follow && rule.is_empty() {
             r.report_key("agents.rule", format!("missing, allowed a list of 1 to {MAX_TERMS} terms"));
         } else if control != Control::Follow && !rule.is_empty() {
-            r.report_key("agents.rule", format!("found with control = \"{control}\", allowed with \"follow\""));
+            r.report_key("agents.rule", found_with("\"follow\""));
         }
         let errors = r.error_count();
         let names = summary.class_names(&[]);
         let leads = AgentClass::leads(r).names("names of classes", false, names.as_deref(), |_| None);
         if !leads.is_empty() && is_known && !learns {
-            let message = format!("found with control = \"{control}\", allowed with {LEARNS}: others cannot lead yet");
-            r.report_key("agents.leads", message);
+            r.report_key("agents.leads", found_with(LEARNS) + ": others cannot lead yet");
         }
         let influence_radius = AgentClass::influence_radius(r)
             .optional_number(between(0.01, LONGEST), "the largest radius of the led class's rule");
@@ -368,7 +367,7 @@ impl AgentClass {
         }
         let fitness = AgentClass::fitness(r).optional_choice("learning.fitness");
         if fitness.is_some() && is_known && !learns {
-            r.report_key("agents.fitness", format!("found with control = \"{control}\", allowed with {LEARNS}"));
+            r.report_key("agents.fitness", found_with(LEARNS));
         }
         AgentClass {
             name,
