@@ -5,7 +5,7 @@ use std::ops::Range;
 use bytemuck::Zeroable;
 use fearless_simd::Simd;
 
-use super::classes::{AgentClass, Classes, ControlKind, MAX_CHANNELS, MAX_CLASSES, MAX_TERMS};
+use super::classes::{AgentClass, Classes, ControlKind, MAX_CHANNELS, MAX_CLASSES, MAX_TERMS, PoiGroup, successive};
 use super::follow::{RuleConstants, TermConstants};
 use super::motion::{Mobility, MotionConstants};
 use super::pursue::PursuitConstants;
@@ -71,8 +71,8 @@ impl Class {
     /// Computes the constants of all classes of a valid config. `values` are those of the POIs.
     pub(crate) fn all(described: &Classes, values: &[f32], map: [f64; 2], dt: f64) -> Vec<Class> {
         let classes = &described.agents;
-        let places = runs(classes.iter().map(|class| class.size()));
-        let groups = runs(described.pois.iter().map(|group| group.size()));
+        let places = successive(classes.iter().map(AgentClass::size));
+        let groups = successive(described.pois.iter().map(PoiGroup::size));
         let end = places.last().map_or(0, |place| place.end);
         let of_class = |name: &str| {
             let index = classes.iter().position(|class| class.name == name);
@@ -122,16 +122,6 @@ impl Class {
         };
         classes.iter().enumerate().map(class).collect()
     }
-}
-
-/// Returns where each of some counts begins and ends, one after the other.
-fn runs(counts: impl Iterator<Item = usize>) -> Vec<Range<usize>> {
-    let mut end = 0;
-    let run = |count| {
-        end += count;
-        end - count..end
-    };
-    counts.map(run).collect()
 }
 
 impl Class {

@@ -416,7 +416,7 @@ impl Classes {
 
     /// Returns the agents that start in each region.
     pub fn start_regions(&self) -> Vec<(Range<usize>, Region)> {
-        regions(self.agents.iter().map(|class| (class.size(), class.region)))
+        regions(self.agents.iter().map(AgentClass::size), self.agents.iter().map(|class| class.region))
     }
 
     /// Returns each agent's heading at the start in radians, `[agents]`: examples of those that are drawn.
@@ -436,8 +436,7 @@ impl Classes {
 
     /// Returns the agents of a class.
     pub fn agents_of(&self, class: usize) -> Range<usize> {
-        let first = self.agents[..class].iter().map(AgentClass::size).sum::<usize>();
-        first..first + self.agents[class].size()
+        successive(self.agents.iter().map(AgentClass::size)).swap_remove(class)
     }
 
     /// Returns the index of each agent's class, `[agents]`.
@@ -453,7 +452,7 @@ impl Classes {
 
     /// Returns the POIs that are in each region.
     pub fn poi_regions(&self) -> Vec<(Range<usize>, Region)> {
-        regions(self.pois.iter().map(|group| (group.size(), group.region)))
+        regions(self.pois.iter().map(PoiGroup::size), self.pois.iter().map(|group| group.region))
     }
 
     /// Returns the index of each POI's group, `[pois]`.
@@ -520,13 +519,21 @@ fn examples<'a>(tables: impl Iterator<Item = (&'a [[f64; 2]], usize, Option<Regi
 }
 
 /// Returns the regions of those that are in one, with their indices.
-fn regions(tables: impl Iterator<Item = (usize, Option<Region>)>) -> Vec<(Range<usize>, Region)> {
+fn regions(
+    sizes: impl Iterator<Item = usize>,
+    regions: impl Iterator<Item = Option<Region>>,
+) -> Vec<(Range<usize>, Region)> {
+    successive(sizes).into_iter().zip(regions).filter_map(|(range, region)| Some((range, region?))).collect()
+}
+
+/// Returns where each of some counts begins and ends, one after the other.
+pub(crate) fn successive(counts: impl Iterator<Item = usize>) -> Vec<Range<usize>> {
     let mut end = 0;
-    let region = |(count, region): (usize, Option<Region>)| {
+    let range = |count| {
         end += count;
-        Some((end - count..end, region?))
+        end - count..end
     };
-    tables.filter_map(region).collect()
+    counts.map(range).collect()
 }
 
 impl PoiGroup {
