@@ -60,9 +60,9 @@ impl Genome {
 pub(super) struct Climber {
     genome: Genome,
     /// The best team so far. Empty before the first round.
-    parent: Vec<f32>,
-    /// Summed worth of the POIs that it observes in the episodes of this generation.
-    observed: u64,
+    pub(super) parent: Vec<f32>,
+    /// Summed worth of the POIs that it observes in the episodes of its last generation.
+    pub(super) observed: u64,
     /// The teams of this round, `[teams][numbers]`.
     teams: Vec<f32>,
 }
@@ -70,11 +70,6 @@ pub(super) struct Climber {
 impl Climber {
     pub(super) fn new(genome: Genome) -> Climber {
         Climber { genome, parent: vec![], observed: 0, teams: vec![] }
-    }
-
-    /// Returns POIs that the best team observes in the episodes of its last generation.
-    pub(super) fn observed(&self) -> u64 {
-        self.observed
     }
 
     /// Writes the teams of a round: `count` of a generation, from its slot `first` on. With `again`, the parent is the
@@ -134,11 +129,6 @@ impl Climber {
     /// Writes the policies of the best team, `[populations][parameters]`, for one population.
     pub(super) fn write_policy(&self, population: usize, policy: &mut [f32]) {
         policy.copy_from_slice(&self.parent[population * policy.len()..][..policy.len()]);
-    }
-
-    /// Returns the best team alone.
-    pub(super) fn best(&self) -> &[f32] {
-        &self.parent
     }
 }
 

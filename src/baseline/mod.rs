@@ -515,8 +515,8 @@ impl Setting {
             self.found.constant[place].push(most as f64 / whole);
             let Baseline { actions, random: networks, shared, open_loop, hill_climbing, .. } = &mut self.found;
             if let Some(climbers) = &trial.climbers {
-                open_loop[place].push(climbers.segments.observed() as f64 / whole);
-                hill_climbing[place].push(climbers.networks.observed() as f64 / whole);
+                open_loop[place].push(climbers.segments.observed as f64 / whole);
+                hill_climbing[place].push(climbers.networks.observed as f64 / whole);
             }
             let kinds =
                 random.chunks_exact(self.config.learning.team_count()).zip([actions, networks, shared]).zip(RANDOM);
@@ -542,7 +542,7 @@ impl Setting {
             let whole = (self.world.total_worth as usize * episodes_per_team) as f64;
             let [action, network, shared] = [0, 1, 2].map(|kind| trial.finalists[kind][0].0 as f64 / whole);
             let climbed = |of: fn(&Climbers) -> &Climber| {
-                trial.climbers.as_ref().map_or(0.0, |climbers| of(climbers).observed() as f64 / whole)
+                trial.climbers.as_ref().map_or(0.0, |climbers| of(climbers).observed as f64 / whole)
             };
             let open_loop = climbed(|climbers| &climbers.segments);
             let hill_climbing = climbed(|climbers| &climbers.networks);
@@ -585,7 +585,7 @@ impl Setting {
             Some(climbers) => {
                 let weights = &vec![0.0; self.config.populations() * world.parameters()];
                 let round = Round { world, teams: 1, weights, starts: &starts };
-                play_segments(&[round], &[climbers.segments.best()])?[0][0] as f64 / whole
+                play_segments(&[round], &[&climbers.segments.parent])?[0][0] as f64 / whole
             }
             None => 0.0,
         };

@@ -24,6 +24,8 @@ pub(crate) use lanes::LaneCredit;
 pub use record::{Episode, Paths, RecordRequest, Seen, Strided, owner_bits};
 pub use replay::observed_at;
 
+use fearless_simd::{Level, dispatch};
+
 use paths::PathCredit;
 
 use crate::config::Fitness;
@@ -83,7 +85,7 @@ impl Credit {
     /// the team observed. The episode must be of `world`, with the [record](RecordRequest) that the fitness needs.
     pub fn score(&mut self, episode: &Episode<'_>, world: &World, fitness: Fitness, scores: &mut [f32]) -> u32 {
         if let (Some(rule), Some(paths)) = (&world.paths, &episode.paths) {
-            return self.paths.score(paths, world, rule, fitness, scores);
+            return dispatch!(Level::new(), simd => self.paths.score(simd, paths, world, rule, fitness, scores));
         }
         if world.rule.is_timed() || fitness == Fitness::Dt {
             return self.replay(episode, world, fitness, scores);
@@ -114,11 +116,6 @@ impl Credit {
             }
         }
         self.observed_worth(world)
-    }
-
-    /// Returns every fitness of every leader of a team that took some paths, in a world that is scored by them.
-    pub(crate) fn of_paths(&mut self, paths: &Paths<'_>, world: &World) -> Scores {
-        self.all(&Episode { paths: Some(*paths), ..Episode::whole(&[], &[], &[]) }, world)
     }
 
     /// Returns every fitness of every leader. The episode must be of `world`, with the [record](RecordRequest) that D++

@@ -1,6 +1,6 @@
 //! Scores from paths: for POIs that count by distance or by when, and for learners that lead learners.
 
-use fearless_simd::{Level, Simd, dispatch, prelude::*};
+use fearless_simd::{Simd, prelude::*};
 use glam::Vec2;
 
 use super::assignment::{first_most, lead};
@@ -51,18 +51,7 @@ enum Change {
 impl PathCredit {
     /// Scores every learner of a team by `fitness` into `scores`, `[leaders]`, and returns what the POIs are worth that
     /// the team observed.
-    pub(super) fn score(
-        &mut self,
-        paths: &Paths<'_>,
-        world: &World,
-        rule: &PathRule,
-        fitness: Fitness,
-        scores: &mut [f32],
-    ) -> u32 {
-        dispatch!(Level::new(), simd => self.score_with(simd, paths, world, rule, fitness, scores))
-    }
-
-    fn score_with<S: Simd>(
+    pub(super) fn score<S: Simd>(
         &mut self,
         simd: S,
         paths: &Paths<'_>,

@@ -28,9 +28,8 @@ pub(super) fn play<'a>(
         let (stage, range) = (experiment.stage(), experiment.playing());
         let (teams, leaders) = (experiment.teams(), stage.world.leaders());
         let previous = experiment.stages.ending_before(experiment.generation);
-        let on_device = experiment.residency.on_device();
-        for (index, (trial, schedule)) in experiment.trials.iter().zip(&experiment.schedules).enumerate() {
-            let weights = on_device.get(index).map_or(trial.weights[..].into(), |held| Weights::OnDevice(&**held));
+        for (index, schedule) in experiment.schedules.iter().enumerate() {
+            let weights = experiment.weights(index);
             let mut add = |stage: &'a Stage, starts, range: Range<usize>| {
                 let teams = &schedule.teams[range.start * leaders..range.end * leaders];
                 groups.extend(episodes(stage, starts, weights, teams, &stage.fitnesses));
@@ -70,15 +69,14 @@ pub(super) fn test(
 ) -> Result<(), BackendError> {
     let mut groups = Vec::new();
     for (_, experiment) in experiments.iter().filter(|(_, experiment)| !experiment.only_champions_left()) {
-        let (stage, on_device) = (experiment.stage(), experiment.residency.on_device());
+        let stage = experiment.stage();
         let (teams, leaders) = (stage.config.learning.team_count(), stage.world.leaders());
         for (index, (trial, schedule)) in experiment.trials.iter().zip(&experiment.schedules).enumerate() {
             if !schedule.test_starts.is_empty() {
-                let weights = on_device.get(index).map_or(trial.weights[..].into(), |held| Weights::OnDevice(&**held));
                 let sums = (0..teams).map(|team| observed(&trial.scores, team));
                 let best = sums.enumerate().max_by_key(|&(team, sum)| (sum, Reverse(team))).map_or(0, |(team, _)| team);
                 let best = &schedule.teams[best * leaders..(best + 1) * leaders];
-                groups.extend(episodes(stage, &schedule.test_starts, weights, best, &[]));
+                groups.extend(episodes(stage, &schedule.test_starts, experiment.weights(index), best, &[]));
             }
         }
     }
@@ -106,6 +104,12 @@ pub(super) fn keep(scores: Vec<GroupScores>, experiments: &mut [(usize, &mut Exp
 }
 
 impl ExperimentState {
+    /// Returns the weights of a trial, on the device that holds them or else on the host.
+    fn weights(&self, trial: usize) -> Weights<'_> {
+        let held = self.residency.on_device().get(trial);
+        held.map_or(self.trials[trial].weights[..].into(), |held| Weights::OnDevice(&**held))
+    }
+
     /// Returns the range of teams to play. The last is the champions' team: it does not play in the first generation,
     /// and plays alone after the last one.
     fn playing(&self) -> Range<usize> {
