@@ -1,7 +1,9 @@
 //! The trace of a group: all quantities of every step.
 
+use bytemuck::Zeroable;
 use glam::Vec2;
 
+use super::Group;
 use crate::credit::{Episode, Paths, Strided};
 use crate::gpu_struct::gpu_struct;
 use crate::world::{OUTPUTS, World};
@@ -54,6 +56,37 @@ pub struct Trace {
 }
 
 impl Trace {
+    /// Returns a trace of a group with zeros in all arrays.
+    pub(super) fn of_zeros(group: &Group<'_>) -> Trace {
+        let (world, teams) = (group.world, group.team_count());
+        let (agents, leaders, moments) = (world.agents(), world.leaders(), (world.steps() + 1) * teams);
+        let trail = match world.paths {
+            Some(_) => world.path_words(),
+            None if group.records().sights() => world.sight_words(),
+            None => 0,
+        };
+        Trace {
+            teams,
+            agents,
+            leaders,
+            moments: vec![Moment::zeroed(); moments * agents],
+            inputs: vec![0.0; moments * leaders * world.inputs()],
+            sets: vec![0; teams * world.set_words()],
+            seen: vec![0; teams * leaders * world.followers()],
+            trail: vec![0; teams * trail],
+            pois: group.pois().to_vec(),
+        }
+    }
+
+    /// Stores the record of one team.
+    pub(super) fn store(&mut self, team: usize, episode: &Episode<'_>) {
+        let Trace { sets, seen, trail, .. } = self;
+        for (all, words) in [(sets, episode.sets), (seen, episode.seen.words()), (trail, episode.trail())] {
+            let to = all[team * words.len()..].iter_mut();
+            to.zip(words.iter()).for_each(|(to, word)| *to = word);
+        }
+    }
+
     /// Returns what one agent of one team did at one step.
     pub fn moment(&self, step: usize, team: usize, agent: usize) -> &Moment {
         &self.moments[(step * self.teams + team) * self.agents + agent]

@@ -1,31 +1,19 @@
 //! Whole episodes of one vector of teams.
 
+use std::ops::Range;
+
 use fearless_simd::{Simd, prelude::*};
 
-use super::ScoreTable;
 use super::batch::WorldBatch;
 use super::block::Block;
 use super::network::Network;
+use super::steps::{StepArrays, write_columns};
+use super::together::{Observer, Together};
+use super::{Moment, ScoreTable};
 use crate::config::Fitness;
 use crate::credit::{Episode, LaneCredit, Paths, Seen, Strided};
 use crate::model::class::Class;
-use crate::world::World;
-
-/// Follows the episodes of one vector of teams. By default nothing is done.
-pub(super) trait Observer<S: Simd> {
-    /// The teams are at their start.
-    #[inline(always)]
-    fn started(&mut self, _: &Block<S>) {}
-
-    /// Policies have answered what leaders sense before this step, and agents are about to move. The outputs may be
-    /// changed.
-    #[inline(always)]
-    fn decided(&mut self, _: &mut Block<S>, _step: usize) {}
-
-    /// The agents have moved. `sets` are the agents at each POI, `[pois][words][lanes]`.
-    #[inline(always)]
-    fn moved(&mut self, _: &Block<S>, _sets: &[u32], _step: usize) {}
-}
+use crate::world::{OUTPUTS, World};
 
 /// Whole episodes of one vector of teams: their state, policies and record.
 pub(super) struct EpisodeBlock<S: Simd> {
@@ -51,36 +39,13 @@ pub(super) fn sight_words(world: &World, sighted: bool) -> usize {
 }
 
 impl<S: Simd> EpisodeBlock<S> {
-    pub(super) fn new(simd: S, world: &World, sighted: bool) -> EpisodeBlock<S> {
-        EpisodeBlock {
-            classes: world.classes.clone(),
-            block: Block::new(simd, world),
-            network: Network::new(simd, &world.constants.policy, world.choices()),
-            places: Vec::with_capacity(S::f32s::LEN),
-            sets: vec![0; world.set_words() * S::f32s::LEN],
-            seen: vec![0; world.followers() * world.leaders() * S::f32s::LEN],
-            sights: vec![0; sight_words(world, sighted) * S::f32s::LEN],
-            paths: vec![0; if world.paths.is_some() { world.path_words() * S::f32s::LEN } else { 0 }],
-            credit: LaneCredit::new(simd, world),
-        }
-    }
-
-    /// Reports whether it has the sizes and constants of a world and its record.
-    pub(super) fn fits(&self, world: &World, sighted: bool) -> bool {
-        bytemuck::cast_slice::<_, u8>(&self.classes) == bytemuck::cast_slice::<_, u8>(&world.classes)
-            && self.block.world.constants == world.constants
-            && [&self.block.radii2, &self.block.values] == [&world.radii2, &world.values]
-            && self.block.gone_within == world.gone_within
-            && self.sights.len() == sight_words(world, sighted) * S::f32s::LEN
-            && self.paths.is_empty() == world.paths.is_none()
-    }
-
-    /// Puts teams at their start, see [`EpisodeBlock::play`].
+    /// Puts teams at their start. Unused lanes repeat the first team.
     #[inline(always)]
-    fn load(&mut self, batch: &WorldBatch<'_>, first: usize, teams: usize) {
+    fn load(&mut self, batch: &WorldBatch<'_>, teams: Range<usize>) {
         let EpisodeBlock { block, network, places, .. } = self;
         places.clear();
-        places.extend((0..S::f32s::LEN).map(|lane| batch.locate(first + if lane < teams { lane } else { 0 })));
+        let team = |lane: usize| teams.start + if lane < teams.len() { lane } else { 0 };
+        places.extend((0..S::f32s::LEN).map(|lane| batch.locate(team(lane))));
         for (lane, &(group, _)) in places.iter().enumerate() {
             block.place(lane, batch.groups[group].starts, batch.groups[group].headings());
             block.place_pois(lane, batch.groups[group].pois());
@@ -89,73 +54,130 @@ impl<S: Simd> EpisodeBlock<S> {
         network.load(batch, places);
     }
 
-    /// Plays the whole episode of `teams` teams of the batch, from `first` on. Unused lanes repeat the first team.
+    /// Records the positions of a moment, if scores need them.
     #[inline(always)]
-    pub(super) fn play(&mut self, batch: &WorldBatch<'_>, first: usize, teams: usize, observer: &mut impl Observer<S>) {
-        self.load(batch, first, teams);
-        let EpisodeBlock { block, network, sets, seen, sights, paths, .. } = self;
-        let steps = batch.world.steps();
-        let [sets_per_step, sights_per_step] = [sets.len() / steps, sights.len() / steps];
-        let moment = (paths.len() / (steps + 1)).max(1);
-        let mut moments = paths.chunks_exact_mut(moment);
-        observer.started(block);
-        write_positions(block, &mut moments);
-        for step in 0..steps {
-            block.sense();
-            network.decide(&block.inputs, &mut block.outputs);
-            observer.decided(block, step);
-            let sets = &mut sets[step * sets_per_step..][..sets_per_step];
-            block.step(&mut sights[step * sights_per_step..][..sights_per_step], sets);
-            observer.moved(block, sets, step);
-            write_positions(block, &mut moments);
+    fn record_positions(&mut self, moment: usize) {
+        let words = self.block.agents.len() * 2 * S::f32s::LEN;
+        let Some(paths) = self.paths.get_mut(moment * words..(moment + 1) * words) else { return };
+        for (agent, to) in self.block.agents.iter().zip(paths.chunks_exact_mut(2 * S::f32s::LEN)) {
+            let (x, y) = to.split_at_mut(S::f32s::LEN);
+            agent.x.bitcast::<S::u32s>().store_slice(x);
+            agent.y.bitcast::<S::u32s>().store_slice(y);
         }
-        for (words, count) in seen.chunks_exact_mut(S::f32s::LEN).zip(&block.counts) {
+    }
+}
+
+impl<S: Simd> Together<S> for EpisodeBlock<S> {
+    const MOST: usize = S::f32s::LEN;
+
+    fn allocate(simd: S, batch: &WorldBatch<'_>, _: bool) -> EpisodeBlock<S> {
+        let world = batch.world;
+        EpisodeBlock {
+            classes: world.classes.clone(),
+            block: Block::new(simd, world),
+            network: Network::new(simd, &world.constants.policy, world.choices()),
+            places: Vec::with_capacity(S::f32s::LEN),
+            sets: vec![0; world.set_words() * S::f32s::LEN],
+            seen: vec![0; world.followers() * world.leaders() * S::f32s::LEN],
+            sights: vec![0; sight_words(world, batch.sighted) * S::f32s::LEN],
+            paths: vec![0; if world.paths.is_some() { world.path_words() * S::f32s::LEN } else { 0 }],
+            credit: LaneCredit::new(simd, world),
+        }
+    }
+
+    fn fits(&self, batch: &WorldBatch<'_>) -> bool {
+        let world = batch.world;
+        bytemuck::cast_slice::<_, u8>(&self.classes) == bytemuck::cast_slice::<_, u8>(&world.classes)
+            && self.block.world.constants == world.constants
+            && [&self.block.radii2, &self.block.values] == [&world.radii2, &world.values]
+            && self.block.gone_within == world.gone_within
+            && self.sights.len() == sight_words(world, batch.sighted) * S::f32s::LEN
+            && self.paths.is_empty() == world.paths.is_none()
+    }
+
+    #[inline(always)]
+    fn play(&mut self, batch: &WorldBatch<'_>, teams: Range<usize>, observer: &mut impl Observer<S, Self>) {
+        self.load(batch, teams);
+        let steps = batch.world.steps();
+        let [sets_per_step, sights_per_step] = [self.sets.len() / steps, self.sights.len() / steps];
+        observer.started(self);
+        self.record_positions(0);
+        for step in 0..steps {
+            self.block.sense();
+            self.network.decide(&self.block.inputs, &mut self.block.outputs);
+            observer.decided(self, step);
+            let sights = &mut self.sights[step * sights_per_step..][..sights_per_step];
+            self.block.step(sights, &mut self.sets[step * sets_per_step..][..sets_per_step]);
+            observer.moved(self, step);
+            self.record_positions(step + 1);
+        }
+        for (words, count) in self.seen.chunks_exact_mut(S::f32s::LEN).zip(&self.block.counts) {
             count.store_slice(words);
         }
     }
 
-    /// Scores the teams that [`EpisodeBlock::play`] played: all lanes at once if the fitnesses allow it.
+    /// Scores all lanes at once if the fitnesses allow it.
     #[inline(always)]
-    pub(super) fn score(&mut self, batch: &WorldBatch<'_>, first: usize, teams: usize, scores: &ScoreTable<'_>) {
-        let places = |lane: usize| {
-            let (group, team) = batch.locate(first + lane);
-            (batch.first + group, team)
-        };
+    fn score(&mut self, batch: &WorldBatch<'_>, teams: Range<usize>, scores: &ScoreTable<'_>) {
         // Without a fitness, only the observed POIs are wanted.
         let counted = batch.fitnesses.map(|fitnesses| if fitnesses.is_empty() { &[Fitness::G] } else { fitnesses });
         let in_lanes = |fitness: &Fitness| LaneCredit::<S>::can_score(batch.world, *fitness);
         let Some(counted) = counted.filter(|fitnesses| fitnesses.iter().all(in_lanes)) else {
-            for lane in 0..teams {
-                let (group, team) = places(lane);
-                scores.score(group, team, &self.episode(batch, lane));
+            for lane in 0..teams.len() {
+                let (group, team) = self.places[lane];
+                scores.score(batch.first + group, team, &self.episode_of(batch, lane));
             }
             return;
         };
         for (row, &fitness) in counted.iter().enumerate() {
             self.credit.score(&self.sets, &self.block.counts, batch.world, fitness);
-            for lane in 0..teams {
-                scores.put(places(lane), row, self.credit.observed(lane), self.credit.scores(lane));
+            for (lane, &(group, team)) in self.places[..teams.len()].iter().enumerate() {
+                let place = (batch.first + group, team);
+                scores.put(place, row, self.credit.observed(lane), self.credit.scores(lane));
             }
         }
     }
 
-    /// Returns one lane's record of a batch that was played.
-    pub(super) fn episode<'a>(&'a self, batch: &WorldBatch<'a>, lane: usize) -> Episode<'a> {
-        let strided = |words| Strided { words, stride: S::f32s::LEN, offset: lane };
+    fn episode_of<'a>(&'a self, batch: &WorldBatch<'a>, team: usize) -> Episode<'a> {
+        let strided = |words| Strided { words, stride: S::f32s::LEN, offset: team };
         let seen = Seen::Counts(strided(&self.seen));
-        let pois = batch.groups[self.places[lane].0].pois();
+        let pois = batch.groups[self.places[team].0].pois();
         let paths = batch.world.paths.is_some().then(|| Paths { positions: strided(&self.paths), pois });
         Episode { sets: strided(&self.sets), seen, sights: strided(&self.sights), paths }
     }
-}
 
-/// Writes the positions of a moment, `[agents][2][lanes]`, if they are recorded.
-#[inline(always)]
-fn write_positions<'a, S: Simd>(block: &Block<S>, moments: &mut impl Iterator<Item = &'a mut [u32]>) {
-    let Some(moment) = moments.next() else { return };
-    for (agent, to) in block.agents.iter().zip(moment.chunks_exact_mut(2 * S::f32s::LEN)) {
-        let (x, y) = to.split_at_mut(S::f32s::LEN);
-        agent.x.bitcast::<S::u32s>().store_slice(x);
-        agent.y.bitcast::<S::u32s>().store_slice(y);
+    #[inline(always)]
+    fn outputs(&mut self) -> &mut [[S::f32s; OUTPUTS]] {
+        &mut self.block.outputs
+    }
+
+    #[inline(always)]
+    fn place(leader: usize) -> (usize, usize) {
+        (leader, 0)
+    }
+
+    fn moments(&self, team: usize, sensed: bool, moments: &mut [Moment], inputs: &mut [f32]) {
+        self.block.moments(team, sensed, moments, inputs);
+    }
+
+    #[inline(always)]
+    fn store_states(&self, row: (usize, usize), arrays: &mut StepArrays<'_>) {
+        arrays.write_states(self.block.simd, &self.block.agents, row);
+    }
+
+    #[inline(always)]
+    fn store_inputs(&self, row: (usize, usize), arrays: &mut StepArrays<'_>) {
+        arrays.write_inputs(&self.block, row);
+    }
+
+    #[inline(always)]
+    fn store_outputs(&self, row: (usize, usize), outputs: &mut [f32]) {
+        write_columns(self.block.simd, self.block.outputs.as_flattened(), row, outputs);
+    }
+
+    #[inline(always)]
+    fn store_sets(&self, row: (usize, usize), arrays: &mut StepArrays<'_>) {
+        let words = self.sets.len() / row.1;
+        arrays.write_sets(self.block.simd, &self.sets[row.0 * words..][..words], row);
     }
 }

@@ -4,7 +4,6 @@
 //! The loops here may skip whatever adds nothing (an agent out of reach in every lane), since sums start at +0 and
 //! keep their order. The formulas are those of [`crate::model`].
 
-use std::any::Any;
 use std::ops::Range;
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
@@ -27,6 +26,7 @@ mod network;
 mod record;
 mod steps;
 mod swarm;
+mod together;
 mod transpose;
 
 pub(crate) use agent::Agent;
@@ -38,25 +38,16 @@ pub(crate) use swarm::{Recorded, Swarm};
 pub(crate) use transpose::transpose_rows;
 
 use batch::{WorldBatch, world_batches};
-use episode::{EpisodeBlock, Observer, sight_words};
-use swarm::Watch;
+use episode::{EpisodeBlock, sight_words};
+use together::{Observer, Together, Workspace, play_together};
 
 /// Plays episodes on the CPU, with the widest instruction set that it has, on the threads of the current rayon pool.
 pub struct Cpu {
     level: Level,
     /// Teams of so many agents play one at a time.
     large_from: usize,
-    /// A [`Workspace`] per thread, kept between batches.
-    workspaces: Option<Box<dyn Any + Send>>,
-}
-
-/// The memory of a thread, as it was last used.
-enum Workspace<S: Simd> {
-    Unused,
-    /// For one vector of teams.
-    Block(Box<EpisodeBlock<S>>),
-    /// For one large team.
-    Swarm(Box<Swarm<S>>),
+    /// One per thread, kept between batches.
+    workspaces: Vec<Workspace>,
 }
 
 impl Default for Cpu {
@@ -68,7 +59,7 @@ impl Default for Cpu {
 impl Cpu {
     /// Returns a backend that uses a given instruction set, for tests and benchmarks.
     pub fn at_level(level: Level) -> Cpu {
-        Cpu { level, large_from: LARGE_FROM, workspaces: None }
+        Cpu { level, large_from: LARGE_FROM, workspaces: vec![] }
     }
 
     /// Plays teams of at least so many agents one at a time. The bits are the same, so this is for tests and benchmarks.
@@ -151,7 +142,10 @@ impl Backend for Cpu {
         group.weights.on_host()?;
         let level = self.level;
         let is_large = is_large(group.world, self.large_from);
-        Ok(dispatch!(level, simd => if is_large { trace_large(simd, group) } else { trace(simd, group) }))
+        Ok(dispatch!(level, simd => match is_large {
+            true => trace::<_, Swarm<_>>(simd, group),
+            false => trace::<_, EpisodeBlock<_>>(simd, group),
+        }))
     }
 
     fn describe(&self) -> String {
@@ -170,7 +164,7 @@ fn play<S: Simd>(
     simd: S,
     groups: &[Group<'_>],
     large_from: usize,
-    workspaces: &mut Option<Box<dyn Any + Send>>,
+    workspaces: &mut Vec<Workspace>,
     actions: Option<&Actions<'_>>,
     scores: &ScoreTable<'_>,
 ) {
@@ -180,64 +174,30 @@ fn play<S: Simd>(
         .iter()
         .flat_map(|batch| (0..batch.teams).step_by(width(batch)).map(move |team| (batch, team)))
         .collect();
-    let mut own = workspaces.take().and_then(|kept| kept.downcast::<Vec<Workspace<S>>>().ok()).unwrap_or_default();
-    own.resize_with(current_num_threads(), || Workspace::Unused);
+    workspaces.resize_with(current_num_threads(), || None);
     let next = AtomicUsize::new(0);
-    let threads = own.len().min(blocks.len());
+    let threads = workspaces.len().min(blocks.len());
     let early = blocks.len() >= PREFETCH_FROM * threads;
-    own[..threads].par_iter_mut().with_max_len(1).for_each(|workspace| {
+    workspaces[..threads].par_iter_mut().with_max_len(1).for_each(|workspace| {
         let take = || blocks.get(next.fetch_add(1, Relaxed));
         let mut current = take();
         while let Some(&(batch, first)) = current {
             let following = if early { take() } else { None };
+            let teams_from = |first: usize| first..batch.teams.min(first + width(batch));
+            let ahead = match following {
+                Some((next, first)) if std::ptr::eq(*next, batch) => teams_from(*first),
+                _ => 0..0,
+            };
+            let teams = teams_from(first);
+            let mut observer = Playing { batch, playing: teams.clone(), ahead, actions };
             if is_large(batch.world, large_from) {
-                let swarm = workspace.swarm(simd, batch);
-                swarm.play(batch, first, &mut Directed { team: first, actions });
-                swarm.score(batch, first, scores);
+                let _: &Swarm<S> = play_together(simd, workspace, batch, teams, &mut observer, scores);
             } else {
-                let episodes = workspace.block(simd, batch);
-                let teams = S::f32s::LEN.min(batch.teams - first);
-                let ahead = match following {
-                    Some((next, first)) if std::ptr::eq(*next, batch) => {
-                        *first..(first + S::f32s::LEN).min(batch.teams)
-                    }
-                    _ => 0..0,
-                };
-                simd.vectorize(
-                    #[inline(always)]
-                    || {
-                        let playing = first..first + teams;
-                        let mut observer = Playing { batch, playing, ahead: ahead.clone(), actions };
-                        episodes.play(batch, first, teams, &mut observer);
-                        episodes.score(batch, first, teams, scores);
-                    },
-                );
+                let _: &EpisodeBlock<S> = play_together(simd, workspace, batch, teams, &mut observer, scores);
             }
             current = if early { following } else { take() };
         }
     });
-    *workspaces = Some(own);
-}
-
-impl<S: Simd> Workspace<S> {
-    /// Returns memory for vectors of teams of a batch.
-    fn block(&mut self, simd: S, batch: &WorldBatch<'_>) -> &mut EpisodeBlock<S> {
-        if !matches!(self, Workspace::Block(block) if block.fits(batch.world, batch.sighted)) {
-            *self = Workspace::Block(Box::new(EpisodeBlock::new(simd, batch.world, batch.sighted)));
-        }
-        let Workspace::Block(block) = self else { unreachable!("it was just made") };
-        block
-    }
-
-    /// Returns memory for large teams of a batch.
-    fn swarm(&mut self, simd: S, batch: &WorldBatch<'_>) -> &mut Swarm<S> {
-        let recorded = Recorded { counts: batch.counted, sights: batch.sighted, forces: false };
-        if !matches!(self, Workspace::Swarm(swarm) if swarm.fits(batch.world, recorded)) {
-            *self = Workspace::Swarm(Box::new(Swarm::new(simd, batch.world, recorded)));
-        }
-        let Workspace::Swarm(swarm) = self else { unreachable!("it was just made") };
-        swarm
-    }
 }
 
 /// Prefetches the policies of the teams that play next, during the steps of those before, and replaces the actions of these
@@ -250,147 +210,62 @@ struct Playing<'a> {
     actions: Option<&'a Actions<'a>>,
 }
 
-impl<S: Simd> Observer<S> for Playing<'_> {
+impl<S: Simd, T: Together<S>> Observer<S, T> for Playing<'_> {
     #[inline(always)]
-    fn decided(&mut self, block: &mut Block<S>, step: usize) {
+    fn decided(&mut self, teams: &mut T, step: usize) {
         self.batch.prefetch(self.ahead.clone(), step);
         let Some(actions) = self.actions else { return };
-        for (leader, outputs) in block.outputs.iter_mut().enumerate() {
-            for (lane, team) in self.playing.clone().enumerate() {
+        for leader in 0..self.batch.world.leaders() {
+            let (index, first) = T::place(leader);
+            let outputs = &mut teams.outputs()[index];
+            for (lane, team) in (first..).zip(self.playing.clone()) {
                 outputs.iter_mut().zip(actions(team, leader, step)).for_each(|(to, action)| to[lane] = action);
             }
         }
     }
 }
 
-/// Replaces the actions of a large team if others are given.
-struct Directed<'a> {
-    team: usize,
-    actions: Option<&'a Actions<'a>>,
-}
-
-impl<S: Simd> Watch<S> for Directed<'_> {
-    fn decided(&mut self, swarm: &mut Swarm<S>, step: usize) {
-        let Some(actions) = self.actions else { return };
-        for leader in 0..swarm.leaders() {
-            let outputs = swarm.outputs[leader / S::f32s::LEN].iter_mut();
-            let given = actions(self.team, leader, step);
-            outputs.zip(given).for_each(|(to, action)| to[leader % S::f32s::LEN] = action);
-        }
-    }
-}
-
 /// Plays a group, and records all quantities of every step.
-fn trace<S: Simd>(simd: S, group: &Group<'_>) -> Trace {
-    let world = group.world;
-    let (teams, agents, steps) = (group.team_count(), world.agents(), world.steps());
+fn trace<S: Simd, T: Together<S>>(simd: S, group: &Group<'_>) -> Trace {
     let batch = WorldBatch::new(std::slice::from_ref(group), 0);
-    let mut moments = vec![bytemuck::Zeroable::zeroed(); (steps + 1) * teams * agents];
-    let of_team = world.leaders() * world.inputs();
-    let mut inputs = vec![0.0; (steps + 1) * teams * of_team];
-    let (mut sets, mut seen, mut trail) = (Vec::new(), Vec::new(), Vec::new());
-    let mut episodes = EpisodeBlock::new(simd, world, batch.sighted);
-    for first in (0..teams).step_by(S::f32s::LEN) {
-        let lanes = S::f32s::LEN.min(teams - first);
-        let mut observer = Moments { moments: &mut moments, inputs: &mut inputs, of_team, teams, first, lanes };
-        episodes.play(&batch, first, lanes, &mut observer);
-        for lane in 0..lanes {
-            let episode = episodes.episode(&batch, lane);
-            sets.extend(episode.sets.iter());
-            seen.extend(episode.seen.words().iter());
-            trail.extend(episode.trail().iter());
+    let (mut trace, mut together) = (Trace::of_zeros(group), T::allocate(simd, &batch, true));
+    for first in (0..batch.teams).step_by(T::MOST) {
+        let teams = first..batch.teams.min(first + T::MOST);
+        together.play(&batch, teams.clone(), &mut Moments { trace: &mut trace, playing: teams.clone() });
+        for team in teams {
+            trace.store(team, &together.episode_of(&batch, team - first));
         }
     }
-    Trace { teams, agents, leaders: world.leaders(), moments, inputs, sets, seen, trail, pois: group.pois().to_vec() }
+    trace
 }
 
-/// [`trace`] of large teams.
-fn trace_large<S: Simd>(simd: S, group: &Group<'_>) -> Trace {
-    let world = group.world;
-    let (teams, agents, leaders) = (group.team_count(), world.agents(), world.leaders());
-    let of_team = leaders * world.inputs();
-    let batch = WorldBatch::new(std::slice::from_ref(group), 0);
-    let recorded = Recorded { counts: true, sights: batch.sighted, forces: true };
-    let mut swarm = Swarm::new(simd, world, recorded);
-    let mut watch = LargeMoments {
-        moments: vec![bytemuck::Zeroable::zeroed(); (world.steps() + 1) * teams * agents],
-        inputs: vec![0.0; (world.steps() + 1) * teams * of_team],
-        sizes: [teams, agents, of_team],
-        team: 0,
-    };
-    let (mut sets, mut seen, mut trail) = (Vec::new(), Vec::new(), Vec::new());
-    for team in 0..teams {
-        watch.team = team;
-        swarm.play(&batch, team, &mut watch);
-        let episode = swarm.episode();
-        sets.extend(episode.sets.iter());
-        seen.extend(episode.seen.words().iter());
-        trail.extend(episode.trail().iter());
-    }
-    let LargeMoments { moments, inputs, .. } = watch;
-    Trace { teams, agents, leaders, moments, inputs, sets, seen, trail, pois: group.pois().to_vec() }
-}
-
-/// The moments and inputs of a [`Trace`] of large teams.
-struct LargeMoments {
-    moments: Vec<Moment>,
-    inputs: Vec<f32>,
-    /// Teams, agents, and inputs of a team.
-    sizes: [usize; 3],
-    team: usize,
-}
-
-impl LargeMoments {
-    fn write<S: Simd>(&mut self, swarm: &Swarm<S>, row: usize) {
-        let [teams, agents, inputs] = self.sizes;
-        let place = row * teams + self.team;
-        let moments = &mut self.moments[place * agents..][..agents];
-        swarm.moments(row > 0, moments, &mut self.inputs[place * inputs..][..inputs]);
-    }
-}
-
-impl<S: Simd> Watch<S> for LargeMoments {
-    fn started(&mut self, swarm: &mut Swarm<S>) {
-        self.write(swarm, 0);
-    }
-
-    fn moved(&mut self, swarm: &mut Swarm<S>, step: usize) {
-        self.write(swarm, step + 1);
-    }
-}
-
-/// Writes the moments of a vector of teams to those of all teams, `[steps + 1][teams][agents]`, and the inputs, of which
-/// each team has `of_team`.
+/// Writes the moments and inputs of teams that play together to a trace.
 struct Moments<'a> {
-    moments: &'a mut [Moment],
-    inputs: &'a mut [f32],
-    of_team: usize,
-    teams: usize,
-    first: usize,
-    lanes: usize,
+    trace: &'a mut Trace,
+    playing: Range<usize>,
 }
 
 impl Moments<'_> {
-    fn write<S: Simd>(&mut self, block: &Block<S>, row: usize) {
-        let agents = block.agents.len();
-        let at = (row * self.teams + self.first) * agents;
-        let moments = self.moments[at..at + self.lanes * agents].chunks_exact_mut(agents);
-        let inputs = self.inputs[(row * self.teams + self.first) * self.of_team..].chunks_exact_mut(self.of_team);
-        for (lane, (moments, inputs)) in moments.zip(inputs).enumerate() {
-            block.moments(lane, row > 0, moments, inputs);
+    fn write<S: Simd, T: Together<S>>(&mut self, together: &T, step: usize) {
+        let Trace { teams, agents, ref mut moments, ref mut inputs, .. } = *self.trace;
+        let of_team = inputs.len() / (moments.len() / agents);
+        for (index, team) in self.playing.clone().enumerate() {
+            let place = step * teams + team;
+            let (moments, inputs) = (&mut moments[place * agents..], &mut inputs[place * of_team..]);
+            together.moments(index, step > 0, &mut moments[..agents], &mut inputs[..of_team]);
         }
     }
 }
 
-impl<S: Simd> Observer<S> for Moments<'_> {
+impl<S: Simd, T: Together<S>> Observer<S, T> for Moments<'_> {
     #[inline(always)]
-    fn started(&mut self, block: &Block<S>) {
-        self.write(block, 0);
+    fn started(&mut self, teams: &mut T) {
+        self.write(teams, 0);
     }
 
     #[inline(always)]
-    fn moved(&mut self, block: &Block<S>, _: &[u32], step: usize) {
-        self.write(block, step + 1);
+    fn moved(&mut self, teams: &mut T, step: usize) {
+        self.write(teams, step + 1);
     }
 }
 

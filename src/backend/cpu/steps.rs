@@ -1,15 +1,18 @@
 //! Episodes whose steps are written to the caller's arrays, on all threads, with noise on the actions if wanted.
 
+use std::ops::Range;
+
 use fearless_simd::{Simd, dispatch, prelude::*};
 
 use super::agent::Agent;
 use super::batch::{WorldBatch, world_batches};
 use super::block::Block;
-use super::episode::Observer;
-use super::swarm::{Swarm, Watch};
+use super::episode::EpisodeBlock;
+use super::swarm::Swarm;
+use super::together::{Observer, Together, play_together};
 use super::transpose::to_rows;
-use super::{BackendError, Cpu, Group, GroupScores, ScoreTable, Workspace, is_large};
-use crate::credit::{self, Episode};
+use super::{BackendError, Cpu, Group, GroupScores, ScoreTable, is_large};
+use crate::credit;
 use crate::evolve::{self, Key};
 use crate::kernels::{clamp_to, splat};
 use crate::parallel::*;
@@ -136,8 +139,9 @@ impl StepArrays<'_> {
     }
 }
 
+/// Writes columns, one team per lane, to row `row` of each team's `rows` rows.
 #[inline(always)]
-fn write_columns<S: Simd>(simd: S, columns: &[S::f32s], row: (usize, usize), to: &mut [f32]) {
+pub(super) fn write_columns<S: Simd>(simd: S, columns: &[S::f32s], row: (usize, usize), to: &mut [f32]) {
     to_rows(
         simd,
         columns.len(),
@@ -176,165 +180,93 @@ impl Cpu {
         }
         let (level, scores) = (self.level, ScoreTable::new(groups));
         let is_large = is_large(batch.world, self.large_from);
-        dispatch!(level, simd => record(simd, batch, is_large, noise, arrays, &scores));
+        dispatch!(level, simd => match is_large {
+            true => record::<_, Swarm<_>>(simd, batch, noise, arrays, &scores),
+            false => record::<_, EpisodeBlock<_>>(simd, batch, noise, arrays, &scores),
+        });
         Ok(scores.finish())
     }
 }
 
-/// Plays and scores the teams of a batch, and writes every step to the arrays. Large teams play one at a time.
-fn record<S: Simd>(
+/// Plays and scores the teams of a batch, and writes every step to the arrays.
+fn record<S: Simd, T: Together<S>>(
     simd: S,
     batch: &WorldBatch<'_>,
-    is_large: bool,
     noise: Option<Noise<'_>>,
     mut arrays: StepArrays<'_>,
     scores: &ScoreTable<'_>,
 ) {
     let (world, steps) = (batch.world, batch.world.steps());
-    let (width, sizes) = (if is_large { 1 } else { S::f32s::LEN }, step_sizes(world, steps + 1, steps));
+    let sizes = step_sizes(world, steps + 1, steps);
     let part = |first: usize| {
-        let teams = width.min(batch.teams - first);
-        (first, teams, arrays.split(sizes, teams))
+        let teams = first..batch.teams.min(first + T::MOST);
+        (teams.clone(), arrays.split(sizes, teams.len()))
     };
-    let mut parts: Vec<(usize, usize, StepArrays<'_>)> = (0..batch.teams).step_by(width).map(part).collect();
-    // One workspace for several parts, because they are large.
-    let together = if is_large { parts.len().div_ceil(current_num_threads()).max(1) } else { VECTORS_PER_TASK };
-    parts.par_chunks_mut(together).for_each(|parts| {
-        let mut workspace = Workspace::Unused;
-        for &mut (first, teams, ref mut arrays) in parts {
+    let mut parts: Vec<(Range<usize>, StepArrays<'_>)> = (0..batch.teams).step_by(T::MOST).map(part).collect();
+    // One workspace for several large teams, because it is large.
+    let parts_per_task =
+        if T::MOST == 1 { parts.len().div_ceil(current_num_threads()).max(1) } else { VECTORS_PER_TASK };
+    parts.par_chunks_mut(parts_per_task).for_each(|parts| {
+        let mut workspace = None;
+        for (teams, arrays) in parts {
             let observed_at = std::mem::take(&mut arrays.observed_at);
-            if is_large {
-                let swarm = workspace.swarm(simd, batch);
-                swarm.play(batch, first, &mut LargeRecorder { world, noise, team: first, arrays });
-                swarm.score(batch, first, scores);
-                write_observed(world, observed_at, |_| swarm.episode());
-            } else {
-                let block = workspace.block(simd, batch);
-                simd.vectorize(
-                    #[inline(always)]
-                    || {
-                        block.play(batch, first, teams, &mut Recorder { world, noise, first, arrays });
-                        block.score(batch, first, teams, scores);
-                    },
-                );
-                write_observed(world, observed_at, |lane| block.episode(batch, lane));
+            let mut recorder = Recorder { simd, steps, noise, first: teams.start, arrays };
+            let played: &T = play_together(simd, &mut workspace, batch, teams.clone(), &mut recorder, scores);
+            // The step, from 1, at which each POI was observed, or 0.
+            for (team, to) in observed_at.chunks_exact_mut(world.pois.len()).enumerate() {
+                let steps = credit::observed_at(played.episode_of(batch, team).sets, world);
+                to.iter_mut().zip(steps).for_each(|(to, step)| *to = step.unwrap_or(0) as u32);
             }
         }
     });
 }
 
-/// Writes the step, from 1, at which each POI was observed, or 0, `[teams][pois]`, from the record of each team.
-fn write_observed<'a>(world: &World, observed_at: &mut [u32], episode: impl Fn(usize) -> Episode<'a>) {
-    for (team, to) in observed_at.chunks_exact_mut(world.pois.len()).enumerate() {
-        let steps = credit::observed_at(episode(team).sets, world);
-        to.iter_mut().zip(steps).for_each(|(to, step)| *to = step.unwrap_or(0) as u32);
-    }
-}
-
-/// Writes the steps of a large team, and adds noise to its actions.
-struct LargeRecorder<'a, 'b> {
-    world: &'a World,
-    noise: Option<Noise<'a>>,
-    team: usize,
-    arrays: &'a mut StepArrays<'b>,
-}
-
-/// Returns row `row` of an array of so many rows, or nothing of an empty array.
-fn row(array: &mut [f32], row: usize, rows: usize) -> &mut [f32] {
-    let width = array.len() / rows;
-    &mut array[row * width..][..width]
-}
-
-impl LargeRecorder<'_, '_> {
-    fn write_states<S: Simd>(&mut self, swarm: &Swarm<S>, moment: usize) {
-        let StepArrays { positions, headings, speeds, .. } = &mut *self.arrays;
-        let [positions, headings, speeds] =
-            [positions, headings, speeds].map(|array| row(array, moment, self.world.steps() + 1));
-        swarm.write_states(positions, headings, speeds);
-    }
-}
-
-impl<S: Simd> Watch<S> for LargeRecorder<'_, '_> {
-    fn started(&mut self, swarm: &mut Swarm<S>) {
-        self.write_states(swarm, 0);
-    }
-
-    fn decided(&mut self, swarm: &mut Swarm<S>, step: usize) {
-        let steps = self.world.steps();
-        let StepArrays { inputs, outputs, actions, .. } = &mut *self.arrays;
-        swarm.write_inputs(row(inputs, step, steps));
-        swarm.write_outputs(row(outputs, step, steps));
-        if let Some(Noise { key, deviations, first }) = self.noise {
-            let team = S::u32s::splat(swarm.simd, first.wrapping_add(self.team as u32));
-            for (leader, deviations) in deviations.iter().enumerate() {
-                let drawn = evolve::noise::<S>(key, step, leader, team);
-                let outputs = &mut swarm.outputs[leader / S::f32s::LEN];
-                for ((output, &deviation), drawn) in outputs.iter_mut().zip(deviations).zip(drawn) {
-                    output[leader % S::f32s::LEN] += drawn[0] * deviation;
-                }
-            }
-        }
-        swarm.write_outputs(row(actions, step, steps));
-        if self.noise.is_some() {
-            for output in swarm.outputs.as_flattened_mut() {
-                *output = clamp_to::<S>(*output, splat(swarm.simd, -1.0), splat(swarm.simd, 1.0));
-            }
-        }
-    }
-
-    fn moved(&mut self, swarm: &mut Swarm<S>, step: usize) {
-        self.write_states(swarm, step + 1);
-        if !self.arrays.agents_at_poi.is_empty() {
-            let words = self.world.words_per_step();
-            let sets = &swarm.sets[step * words..][..words];
-            self.arrays.agents_at_poi[step * words..][..words].copy_from_slice(sets);
-        }
-    }
-}
-
 /// Vectors of teams per task.
 const VECTORS_PER_TASK: usize = 8;
 
-/// Writes the steps of one vector of teams, whose first is team `first`, and adds noise to their actions.
-struct Recorder<'a, 'b> {
-    world: &'a World,
+/// Writes the steps of teams that play together, whose first is team `first`, and adds noise to their actions.
+struct Recorder<'a, 'b, S: Simd> {
+    simd: S,
+    steps: usize,
     noise: Option<Noise<'a>>,
     first: usize,
     arrays: &'a mut StepArrays<'b>,
 }
 
-impl<S: Simd> Observer<S> for Recorder<'_, '_> {
+impl<S: Simd, T: Together<S>> Observer<S, T> for Recorder<'_, '_, S> {
     #[inline(always)]
-    fn started(&mut self, block: &Block<S>) {
-        self.arrays.write_states(block.simd, &block.agents, (0, self.world.steps() + 1));
+    fn started(&mut self, teams: &mut T) {
+        teams.store_states((0, self.steps + 1), self.arrays);
     }
 
     #[inline(always)]
-    fn decided(&mut self, block: &mut Block<S>, step: usize) {
-        let (simd, arrays, row) = (block.simd, &mut *self.arrays, (step, self.world.steps()));
-        arrays.write_inputs(block, row);
-        write_columns(simd, block.outputs.as_flattened(), row, arrays.outputs);
+    fn decided(&mut self, teams: &mut T, step: usize) {
+        let (simd, arrays, row) = (self.simd, &mut *self.arrays, (step, self.steps));
+        teams.store_inputs(row, arrays);
+        teams.store_outputs(row, arrays.outputs);
         if let Some(Noise { key, deviations, first: number }) = self.noise {
-            let teams = S::u32s::from_fn(simd, |lane| number.wrapping_add((self.first + lane) as u32));
-            for (leader, (outputs, deviations)) in block.outputs.iter_mut().zip(deviations).enumerate() {
-                let drawn = evolve::noise::<S>(key, step, leader, teams);
-                for ((output, &deviation), drawn) in outputs.iter_mut().zip(deviations).zip(drawn) {
-                    *output += drawn * splat(simd, deviation);
+            let numbers = S::u32s::from_fn(simd, |lane| number.wrapping_add((self.first + lane) as u32));
+            for (leader, deviations) in deviations.iter().enumerate() {
+                let drawn = evolve::noise::<S>(key, step, leader, numbers);
+                let (index, lane) = T::place(leader);
+                for ((output, &deviation), drawn) in teams.outputs()[index].iter_mut().zip(deviations).zip(drawn) {
+                    let noise = drawn * splat(simd, deviation);
+                    let outputs = &mut output.as_mut_slice()[lane..lane + T::MOST];
+                    outputs.iter_mut().zip(noise.as_slice()).for_each(|(output, noise)| *output += noise);
                 }
             }
         }
-        write_columns(simd, block.outputs.as_flattened(), row, arrays.actions);
+        teams.store_outputs(row, arrays.actions);
         if self.noise.is_some() {
-            for output in block.outputs.as_flattened_mut() {
+            for output in teams.outputs().as_flattened_mut() {
                 *output = clamp_to::<S>(*output, splat(simd, -1.0), splat(simd, 1.0));
             }
         }
     }
 
     #[inline(always)]
-    fn moved(&mut self, block: &Block<S>, sets: &[u32], step: usize) {
-        let (simd, steps) = (block.simd, self.world.steps());
-        self.arrays.write_states(simd, &block.agents, (step + 1, steps + 1));
-        self.arrays.write_sets(simd, sets, (step, steps));
+    fn moved(&mut self, teams: &mut T, step: usize) {
+        teams.store_states((step + 1, self.steps + 1), self.arrays);
+        teams.store_sets((step, self.steps), self.arrays);
     }
 }

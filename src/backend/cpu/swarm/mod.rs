@@ -9,11 +9,11 @@ use std::ops::Range;
 use fearless_simd::{Simd, prelude::*};
 use glam::Vec2;
 
-use super::ScoreTable;
 use super::agent::Agent;
 use super::batch::WorldBatch;
 use super::network::Network;
-use crate::backend::Moment;
+use super::together::{Observer, Together};
+use super::{Moment, ScoreTable, StepArrays};
 use crate::config::{Combine, ControlKind, Measure};
 use crate::credit::{Episode, Paths, Seen, Strided};
 use crate::kernels::math::on_lattice;
@@ -29,21 +29,6 @@ use crate::world::{GoneWithin, OUTPUTS, World};
 mod cells;
 
 use cells::{Cells, Slots};
-
-/// Follows the episode of one team. By default nothing is done.
-pub(super) trait Watch<S: Simd> {
-    /// The team is at its start.
-    fn started(&mut self, _: &mut Swarm<S>) {}
-
-    /// Policies have answered what learners sense before this step, and agents are about to move. The outputs may be
-    /// changed.
-    fn decided(&mut self, _: &mut Swarm<S>, _step: usize) {}
-
-    /// The agents have moved.
-    fn moved(&mut self, _: &mut Swarm<S>, _step: usize) {}
-}
-
-impl<S: Simd> Watch<S> for () {}
 
 /// The parts of a team's record besides the sets of agents at POIs.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -149,36 +134,6 @@ impl<S: Simd> Swarm<S> {
         }
     }
 
-    /// Reports whether it has the sizes and constants of a world and its record.
-    pub fn fits(&self, world: &World, recorded: Recorded) -> bool {
-        bytemuck::cast_slice::<_, u8>(&self.constants) == bytemuck::cast_slice::<_, u8>(&world.classes)
-            && self.world.constants == world.constants
-            && [&self.radii2, &self.values] == [&world.radii2, &world.values]
-            && self.gone_within == world.gone_within
-            && self.recorded == recorded
-            && self.paths.is_empty() == world.paths.is_none()
-    }
-
-    /// Plays the whole episode of a team of the batch.
-    pub(super) fn play(&mut self, batch: &WorldBatch<'_>, team: usize, watch: &mut impl Watch<S>) {
-        let place = batch.locate(team);
-        let group = &batch.groups[place.0];
-        let (leaders, steps) = (batch.world.leaders(), batch.world.steps());
-        self.network.load_policies(
-            #[inline(always)]
-            |vector, lane| batch.policy((vector * S::f32s::LEN + lane).min(leaders - 1), place),
-        );
-        self.start(group.starts, group.headings(), group.pois());
-        watch.started(self);
-        for step in 0..steps {
-            self.sense();
-            self.network.decide(&self.inputs, &mut self.outputs);
-            watch.decided(self, step);
-            self.step(step);
-            watch.moved(self, step);
-        }
-    }
-
     /// Puts the agents at their start, with their headings, both `[agents]`, and the POIs into their places.
     pub fn start(&mut self, starts: &[Vec2], headings: &[Vec2], pois: &[Vec2]) {
         self.place(starts, headings, pois, |_, initial| initial);
@@ -244,12 +199,6 @@ impl<S: Simd> Swarm<S> {
         );
     }
 
-    /// Scores the team of the batch that was played.
-    pub(super) fn score(&self, batch: &WorldBatch<'_>, team: usize, scores: &ScoreTable<'_>) {
-        let (group, team) = batch.locate(team);
-        scores.score(batch.first + group, team, &self.episode());
-    }
-
     /// Returns the record of the team that was played.
     pub fn episode(&self) -> Episode<'_> {
         let positions = Strided::contiguous(&self.paths);
@@ -304,10 +253,6 @@ impl<S: Simd> Swarm<S> {
             }
         }
         self.inputs = inputs;
-    }
-
-    pub fn leaders(&self) -> usize {
-        self.world.constants.leaders as usize
     }
 
     fn diagonal2(&self) -> f32 {
@@ -580,14 +525,69 @@ impl<S: Simd> Swarm<S> {
     pub fn write_inputs(&self, to: &mut [f32]) {
         write_lanes::<S>(&self.inputs, self.world.constants.policy.inputs(), to);
     }
+}
 
-    pub fn write_outputs(&self, to: &mut [f32]) {
-        write_lanes::<S>(self.outputs.as_flattened(), OUTPUTS, to);
+/// Returns row `row` of an array of `rows` rows, or nothing of an empty array.
+fn part<T>(array: &mut [T], (row, rows): (usize, usize)) -> &mut [T] {
+    let width = array.len() / rows;
+    &mut array[row * width..][..width]
+}
+
+impl<S: Simd> Together<S> for Swarm<S> {
+    const MOST: usize = 1;
+
+    fn allocate(simd: S, batch: &WorldBatch<'_>, traced: bool) -> Swarm<S> {
+        let recorded = Recorded { counts: batch.counted || traced, sights: batch.sighted, forces: traced };
+        Swarm::new(simd, batch.world, recorded)
     }
 
-    /// Writes the moments of the agents, and the inputs of the leaders, `[leaders][inputs]`. Before the first step nothing
-    /// has been sensed.
-    pub fn moments(&self, sensed: bool, moments: &mut [Moment], inputs: &mut [f32]) {
+    fn fits(&self, batch: &WorldBatch<'_>) -> bool {
+        let world = batch.world;
+        bytemuck::cast_slice::<_, u8>(&self.constants) == bytemuck::cast_slice::<_, u8>(&world.classes)
+            && self.world.constants == world.constants
+            && [&self.radii2, &self.values] == [&world.radii2, &world.values]
+            && self.gone_within == world.gone_within
+            && self.recorded == Recorded { counts: batch.counted, sights: batch.sighted, forces: false }
+            && self.paths.is_empty() == world.paths.is_none()
+    }
+
+    fn play(&mut self, batch: &WorldBatch<'_>, teams: Range<usize>, observer: &mut impl Observer<S, Self>) {
+        let place = batch.locate(teams.start);
+        let group = &batch.groups[place.0];
+        let (leaders, steps) = (batch.world.leaders(), batch.world.steps());
+        self.network.load_policies(
+            #[inline(always)]
+            |vector, lane| batch.policy((vector * S::f32s::LEN + lane).min(leaders - 1), place),
+        );
+        self.start(group.starts, group.headings(), group.pois());
+        observer.started(self);
+        for step in 0..steps {
+            self.sense();
+            self.network.decide(&self.inputs, &mut self.outputs);
+            observer.decided(self, step);
+            self.step(step);
+            observer.moved(self, step);
+        }
+    }
+
+    fn score(&mut self, batch: &WorldBatch<'_>, teams: Range<usize>, scores: &ScoreTable<'_>) {
+        let (group, team) = batch.locate(teams.start);
+        scores.score(batch.first + group, team, &self.episode());
+    }
+
+    fn episode_of<'a>(&'a self, _: &WorldBatch<'a>, _: usize) -> Episode<'a> {
+        self.episode()
+    }
+
+    fn outputs(&mut self) -> &mut [[S::f32s; OUTPUTS]] {
+        &mut self.outputs
+    }
+
+    fn place(leader: usize) -> (usize, usize) {
+        (leader / S::f32s::LEN, leader % S::f32s::LEN)
+    }
+
+    fn moments(&self, _: usize, sensed: bool, moments: &mut [Moment], inputs: &mut [f32]) {
         let leaders = self.world.constants.leaders as usize;
         self.each_agent(|agent, cells, slot| {
             let (slots, moment) = (&cells.slots, &mut moments[agent]);
@@ -603,6 +603,25 @@ impl<S: Simd> Swarm<S> {
         if sensed {
             self.write_inputs(inputs);
         }
+    }
+
+    fn store_states(&self, row: (usize, usize), arrays: &mut StepArrays<'_>) {
+        let [positions, headings, speeds] =
+            [&mut *arrays.positions, arrays.headings, arrays.speeds].map(|array| part(array, row));
+        self.write_states(positions, headings, speeds);
+    }
+
+    fn store_inputs(&self, row: (usize, usize), arrays: &mut StepArrays<'_>) {
+        self.write_inputs(part(arrays.inputs, row));
+    }
+
+    fn store_outputs(&self, row: (usize, usize), outputs: &mut [f32]) {
+        write_lanes::<S>(self.outputs.as_flattened(), OUTPUTS, part(outputs, row));
+    }
+
+    fn store_sets(&self, row: (usize, usize), arrays: &mut StepArrays<'_>) {
+        let sets = part(arrays.agents_at_poi, row);
+        sets.copy_from_slice(&self.sets[row.0 * sets.len()..][..sets.len()]);
     }
 }
 
@@ -790,7 +809,7 @@ mod tests {
         }
     }
 
-    impl<S: Simd> Watch<S> for Shuffle {
+    impl<S: Simd> Observer<S, Swarm<S>> for Shuffle {
         fn started(&mut self, swarm: &mut Swarm<S>) {
             self.shuffle(swarm);
         }
@@ -799,6 +818,9 @@ mod tests {
             self.shuffle(swarm);
         }
     }
+
+    /// Leaves the order as it is.
+    impl<S: Simd> Observer<S, Swarm<S>> for () {}
 
     /// The record and the last positions of a team, with agents in two orders.
     fn in_two_orders<S: Simd>(simd: S, world: &World, seed: u64) -> [(Swarm<S>, Vec<f32>); 2] {
@@ -810,8 +832,8 @@ mod tests {
         let play = |watch: &mut Shuffle, shuffles: bool| {
             let mut swarm = Swarm::new(simd, world, Recorded { counts: true, sights: true, forces: false });
             match shuffles {
-                true => swarm.play(&batch, 0, watch),
-                false => swarm.play(&batch, 0, &mut ()),
+                true => swarm.play(&batch, 0..1, watch),
+                false => swarm.play(&batch, 0..1, &mut ()),
             }
             let mut positions = vec![0.0; world.agents() * 2];
             swarm.write_states(&mut positions, &mut [], &mut []);

@@ -18,8 +18,6 @@ use std::ops::Range;
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
-use bytemuck::Zeroable;
-
 use super::device::{DeviceError, Executor, Gpu, Kind, Traffic, Workspace};
 use super::population::{Held, Population};
 use super::recording::{Readback, iterations};
@@ -34,7 +32,6 @@ use crate::backend::{
 use crate::credit::{Episode, Paths, Seen, Strided};
 use crate::host::Instant;
 use crate::parallel::*;
-use crate::world::World;
 
 mod check;
 mod inspect;
@@ -87,18 +84,6 @@ impl Records {
             Records::PackedFrom(minimum) => bytes >= minimum,
             Records::Packed => true,
         }
-    }
-}
-
-/// Writes the positions of a team at some moments, f32 as bits, `[moments][agents][2]`, from the moments of a trace.
-fn write_path(moments: impl Iterator<Item = usize>, world: &World, traced: &[f32], positions: &mut Vec<u32>) {
-    const POSITION: usize = std::mem::offset_of!(Moment, position) / size_of::<f32>();
-    positions.clear();
-    for moment in moments {
-        let agents = traced[moment * world.agents() * MOMENT_WORDS..].chunks_exact(MOMENT_WORDS);
-        positions.extend(
-            agents.take(world.agents()).flat_map(|agent| [agent[POSITION], agent[POSITION + 1]]).map(f32::to_bits),
-        );
     }
 }
 
@@ -441,6 +426,56 @@ impl GpuBackend {
     }
 }
 
+/// Calls `visit` with the record of each team of a task, and the team's index in its group.
+fn each_episode(
+    groups: &[Group<'_>],
+    planned: &PlannedTask,
+    record: RecordWords<'_>,
+    traced: &[f32],
+    mut visit: impl FnMut(usize, &Episode<'_>),
+) {
+    let (group, world) = (&groups[planned.group], groups[planned.group].world);
+    const POSITION: usize = std::mem::offset_of!(Moment, position) / size_of::<f32>();
+    let Task { sets, counts, table, owners, .. } = planned.task;
+    let stride = planned.task.teams as usize;
+    match record {
+        RecordWords::Whole(words) => {
+            let sets = &words[sets as usize..][..world.set_words() * stride];
+            let sight_words = if group.records().sights() { world.sight_words() } else { 0 };
+            let (counts, sights) = words[counts as usize..].split_at(world.leaders() * world.followers() * stride);
+            let sights = &sights[..sight_words * stride];
+            let (traced, mut positions) = (&traced[planned.task.traced as usize..], Vec::new());
+            for offset in 0..stride {
+                let strided = |words| Strided { words, stride, offset };
+                let (sets, seen, sights) = (strided(sets), Seen::Counts(strided(counts)), strided(sights));
+                let paths = world.paths.is_some().then(|| {
+                    positions.clear();
+                    let moment = world.agents() * MOMENT_WORDS;
+                    for moment in traced[offset * moment..].chunks(stride * moment).take(world.steps() + 1) {
+                        let agents = moment.chunks_exact(MOMENT_WORDS).take(world.agents());
+                        let places = agents.flat_map(|agent| [agent[POSITION], agent[POSITION + 1]]);
+                        positions.extend(places.map(f32::to_bits));
+                    }
+                    Paths { positions: Strided::contiguous(&positions), pois: group.pois() }
+                });
+                visit(planned.first_team + offset, &Episode { sets, seen, sights, paths });
+            }
+        }
+        RecordWords::Packed(words) => {
+            let table = &words[table as usize..][..=stride];
+            let owners = match owners {
+                NOWHERE => &[],
+                owners => &words[owners as usize..][..owner_words(world) * stride],
+            };
+            for (offset, ends) in table.windows(2).enumerate() {
+                let sets = Strided::contiguous(&words[ends[0] as usize..ends[1] as usize]);
+                let seen = Seen::Owners(Strided { words: owners, stride, offset });
+                visit(planned.first_team + offset, &Episode { sets, seen, sights: Strided::NONE, paths: None });
+            }
+        }
+    }
+}
+
 impl Backend for GpuBackend {
     fn play(&mut self, groups: &[Group<'_>]) -> Result<Vec<GroupScores>, BackendError> {
         groups.iter().try_for_each(Group::check)?;
@@ -448,108 +483,35 @@ impl Backend for GpuBackend {
         // Paths are read from traces.
         let trace = groups.iter().any(|group| group.world.paths.is_some());
         self.play_tasks(groups, trace, &|planned, record, traced| {
-            let world = groups[planned.group].world;
-            let Task { sets, counts, table, owners, .. } = planned.task;
-            let stride = planned.task.teams as usize;
-            let (group, first) = (planned.group, planned.first_team);
-            match record {
-                RecordWords::Whole(words) => {
-                    let sets = &words[sets as usize..][..world.set_words() * stride];
-                    let sight_words = if groups[group].records().sights() { world.sight_words() } else { 0 };
-                    let counted = world.leaders() * world.followers() * stride;
-                    let (counts, sights) = words[counts as usize..].split_at(counted);
-                    let sights = &sights[..sight_words * stride];
-                    let (mut positions, pois) = (Vec::new(), groups[group].pois());
-                    for offset in 0..stride {
-                        let strided = |words| Strided { words, stride, offset };
-                        let (sets, seen, sights) = (strided(sets), Seen::Counts(strided(counts)), strided(sights));
-                        let paths = world.paths.is_some().then(|| {
-                            let moments = (0..=world.steps()).map(|step| step * stride + offset);
-                            write_path(moments, world, &traced[planned.task.traced as usize..], &mut positions);
-                            Paths { positions: Strided::contiguous(&positions), pois }
-                        });
-                        scores.score(group, first + offset, &Episode { sets, seen, sights, paths });
-                    }
-                }
-                RecordWords::Packed(words) => {
-                    let table = &words[table as usize..][..=stride];
-                    let owners = match owners {
-                        NOWHERE => &[],
-                        owners => &words[owners as usize..][..owner_words(world) * stride],
-                    };
-                    for (offset, ends) in table.windows(2).enumerate() {
-                        let words = &words[ends[0] as usize..ends[1] as usize];
-                        let sets = Strided::contiguous(words);
-                        let seen = Seen::Owners(Strided { words: owners, stride, offset });
-                        scores.score(
-                            group,
-                            first + offset,
-                            &Episode { sets, seen, sights: Strided::NONE, paths: None },
-                        );
-                    }
-                }
-            }
+            each_episode(groups, planned, record, traced, |team, episode| scores.score(planned.group, team, episode));
         })?;
         Ok(scores.finish())
     }
 
     fn trace(&mut self, group: &Group<'_>) -> Result<Trace, BackendError> {
         group.check()?;
-        let world = group.world;
-        let (teams, agents, steps) = (group.team_count(), world.agents(), world.steps());
-        let (set_words, seen_words) = (world.set_words(), world.leaders() * world.followers());
-        let inputs = world.leaders() * world.inputs();
-        let sight_words = if group.records().sights() { world.sight_words() } else { 0 };
-        let trace = Mutex::new(Trace {
-            teams,
-            agents,
-            leaders: world.leaders(),
-            moments: vec![Moment::zeroed(); (steps + 1) * teams * agents],
-            inputs: vec![0.0; (steps + 1) * teams * inputs],
-            sets: vec![0; teams * set_words],
-            seen: vec![0; teams * seen_words],
-            trail: vec![0; teams * sight_words],
-            pois: group.pois().to_vec(),
-        });
-        self.play_tasks(std::slice::from_ref(group), true, &|planned, record, traced| {
-            let RecordWords::Whole(record) = record else { unreachable!("no trace is packed") };
+        let (world, groups) = (group.world, std::slice::from_ref(group));
+        let trace = Mutex::new(Trace::of_zeros(group));
+        self.play_tasks(groups, true, &|planned, record, traced| {
             let all = &mut *lock(&trace);
-            let Task { teams: stride, traced: first_word, sets: first_set, counts: first_count, .. } = planned.task;
-            let [stride, first_word, first_set, first_count] =
-                [stride, first_word, first_set, first_count].map(|number| number as usize);
+            each_episode(groups, planned, record, traced, |team, episode| all.store(team, episode));
             // The moments of all steps, then the inputs.
-            let mut from = &traced[first_word..];
-            let parts: [(&mut [f32], usize); 2] =
-                [(bytemuck::cast_slice_mut(&mut all.moments), agents * MOMENT_WORDS), (&mut all.inputs, inputs)];
+            let stride = planned.task.teams as usize;
+            let mut from = &traced[planned.task.traced as usize..];
+            let parts: [(&mut [f32], usize); 2] = [
+                (bytemuck::cast_slice_mut(&mut all.moments), world.agents() * MOMENT_WORDS),
+                (&mut all.inputs, world.leaders() * world.inputs()),
+            ];
             for (all, size) in parts {
                 let part;
-                (part, from) = from.split_at((steps + 1) * stride * size);
+                (part, from) = from.split_at((world.steps() + 1) * stride * size);
                 for (step, words) in part.chunks_exact(stride * size).enumerate() {
-                    all[(step * teams + planned.first_team) * size..][..words.len()].copy_from_slice(words);
+                    all[(step * group.team_count() + planned.first_team) * size..][..words.len()]
+                        .copy_from_slice(words);
                 }
             }
-            let Trace { sets, seen, trail, .. } = all;
-            // Copies words that are interleaved by team.
-            let scatter = |from: usize, words: usize, all: &mut [u32]| {
-                for (word, numbers) in record[from..].chunks_exact(stride).take(words).enumerate() {
-                    let to = all[planned.first_team * words + word..].iter_mut().step_by(words);
-                    to.zip(numbers).for_each(|(to, &number)| *to = number);
-                }
-            };
-            scatter(first_set, set_words, sets);
-            scatter(first_count, seen_words, seen);
-            scatter(first_count + seen_words * stride, sight_words, trail);
         })?;
-        let mut trace = trace.into_inner().unwrap_or_else(PoisonError::into_inner);
-        if world.paths.is_some() {
-            let mut positions = Vec::new();
-            for team in 0..teams {
-                let moments = (0..=steps).map(|step| step * teams + team);
-                write_path(moments, world, bytemuck::cast_slice(&trace.moments), &mut positions);
-                trace.trail.extend(&positions);
-            }
-        }
-        Ok(trace)
+        Ok(trace.into_inner().unwrap_or_else(PoisonError::into_inner))
     }
 
     fn hold(&mut self, weights: &[f32], sizes: [usize; 3]) -> Result<Option<Box<dyn DevicePopulation>>, BackendError> {
