@@ -1,8 +1,8 @@
-//! Enums whose variants are words in configs and constants in shaders.
+//! Enums whose variants are words in configs and messages, and constants in shaders.
 
 use serde::Serialize;
 
-/// A key whose values are words, see `config_enum!`.
+/// An enum whose variants are words, see `config_enum!`.
 pub trait Choice: Copy + Serialize + 'static {
     /// Every word with its variant, ordered by number.
     const ALL: &'static [(&'static str, Self)];
@@ -22,7 +22,7 @@ pub trait ConstDispatch {
     fn with<const WORD: u32>(self) -> Self::Output;
 }
 
-/// Defines an enum whose variants are words in configs and constants in shaders. For `Density::Linear`, `wgsl` returns
+/// Defines an enum whose variants are words in configs and messages, and constants in shaders. For `Density::Linear`, `wgsl` returns
 /// `const DENSITY_LINEAR: u32 = 0u;`.
 macro_rules! config_enum {
     ($(#[$doc:meta])* $name:ident { $($(#[$variant_doc:meta])* $variant:ident = $word:literal,)* }) => {

@@ -186,17 +186,7 @@ macro_rules! gpu_struct {
                 self
             }
 
-            fn declared(_: &str) -> String {
-                <$name as $crate::gpu_struct::GpuStruct>::fields()
-            }
-
-            fn value(&self) -> String {
-                $crate::gpu_struct::GpuStruct::values(self)
-            }
-
-            fn names(_: &'static str) -> Vec<&'static str> {
-                <$name as $crate::gpu_struct::GpuStruct>::names()
-            }
+            $crate::gpu_struct::gpu_struct! { @nested }
         }
         $crate::gpu_struct::gpu_struct! { $($more)* }
     };
@@ -233,6 +223,19 @@ macro_rules! gpu_struct {
             }
         }
     };
+    (@nested) => {
+        fn declared(_: &str) -> String {
+            <Self as $crate::gpu_struct::GpuStruct>::fields()
+        }
+
+        fn value(&self) -> String {
+            $crate::gpu_struct::GpuStruct::values(self)
+        }
+
+        fn names(_: &'static str) -> Vec<&'static str> {
+            <Self as $crate::gpu_struct::GpuStruct>::names()
+        }
+    };
     (@lanes $name:ident $lanes:ident { $($(#[$doc:meta])* pub $field:ident: $type:ty,)+ }) => {
         #[doc = concat!("[`", stringify!($name), "`] with every float in all lanes: operations take it from memory.")]
         #[derive(Clone, Copy)]
@@ -247,17 +250,7 @@ macro_rules! gpu_struct {
                 $lanes { $($field: $crate::gpu_struct::Field::lanes(self.$field, simd),)+ }
             }
 
-            fn declared(_: &str) -> String {
-                <$name as $crate::gpu_struct::GpuStruct>::fields()
-            }
-
-            fn value(&self) -> String {
-                $crate::gpu_struct::GpuStruct::values(self)
-            }
-
-            fn names(_: &'static str) -> Vec<&'static str> {
-                <$name as $crate::gpu_struct::GpuStruct>::names()
-            }
+            $crate::gpu_struct::gpu_struct! { @nested }
         }
     };
 }

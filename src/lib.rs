@@ -92,7 +92,7 @@
 //! | [`version`] | the version, commit and target of this build |
 //! | [`escape`], [`mod@file`] | reading and writing of names and files |
 //! | [`host`], [`parallel`] | time, waiting, threads and the cache |
-//! | [`config_enum`], [`gpu_struct`] | enums that configs write as words, structs shared with shaders |
+//! | [`config_enum`], [`gpu_struct`] | enums whose variants are words, structs shared with shaders |
 //! | [`reader`] | reading configs key by key, from TOML or from programs |
 //! | [`kernels`] | vector arithmetic on many teams at once |
 //! | [`model`] | the parts of a step: keys, constants, formulas, shaders |

@@ -2,7 +2,6 @@
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet, HashSet};
-use std::fmt;
 use std::sync::Mutex;
 
 use glam::Vec2;
@@ -10,6 +9,7 @@ use glam::Vec2;
 use crate::backend::Group;
 use crate::backend::grid::{LARGE_FROM, is_large};
 use crate::config::MAX_HIDDEN_LAYERS;
+use crate::config_enum::config_enum;
 use crate::model::Constants;
 use crate::model::class::{Class, ClassShape};
 use crate::model::follow::TermShape;
@@ -36,25 +36,16 @@ const MAX_STRAIGHT_WEIGHTS: usize = 512;
 /// Maximum number of specialised kernels per rollout under [`Kernel::Best`]: each takes a fraction of a second to compile.
 const MAX_SPECIALISED: usize = 16;
 
-/// Selects the kernel that plays. Results do not depend on it.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Kernel {
-    /// In rollouts a specialised kernel for the kinds of worlds with most to play, up to a limit. Otherwise the generic
-    /// one.
-    Best,
-    /// The generic kernel.
-    Generic,
-    /// A specialised kernel wherever one is possible.
-    Specialised,
-}
-
-impl fmt::Display for Kernel {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.pad(match self {
-            Kernel::Best => "best",
-            Kernel::Generic => "generic",
-            Kernel::Specialised => "specialised",
-        })
+config_enum! {
+    /// Selects the kernel that plays. Results do not depend on it.
+    Kernel {
+        /// In rollouts a specialised kernel for the kinds of worlds with most to play, up to a limit. Otherwise the
+        /// generic one.
+        Best = "best",
+        /// The generic kernel.
+        Generic = "generic",
+        /// A specialised kernel wherever one is possible.
+        Specialised = "specialised",
     }
 }
 
@@ -66,6 +57,7 @@ pub struct Shape {
     /// Agents that a thread plays, one after another.
     pub(super) slots: usize,
     pub(super) records: Recorded,
+    pub(super) uses: Uses,
     pub(super) sizes: Sizes,
 }
 
@@ -87,25 +79,18 @@ impl Recorded {
 /// The sizes that a kernel is compiled for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Sizes {
-    /// The widest layer, inputs included and rounded up to save compilations, whether the outputs choose a behaviour,
-    /// what classes of agents do, and whether teams are large: each step then takes several dispatches.
-    Any { widest: usize, chooses: bool, uses: Uses, large: bool },
+    /// The widest layer, inputs included and rounded up to save compilations, and whether teams are large: each step
+    /// then takes several dispatches.
+    Any { widest: usize, large: bool },
     /// Everything that the code depends on.
-    Fixed {
-        teams: usize,
-        leaders: u32,
-        agents: u32,
-        pois: u32,
-        widths: [u32; WIDTHS],
-        chooses: bool,
-        uses: Uses,
-        kinds: &'static [ClassKind],
-    },
+    Fixed { teams: usize, leaders: u32, agents: u32, pois: u32, widths: [u32; WIDTHS], kinds: &'static [ClassKind] },
 }
 
 /// The parts of kernels that only some worlds use.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Uses {
+    /// Whether the outputs of policies choose a behaviour.
+    pub(super) chooses: bool,
     /// Whether any rule aligns headings.
     pub(super) aligns: bool,
     /// Whether agents of any class move straight to others.
@@ -120,6 +105,7 @@ impl Uses {
     fn of(world: &World) -> Uses {
         let any = |is: fn(&ClassShape) -> bool| world.classes.iter().any(|class| is(&class.constants.shape));
         Uses {
+            chooses: world.constants.policy.actions() == Actions::Behaviours,
             aligns: world.aligns(),
             pursues: any(ClassShape::pursues),
             confines: any(ClassShape::is_confined),
@@ -172,14 +158,13 @@ impl Shape {
             true => Workgroup { threads: WORKGROUPS[0], slots: 1, teams: 1 },
             false => Workgroup::generic(world, capacity.workgroup),
         };
-        let policy = &world.constants.policy;
-        let sizes = Sizes::Any {
-            widest: policy.widest().next_power_of_two().max(LEAST_WIDTH),
-            chooses: policy.actions() == Actions::Behaviours,
-            uses: Uses::of(world),
-            large,
-        };
-        (Shape { workgroup: workgroup.threads, slots: workgroup.slots, records, sizes }, workgroup)
+        let widest = world.constants.policy.widest().next_power_of_two().max(LEAST_WIDTH);
+        Shape::new(world, workgroup, records, Sizes::Any { widest, large })
+    }
+
+    fn new(world: &World, workgroup: Workgroup, records: Recorded, sizes: Sizes) -> (Shape, Workgroup) {
+        let Workgroup { threads, slots, .. } = workgroup;
+        (Shape { workgroup: threads, slots, records, uses: Uses::of(world), sizes }, workgroup)
     }
 
     /// Reports whether each step takes several dispatches.
@@ -197,11 +182,9 @@ impl Shape {
             agents: leaders + followers,
             pois,
             widths: policy.widths,
-            chooses: policy.actions() == Actions::Behaviours,
-            uses: Uses::of(world),
             kinds: ClassKind::of(world),
         };
-        Some((Shape { workgroup: workgroup.threads, slots: workgroup.slots, records, sizes }, workgroup))
+        Some(Shape::new(world, workgroup, records, sizes))
     }
 }
 

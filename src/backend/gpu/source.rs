@@ -8,6 +8,7 @@ use super::shape::{Capacity, ClassKind, MAX_THREADS, ROLE, Recorded, Shape, Size
 use crate::backend::grid::LARGE_FROM;
 use crate::backend::{MOMENT_WORDS, VECTOR};
 use crate::config::{Config, MAX_CLASSES, MAX_SECTORS, Policy};
+use crate::config_enum::{Choice, config_enum};
 use crate::evolve::{MAX_WEIGHT, MIN_WEIGHT, UNCHANGED};
 use crate::gpu_struct::{GpuStruct, gpu_constants, gpu_struct};
 use crate::model;
@@ -170,21 +171,23 @@ pub enum Pipeline {
     Swarm(SwarmPart, Shape),
 }
 
-/// The parts of a step of large teams, in order, see `shaders/swarm.wgsl`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum SwarmPart {
-    /// Clears the record and the cells before the first step.
-    Clear,
-    /// Puts the agents at their start.
-    Enter,
-    /// Gives slots to cells.
-    Allocate,
-    /// Puts the agents into the slots.
-    Fill,
-    /// Moves learners.
-    Learn,
-    /// Moves the other agents.
-    ObeyRule,
+config_enum! {
+    /// The parts of a step of large teams, in order, and their entry points in `shaders/swarm.wgsl`.
+    #[derive(PartialOrd, Ord)]
+    SwarmPart {
+        /// Clears the record and the cells before the first step.
+        Clear = "clear",
+        /// Puts the agents at their start.
+        Enter = "enter",
+        /// Gives slots to cells.
+        Allocate = "allocate",
+        /// Puts the agents into the slots.
+        Fill = "fill",
+        /// Moves learners.
+        Learn = "learn",
+        /// Moves the other agents.
+        ObeyRule = "obey_rule",
+    }
 }
 
 impl Pipeline {
@@ -197,12 +200,7 @@ impl Pipeline {
             Pipeline::Gather => "gather",
             Pipeline::Pack => "pack",
             Pipeline::Episode(_) => "episode",
-            Pipeline::Swarm(SwarmPart::Clear, _) => "clear",
-            Pipeline::Swarm(SwarmPart::Enter, _) => "enter",
-            Pipeline::Swarm(SwarmPart::Allocate, _) => "allocate",
-            Pipeline::Swarm(SwarmPart::Fill, _) => "fill",
-            Pipeline::Swarm(SwarmPart::Learn, _) => "learn",
-            Pipeline::Swarm(SwarmPart::ObeyRule, _) => "obey_rule",
+            Pipeline::Swarm(part, _) => SwarmPart::ALL[part as usize].0,
         }
     }
 
@@ -265,13 +263,13 @@ fn declarations() -> String {
 
 /// Returns the shader of episodes for a shape, of large teams or of others.
 fn episode(shape: Shape) -> String {
-    let Shape { workgroup, slots, records: Recorded { trace, sightings }, sizes } = shape;
-    let (shared, in_registers, counted, Uses { aligns, pursues, confines, gone }) = match sizes {
+    let Shape { workgroup, slots, records: Recorded { trace, sightings }, uses, sizes } = shape;
+    let (shared, in_registers, counted) = match sizes {
         // The agents of one large team, or of several small ones.
-        Sizes::Any { uses, .. } => ((workgroup * slots).min(MAX_SHARED), false, 1, uses),
-        Sizes::Fixed { teams, leaders, agents, uses, .. } => {
+        Sizes::Any { .. } => ((workgroup * slots).min(MAX_SHARED), false, 1),
+        Sizes::Fixed { teams, leaders, agents, .. } => {
             let in_registers = leaders < agents && leaders as usize <= MAX_COUNTED_LEADERS;
-            (teams * agents as usize, in_registers, if in_registers { leaders } else { 1 }, uses)
+            (teams * agents as usize, in_registers, if in_registers { leaders } else { 1 })
         }
     };
     let constants = gpu_constants!(
@@ -283,10 +281,10 @@ fn episode(shape: Shape) -> String {
         SIGHTINGS = sightings,
         COUNTS_IN_REGISTERS = in_registers,
         COUNTED_LEADERS = counted,
-        ALIGNS = aligns,
-        PURSUES = pursues,
-        CONFINES = confines,
-        GONE = gone,
+        ALIGNS = uses.aligns,
+        PURSUES = uses.pursues,
+        CONFINES = uses.confines,
+        GONE = uses.gone,
         MAX_SECTORS,
         MAX_CLASSES,
         MOMENT_WORDS,
@@ -298,8 +296,8 @@ fn episode(shape: Shape) -> String {
         ClassConstants::copied_from("classes[class_number]")
     );
     let front = match sizes {
-        Sizes::Any { widest, chooses, .. } => [
-            gpu_constants!(INPUTS = widest, CHOICES = widest, CHOOSES = chooses),
+        Sizes::Any { widest, .. } => [
+            gpu_constants!(INPUTS = widest, CHOICES = widest, CHOOSES = uses.chooses),
             getter("shape_of", "class_number: u32", &ClassShape::copied_from("classes[class_number]"), "ClassShape"),
             getter(
                 "channel_of",
@@ -316,7 +314,7 @@ fn episode(shape: Shape) -> String {
             include_str!("../../../shaders/generic.wgsl").into(),
         ]
         .concat(),
-        Sizes::Fixed { teams, leaders, agents, pois, widths, chooses, uses, kinds } => {
+        Sizes::Fixed { teams, leaders, agents, pois, widths, kinds } => {
             let outputs = widths.into_iter().rfind(|&width| width > 0).expect("a policy has outputs");
             let (words, classes, inputs) = (agents.div_ceil(32), kinds.len(), widths[0]);
             format!(
@@ -324,7 +322,7 @@ fn episode(shape: Shape) -> String {
                  fn set_shape(task: Task) {{}}\n{}{}",
                 gpu_constants!(INPUTS = inputs, CHOICES = outputs),
                 straight_classes(kinds),
-                straight_policy(&widths, chooses, uses.pursues)
+                straight_policy(&widths, uses.chooses, uses.pursues)
             )
         }
     };
@@ -440,18 +438,13 @@ pub fn shaders() -> Vec<(&'static str, String)> {
     const PLAIN: Recorded = Recorded { trace: false, sightings: false };
     const SIGHTINGS: Recorded = Recorded { sightings: true, ..PLAIN };
     const TRACE: Recorded = Recorded { trace: true, sightings: true };
-    let generic = |workgroup, slots, widest, records: Recorded| {
-        let [aligns, pursues, confines, gone] = [records.trace; 4];
-        let uses = Uses { aligns, pursues, confines, gone };
-        let sizes = Sizes::Any { widest, chooses: records.trace, uses, large: false };
-        Pipeline::Episode(Shape { workgroup, slots, records, sizes })
+    let any = |workgroup, slots, widest, records: Recorded, large: bool| {
+        let [chooses, aligns, confines, gone] = [records.trace; 4];
+        let uses = Uses { chooses, aligns, pursues: records.trace && !large, confines, gone };
+        Shape { workgroup, slots, records, uses, sizes: Sizes::Any { widest, large } }
     };
-    let swarm = |records: Recorded| {
-        let [aligns, confines, gone] = [records.trace; 3];
-        let uses = Uses { aligns, pursues: false, confines, gone };
-        let sizes = Sizes::Any { widest: 16, chooses: records.trace, uses, large: true };
-        Pipeline::Swarm(SwarmPart::Clear, Shape { workgroup: WORKGROUPS[0], slots: 1, records, sizes })
-    };
+    let generic = |workgroup, slots, widest, records| Pipeline::Episode(any(workgroup, slots, widest, records, false));
+    let swarm = |records| Pipeline::Swarm(SwarmPart::Clear, any(WORKGROUPS[0], 1, 16, records, true));
     let specialised = |records, actions: Actions| {
         let text = include_str!("../../../configs/generally_forward.toml");
         let config = Config::parse(text, "generally_forward.toml").expect("the project's own config");

@@ -5,6 +5,7 @@ use std::sync::OnceLock;
 
 use super::DeviceError;
 use crate::backend::gpu::exact::Pass;
+use crate::config_enum::config_enum;
 use crate::escape;
 use crate::host;
 
@@ -28,37 +29,27 @@ pub struct AdapterInfo {
     pub pci: String,
 }
 
-/// The kind of device, the preferred kinds first.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Kind {
-    /// A GPU with memory of its own.
-    Discrete,
-    /// A GPU that shares the host's memory.
-    Integrated,
-    /// A GPU passed to a virtual machine.
-    Virtual,
-    /// The driver does not report the kind.
-    Unknown,
-    /// A renderer that runs on the CPU.
-    Software,
+config_enum! {
+    /// The kind of device, the preferred kinds first.
+    #[derive(PartialOrd, Ord)]
+    Kind {
+        /// A GPU with memory of its own.
+        Discrete = "discrete GPU",
+        /// A GPU that shares the host's memory.
+        Integrated = "integrated GPU",
+        /// A GPU passed to a virtual machine.
+        Virtual = "virtual GPU",
+        /// The driver does not report the kind.
+        Unknown = "unknown kind",
+        /// A renderer that runs on the CPU.
+        Software = "software renderer",
+    }
 }
 
 impl Kind {
     /// Reports whether this is certainly a GPU.
     pub fn is_real(self) -> bool {
         self <= Kind::Virtual
-    }
-}
-
-impl fmt::Display for Kind {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.pad(match self {
-            Kind::Discrete => "discrete GPU",
-            Kind::Integrated => "integrated GPU",
-            Kind::Virtual => "virtual GPU",
-            Kind::Unknown => "unknown kind",
-            Kind::Software => "software renderer",
-        })
     }
 }
 

@@ -14,7 +14,7 @@ use crate::backend::gpu::source::{
 };
 use crate::backend::grid::{Grid, LARGE_FROM, is_large};
 use crate::backend::{BackendError, Group, VECTOR, WeightVector, Weights, record_words, traced_words, weight_vectors};
-use crate::config::MAX_CLASSES;
+use crate::config::{Choice, MAX_CLASSES};
 use crate::credit::{RecordRequest, owner_bits};
 use crate::model::Constants;
 use crate::model::class::Class;
@@ -550,19 +550,18 @@ impl BatchPlan {
 
     /// Returns the dispatches of a round of a shape: pipelines and, if a task takes several, the workgroups of each task.
     fn dispatches(&self, groups: &[Group<'_>], shape: Shape, is_first_round: bool) -> Vec<(Pipeline, Option<usize>)> {
-        use SwarmPart::{Allocate, Clear, Enter, Fill, Learn, ObeyRule};
         if !shape.is_large() {
             return vec![(Pipeline::Episode(shape), None)];
         }
         let tasks = self.tasks.chunk_by(|a, b| a.group == b.group).map(|tasks| &tasks[0]);
         let worlds: Vec<&World> =
             tasks.filter(|planned| planned.shape == shape).map(|planned| groups[planned.group].world).collect();
-        let parts = [Clear, Enter, Allocate, Fill, Learn, ObeyRule].into_iter();
-        let dispatch = |part| {
+        let dispatch = |&(_, part): &(_, SwarmPart)| {
             let most = worlds.iter().map(|world| workgroups(part, world, shape.workgroup)).max();
             (Pipeline::Swarm(part, shape), most)
         };
-        parts.skip(if is_first_round { 0 } else { 2 }).map(dispatch).collect()
+        // The first two only start an episode.
+        SwarmPart::ALL[if is_first_round { 0 } else { 2 }..].iter().map(dispatch).collect()
     }
 
     /// Records how policies are gathered from populations on the device.

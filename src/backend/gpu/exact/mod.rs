@@ -27,26 +27,18 @@ pub use contraction::{decorate, emit, spirv, undecorated};
 pub use guard::{guarded, unguarded};
 pub use operations::inexact_operations;
 
+use crate::config_enum::config_enum;
 use operations::inexact_in;
 
-/// The compile pass that keeps a shader's float arithmetic from being contracted and reassociated.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub enum Pass {
-    /// SPIR-V with every float result decorated `NoContraction`. Vulkan only. Costs no instruction.
-    NoContraction,
-    /// naga IR whose float sums and products pass through integer bits. Works everywhere. Costs one `or` each.
-    Guarded,
-    /// No protection. Never chosen; for tests that show that differences are detected.
-    Plain,
-}
-
-impl std::fmt::Display for Pass {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.pad(match self {
-            Pass::NoContraction => "no-contraction",
-            Pass::Guarded => "guarded",
-            Pass::Plain => "plain",
-        })
+config_enum! {
+    /// The compile pass that keeps a shader's float arithmetic from being contracted and reassociated.
+    Pass {
+        /// SPIR-V with every float result decorated `NoContraction`. Vulkan only. Costs no instruction.
+        NoContraction = "no-contraction",
+        /// naga IR whose float sums and products pass through integer bits. Works everywhere. Costs one `or` each.
+        Guarded = "guarded",
+        /// No protection. Never chosen; for tests that show that differences are detected.
+        Plain = "plain",
     }
 }
 
