@@ -203,19 +203,18 @@ fn plain_world(seed: u64) -> Config {
         false => vec![],
     };
     let gain = |rng: &mut ChaCha8Rng, high: f64| if rng.random_bool(0.1) { 0.0 } else { rng.random_range(0.1..high) };
+    let Config { world, learning, credit, checkpoint, .. } =
+        Config::parse("[world]\nleaders = [[0, 0]]\npois = [[0, 0]]\ncoupling = 1", "the defaults")
+            .expect("a valid config");
     Config {
-        world: crate::config::WorldConfig {
+        world: WorldConfig {
             map,
             leaders: starts[..leaders].to_vec(),
             followers: starts[leaders..].to_vec(),
             pois,
             coupling,
             observation_radius,
-            observers: Observers::All,
-            windows: vec![],
-            after: vec![],
             steps: rng.random_range(20..=60),
-            start_counts: false,
             dt: [0.05, 0.2, 0.2, 0.5, 1.0][rng.random_range(0..5)],
             heading: Heading::Same(if exact || rng.random_bool(0.3) {
                 quarter * f64::from(rng.random_range(-2..=2))
@@ -223,6 +222,7 @@ fn plain_world(seed: u64) -> Config {
                 rng.random_range(-4.0..4.0)
             }),
             speed: if rng.random_bool(0.5) { min_speed } else { max_speed },
+            ..world
         },
         motion: Motion {
             min_speed,
@@ -254,7 +254,6 @@ fn plain_world(seed: u64) -> Config {
         },
         learning: Learning {
             paradigm: if rng.random_bool(0.25) { Paradigm::AllLeaders } else { Paradigm::LeaderFollower },
-            groups: vec![],
             sharing: match later.random_bool(0.2) {
                 true => Sharing::Shared,
                 false if seed % 4 == 1 => Sharing::Group,
@@ -262,33 +261,18 @@ fn plain_world(seed: u64) -> Config {
             },
             fitness: word(rng),
             population: rng.random_range(2..=20),
-            partners: 1,
-            teams: Teams::Random,
-            temperature: 1.0,
-            hall_of_fame: 0,
-            leniency: Leniency::Mean,
             generations: 3,
             trials: 1,
             initial: if seed % 5 == 2 { Initial::Uniform } else { Initial::Normal },
             initial_scale: if seed % 5 < 2 { 1.0 } else { 2.0 },
-            elites: Elites::Count(1),
-            team_elites: 0,
-            team_g_elites: 0,
-            parents: Parents::All,
-            method: Method::Tournament,
-            search_sigma: 0.3,
-            search_step: 1.0,
             mutation: if rng.random_bool(0.5) { Mutation::Scaled } else { Mutation::Additive },
-            mutation_probability: 0.15,
-            mutation_sigma: 0.1,
-            episodes_per_team: 1,
-            start_jitter: 0.0,
             poi_jitter: if later.random_bool(0.3) { later.random_range(0.5..5.0) } else { 0.0 },
             test_episodes: usize::from(seed % 6 == 4),
             seed,
+            ..learning
         },
-        credit: CreditConfig { led_by: LedBy::MostSeen, led_within: 0, removes: vec![], add_g: false },
-        checkpoint: CheckpointConfig::default(),
+        credit,
+        checkpoint,
         agents: vec![],
         pois: vec![],
         stages,
