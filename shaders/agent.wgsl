@@ -151,26 +151,6 @@ fn boundary_of(class_number: u32, index: u32, sector: u32) -> vec2<f32> {
     return vec2((*channel).boundaries[2u * sector], (*channel).boundaries[2u * sector + 1u]);
 }
 
-// Senses every `parts`-th of the POIs from `begin` to before `end`.
-fn sense_pois(
-    task: Task,
-    channel: ChannelShape,
-    gauge: Gauge,
-    index: u32,
-    begin: u32,
-    end: u32,
-    parts: u32,
-    me: ptr<function, Agent>,
-    sensed: ptr<function, Sensed>,
-) {
-    for (var poi = begin; poi < end; poi += parts) {
-        if !is_gone(task, (*me).team, poi) {
-            let place = places[task.pois + poi];
-            add_sensed(channel, gauge, index, poi_of(task, poi).y, place.x - (*me).x, place.y - (*me).y, me, sensed);
-        }
-    }
-}
-
 // Returns the squared distance within which an observer makes a POI gone, and the classes of its observers, one bit each.
 // They come after the radii and values of all POIs.
 fn gone_within_of(task: Task, poi: u32) -> vec2<f32> {
@@ -254,10 +234,16 @@ fn sense_part(
         if range.x == range.y {
             break;
         }
-        if channel.of_pois != 0u {
-            sense_pois(task, channel, gauge, index, range.x + part, range.y, parts, me, sensed);
-        } else {
+        if channel.of_pois == 0u {
             sense_agents(task, first, channel, gauge, index, range, part, me, sensed);
+            continue;
+        }
+        for (var poi = range.x + part; poi < range.y; poi += parts) {
+            if !is_gone(task, (*me).team, poi) {
+                let place = places[task.pois + poi];
+                let value = poi_of(task, poi).y;
+                add_sensed(channel, gauge, index, value, place.x - (*me).x, place.y - (*me).y, me, sensed);
+            }
         }
     }
 }

@@ -114,12 +114,8 @@ fn obey_agents(
                 x = on_lattice((*state).hx, own.heading_base);
                 y = on_lattice((*state).hy, own.heading_base);
             }
-            var sum = (*sums)[0];
-            add_to_term(one, d2, x, y, &sum);
-            (*sums)[0] = sum;
-            sum = (*sums)[1];
-            add_to_term(two, d2, x, y, &sum);
-            (*sums)[1] = sum;
+            (*sums)[0] = with_other((*sums)[0], one, d2, x, y);
+            (*sums)[1] = with_other((*sums)[1], two, d2, x, y);
         }
     }
 }

@@ -23,14 +23,12 @@ struct Steering {
     speed: f32,
 }
 
-// Adds an offset or a heading, on its lattice, if the squared distance is within the term's. Compares bits, which are in
-// the order of the numbers because only a distance within which nothing is can be negative.
-fn add_to_term(pull: Pull, d2: f32, x: i32, y: i32, sum: ptr<function, Sum>) {
+// Returns a sum with an offset or a heading, on its lattice, if the squared distance is within the term's. Compares bits,
+// which are in the order of the numbers because only a distance within which nothing is can be negative.
+fn with_other(sum: Sum, pull: Pull, d2: f32, x: i32, y: i32) -> Sum {
     let bits = bitcast<i32>(d2);
     let counts = bits <= bitcast<i32>(pull.outer2) && bits > bitcast<i32>(pull.inner2);
-    (*sum).x += select(0, x, counts);
-    (*sum).y += select(0, y, counts);
-    (*sum).count += select(0, 1, counts);
+    return Sum(sum.x + select(0, x, counts), sum.y + select(0, y, counts), sum.count + select(0, 1, counts));
 }
 
 // The force on an agent that obeys a rule, and whether any agent or wall is near.
