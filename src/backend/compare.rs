@@ -136,9 +136,6 @@ pub(crate) fn compare_breeding(
 
 /// Returns the first difference of two traces of the same group: by step, then stage, then team.
 fn first_mismatch(world: &World, expected: &Trace, found: &Trace) -> Option<Mismatch> {
-    if expected == found && bits(expected) == bits(found) && inputs(expected) == inputs(found) {
-        return None;
-    }
     let mut first: Option<Mismatch> = None;
     // Compares two arrays. `locate` returns step, quantity, team and place of a number.
     let mut compare = |a: &[u32], b: &[u32], locate: &dyn Fn(usize) -> (usize, Quantity, usize, String)| {
@@ -149,13 +146,15 @@ fn first_mismatch(world: &World, expected: &Trace, found: &Trace) -> Option<Mism
             }
         }
     };
-    compare(bits(expected), bits(found), &|index| {
-        let (moment, (stage, name)) = (index / MOMENT_WORDS, field(index % MOMENT_WORDS));
+    let [moments, found_moments] = [expected, found].map(|trace| bytemuck::cast_slice(&trace.moments));
+    compare(moments, found_moments, &|index| {
+        let (moment, (stage, name)) = (index / MOMENT_WORDS, FIELDS[index % MOMENT_WORDS]);
         let (agent, team) = (moment % expected.agents, moment / expected.agents % expected.teams);
         (moment / expected.agents / expected.teams, stage, team, format!("agent {agent}, {name}"))
     });
     let (leaders, width) = (world.leaders(), world.inputs());
-    compare(inputs(expected), inputs(found), &|index| {
+    let [inputs, found_inputs] = [expected, found].map(|trace| bytemuck::cast_slice(&trace.inputs));
+    compare(inputs, found_inputs, &|index| {
         let (leader, step) = (index / width, index / width / leaders / expected.teams);
         let place = format!("agent {}, input {}", leader % leaders, index % width);
         (step, Quantity::Sense, leader / leaders % expected.teams, place)
@@ -182,26 +181,15 @@ fn first_mismatch(world: &World, expected: &Trace, found: &Trace) -> Option<Mism
     first
 }
 
-/// Returns the quantity and the name of each word of a [`Moment`].
-fn field(word: usize) -> (Quantity, &'static str) {
-    const FIELDS: [(Quantity, &str); MOMENT_WORDS] = [
-        (Quantity::Policy, "turn"),
-        (Quantity::Policy, "speed"),
-        (Quantity::Follow, "force x"),
-        (Quantity::Follow, "force y"),
-        (Quantity::Move, "x"),
-        (Quantity::Move, "y"),
-        (Quantity::Move, "heading x"),
-        (Quantity::Move, "heading y"),
-        (Quantity::Move, "speed"),
-    ];
-    FIELDS[word]
-}
-
-fn bits(trace: &Trace) -> &[u32] {
-    bytemuck::cast_slice(&trace.moments)
-}
-
-fn inputs(trace: &Trace) -> &[u32] {
-    bytemuck::cast_slice(&trace.inputs)
-}
+/// The quantity and the name of each word of a [`Moment`](super::Moment).
+const FIELDS: [(Quantity, &str); MOMENT_WORDS] = [
+    (Quantity::Policy, "turn"),
+    (Quantity::Policy, "speed"),
+    (Quantity::Follow, "force x"),
+    (Quantity::Follow, "force y"),
+    (Quantity::Move, "x"),
+    (Quantity::Move, "y"),
+    (Quantity::Move, "heading x"),
+    (Quantity::Move, "heading y"),
+    (Quantity::Move, "speed"),
+];

@@ -47,17 +47,14 @@ impl<'a> ScoreTable<'a> {
     pub(crate) fn score(&self, group: usize, team: usize, episode: &Episode<'_>) {
         thread_local! { static CREDIT: RefCell<(Credit, Vec<f32>)> = RefCell::default(); }
         let Group { world, fitnesses, .. } = self.groups[group];
-        let leaders = world.leaders();
         CREDIT.with_borrow_mut(|(credit, scores)| {
-            scores.resize(leaders, 0.0);
-            let table = self.scores[group][team * fitnesses.len() * leaders..].chunks_exact(leaders);
-            let mut observed = None;
-            for (&fitness, row) in fitnesses.iter().zip(table) {
-                observed = Some(credit.score(episode, world, fitness, scores));
-                row.iter().zip(&*scores).for_each(|(to, score)| to.store(score.to_bits(), Relaxed));
+            scores.resize(world.leaders(), 0.0);
+            // Without a fitness, only the observed POIs are wanted.
+            let wanted = if fitnesses.is_empty() { &[Fitness::G] } else { fitnesses };
+            for (index, &fitness) in wanted.iter().enumerate() {
+                let observed = credit.score(episode, world, fitness, scores);
+                self.put((group, team), index, observed, scores.iter().copied());
             }
-            let observed = observed.unwrap_or_else(|| credit.score(episode, world, Fitness::G, scores));
-            self.observed[group][team].store(observed, Relaxed);
         });
     }
 

@@ -226,11 +226,6 @@ impl<S: Simd> Block<S> {
     /// Plays a step by the leaders' outputs. Writes which leaders each follower sees before it moves, unless `sights` is
     /// empty, and the agents at each POI after it, see [`Block::record_sightings`] and [`Block::record_poi_sets`].
     pub fn step(&mut self, sights: &mut [u32], sets: &mut [u32]) {
-        self.advance(sights);
-        self.record_poi_sets(sets);
-    }
-
-    fn advance(&mut self, sights: &mut [u32]) {
         self.simd.vectorize(
             #[inline(always)]
             || {
@@ -243,6 +238,7 @@ impl<S: Simd> Block<S> {
                 self.move_agents();
             },
         );
+        self.record_poi_sets(sets);
     }
 
     /// Keeps the agents of classes that move only near others, and finds out whether they move.

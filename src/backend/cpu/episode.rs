@@ -51,7 +51,10 @@ impl<S: Simd> EpisodeBlock<S> {
             block.place_pois(lane, batch.groups[group].pois());
         }
         block.start();
-        network.load(batch, places);
+        network.load_policies(
+            #[inline(always)]
+            |leader, lane| batch.policy(leader, places[lane]),
+        );
     }
 
     /// Records the positions of a moment, if scores need them.

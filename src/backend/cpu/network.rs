@@ -2,7 +2,6 @@
 
 use fearless_simd::{Simd, prelude::*};
 
-use super::batch::WorldBatch;
 use super::transpose::transpose_rows;
 use crate::kernels::{math, splat};
 use crate::model::policy::{Actions, PolicyConstants};
@@ -51,15 +50,6 @@ impl<S: Simd> Network<S> {
             slots,
             hidden: [vec![zero; leaders * widest], vec![zero; leaders * widest]],
         }
-    }
-
-    /// Loads the policies of each lane's group and team.
-    #[inline(always)]
-    pub(super) fn load(&mut self, batch: &WorldBatch<'_>, places: &[(usize, usize)]) {
-        self.load_policies(
-            #[inline(always)]
-            |leader, lane| batch.policy(leader, places[lane]),
-        );
     }
 
     /// Loads the policy of each leader and lane.

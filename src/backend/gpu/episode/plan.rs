@@ -112,15 +112,19 @@ pub fn state_bytes(world: &World, request: RecordRequest<'_>) -> u64 {
     let generic = Workgroup::generic(world, WORKGROUPS[2]);
     let specialised = Workgroup::specialised(world, Capacity::of_workgroups(MAX_THREADS));
     let is_parted = |workgroup| world.steps() > steps_per_dispatch(world, workgroup, recorded);
-    if is_large(world, LARGE_FROM) {
-        (3 * world.agents() * size_of::<State>() + cell_words(world).1 * size_of::<u32>()) as u64
-    } else if world.aligns() {
-        (2 * world.agents() * size_of::<State>()) as u64
-    } else if is_parted(generic) || specialised.is_some_and(is_parted) {
-        (world.agents() * size_of::<State>()) as u64
-    } else {
-        0
-    }
+    let is_large = is_large(world, LARGE_FROM);
+    let states = states(world, is_large, is_parted(generic) || specialised.is_some_and(is_parted));
+    (states * size_of::<State>()) as u64 + if is_large { words(cell_words(world).1) } else { 0 }
+}
+
+/// Returns the number of states that a team keeps between two dispatches.
+fn states(world: &World, is_large: bool, is_parted: bool) -> usize {
+    let per_agent = match world.aligns() {
+        _ if is_large => 3,
+        true => 2,
+        false => usize::from(is_parted),
+    };
+    per_agent * world.agents()
 }
 
 /// A task and where its teams come from.
@@ -236,12 +240,7 @@ impl<'a> GroupPlan<'a> {
             record: record_words(world, group.records()),
             weights: weight_vectors(world),
             traced: if trace { (world.steps() + 1) * traced_words(world) } else { 0 },
-            states: match world.aligns() {
-                _ if shape.is_large() => 3 * world.agents(),
-                true => 2 * world.agents(),
-                false if world.steps() > steps_per_dispatch => world.agents(),
-                false => 0,
-            },
+            states: states(world, shape.is_large(), world.steps() > steps_per_dispatch),
         };
         let after_record = STATUS + if shape.is_large() { cell_words(world).1 } else { 0 };
         let bytes_per_team = Elements { record: per_team.record + after_record, ..per_team }.largest();
