@@ -41,16 +41,9 @@ fn measure(config: &Config, level: Level, teams: usize, rounds: usize) -> Result
     let leaders = world.leaders();
     let weights = [&world, &small].map(|world| constant(world, teams, config.learning.seed));
     let order: Vec<u32> = (0..teams as u32).flat_map(|team| vec![team; leaders]).collect();
-    let group = |world, weights| Group {
-        world,
-        starts: &world.starts,
-        weights,
-        policies: teams,
-        populations: own_populations(leaders),
-        teams: &order,
-        fitnesses: &[],
-    };
-    let groups = [group(&world, weights[0][..].into()), group(&small, weights[1][..].into())];
+    let group =
+        |world, weights| Group { populations: own_populations(leaders), ..Group::new(world, weights, teams, &order) };
+    let groups = [group(&world, &weights[0][..]), group(&small, &weights[1][..])];
     let mut cpu = Cpu::at_level(level);
     let mut rollout = |group| cpu.play(&[group]).map(|scores| _ = std::hint::black_box(scores));
 

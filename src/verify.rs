@@ -89,8 +89,7 @@ impl Teams {
 
     fn group(&self) -> Group<'_> {
         let &Teams { ref world, policies, ref weights, ref choice, ref places, fitnesses } = self;
-        let populations = &world.populations;
-        Group { world, starts: places, weights: weights[..].into(), policies, populations, teams: choice, fitnesses }
+        Group { starts: places, fitnesses, ..Group::new(world, &weights[..], policies, choice) }
     }
 }
 

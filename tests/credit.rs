@@ -7,6 +7,7 @@ use flotilla::backend::cpu::Cpu;
 use flotilla::backend::{Backend, Group, GroupScores};
 use flotilla::config::{Choice, Config, Coupling, Fitness, LedBy, MAX_LEARNERS, Observers, Score, When, WorldConfig};
 use flotilla::credit::{Credit, Episode, RecordRequest, Scores, Seen, Strided, owner_bits};
+use flotilla::evolve::aligned_teams;
 use flotilla::front;
 use flotilla::sample;
 use flotilla::world::{Led, PathRule, World};
@@ -568,15 +569,8 @@ fn played_teams_get_the_scores_of_their_records() {
         let populations: Vec<u32> = (0..leaders as u32).collect();
         let weights = sample::weights(&world, policies, seed);
         let teams: Vec<u32> = (0..37 * leaders).map(|place| (place * 7 % policies) as u32).collect();
-        let group = |fitnesses| Group {
-            world: &world,
-            starts: &world.starts,
-            weights: weights[..].into(),
-            policies,
-            populations: &populations,
-            teams: &teams,
-            fitnesses,
-        };
+        let group = Group { populations: &populations, ..Group::new(&world, &weights[..], policies, &teams) };
+        let group = |fitnesses| Group { fitnesses, ..group };
         let trace = cpu.trace(&group(&[Fitness::Dt])).unwrap();
         for fitnesses in &fitnesses {
             let found = cpu.play(&[group(fitnesses)]).unwrap();
@@ -606,16 +600,9 @@ fn paths_of(world: &World, seed: u64) -> (Vec<f32>, Vec<f32>) {
     let (policies, leaders) = (4, world.leaders());
     let weights = sample::weights(world, policies, seed);
     let populations: Vec<u32> = (0..leaders as u32).collect();
-    let teams: Vec<u32> = (0..policies as u32).flat_map(|policy| vec![policy; leaders]).collect();
-    let group = Group {
-        world,
-        starts: &world.starts,
-        weights: weights[..].into(),
-        policies,
-        populations: &populations,
-        teams: &teams,
-        fitnesses: &EVERY,
-    };
+    let teams = aligned_teams(policies, leaders);
+    let group = Group::new(world, &weights[..], policies, &teams);
+    let group = Group { populations: &populations, fitnesses: &EVERY, ..group };
     let (mut cpu, mut positions) = (Cpu::default(), vec![]);
     let trace = cpu.trace(&group).unwrap();
     for team in 0..policies {

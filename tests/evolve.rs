@@ -297,15 +297,7 @@ coupling = 1
     assert_distribution("headings", &counts, |_| 1.0 / 16.0);
 
     let weights = vec![0.0; world.parameters()];
-    let group = Group {
-        world: &world,
-        starts: &places,
-        weights: weights[..].into(),
-        policies: 1,
-        populations: &world.populations,
-        teams: &[0],
-        fitnesses: &[],
-    };
+    let group = Group { starts: &places, ..Group::new(&world, &weights[..], 1, &[0]) };
     let trace = Cpu::default().trace(&group).unwrap();
     let headings = |agent| Vec2::from(trace.moment(0, 0, agent).heading);
     assert_eq!((0..5).map(headings).collect::<Vec<_>>(), places[7..]);
@@ -1111,13 +1103,10 @@ impl PlainTrial<'_> {
             evolve::jitter_pois(of_pois, generation, episode, &world, poi_jitter, &mut starts);
             let teams = vec![0; team.len()];
             let group = Group {
-                world: &world,
                 starts: &starts,
-                weights: weights[..].into(),
-                policies: 1,
                 populations: own_populations(world.leaders()),
-                teams: &teams,
                 fitnesses: &[Fitness::Dt],
+                ..Group::new(&world, &weights[..], 1, &teams)
             };
             // Scores come from the full trace, which is independent of the scores that `play` of a backend returns.
             let trace = Cpu::default().trace(&group).unwrap();

@@ -70,16 +70,7 @@ pub fn train(configs: &[Config], backend: &mut dyn Backend) -> Vec<(Golden, f64)
 fn trace(backend: &mut dyn Backend, config: &Config, world: &World, weights: &[f32]) -> String {
     let policies = config.learning.population;
     let teams: Vec<u32> = (0..policies * world.leaders()).map(|place| (place / world.leaders()) as u32).collect();
-    let group = Group {
-        world,
-        starts: &world.starts,
-        weights: weights.into(),
-        policies,
-        populations: &world.populations,
-        teams: &teams,
-        fitnesses: &[],
-    };
-    let trace = backend.trace(&group).unwrap();
+    let trace = backend.trace(&Group::new(world, weights, policies, &teams)).unwrap();
     // Each agent's inputs, zeros if it follows, and its moment.
     let mut floats: Vec<f32> = vec![];
     for (index, moment) in trace.moments.iter().enumerate() {

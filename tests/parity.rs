@@ -35,8 +35,8 @@ fn open(request: &Request, pass: Pass, kernel: Kernel) -> GpuBackend {
 
 /// Returns a group of teams with separate policies per leader, scored by every fitness.
 fn group_of_teams<'a>(world: &'a World, weights: &'a [f32], policies: usize, teams: &'a [u32]) -> Group<'a> {
-    let (starts, populations, fitnesses) = (&world.starts, own_populations(world.leaders()), SCORES_AND_DT);
-    Group { world, starts, weights: weights.into(), policies, populations, teams, fitnesses }
+    let (populations, fitnesses) = (own_populations(world.leaders()), SCORES_AND_DT);
+    Group { populations, fitnesses, ..Group::new(world, weights, policies, teams) }
 }
 
 fn check(plan: &Plan, mut backend: GpuBackend) -> Agreement {

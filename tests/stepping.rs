@@ -10,6 +10,7 @@ use flotilla::backend::{Backend, Group, Moment, Trace};
 use flotilla::config::{Config, Fitness, MAX_POPULATION, own_populations};
 use flotilla::credit::{self, Credit, Scores};
 use flotilla::evaluate::Starts;
+use flotilla::evolve::aligned_teams;
 use flotilla::sample;
 use flotilla::stepping::{Recording, StepError, Stepper};
 use flotilla::world::World;
@@ -30,16 +31,12 @@ impl Played {
             _ => Starts::Drawn { episodes: 1, seed, jitter: 0.7, poi_jitter: 0.0 }.of(0, &world),
         };
         let weights = sample::weights(&world, teams, seed);
-        let order: Vec<u32> = (0..teams as u32).flat_map(|team| vec![team; world.leaders()]).collect();
-        let weights = weights[..].into();
+        let order = aligned_teams(teams, world.leaders());
         let group = Group {
-            world: &world,
             starts: &starts,
-            weights,
-            policies: teams,
             populations: own_populations(world.leaders()),
-            teams: &order,
             fitnesses: &[Fitness::Dt],
+            ..Group::new(&world, &weights[..], teams, &order)
         };
         let trace = Cpu::default().trace(&group).expect("the group is valid");
         Played { world, starts, trace }

@@ -5,7 +5,7 @@ use flotilla::backend::cpu::{Cpu, Noise, StepArrays, level_name};
 use flotilla::backend::gpu::device::DeviceError;
 use flotilla::backend::gpu::episode::{GpuBackend, Records};
 use flotilla::backend::{BackendError, Group, gpu};
-use flotilla::config::{Config, Sectors, own_populations};
+use flotilla::config::{Config, Sectors};
 use flotilla::evaluate::SCORES_AND_DT;
 use flotilla::evolve::{Key, Purpose};
 use flotilla::sample;
@@ -171,9 +171,7 @@ fn recorded_steps_are_equal_with_a_grid_and_without() {
     let world = World::new(&Config::parse(SWARM, "swarm.toml").unwrap().validate().unwrap());
     let (steps, agents, leaders, pois) = (world.steps(), world.agents(), world.leaders(), world.pois.len());
     let (weights, teams) = (sample::weights(&world, 3, 7), [0, 1, 2, 0, 2, 1, 0, 1]);
-    let (starts, populations) = (&world.starts, own_populations(leaders));
-    let (weights, fitnesses, policies) = (weights[..].into(), SCORES_AND_DT, 3);
-    let group = Group { world: &world, starts, weights, policies, populations, teams: &teams, fitnesses };
+    let group = Group { fitnesses: SCORES_AND_DT, ..Group::new(&world, &weights[..], 3, &teams) };
     let key = Key::new(5, 0, Purpose::Exploration);
     let noise = Noise { key, deviations: &vec![[0.1, 0.2]; leaders], first: 3 };
     let record = |large_from: usize| {

@@ -33,6 +33,12 @@ pub struct Group<'a> {
 }
 
 impl<'a> Group<'a> {
+    /// Returns a group of teams that start at the world's positions, choose from its populations, and are not scored.
+    pub fn new(world: &'a World, weights: impl Into<Weights<'a>>, policies: usize, teams: &'a [u32]) -> Group<'a> {
+        let (starts, weights, populations) = (&world.starts, weights.into(), &world.populations);
+        Group { world, starts, weights, policies, populations, teams, fitnesses: &[] }
+    }
+
     /// Returns the number of teams.
     pub fn team_count(&self) -> usize {
         self.teams.len() / self.world.leaders()

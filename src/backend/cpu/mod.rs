@@ -322,15 +322,8 @@ mod tests {
                 [libm::sinf(angle) * 0.3, libm::cosf(angle * 0.7)]
             };
             let (weights, teams) = (sample::weights(&world, 1, seed), vec![0; TEAMS * world.leaders()]);
-            let group = Group {
-                world: &world,
-                starts: &world.starts,
-                weights: weights[..].into(),
-                policies: 1,
-                populations: own_populations(world.leaders()),
-                teams: &teams,
-                fitnesses: SCORES_AND_DT,
-            };
+            let (populations, fitnesses) = (own_populations(world.leaders()), SCORES_AND_DT);
+            let group = Group { populations, fitnesses, ..Group::new(&world, &weights[..], 1, &teams) };
             let mut stepper = Stepper::new(world.clone(), TEAMS, Recording::SetsAndSights).unwrap();
             for step in 0..world.steps() {
                 let leaders = (0..TEAMS).flat_map(|team| (0..world.leaders()).map(move |leader| (team, leader)));

@@ -12,6 +12,7 @@ use crate::backend::cpu::Cpu;
 use crate::backend::{Backend, BackendError, Group, Weights};
 use crate::config::{Config, Fitness, Learning};
 use crate::config_enum::Choice;
+use crate::evolve::aligned_teams;
 use crate::model::sense::Density;
 use crate::sample;
 use crate::world::World;
@@ -125,12 +126,6 @@ fn world(density: Density) -> (World, Config) {
     (World::new(&config.validate().expect("the project's own config")), config)
 }
 
-/// Returns a group of teams that play random policies.
-fn group<'a>(world: &'a World, weights: &'a [f32], policies: usize, teams: &'a [u32]) -> Group<'a> {
-    let (starts, weights, populations) = (&world.starts[..], Weights::OnHost(weights), &world.populations[..]);
-    Group { world, starts, weights, policies, teams, populations, fitnesses: &[] }
-}
-
 /// Tests an episode with each density, and one with classes of agents, stage by stage.
 fn episode(executor: &Executor) -> Result<Option<String>, BackendError> {
     const TEAMS: usize = 8;
@@ -143,8 +138,8 @@ fn episode(executor: &Executor) -> Result<Option<String>, BackendError> {
     let worlds = Density::ALL.iter().map(|&(name, density)| (format!("{name} density"), world(density).0));
     for (name, world) in worlds.chain([("classes of agents".into(), classes)]) {
         let weights = sample::weights(&world, TEAMS, 0);
-        let teams: Vec<u32> = (0..TEAMS as u32).flat_map(|team| vec![team; world.leaders()]).collect();
-        let group = group(&world, &weights, TEAMS, &teams);
+        let teams = aligned_teams(TEAMS, world.leaders());
+        let group = Group::new(&world, &weights[..], TEAMS, &teams);
         if let Some(mismatch) = compare_traces(&group, &mut Cpu::default(), &mut backend)? {
             return Ok(Some(format!("an episode with {name} differs: {mismatch}")));
         }
@@ -168,7 +163,7 @@ fn training(executor: &Executor) -> Result<Option<String>, BackendError> {
         world.pois[poi] + Vec2::new((agent % 3) as f32, 0.5 * (agent / leaders) as f32)
     };
     let starts: Vec<Vec2> = POI_OF_AGENT.iter().enumerate().map(start).collect();
-    let group = Group { starts: &starts, ..group(&world, &weights, TEAMS, &teams) };
+    let group = Group { starts: &starts, ..Group::new(&world, &weights[..], TEAMS, &teams) };
     let fitnesses: [&[Fitness]; 2] = [&[Fitness::D, Fitness::Df], &[Fitness::Dpp]];
     let groups = fitnesses.map(|fitnesses| Group { fitnesses, ..group });
     let expected = Cpu::default().play(&groups)?;

@@ -825,9 +825,8 @@ mod tests {
     /// The record and the last positions of a team, with agents in two orders.
     fn in_two_orders<S: Simd>(simd: S, world: &World, seed: u64) -> [(Swarm<S>, Vec<f32>); 2] {
         let (weights, teams) = (sample::weights(world, 1, seed), vec![0; world.leaders()]);
-        let (starts, populations) = (&world.starts, own_populations(world.leaders()));
-        let (weights, fitnesses) = (weights[..].into(), SCORES_AND_DT);
-        let group = Group { world, starts, weights, policies: 1, populations, teams: &teams, fitnesses };
+        let (populations, fitnesses) = (own_populations(world.leaders()), SCORES_AND_DT);
+        let group = Group { populations, fitnesses, ..Group::new(world, &weights[..], 1, &teams) };
         let batch = WorldBatch::new(std::slice::from_ref(&group), 0);
         let play = |watch: &mut Shuffle, shuffles: bool| {
             let mut swarm = Swarm::new(simd, world, Recorded { counts: true, sights: true, forces: false });

@@ -19,8 +19,7 @@ pub(super) fn large_teams(executor: &Executor) -> Result<Option<String>, Backend
     config.agents.retain(|class| class.control.target().is_none());
     let world = World::new(&config.validate().expect("the project's own config"));
     let (weights, teams) = (sample::weights(&world, 1, 0), vec![0; TEAMS * world.leaders()]);
-    let (starts, weights, populations) = (&world.starts[..], weights[..].into(), &world.populations[..]);
-    let group = Group { world: &world, starts, weights, policies: 1, teams: &teams, populations, fitnesses: &[] };
+    let group = Group::new(&world, &weights[..], 1, &teams);
     let mut backend = GpuBackend::with_executor(executor.clone()).with_large_from(0);
     let mismatch = compare_traces(&group, &mut Cpu::default(), &mut backend)?;
     Ok(mismatch.map(|mismatch| format!("an episode of a large team differs: {mismatch}")))

@@ -769,16 +769,12 @@ mod tests {
         let held = Held { sizes: [1, 1, groups[0].1.parameters()], turn: 1, status: vec![7, 8] };
         let (weights, choices) = (vec![0.0; groups[0].1.parameters()], vec![0; 30_000]);
         let shared = &choices[..];
-        let group = |&(teams, world): &(usize, _)| Group {
-            world,
-            starts: &world.starts,
-            weights: Weights::OnHost(&weights),
-            policies: 1,
-            teams: &choices[..teams],
+        let groups = groups.iter().map(|&(teams, world)| Group {
             populations: &shared[..world.leaders()],
             fitnesses: &[Fitness::Df],
-        };
-        let groups: Vec<Group<'_>> = groups.iter().map(group).collect();
+            ..Group::new(world, &weights[..], 1, &choices[..teams])
+        });
+        let groups: Vec<Group<'_>> = groups.collect();
         let capacity = Capacity { batch: BATCH_BYTES, buffer, large_from, ..Capacity::of_workgroups(256) };
         let batches = plan(&groups, false, records, capacity, &HashSet::new()).unwrap();
         // Every team is in one task.
