@@ -5,7 +5,7 @@
 
 use std::f32::consts::PI;
 
-use serde::{Deserialize, Serialize};
+use serde::Deserialize;
 
 use flotilla::config::{Config, Mobility, StageConfig};
 use flotilla::evaluate::Starts;
@@ -13,11 +13,11 @@ use flotilla::stepping::{Recording, StepError, Stepper};
 use flotilla::world::World;
 
 /// The places that a team's leaders drive to.
-#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default)]
 pub struct Script(Vec<Leg>);
 
 /// A target of one leader, until a step.
-#[derive(Clone, Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Leg {
     leader: usize,

@@ -10,6 +10,7 @@ use crate::support::{Place, SMALL};
 use flotilla::trainer::Row;
 use flotilla::{Config, front};
 use flotilla_app::ops;
+use flotilla_app::ops::train::TrainRequest;
 use flotilla_app::record::RecordError;
 use flotilla_app::record::disk::Disk;
 use flotilla_app::record::finished::{Content, Finished, Storage};
@@ -866,8 +867,8 @@ fn compare_files(method: &str) {
 }
 
 /// Runs a use case. `meanwhile` is called once, after some generations.
-fn answer(request: &serde_json::Value, meanwhile: &dyn Fn()) -> serde_json::Value {
-    let (request, moved) = (serde_json::from_value(request.clone()).unwrap(), Cell::new(false));
+fn disturbed<R>(work: impl FnOnce(ops::Context<'_>) -> R, meanwhile: &dyn Fn()) -> R {
+    let moved = Cell::new(false);
     let report = |event: ops::Event<'_>| {
         let begun = match event {
             ops::Event::Rows { next, .. } => next == 3,
@@ -878,7 +879,7 @@ fn answer(request: &serde_json::Value, meanwhile: &dyn Fn()) -> serde_json::Valu
             meanwhile();
         }
     };
-    let outcome = flotilla_cli::request::answer(&request, &mut &mut front::cpu(), ops::Context::new(&report)).unwrap();
+    let outcome = work(ops::Context::new(&report));
     assert!(moved.get());
     outcome
 }
@@ -889,10 +890,12 @@ fn seeded(seed: u64) -> String {
     text.replace("pois = [[10, 9], [20, 9]]", "pois = [[11, 9], [23, 9]]")
 }
 
-/// A request to train `small.toml` with a seed into a folder.
-fn training(out: &Path, seed: u64) -> serde_json::Value {
-    let config = serde_json::json!({ "text": seeded(seed), "name": "small.toml" });
-    serde_json::json!({ "use_case": "train", "name": "small", "out": out, "start": "fresh", "config": config })
+/// Trains `small.toml` with a seed into a folder. `meanwhile` is called once, after some generations.
+fn train_disturbed(out: PathBuf, seed: u64, meanwhile: &dyn Fn()) -> serde_json::Value {
+    let config = ops::ConfigText { text: seeded(seed), name: "small.toml".into(), set: vec![] };
+    let request = TrainRequest { config, name: "small".into(), out: Some(out), start: Start::Fresh, init: None };
+    let found = disturbed(|context| ops::train::run(&request, &mut &mut front::cpu(), context), meanwhile);
+    serde_json::to_value(found.unwrap()).unwrap()
 }
 
 /// Returns the files of a folder that do not depend on the time and the place.
@@ -905,8 +908,8 @@ fn results(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
 #[test]
 fn a_run_whose_folder_is_moved_ends_where_it_is() {
     let place = place();
-    let expected = answer(&training(&place.path("reference"), 1), &|| ());
-    let other = answer(&training(&place.path("other"), 2), &|| ());
+    let expected = train_disturbed(place.path("reference"), 1, &|| ());
+    let other = train_disturbed(place.path("other"), 2, &|| ());
     assert_ne!(expected["first"], other["first"]);
     let check = |outcome: serde_json::Value, moved: &str, path: &str| {
         assert_eq!(outcome["digest"], expected["digest"]);
@@ -922,9 +925,9 @@ fn a_run_whose_folder_is_moved_ends_where_it_is() {
         }
     };
     // Another run takes the path.
-    let moved = answer(&training(&place.path("run"), 1), &|| {
+    let moved = train_disturbed(place.path("run"), 1, &|| {
         fs::rename(place.path("run"), place.path("moved")).unwrap();
-        answer(&training(&place.path("run"), 2), &|| ());
+        train_disturbed(place.path("run"), 2, &|| ());
     });
     check(moved, "moved", "run");
     // The path is a link, which leads to another folder later.
@@ -936,14 +939,14 @@ fn a_run_whose_folder_is_moved_ends_where_it_is() {
             std::os::unix::fs::symlink(to, place.path("latest")).unwrap();
         };
         lead("first");
-        let linked = answer(&training(&place.path("latest"), 1), &|| {
+        let linked = train_disturbed(place.path("latest"), 1, &|| {
             lead("second");
-            answer(&training(&place.path("latest"), 2), &|| ());
+            train_disturbed(place.path("latest"), 2, &|| ());
         });
         check(linked, "first", "latest");
     }
     // Nothing takes the path.
-    let moved = answer(&training(&place.path("run-2"), 1), &|| {
+    let moved = train_disturbed(place.path("run-2"), 1, &|| {
         fs::rename(place.path("run-2"), place.path("moved-2")).unwrap();
     });
     check(moved, "moved-2", "other");
@@ -953,16 +956,20 @@ fn a_run_whose_folder_is_moved_ends_where_it_is() {
 #[test]
 fn a_sweep_whose_folder_is_moved_ends_where_it_is() {
     let place = place();
-    let sweep = |out: &str, seed: u64| {
+    let sweep = |out: &str, seed: u64, meanwhile: &dyn Fn()| {
         let text = format!("{}\n[grid]\n\"learning.fitness\" = ['D', 'Df']\n", seeded(seed));
-        serde_json::json!({ "use_case": "sweep", "text": text, "name": "small.toml", "out": place.path(out),
-            "named": true, "start": "fresh" })
+        let request = serde_json::json!({ "use_case": "sweep", "text": text, "name": "small.toml",
+            "out": place.path(out), "named": true, "start": "fresh" });
+        let request = serde_json::from_value(request).unwrap();
+        let answer =
+            |context: ops::Context<'_>| flotilla_cli::request::answer(&request, &mut &mut front::cpu(), context);
+        disturbed(answer, meanwhile).unwrap();
     };
-    answer(&sweep("reference", 1), &|| ());
-    answer(&sweep("other", 2), &|| ());
-    answer(&sweep("grid", 1), &|| {
+    sweep("reference", 1, &|| ());
+    sweep("other", 2, &|| ());
+    sweep("grid", 1, &|| {
         fs::rename(place.path("grid"), place.path("moved")).unwrap();
-        answer(&sweep("grid", 2), &|| ());
+        sweep("grid", 2, &|| ());
     });
     assert_eq!(results(&place.path("reference")).len(), 3);
     assert_eq!(results(&place.path("moved")), results(&place.path("reference")));

@@ -6,7 +6,7 @@
 
 use std::path::{Path, PathBuf};
 
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 
 use crate::questions::champions;
 use flotilla::backend::{Backend, OpenBackend};
@@ -41,8 +41,7 @@ pub const SOLVED: f64 = 0.9;
 pub const FITNESSES: [Fitness; 4] = [Fitness::G, Fitness::D, Fitness::Df, Fitness::Dpp];
 
 /// Request to check tasks.
-#[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[derive(Clone, Debug)]
 pub struct Request {
     /// The tasks.
     pub tasks: Vec<Task>,
@@ -61,8 +60,7 @@ pub struct Request {
 }
 
 /// A task.
-#[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[derive(Clone, Debug)]
 pub struct Task {
     /// The name.
     pub name: String,

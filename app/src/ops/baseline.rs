@@ -1,6 +1,6 @@
 //! Plays teams that do not learn.
 
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::{BackendSource, ConfigText, Context, Error, ProcessorInfo};
@@ -10,9 +10,8 @@ use flotilla::baseline::{self, Baselines, SPEEDS};
 use flotilla::config::{Actions, Paradigm, ValidConfig};
 use flotilla::statistics;
 
-/// BaselineRequest of baselines.
-#[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+/// A request to play baselines.
+#[derive(Clone, Debug)]
 pub struct BaselineRequest {
     /// The config.
     pub config: ConfigText,

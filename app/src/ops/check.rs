@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 
 use super::{ConfigText, Context, Error, output, plot};
 use crate::report::map;
@@ -13,16 +13,14 @@ use flotilla::parallel;
 use flotilla::reach;
 use flotilla::world::World;
 
-/// CheckRequest of a check.
-#[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+/// A request to check a config.
+#[derive(Clone, Debug)]
 pub struct CheckRequest {
     /// The config.
     pub config: ConfigText,
     /// The name of the layout, for the picture.
     pub name: String,
     /// A picture of the layout to write.
-    #[serde(default)]
     pub out: Option<PathBuf>,
 }
 

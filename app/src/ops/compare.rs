@@ -18,8 +18,8 @@ use flotilla::escape::PathExt;
 use flotilla::file;
 use flotilla::statistics;
 
-/// CompareRequest of a comparison.
-#[derive(Clone, Debug, Serialize, Deserialize)]
+/// A request to compare runs.
+#[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CompareRequest {
     /// Folders of runs, two at least, or the folder of one sweep.

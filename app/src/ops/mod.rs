@@ -1,7 +1,7 @@
 //! The use cases of the program, below the command line, Python and the page.
 //!
 //! Each use case takes a request and reports its progress to a [`Context`]. It returns an outcome, or an [`Error`] with a
-//! stable code. Requests and outcomes can be serialised.
+//! stable code. Outcomes can be serialised.
 //!
 //! # Example
 //!
@@ -34,7 +34,7 @@ use std::ffi::OsString;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 
 use crate::choice::Work;
 use crate::record::folder::Run;
@@ -217,15 +217,13 @@ impl BackendSource for &mut OpenBackend {
 }
 
 /// A config as a request carries it.
-#[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[derive(Clone, Debug)]
 pub struct ConfigText {
     /// The text of the file.
     pub text: String,
     /// The file's name in errors.
     pub name: String,
     /// Config keys to set.
-    #[serde(default)]
     pub set: Vec<Override>,
 }
 

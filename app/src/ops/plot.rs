@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 
 use super::output::Destination;
 use super::{Context, Error, escaped, with_remedy};
@@ -14,23 +14,18 @@ use crate::report::runs::{self, MAX_RUNS, TeamKind};
 use crate::report::scene::{Format, Scene};
 use flotilla::escape::PathExt;
 
-/// PlotRequest of a picture of learning curves.
-#[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+/// A request to draw learning curves.
+#[derive(Clone, Debug)]
 pub struct PlotRequest {
     /// Folders of runs.
     pub runs: Vec<PathBuf>,
     /// The picture. By default `curves.svg` in the folder of one run, or `comparison.svg` here of several.
-    #[serde(default)]
     pub out: Option<PathBuf>,
     /// Team whose G is shown. By default all of one run, and the champions of several.
-    #[serde(default)]
     pub measure: Option<TeamKind>,
     /// Range that is shown around a mean.
-    #[serde(default)]
     pub band: Band,
     /// Whether files that differ from their digests are read.
-    #[serde(default)]
     pub unverified: bool,
 }
 

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 
 use super::output::{self, Destination};
 use super::{BackendSource, Context, Error, escaped, points, with_remedy};
@@ -21,38 +21,28 @@ use flotilla::config::{Config, Learning, ValidConfig};
 use flotilla::escape::PathExt;
 use flotilla::file;
 
-/// ReplayRequest of a replay.
-#[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+/// A request to replay episodes.
+#[derive(Clone, Debug)]
 pub struct ReplayRequest {
     /// A run's folder.
     pub folder: PathBuf,
-    /// The trial. The first by default.
-    #[serde(default)]
+    /// The trial.
     pub trial: WhichTrial,
     /// The generation. The newest by default.
-    #[serde(default)]
     pub generation: Option<usize>,
-    /// The team. The champion by default.
-    #[serde(default)]
+    /// The team.
     pub team: Which,
     /// Another generation of the trial, side by side.
-    #[serde(default)]
     pub compare: Option<usize>,
     /// The step that a still picture shows. The last by default.
-    #[serde(default)]
     pub step: Option<usize>,
     /// The file. `replay.html` in the run's folder by default.
-    #[serde(default)]
     pub out: Option<PathBuf>,
     /// Width in pixels.
-    #[serde(default)]
     pub width: Option<u32>,
     /// Pictures per second.
-    #[serde(default)]
     pub fps: Option<u32>,
     /// Whether files that differ from their digests are read.
-    #[serde(default)]
     pub unverified: bool,
 }
 
@@ -125,8 +115,7 @@ impl Episode {
 }
 
 /// The trial to show.
-#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
+#[derive(Clone, Copy, Debug)]
 pub enum WhichTrial {
     /// The one with the largest G.
     Best,
@@ -134,12 +123,6 @@ pub enum WhichTrial {
     Worst,
     /// The one with this number, from 0.
     Number(usize),
-}
-
-impl Default for WhichTrial {
-    fn default() -> WhichTrial {
-        WhichTrial::Number(0)
-    }
 }
 
 impl std::str::FromStr for WhichTrial {

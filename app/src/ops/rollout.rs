@@ -4,7 +4,7 @@ use std::io::{self, Write};
 use std::ops::ControlFlow::{Break, Continue};
 use std::path::{Path, PathBuf};
 
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 
 use super::{BackendSource, ConfigText, Context, Error, ProcessorInfo, output, points, with_remedy};
 use crate::choice::Work;
@@ -46,38 +46,28 @@ fn sensed(world: &World) -> String {
     format!("{inputs},turn_output,speed_output")
 }
 
-/// RolloutRequest of a rollout.
-#[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+/// A request to play teams.
+#[derive(Clone, Debug)]
 pub struct RolloutRequest {
     /// A run's folder, or a config file.
     pub path: PathBuf,
     /// Config keys to set.
-    #[serde(default)]
     pub set: Vec<Override>,
     /// The file of policies. The run's own by default.
-    #[serde(default)]
     pub policies: Option<PathBuf>,
     /// The trial whose policies play, if the file has several.
-    #[serde(default)]
     pub trial: Option<usize>,
     /// The config's stage to play in. The world before any stage by default.
-    #[serde(default)]
     pub stage: Option<usize>,
     /// A file to write every agent's states to.
-    #[serde(default)]
     pub trace: Option<PathBuf>,
     /// A file to write every leader's scores to.
-    #[serde(default)]
     pub scores: Option<PathBuf>,
     /// Whether files that differ from their digests are read.
-    #[serde(default)]
     pub unverified: bool,
     /// Number of held-out starts. The config's own start by default.
-    #[serde(default)]
     pub episodes: Option<u32>,
     /// Random seed of held-out starts, 0 by default.
-    #[serde(default)]
     pub seed: Option<u64>,
 }
 

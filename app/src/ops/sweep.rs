@@ -32,8 +32,8 @@ use flotilla::memory;
 use flotilla::reach::{self, Unreachable};
 use flotilla::statistics;
 
-/// SweepRequest to train or collect a sweep.
-#[derive(Clone, Debug, Serialize, Deserialize)]
+/// A request to train or collect a sweep.
+#[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SweepRequest {
     /// The text of the sweep file.
@@ -64,7 +64,7 @@ pub struct SweepRequest {
 }
 
 /// How the results of a sweep are collected.
-#[derive(Clone, Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ResultOptions {
     /// Generations per row of `results.csv`.
@@ -115,7 +115,7 @@ pub struct PointOutcome {
     pub described: String,
 }
 
-/// ResultOptions of a finished point.
+/// Results of a finished point.
 #[derive(Clone, Debug, Serialize)]
 pub struct PointScores {
     /// The run's digest.

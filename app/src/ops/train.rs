@@ -6,7 +6,7 @@ use std::io;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 
 use super::{BackendSource, ConfigText, Context, Error, Event, ProcessorInfo, check_memory, escaped, with_remedy};
 use crate::choice::Work;
@@ -34,21 +34,18 @@ use flotilla::trainer::Row;
 const FILES: [(&str, &str); 5] =
     [("config", CONFIG), ("run", RUN), ("metrics", METRICS), ("policies", POLICIES), ("curves", CURVES)];
 
-/// TrainRequest of a training.
-#[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+/// A request to train.
+#[derive(Clone, Debug)]
 pub struct TrainRequest {
     /// The config.
     pub config: ConfigText,
     /// The name of the run. Its folder has this name by default.
     pub name: String,
     /// The folder. `runs/NAME`, or the next that is free, by default.
-    #[serde(default)]
     pub out: Option<PathBuf>,
     /// Treatment of a run that is in the folder.
     pub start: Start,
     /// A file with the policies to start from.
-    #[serde(default)]
     pub init: Option<PathBuf>,
 }
 

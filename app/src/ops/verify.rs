@@ -16,8 +16,8 @@ use flotilla::host::Instant;
 use flotilla::verify::{Agreement, Plan, compare};
 use flotilla::version::{COMMIT, VERSION};
 
-/// VerifyRequest of a verification.
-#[derive(Clone, Debug, Serialize, Deserialize)]
+/// A request to compare adapters with the CPU.
+#[derive(Clone, Debug, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct VerifyRequest {
     /// The name and the text of a config to compare, instead of random worlds.

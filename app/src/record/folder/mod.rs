@@ -41,7 +41,7 @@ const LOCK: &str = ".lock";
 const MAX_KEPT_BYTES: u64 = 1 << 20;
 
 /// The way to treat a folder that already holds a run.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Start {
     /// Fails if the folder holds a run.

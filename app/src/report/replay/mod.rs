@@ -131,13 +131,11 @@ fn places(count: usize) -> String {
 }
 
 /// The team of a generation to replay.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
-#[serde(rename_all = "snake_case")]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Which {
     /// The team with the largest G; the first one if several are equal.
     Best,
     /// The team of the best policy of each population after the generation is scored.
-    #[default]
     Champion,
     /// The team with this index in its generation.
     Number(usize),

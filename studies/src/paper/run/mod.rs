@@ -35,7 +35,7 @@ const SUMMARY: &str = "summary.json";
 pub const OUT: &str = "paper";
 
 /// Request to train the paper's experiments.
-#[derive(Clone, Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Request {
     /// The folder for figures, claims and runs.
