@@ -11,7 +11,7 @@ use super::recovery;
 use super::{Error, ExistingResults, Overrides, RunOptions, between, print, print_json, say, whole};
 use flotilla::config;
 use flotilla::escape::PathExt;
-use flotilla_app::ops::sweep::{ResultOptions, SweepRequest, claim};
+use flotilla_app::ops::sweep::{SweepRequest, claim};
 use flotilla_app::ops::{self, output};
 use flotilla_app::record::disk::Disk;
 use flotilla_app::record::folder::{RUNS, SWEEP};
@@ -20,6 +20,7 @@ use flotilla_app::report::curves::Band;
 use flotilla_app::report::runs::TeamKind;
 use flotilla_app::shell;
 use flotilla_app::sweep::Sweep;
+use flotilla_app::sweep::results::ResultOptions;
 use flotilla_app::sweep::shard::{self, MAX_SHARDS, Shard};
 use flotilla_app::sweep::slurm::Job;
 

@@ -11,22 +11,21 @@ use serde_json::Value;
 use super::{BackendSource, Context, Error, Event, check_memory};
 use crate::choice::Work;
 use crate::record::RecordError;
-use crate::record::digests::{UNVERIFIED, Verification};
+use crate::record::digests::UNVERIFIED;
 use crate::record::disk::{Disk, Place};
 use crate::record::folder::{self, CONFIG, RUN, Run, SWEEP, Start};
 use crate::record::ownership;
 use crate::record::runs;
 use crate::report::comparison;
-use crate::report::curves::Band;
 use crate::report::runs::TeamKind;
-use crate::run::{self as training, SessionEnd};
+use crate::run::{Progress, RunError, Session, SessionEnd};
 use crate::sweep::pictures;
-use crate::sweep::results::{self, Missing};
+use crate::sweep::results::{self, Missing, PointResults, ResultOptions};
 use crate::sweep::run::{self, SweepProgress};
 use crate::sweep::shard::Shard;
 use crate::sweep::{Point, Sweep};
 use flotilla::backend::OpenBackend;
-use flotilla::config::{self, ConfigError, Override, Problem, ValidConfig};
+use flotilla::config::{self, Config, ConfigError, Override, Problem, ValidConfig};
 use flotilla::escape::PathExt;
 use flotilla::memory;
 use flotilla::reach::{self, Unreachable};
@@ -61,31 +60,6 @@ pub struct SweepRequest {
     /// How results are collected.
     #[serde(default)]
     pub results: ResultOptions,
-}
-
-/// How the results of a sweep are collected.
-#[derive(Clone, Debug, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct ResultOptions {
-    /// Generations per row of `results.csv`.
-    pub every: usize,
-    /// G whose first generation is reported, 0 to 1.
-    pub reach: f64,
-    /// Whether files that differ from their digests are read.
-    pub unverified: bool,
-    /// The axes of the pictures, across and down. The first two by default.
-    pub axes: Vec<String>,
-    /// Team whose G the pictures show, and whose first generation with a G is reported.
-    pub measure: TeamKind,
-    /// Range that pictures show around a mean.
-    pub band: Band,
-}
-
-impl Default for ResultOptions {
-    fn default() -> ResultOptions {
-        let (measure, band) = (TeamKind::default(), Band::default());
-        ResultOptions { every: 1, reach: 0.75, unverified: false, axes: vec![], measure, band }
-    }
 }
 
 impl SweepRequest {
@@ -354,7 +328,10 @@ pub fn train(
     }
 }
 
-/// Trains points of a sweep in a folder, and reports their progress.
+/// Trains points of a sweep, each in its folder in `out`, or resumes them. Calls `share` after every generation.
+///
+/// # Errors
+/// A folder cannot be used or written, memory is insufficient, or the backend fails. Earlier progress is saved.
 #[expect(clippy::too_many_arguments, reason = "the two callers have no more of them in common")]
 pub fn train_points(
     context: Context<'_>,
@@ -367,28 +344,50 @@ pub fn train_points(
     backend: &mut OpenBackend,
     share: &dyn Fn(&SweepProgress),
 ) -> Result<SessionEnd, Error> {
-    let mut options = run::SweepOptions {
-        start,
-        disk,
-        memory,
-        runs: training::Options {
-            command: context.command,
-            stop: context.stop,
-            save: context.save,
-            fallback: &mut |error| context.fallback(error),
-            watch: &mut |_| {},
-        },
-        watch: &mut |progress| share(progress),
-        note: &mut |point, note| {
-            // Every resumed point has a note. Only damage is reported.
-            if note.is_damage() {
-                context.warn(format_args!("{}: {note}", sweep.describe(point)));
-            }
-        },
-    };
-    let ended = run::run(points, out, backend, &mut options);
-    (context.report)(Event::Pause);
-    Ok(ended?)
+    let total = points.iter().map(|point| run::team_steps(&point.config)).sum();
+    let mut progress = SweepProgress { points: points.len(), total, ..SweepProgress::default() };
+    // All folders are checked first, so that no batch trains before a later one is refused.
+    let folders: Vec<PathBuf> = points.iter().map(|point| results::point_folder(out, point)).collect();
+    let configs = points.iter().map(|point| &*point.config);
+    folder::check(disk, folders.iter().map(|path| &**path).zip(configs), start).map_err(RunError::from)?;
+    let mut ended = SessionEnd::Finished;
+    for batch in run::batches(points, memory) {
+        if context.is_stopped() {
+            ended = SessionEnd::Stopped;
+            break;
+        }
+        let runs = batch.iter().map(|point| (Config::clone(&point.config), results::point_folder(out, point)));
+        let (mut session, notes) = Session::open(runs.collect(), start, disk)?;
+        // Every resumed point has a note. Only damage is reported.
+        for (run, note) in notes.iter().filter(|(_, note)| note.is_damage()) {
+            context.warn(format_args!("{}: {note}", sweep.describe(batch[*run])));
+        }
+        // Steps of earlier sessions do not count.
+        let resumed: u128 =
+            batch.iter().zip(session.generations()).map(|(point, &next)| run::played(point, next)).sum();
+        progress.total -= resumed;
+        let (done, before) = (progress.done, progress.played);
+        let mut tell = |generations: &[usize]| {
+            let all = || batch.iter().zip(generations);
+            let going = || all().filter(|(point, next)| **next <= run::last(point) + 1);
+            progress.batch = going().count();
+            progress.done = done + batch.len() - progress.batch;
+            progress.generation = going().map(|(_, &next)| next).min().unwrap_or(progress.last + 1);
+            progress.last = batch.iter().map(|point| run::last(point)).max().unwrap_or(0);
+            progress.played = before + all().map(|(point, &next)| run::played(point, next)).sum::<u128>() - resumed;
+            share(&progress);
+        };
+        tell(session.generations());
+        let mut watch = |now: &Progress<'_>| tell(now.generations);
+        if !session.is_done() {
+            ended = context.train(&mut watch, |options| session.train(backend, options))?;
+        }
+        if ended == SessionEnd::Stopped {
+            break;
+        }
+    }
+    context.pause();
+    Ok(ended)
 }
 
 /// Maximum number of POIs that are named one by one.
@@ -482,13 +481,13 @@ fn write_results(
     place: Place<'_>,
 ) -> Result<SweepOutcome, Error> {
     let out = place.path();
-    let ResultOptions { every, reach, unverified, measure, band, .. } = request.results;
-    let options = results::Detail { every, reach, verification: Verification::unless(unverified), measure, band };
+    let options = &request.results;
+    let &ResultOptions { every, reach, unverified, .. } = options;
     let folders: Vec<PathBuf> = sweep.points.iter().map(|point| results::point_folder(out, point)).collect();
-    let outcomes = results::write(sweep, place, &options, disk)?;
-    let (pictures, note) = pictures::draw(sweep, &outcomes, &options, axes, out, disk)?;
+    let outcomes = results::write(sweep, place, options, disk)?;
+    let (pictures, note) = pictures::draw(sweep, &outcomes, options, axes, out, disk)?;
     disk.sync_folder(out).map_err(RecordError::write(out))?;
-    let mut text = summary(sweep, &outcomes, &options);
+    let mut text = summary(sweep, &outcomes, options);
     let rows = if every == 1 { "generation by generation".into() } else { format!("every {every} generations") };
     let _ = write!(
         text,
@@ -505,26 +504,25 @@ fn write_results(
     text.extend(note.map(|note| note + "\n"));
     text += &if unverified { format!("{UNVERIFIED}\n") } else { String::new() };
     let path = |name: &str| out.join(name).escaped().to_string();
-    let point =
-        |((point, outcome), folder): ((&Point, &Result<results::PointResults, Missing>), &PathBuf)| PointOutcome {
-            point: point.index,
-            folder: folder.escaped().to_string(),
-            values: (sweep.axes.iter().zip(&point.values))
-                .map(|(axis, &value)| (axis.key.clone(), serde_json::json!(axis.values[value])))
-                .collect(),
-            missing: outcome.as_ref().err().map(ToString::to_string),
-            found: outcome.as_ref().ok().map(|outcome| PointScores {
-                digest: Run::read(place.at(&folder.join(RUN))).ok().and_then(|run| run.digest),
-                champion_g: outcome.champion.mean(),
-                champion_g_interval_95: statistics::bounded(&outcome.champion, [0.0, 1.0])
-                    .map(|mean| [mean.low, mean.high]),
-                best_g: outcome.best.mean(),
-                test_g: outcome.test.map(|test| test.mean()),
-                reached: outcome.reached.iter().flatten().count(),
-                median: outcome.median_reached(),
-            }),
-            described: sweep.describe(point),
-        };
+    let point = |((point, outcome), folder): ((&Point, &Result<PointResults, Missing>), &PathBuf)| PointOutcome {
+        point: point.index,
+        folder: folder.escaped().to_string(),
+        values: (sweep.axes.iter().zip(&point.values))
+            .map(|(axis, &value)| (axis.key.clone(), serde_json::json!(axis.values[value])))
+            .collect(),
+        missing: outcome.as_ref().err().map(ToString::to_string),
+        found: outcome.as_ref().ok().map(|outcome| PointScores {
+            digest: Run::read(place.at(&folder.join(RUN))).ok().and_then(|run| run.digest),
+            champion_g: outcome.champion.mean(),
+            champion_g_interval_95: statistics::bounded(&outcome.champion, [0.0, 1.0])
+                .map(|mean| [mean.low, mean.high]),
+            best_g: outcome.best.mean(),
+            test_g: outcome.test.map(|test| test.mean()),
+            reached: outcome.reached.iter().flatten().count(),
+            median: outcome.median_reached(),
+        }),
+        described: sweep.describe(point),
+    };
     Ok(SweepOutcome {
         folder: out.escaped().to_string(),
         sweep: sweep.name.clone(),
@@ -542,7 +540,7 @@ fn write_results(
 }
 
 /// Returns the results for people: the best and the worst points.
-fn summary(sweep: &Sweep, outcomes: &[Result<results::PointResults, Missing>], options: &results::Detail) -> String {
+fn summary(sweep: &Sweep, outcomes: &[Result<PointResults, Missing>], options: &ResultOptions) -> String {
     const LISTED: usize = 12;
     let done = sweep.points.iter().zip(outcomes).filter_map(|(point, outcome)| Some((point, outcome.as_ref().ok()?)));
     let mut done: Vec<_> = done.map(|(point, outcome)| (outcome.measured(), point, outcome)).collect();

@@ -11,7 +11,7 @@
 //! |---|---|
 //! | [`layout`] | the paper's geometry for any number of groups and followers |
 //! | [`shard`] | the assignment of points to processes by cost |
-//! | [`run`] | training of points side by side |
+//! | [`run`] | batches of points that fit in memory, and their progress |
 //! | [`results`] | the tables `results.csv` and `points.csv` |
 //! | [`pictures`] | heat maps and curves |
 //! | [`arms`] | points grouped by the values of one axis, for comparison |

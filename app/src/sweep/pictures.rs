@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use super::results::{Detail, Missing, PointResults};
+use super::results::{Missing, PointResults, ResultOptions};
 use super::{Axis, Point, Sweep};
 use crate::record::RecordError;
 use crate::record::digests::UNVERIFIED;
@@ -46,7 +46,7 @@ pub fn names() -> impl Iterator<Item = String> {
 pub fn draw(
     sweep: &Sweep,
     outcomes: &[Result<PointResults, Missing>],
-    options: &Detail,
+    options: &ResultOptions,
     axes: &[usize],
     out: &Path,
     disk: &Disk,
@@ -66,7 +66,7 @@ pub fn draw(
     };
     let mut names = Vec::new();
     for (name, mut scene) in scenes {
-        if options.verification.is_skipped() {
+        if options.unverified {
             scene.warn(UNVERIFIED);
         }
         for kind in Format::ALL {
@@ -82,7 +82,7 @@ pub fn draw(
 
 /// Draws G in the last generation for every value of every varied key, with one panel for each
 /// combination of the grid.
-fn dots(sweep: &Sweep, outcomes: &[Result<PointResults, Missing>], options: &Detail) -> Result<Dots, String> {
+fn dots(sweep: &Sweep, outcomes: &[Result<PointResults, Missing>], options: &ResultOptions) -> Result<Dots, String> {
     let (varied, grid): (Vec<usize>, Vec<usize>) = (0..sweep.axes.len()).partition(|&axis| sweep.axes[axis].varied);
     let rows: usize = varied.iter().map(|&axis| sweep.axes[axis].values.len() - 1).sum();
     let count = grid.iter().fold(1_usize, |count, &axis| count.saturating_mul(sweep.axes[axis].values.len()));
@@ -194,7 +194,7 @@ impl<'a> PanelGrid<'a> {
     }
 
     /// Draws G in the last generation.
-    fn last(&self, options: &Detail) -> HeatMap {
+    fn last(&self, options: &ResultOptions) -> HeatMap {
         let key = [0.0, 0.25, 0.5, 0.75, 1.0].map(|g| (g, g.to_string())).to_vec();
         let what = options.measure.label();
         let cells = match options.band {
@@ -217,7 +217,7 @@ impl<'a> PanelGrid<'a> {
     }
 
     /// Draws the generations to reach a G, shaded by their logarithm. As for G, dark is good: early.
-    fn reach(&self, options: &Detail) -> HeatMap {
+    fn reach(&self, options: &ResultOptions) -> HeatMap {
         let all = self.panels.iter().flat_map(|(_, points)| points).flatten();
         let last = all.map(|(point, _)| point.config.learning.generations).max().unwrap_or(0).max(1) as f64;
         let place = |generation: f64| 1.0 - libm::log1p(generation) / libm::log1p(last);
@@ -243,7 +243,7 @@ impl<'a> PanelGrid<'a> {
     }
 
     /// Draws learning curves, one for each value of the x axis.
-    fn curves(&self, sweep: &Sweep, options: &Detail) -> Curves {
+    fn curves(&self, sweep: &Sweep, options: &ResultOptions) -> Curves {
         let width = self.x.values.len();
         let mut panels = Vec::new();
         for row in 0..self.y.map_or(1, |y| y.values.len()) {

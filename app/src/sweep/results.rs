@@ -4,6 +4,8 @@
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
+use serde::Deserialize;
+
 use super::{Axis, Point, Sweep};
 use crate::record::digests::{Digests, Verification};
 use crate::record::disk::{Disk, Place};
@@ -17,19 +19,29 @@ use flotilla::escape::{self, PathExt};
 use flotilla::statistics::{self, Average};
 use flotilla::trainer::Row;
 
-/// The options of [`write()`].
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Detail {
-    /// The number of generations per row of `results.csv`. The last generation always has a row.
+/// How the results of a sweep are collected.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ResultOptions {
+    /// Generations per row of `results.csv`. The last generation always has a row.
     pub every: usize,
-    /// The G in 0..1 whose first generation is reported.
+    /// G whose first generation is reported, 0 to 1.
     pub reach: f64,
-    /// Whether points' files are compared with their digests.
-    pub verification: Verification,
-    /// The team whose G the pictures show, and whose first generation with a G is reported.
+    /// Whether files that differ from their digests are read.
+    pub unverified: bool,
+    /// The axes of the pictures, across and down. The first two by default.
+    pub axes: Vec<String>,
+    /// Team whose G the pictures show, and whose first generation with a G is reported.
     pub measure: TeamKind,
-    /// Meaning of the pictures' bands.
+    /// Range that pictures show around a mean.
     pub band: Band,
+}
+
+impl Default for ResultOptions {
+    fn default() -> ResultOptions {
+        let (measure, band) = (TeamKind::default(), Band::default());
+        ResultOptions { every: 1, reach: 0.75, unverified: false, axes: vec![], measure, band }
+    }
 }
 
 /// The results of a point's trials.
@@ -41,26 +53,26 @@ pub struct PointResults {
     pub champion: Average,
     /// The tested best team's G in the last generation, averaged over trials, if the point has test episodes.
     pub test: Option<Average>,
-    /// The first generation of every trial at which [`Detail::measure`]'s G is at least [`Detail::reach`].
+    /// The first generation of every trial at which [`ResultOptions::measure`]'s G is at least [`ResultOptions::reach`].
     pub reached: Vec<Option<usize>>,
-    /// [`Detail::measure`]'s G by generation, averaged over the trials, for each row of `results.csv`. The last
+    /// [`ResultOptions::measure`]'s G by generation, averaged over the trials, for each row of `results.csv`. The last
     /// generation is the last entry.
     pub curve: Vec<(usize, Average)>,
 }
 
 impl PointResults {
-    /// Returns the average over trials of [`Detail::measure`]'s G in the last generation.
+    /// Returns the average over trials of [`ResultOptions::measure`]'s G in the last generation.
     pub fn measured(&self) -> Average {
         self.curve.last().map_or(Average::default(), |(_, average)| *average)
     }
 
-    /// Returns the curve of [`Detail::measure`]'s G.
+    /// Returns the curve of [`ResultOptions::measure`]'s G.
     pub(super) fn curve(&self) -> Curve {
         Curve::at(self.curve.iter().map(|(generation, average)| (*generation, average)), 1.0)
     }
 
-    /// Returns the mean and the ends of the band of [`Detail::measure`]'s G in the last generation.
-    pub(super) fn interval(&self, options: &Detail) -> Interval {
+    /// Returns the mean and the ends of the band of [`ResultOptions::measure`]'s G in the last generation.
+    pub(super) fn interval(&self, options: &ResultOptions) -> Interval {
         let last = &self.curve[self.curve.len() - 1..];
         let curve = Curve::at(last.iter().map(|(generation, average)| (*generation, average)), 1.0);
         let [low, high] = curve.ends(options.band, 0, 1.0);
@@ -100,7 +112,7 @@ pub enum Missing {
 pub fn write(
     sweep: &Sweep,
     place: Place<'_>,
-    options: &Detail,
+    options: &ResultOptions,
     disk: &Disk,
 ) -> Result<Vec<Result<PointResults, Missing>>, RecordError> {
     let out = place.path();
@@ -152,7 +164,7 @@ fn labels(sweep: &Sweep, point: &Point) -> Vec<String> {
 fn summary(
     sweep: &Sweep,
     outcomes: &[Result<PointResults, Missing>],
-    options: &Detail,
+    options: &ResultOptions,
     output: &mut dyn Write,
 ) -> io::Result<()> {
     let mut table = csv::Writer::from_writer(output);
@@ -186,7 +198,7 @@ fn summary(
 }
 
 /// Reads the rows of a finished point for `results.csv`, by trial and generation, and its results.
-fn read(point: &Point, place: Place<'_>, options: &Detail) -> Result<(Vec<Row>, PointResults), Missing> {
+fn read(point: &Point, place: Place<'_>, options: &ResultOptions) -> Result<(Vec<Row>, PointResults), Missing> {
     let folder = point_folder(place.path(), point);
     let damaged = |error: &dyn std::fmt::Display| Missing::Damaged(error.to_string());
     let path = folder.join(METRICS);
@@ -194,7 +206,8 @@ fn read(point: &Point, place: Place<'_>, options: &Detail) -> Result<(Vec<Row>, 
     if !exists.map_err(|error| damaged(&format!("{}: cannot be read: {error}", path.escaped())))? {
         return Err(Missing::NotRun);
     }
-    let digests = Digests::read(place.at(&folder), options.verification).map_err(|error| damaged(&error))?;
+    let digests =
+        Digests::read(place.at(&folder), Verification::unless(options.unverified)).map_err(|error| damaged(&error))?;
     let config = load_config(place.at(&folder.join(CONFIG))).map_err(|error| damaged(&error))?;
     if let Some(missing) = options.measure.missing(&point.config) {
         return Err(Missing::Damaged(missing));
