@@ -21,7 +21,6 @@ use flotilla_app::record::digests::Verification;
 use flotilla_app::record::disk::Disk;
 use flotilla_app::record::folder::{self, ARMS};
 use flotilla_app::record::{RecordError, ownership};
-use flotilla_app::report::curves::PRINT;
 use flotilla_app::report::grid::{Dots, Interval};
 use flotilla_app::report::runs;
 use flotilla_app::report::scene::Format;
@@ -201,12 +200,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     for (name, rows) in [(CELLS, &found), (PAIRS, &pairs)] {
         ownership::publish(&disk, &out.join(name), |file| file.write_all(csv(rows).as_bytes()))?;
     }
-    let scene = picture(&found).scene();
-    for kind in Format::ALL {
-        let path = out.join(format!("{PICTURE}.{}", kind.extension()));
-        let content = scene.file(kind, PRINT).map_err(RecordError::write(&path))?;
-        ownership::publish(&disk, &path, |file| file.write_all(&content))?;
-    }
+    picture(&found).scene().publish(&disk, out, PICTURE)?;
     Ok(Outcome {
         folder: out.escaped().to_string(),
         trials: learning.trials,
@@ -219,8 +213,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
 
 /// Returns the names of all files that are made from the runs.
 fn products() -> impl Iterator<Item = String> {
-    let pictures = Format::ALL.map(|kind| format!("{PICTURE}.{}", kind.extension()));
-    [CELLS, PAIRS].map(String::from).into_iter().chain(pictures)
+    [CELLS, PAIRS].map(String::from).into_iter().chain(Format::names(PICTURE))
 }
 
 /// Reads a finished run, and plays its champions from held-out starts.

@@ -9,9 +9,9 @@ use super::{Context, Error, escaped, with_remedy};
 use crate::record::RecordError;
 use crate::record::digests::Verification;
 use crate::record::ownership::CURVES;
-use crate::report::curves::{Band, PRINT};
+use crate::report::curves::Band;
 use crate::report::runs::{self, MAX_RUNS, TeamKind};
-use crate::report::scene::{Format, Scene};
+use crate::report::scene::{Format, PRINT, Scene};
 use flotilla::escape::PathExt;
 
 /// A request to draw learning curves.

@@ -10,8 +10,6 @@ use flotilla::statistics::{self, Average, CONFIDENCE};
 
 /// Width of a column of a two-column paper, in millimetres.
 pub(crate) const COLUMN: f64 = 85.0;
-/// Pixels per millimetre of a PNG: 300 pixels per inch.
-pub const PRINT: f64 = 300.0 / 25.4;
 /// Maximum number of points of a drawn curve.
 const MAX_POINTS: usize = 300;
 /// Font size of 7 points, in millimetres. The next one is 8 points.

@@ -1,3 +1,4 @@
+//! Pictures, films, pages and comparisons of runs.
 //!
 //! | module | contents |
 //! |---|---|

@@ -12,6 +12,11 @@ use tiny_skia::{
 
 use super::letters;
 pub use super::letters::text_width;
+use crate::record::disk::Disk;
+use crate::record::{RecordError, ownership};
+
+/// Pixels per millimetre of a PNG: 300 pixels per inch.
+pub const PRINT: f64 = 300.0 / 25.4;
 
 /// SVG units per millimetre. At 1 unit per millimetre, letters would be too small for browsers to draw.
 const SVG_UNITS: f64 = 10.0;
@@ -151,6 +156,11 @@ pub enum Format {
 impl Format {
     /// All formats.
     pub const ALL: [Format; 3] = [Format::Svg, Format::Png, Format::Pdf];
+
+    /// Returns the names of a picture's files, one per format.
+    pub fn names(name: &str) -> [String; Format::ALL.len()] {
+        Format::ALL.map(|kind| format!("{name}.{}", kind.extension()))
+    }
 
     /// Returns the format that a file name's extension selects.
     pub fn of(path: &std::path::Path) -> Option<Format> {
@@ -420,6 +430,16 @@ impl Scene {
             Format::Png => self.png(per_mm),
             Format::Pdf => Ok(self.pdf()),
         }
+    }
+
+    /// Writes the picture to a folder in every format, as files made from runs.
+    pub fn publish(&self, disk: &Disk, folder: &std::path::Path, name: &str) -> Result<(), RecordError> {
+        for (kind, name) in Format::ALL.into_iter().zip(Format::names(name)) {
+            let path = folder.join(name);
+            let content = self.file(kind, PRINT).map_err(RecordError::write(&path))?;
+            ownership::publish(disk, &path, |output| output.write_all(&content))?;
+        }
+        Ok(())
     }
 }
 

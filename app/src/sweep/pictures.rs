@@ -8,8 +8,7 @@ use super::{Axis, Point, Sweep};
 use crate::record::RecordError;
 use crate::record::digests::UNVERIFIED;
 use crate::record::disk::Disk;
-use crate::record::ownership;
-use crate::report::curves::{Band, PRINT, SMALL, distinct};
+use crate::report::curves::{Band, SMALL, distinct};
 use crate::report::grid::{Cell, Curves, Dots, HeatMap, Scale};
 use crate::report::scene::Format;
 
@@ -38,7 +37,7 @@ const FIGURES: [&str; 3] = ["final", "reach", "curves"];
 
 /// Returns the names of all files.
 pub fn names() -> impl Iterator<Item = String> {
-    FIGURES.into_iter().flat_map(|name| Format::ALL.map(|kind| format!("{name}.{}", kind.extension())))
+    FIGURES.into_iter().flat_map(Format::names)
 }
 
 /// Draws the figures of the finished points over one or two axes. Returns the names of the files, or the reason why
@@ -69,13 +68,8 @@ pub fn draw(
         if options.unverified {
             scene.warn(UNVERIFIED);
         }
-        for kind in Format::ALL {
-            let name = format!("{name}.{}", kind.extension());
-            let path = out.join(&name);
-            let bytes = scene.file(kind, PRINT).map_err(RecordError::write(&path))?;
-            ownership::publish(disk, &path, |output| output.write_all(&bytes))?;
-            names.push(name);
-        }
+        scene.publish(disk, out, name)?;
+        names.extend(Format::names(name));
     }
     Ok((names, None))
 }

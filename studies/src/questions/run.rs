@@ -16,7 +16,6 @@ use flotilla_app::record::disk::Disk;
 use flotilla_app::record::folder::{self, SWEEP};
 use flotilla_app::record::{RecordError, ownership, policies};
 use flotilla_app::report::comparison::{self, Comparison};
-use flotilla_app::report::curves::PRINT;
 use flotilla_app::report::scene::Format;
 use flotilla_app::run::{Session, SessionEnd};
 use flotilla_app::sweep::results::point_folder;
@@ -62,8 +61,7 @@ fn all_parts() -> impl Iterator<Item = &'static Study> {
 
 /// Returns the names of the files that are made for each part.
 fn files() -> impl Iterator<Item = String> {
-    let endings = || Format::ALL.map(Format::extension).into_iter().chain(["csv"]);
-    all_parts().flat_map(move |part| endings().map(|ending| format!("{}.{ending}", part.name)))
+    all_parts().flat_map(|part| Format::names(part.name).into_iter().chain([format!("{}.csv", part.name)]))
 }
 
 /// Trains every part of the questions, each as a sweep in a folder of its own, and writes the results.
@@ -225,11 +223,7 @@ fn compare(
             let Some(sweep) = sweep else { continue };
             (context.report)(Event::Fraction(1.0, format!("comparing {}", part.name)));
             let answer = part.answer(sweep, out, &mut *backend.0)?;
-            for kind in Format::ALL {
-                let path = out.join(format!("{}.{}", part.name, kind.extension()));
-                let bytes = answer.scene().file(kind, PRINT);
-                write(disk, &path, bytes)?;
-            }
+            answer.scene().publish(disk, out, part.name)?;
             let mut csv = Vec::new();
             let all: Vec<_> = answer.comparisons().cloned().collect();
             let path = out.join(format!("{}.csv", part.name));

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use super::{CLAIMS, FIGURES, SUMMARY, products};
+use super::products;
 use flotilla::config::{self, Learning};
 use flotilla::escape::PathExt;
 use flotilla_app::ops::{Error, with_remedy};
@@ -51,7 +51,7 @@ impl Identity {
         if folder::holds_run(out)? {
             return refused(format!("{name} holds a run, no paper"), "choose another --out");
         }
-        if let Some(file) = [ARMS, CLAIMS, SUMMARY].iter().chain(&FIGURES).find(|file| holds(file)) {
+        if let Some(file) = [ARMS.to_string()].into_iter().chain(products()).find(|file| holds(file)) {
             return refused(
                 format!("{name} holds {file} but no {PAPER}, so it is not the folder of a paper"),
                 "choose another --out",

@@ -17,7 +17,6 @@ use flotilla_app::ops::{BackendSource, Context, Error, Event, ProcessorInfo};
 use flotilla_app::record::disk::Disk;
 use flotilla_app::record::folder::{self, Start};
 use flotilla_app::record::{RecordError, ownership};
-use flotilla_app::report::curves::PRINT;
 use flotilla_app::report::scene::Format;
 use flotilla_app::run::RunError;
 
@@ -183,12 +182,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         |name: &str, content: &[u8]| ownership::publish(&disk, &out.join(name), |file| file.write_all(content));
     for (index, layout) in paper::LAYOUTS.iter().enumerate() {
         let Some(number) = layout.figure else { continue };
-        let scene = paper::figure(found, index).scene();
-        for kind in Format::ALL {
-            let name = format!("figure{number}.{}", kind.extension());
-            let picture = scene.file(kind, PRINT).map_err(RecordError::write(&out.join(&name)))?;
-            publish(&name, &picture)?;
-        }
+        paper::figure(found, index).scene().publish(&disk, out, &format!("figure{number}"))?;
     }
     let claims = claims::claims(found);
     let baseline = tables::without_learning(found);
@@ -224,7 +218,11 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         processor: ProcessorInfo::of_run(session.run(0)),
         seconds,
         arms: (0..experiments.all.len()).map(outcome).collect(),
-        files: Files { claims: path(CLAIMS), summary: path(SUMMARY), figures: FIGURES.map(path).to_vec() },
+        files: Files {
+            claims: path(CLAIMS),
+            summary: path(SUMMARY),
+            figures: figures().map(|name| path(&name)).collect(),
+        },
         text: format!("{baseline}\n{}\n{heading}\n\n", tables::verdicts(&claims)),
         claims,
     })
@@ -257,22 +255,15 @@ fn play_baselines(
     Ok(baselines.found())
 }
 
-/// File names of the figures.
-const FIGURES: [&str; 9] = [
-    "figure4.svg",
-    "figure4.png",
-    "figure4.pdf",
-    "figure5.svg",
-    "figure5.png",
-    "figure5.pdf",
-    "figure6.svg",
-    "figure6.png",
-    "figure6.pdf",
-];
+/// Returns the file names of the figures.
+fn figures() -> impl Iterator<Item = String> {
+    let numbers = paper::LAYOUTS.into_iter().filter_map(|layout| layout.figure);
+    numbers.flat_map(|number| Format::names(&format!("figure{number}")))
+}
 
 /// Returns the names of all files that are made from the runs.
-fn products() -> impl Iterator<Item = &'static str> {
-    [CLAIMS, SUMMARY].into_iter().chain(FIGURES)
+fn products() -> impl Iterator<Item = String> {
+    [CLAIMS, SUMMARY].map(String::from).into_iter().chain(figures())
 }
 
 /// Returns the name of an experiment's folder, such as `chaotic-all-leaders-Df`.
