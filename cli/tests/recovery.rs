@@ -19,8 +19,8 @@ use flotilla::backend::gpu::device::DeviceError;
 use flotilla::backend::gpu::episode::GpuBackend;
 use flotilla::backend::{Backend, BackendError, Group, GroupScores, Trace};
 use flotilla::backend::{Machine, OpenBackend};
-use flotilla::config::Config;
-use flotilla_app::record::checkpoint::{self, Checkpoint, CheckpointWriter, Schedule};
+use flotilla::config::{CheckpointConfig, Config};
+use flotilla_app::record::checkpoint::{self, Checkpoint, CheckpointWriter};
 use flotilla_app::record::disk::{Disk, Operation};
 use flotilla_app::record::folder::{self, CONFIG, Folder, METRICS, Note, POLICIES, RUN, Run, Start, StartFrom, Status};
 use flotilla_app::record::{RecordError, metrics, policies};
@@ -129,7 +129,7 @@ fn checkpoints_do_not_change_results() {
 fn checkpoints_are_due_by_generations_or_by_time() {
     let writer = CheckpointWriter::new(Disk::default(), "checkpoints".into(), small(), vec![], 4);
     let due = |generations, seconds| {
-        let schedule = Schedule { generations, seconds };
+        let schedule = CheckpointConfig { generations, seconds };
         [4, 5, 6, 7].map(|next| writer.is_due(&schedule, next))
     };
     assert_eq!(due(0, 0.0), [false; 4]);
@@ -154,7 +154,7 @@ fn no_checkpoint_is_due_by_time_while_the_previous_one_is_written() {
     });
     let metrics = Disk::default().create(&folder.path().join("metrics")).unwrap();
     let mut writer = CheckpointWriter::new(disk, folder.path().into(), small(), vec![], 4);
-    let schedule = Schedule { generations: 0, seconds: f64::MIN_POSITIVE };
+    let schedule = CheckpointConfig { generations: 0, seconds: f64::MIN_POSITIVE };
     // While this is locked, the writer waits.
     let closed = gate.lock().unwrap();
     let since = Instant::now();
@@ -185,7 +185,7 @@ fn one_slow_write_does_not_stop_timed_checkpoints() {
     writer.save(checkpoint, metrics, Instant::now()).unwrap();
     writer.wait().unwrap();
     let written = Instant::now();
-    let schedule = |seconds| Schedule { generations: 0, seconds };
+    let schedule = |seconds| CheckpointConfig { generations: 0, seconds };
     // A checkpoint is due after ten times the interval at the latest.
     while !writer.is_due(&schedule(0.01), 10) {
         assert!(written.elapsed() < slow * 2);

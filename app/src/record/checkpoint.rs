@@ -22,7 +22,7 @@ use super::metrics::Extent;
 use super::policies;
 use super::tensors::{self, Tensor, TensorFile};
 use super::{RecordError, config_digest};
-use flotilla::config::Config;
+use flotilla::config::{CheckpointConfig, Config};
 use flotilla::evolve::{self, Key, Purpose, Selection};
 use flotilla::host::Instant;
 use flotilla::parallel::BackgroundTask;
@@ -299,15 +299,6 @@ pub fn read<'a>(
     Ok(whole.then_some(found))
 }
 
-/// How often a run writes checkpoints. A value of 0 disables that trigger.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Schedule {
-    /// Number of generations between checkpoints. Training waits if the previous checkpoint is still being written.
-    pub generations: usize,
-    /// Seconds between checkpoints. The interval is extended, up to tenfold, until writing takes at most 1/20 of it.
-    pub seconds: f64,
-}
-
 /// Writes checkpoints during training, one at a time.
 pub struct CheckpointWriter {
     disk: Disk,
@@ -329,8 +320,9 @@ impl CheckpointWriter {
         CheckpointWriter { disk, folder, config: Arc::new(config), kept, writing: None, last, cost: 0.0 }
     }
 
-    /// Reports whether a checkpoint is due before a generation is played.
-    pub fn is_due(&self, schedule: &Schedule, generation: usize) -> bool {
+    /// Reports whether a checkpoint is due before a generation is played. After so many generations, training waits if
+    /// the previous checkpoint is still being written. After so many seconds, it does not.
+    pub fn is_due(&self, schedule: &CheckpointConfig, generation: usize) -> bool {
         let (last, moment) = self.last;
         if generation == last {
             return false;

@@ -3,13 +3,13 @@
 use std::path::PathBuf;
 
 use super::{Results, RunError};
-use crate::record::checkpoint::{Checkpoint, CheckpointWriter, Schedule};
+use crate::record::checkpoint::{Checkpoint, CheckpointWriter};
 use crate::record::disk::Disk;
 use crate::record::folder::{self, FileSums, Folder, METRICS, Note, POLICIES, Run, RunSums, Start, StartFrom, Status};
 use crate::record::metrics::{self, Extent};
 use crate::record::policies::{self, Init};
 use crate::record::{RecordError, config_digest};
-use flotilla::config::{self, Config};
+use flotilla::config::Config;
 use flotilla::host::Instant;
 use flotilla::memory;
 use flotilla::trainer::{Row, Snapshot, Trainer};
@@ -120,10 +120,7 @@ impl Member {
     }
 
     pub(super) fn is_due(&self, next: usize) -> bool {
-        let config::CheckpointConfig { generations, seconds } = self.config.checkpoint;
-        self.unfinished
-            .as_ref()
-            .is_some_and(|unfinished| unfinished.checkpoints.is_due(&Schedule { generations, seconds }, next))
+        self.unfinished.as_ref().is_some_and(|unfinished| unfinished.checkpoints.is_due(&self.config.checkpoint, next))
     }
 
     /// Adds complete rows.
