@@ -48,7 +48,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     let request = VerifyRequest {
         config: config.map(read).transpose()?,
         set: set.set,
-        teams,
+        teams: Some(teams),
         worlds,
         seed,
         adapter,

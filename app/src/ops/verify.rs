@@ -17,15 +17,15 @@ use flotilla::verify::{Agreement, Plan, compare};
 use flotilla::version::{COMMIT, VERSION};
 
 /// A request to compare adapters with the CPU.
-#[derive(Clone, Debug, Deserialize)]
+#[derive(Clone, Debug, Default, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct VerifyRequest {
     /// The name and the text of a config to compare, instead of random worlds.
     pub config: Option<(String, String)>,
     /// Config keys to set.
     pub set: Vec<Override>,
-    /// Random teams per world.
-    pub teams: u32,
+    /// Random teams per world. [`TEAMS`] by default.
+    pub teams: Option<u32>,
     /// Random worlds. By default as many of the first 200 as take about a minute.
     pub worlds: Option<u32>,
     /// Random seed.
@@ -42,21 +42,6 @@ pub struct VerifyRequest {
 pub const TEAMS: u32 = 48;
 /// The name of the processor, in place of an adapter's.
 pub const CPU: &str = "cpu";
-
-impl Default for VerifyRequest {
-    fn default() -> VerifyRequest {
-        VerifyRequest {
-            config: None,
-            set: vec![],
-            teams: TEAMS,
-            worlds: None,
-            seed: 0,
-            adapter: None,
-            pass: None,
-            kernel: None,
-        }
-    }
-}
 
 /// Results of a verification.
 #[derive(Clone, Debug, Serialize)]
@@ -285,7 +270,7 @@ fn gpus<'a>(name: Option<&str>, args: &VerifyRequest) -> Result<Vec<Combination<
 
 /// Returns what to compare, and the time budget if no amount is requested.
 fn plan(args: &VerifyRequest) -> Result<(Plan, Option<Duration>), Error> {
-    let (seed, teams) = (u64::from(args.seed), args.teams as usize);
+    let (seed, teams) = (u64::from(args.seed), args.teams.unwrap_or(TEAMS) as usize);
     let is_open = args.config.is_none() && args.worlds.is_none();
     let plan = match &args.config {
         None if !args.set.is_empty() => {
