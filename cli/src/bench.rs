@@ -10,7 +10,7 @@ use serde_json::json;
 use super::{
     BackendChoice, Breed, Error, Overrides, ProcessorInfo, RunOptions, backend, between, print, print_json, with_remedy,
 };
-use crate::measure::{self, Generations, Profile, Subject, Timing};
+use crate::measure::{self, Profile, Subject, Timing};
 use flotilla::backend::Machine;
 use flotilla::backend::cpu::{Cpu, level_name};
 use flotilla::config::{self, Config};
@@ -82,20 +82,16 @@ pub fn run(args: Args) -> Result<(), Error> {
     if !args.json {
         print(&format!("{name} on {}\n{HEADER}\n", subject.backend().describe()))?;
     }
-    let generations = match (args.rollout_only, args.profile) {
-        (true, _) => Generations::LeftOut,
-        (false, false) => Generations::Timed,
-        (false, true) => Generations::Profiled,
-    };
     for config in configs {
-        let timing = measure::measure(&config, &mut subject, args.trained as usize, generations)?;
+        let timing = measure::measure(&config, &mut subject, args.trained as usize, args.rollout_only, args.profile)?;
+        let profile = timing.generation.as_ref().map(|(_, profile)| profile).filter(|_| args.profile);
         match args.json {
             true => {
-                let mut object = json(&timing);
+                let mut object = json(&timing, profile);
                 ProcessorInfo::of(&machine, &subject.backend().describe()).add_to(&mut object);
                 print_json(&object)?;
             }
-            false => print(&line(&timing))?,
+            false => print(&line(&timing, profile))?,
         }
     }
     if args.json { Ok(()) } else { print(LEGEND) }
@@ -172,10 +168,11 @@ A rollout plays and scores all teams once; generations also select and mutate: t
 The ceiling is what chains of f32 sums and products in registers reach, none fused; benches/README.md says what counts.
 ";
 
-fn line(measure: &Timing) -> String {
+fn line(measure: &Timing, profile: Option<&Profile>) -> String {
     let Timing { teams, steps, rollout, generation, .. } = measure;
     let agents = measure.agents();
-    let generations = generation.map_or("-".into(), |generation| format!("{:.0}%", 100.0 * rollout / generation));
+    let generations =
+        generation.as_ref().map_or("-".into(), |(generation, _)| format!("{:.0}%", 100.0 * rollout / generation));
     let mut line = format!(
         "{teams:>8} {agents:>7} {steps:>6} {:>12.3} {:>13.4e} {:>14.2} {generations:>12} {:>10.0}%\n",
         1.0 / rollout,
@@ -183,7 +180,7 @@ fn line(measure: &Timing) -> String {
         1e9 * rollout / (measure.team_steps() * agents as f64),
         100.0 * measure.ceiling_share(),
     );
-    if let Some(profile) = &measure.profile {
+    if let Some(profile) = profile {
         let phases = phases(profile);
         let whole: f64 = phases.iter().filter(|(_, part, _)| !part).map(|(.., ms)| ms).sum();
         for (name, part, ms) in phases {
@@ -239,7 +236,7 @@ fn traffic(profile: &Profile) -> Vec<(&'static str, bool, f64)> {
     rows.map(|(name, part, bytes)| (name, part, bytes as f64 / *generations as f64)).collect()
 }
 
-fn json(measure: &Timing) -> serde_json::Value {
+fn json(measure: &Timing, profile: Option<&Profile>) -> serde_json::Value {
     let Timing { teams, leaders, followers, pois, steps, rollout, mean_g, reach, operations, ceiling, .. } = measure;
     let agents = measure.agents();
     let mut object = json!({
@@ -260,12 +257,12 @@ fn json(measure: &Timing) -> serde_json::Value {
         "ceiling_operations_per_s": ceiling,
         "ceiling_share": measure.ceiling_share(),
     });
-    if let Some(generation) = measure.generation {
+    if let Some((generation, _)) = measure.generation {
         object["generations_per_s"] = json!(1.0 / generation);
         object["generation_team_steps_per_s"] = json!(measure.team_steps() / generation);
         object["generation_share"] = json!(rollout / generation);
     }
-    if let Some(profile) = &measure.profile {
+    if let Some(profile) = profile {
         let phases = phases(profile).into_iter().map(|(name, _, ms)| (format!("{name}_ms"), json!(ms)));
         let traffic = traffic(profile).into_iter().map(|(name, _, bytes)| (format!("{name}_bytes"), json!(bytes)));
         let longest = profile.gpu_times.map(|times| 1e3 * times.longest.as_secs_f64());

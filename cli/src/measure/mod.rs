@@ -81,10 +81,9 @@ pub(crate) struct Timing {
     pub steps: usize,
     /// Seconds per rollout: episodes, record and scores.
     pub rollout: f64,
-    /// Seconds per generation: a rollout, selection and mutation. `None` unless requested.
-    pub generation: Option<f64>,
-    /// The time of generations by phase. `None` unless requested.
-    pub profile: Option<Profile>,
+    /// Seconds per generation: a rollout, selection and mutation; and the time of generations by phase. `None` if only
+    /// rollouts were measured.
+    pub generation: Option<(f64, Profile)>,
     /// Mean G of the teams of the rollout.
     pub mean_g: f64,
     /// The numbers of entities in reach of agents. The operations depend on them.
@@ -105,17 +104,6 @@ pub(crate) struct Profile {
     pub gpu_times: Option<PhaseTimes>,
     /// Bytes over the bus, in rollouts and between them.
     pub traffic: Traffic,
-}
-
-/// The measurements of whole generations.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Generations {
-    /// Nothing: only rollouts.
-    LeftOut,
-    /// The time of a generation.
-    Timed,
-    /// The time of a generation, by phase.
-    Profiled,
 }
 
 impl Timing {
@@ -170,7 +158,8 @@ pub fn with_agents(config: &Config, agents: usize) -> Result<Config, String> {
     Ok(config)
 }
 
-/// Times rollouts of the teams of one trial after `trained` generations, and its next generations.
+/// Times rollouts of the teams of one trial after `trained` generations, and its next generations unless only rollouts
+/// are wanted. `profile` asks for the GPU's own clock.
 ///
 /// # Errors
 /// The backend failed.
@@ -178,24 +167,18 @@ pub(crate) fn measure(
     config: &Config,
     subject: &mut Subject,
     trained: usize,
-    generations: Generations,
+    rollout_only: bool,
+    profile: bool,
 ) -> Result<Timing, BackendError> {
     let world = World::new(&config.validate()?);
     let ceiling = &mut subject.ceiling()?;
     let mut trainer = Trainer::new([config.validate()?]);
     (0..trained).try_for_each(|_| trainer.advance(subject.backend()).map(drop))?;
     let ([rollout, ceiling], mean_g, reach) = rollout(config, &world, &mut trainer, subject.backend(), ceiling)?;
-    let (generation, profile) = match generations {
-        Generations::LeftOut => (None, None),
-        Generations::Timed => (Some(self::generations(&mut trainer, subject)?.0), None),
-        Generations::Profiled => {
-            if let Subject::Gpu(gpu) = subject {
-                gpu.use_clock();
-            }
-            let (generation, profile) = self::generations(&mut trainer, subject)?;
-            (Some(generation), Some(profile))
-        }
-    };
+    if let (Subject::Gpu(gpu), true) = (&mut *subject, profile) {
+        gpu.use_clock();
+    }
+    let generation = if rollout_only { None } else { Some(generations(&mut trainer, subject)?) };
     Ok(Timing {
         teams: config.max_teams() - 1,
         leaders: world.leaders(),
@@ -204,7 +187,6 @@ pub(crate) fn measure(
         steps: world.steps(),
         rollout,
         generation,
-        profile,
         mean_g,
         operations: operations::per_team_step(&world, &reach),
         reach,
