@@ -12,17 +12,13 @@ use flotilla_app::ops::{BackendSource, Context, Event};
 
 /// The flags of a command that concern every use case.
 pub struct Console<'a> {
-    machine: Machine<'a>,
+    options: &'a RunOptions,
+    /// The backend that the flags choose, opened when it is needed.
+    open: Option<(OpenBackend, String)>,
     quiet: bool,
 }
 
-/// The backend that the flags choose, opened when it is needed.
-struct Machine<'a> {
-    options: &'a RunOptions,
-    open: Option<(OpenBackend, String)>,
-}
-
-impl BackendSource for Machine<'_> {
+impl BackendSource for Console<'_> {
     fn open(&mut self, work: Work) -> Result<(&mut OpenBackend, String), Error> {
         let (open, description) = match &mut self.open {
             Some(open) => open,
@@ -35,7 +31,7 @@ impl BackendSource for Machine<'_> {
 impl<'a> Console<'a> {
     /// Returns a console with a command's flags.
     pub fn new(options: &'a RunOptions, quiet: bool) -> Console<'a> {
-        Console { machine: Machine { options, open: None }, quiet }
+        Console { options, open: None, quiet }
     }
 
     /// Runs a use case that signals stop.
@@ -59,8 +55,8 @@ impl<'a> Console<'a> {
         signals: &Signals,
         work: impl FnOnce(&mut dyn BackendSource, Context<'_>) -> Result<R, Error>,
     ) -> Result<R, Error> {
-        let flags = recovery::words_of_machine(self.machine.options);
-        run_reported(self.quiet, signals, &flags, |context| work(&mut self.machine, context))
+        let flags = recovery::words_of_machine(self.options);
+        run_reported(self.quiet, signals, &flags, |context| work(self, context))
     }
 }
 
