@@ -3,7 +3,7 @@
 
 use std::sync::LazyLock;
 
-use tiny_skia::PathBuilder;
+use tiny_skia::{PathBuilder, PathSegment};
 use ttf_parser::{Face, OutlineBuilder};
 
 /// The font file.
@@ -40,92 +40,78 @@ pub fn text_width(text: &str, size: f64) -> f64 {
     f64::from(set(text).1) * size / units_per_em()
 }
 
+/// Collects the outlines of glyphs, with y downwards.
+struct Letters {
+    builder: PathBuilder,
+    scale: f32,
+    /// Where the next glyph starts.
+    x: f32,
+}
+
+impl Letters {
+    fn at(&self, x: f32, y: f32) -> (f32, f32) {
+        (self.x + x * self.scale, -y * self.scale)
+    }
+}
+
+impl OutlineBuilder for Letters {
+    fn move_to(&mut self, x: f32, y: f32) {
+        let (x, y) = self.at(x, y);
+        self.builder.move_to(x, y);
+    }
+    fn line_to(&mut self, x: f32, y: f32) {
+        let (x, y) = self.at(x, y);
+        self.builder.line_to(x, y);
+    }
+    fn quad_to(&mut self, x1: f32, y1: f32, x: f32, y: f32) {
+        let ((x1, y1), (x, y)) = (self.at(x1, y1), self.at(x, y));
+        self.builder.quad_to(x1, y1, x, y);
+    }
+    fn curve_to(&mut self, x1: f32, y1: f32, x2: f32, y2: f32, x: f32, y: f32) {
+        let ((x1, y1), (x2, y2), (x, y)) = (self.at(x1, y1), self.at(x2, y2), self.at(x, y));
+        self.builder.cubic_to(x1, y1, x2, y2, x, y);
+    }
+    fn close(&mut self) {
+        self.builder.close();
+    }
+}
+
 /// Returns a glyph's outline as SVG path data in font units, with y downwards. A space has none.
 pub fn outline(glyph: ttf_parser::GlyphId) -> Option<String> {
-    /// Writes each point relative to the previous one, which takes fewer digits.
-    struct Strokes {
-        path: String,
-        at: [i32; 2],
-        start: [i32; 2],
-    }
-    impl Strokes {
-        fn put(&mut self, command: char, points: &[[f32; 2]]) {
-            self.path.push(command);
-            let ends = points.iter().map(|&[x, y]| [x.round() as i32, -(y.round() as i32)]);
-            let mut numbers = Vec::new();
-            for end in ends {
-                numbers.extend([end[0] - self.at[0], end[1] - self.at[1]]);
-                if numbers.len() == 2 * points.len() {
-                    self.at = end;
-                }
-            }
-            for (index, number) in numbers.iter().enumerate() {
-                // A minus sign separates numbers as well as a space does.
-                if index > 0 && *number >= 0 {
-                    self.path.push(' ');
-                }
-                self.path += &number.to_string();
-            }
-        }
-    }
-    impl OutlineBuilder for Strokes {
-        fn move_to(&mut self, x: f32, y: f32) {
-            self.put('m', &[[x, y]]);
-            self.start = self.at;
-        }
-        fn line_to(&mut self, x: f32, y: f32) {
-            self.put('l', &[[x, y]]);
-        }
-        fn quad_to(&mut self, x1: f32, y1: f32, x: f32, y: f32) {
-            self.put('q', &[[x1, y1], [x, y]]);
-        }
-        fn curve_to(&mut self, x1: f32, y1: f32, x2: f32, y2: f32, x: f32, y: f32) {
-            self.put('c', &[[x1, y1], [x2, y2], [x, y]]);
-        }
-        fn close(&mut self) {
-            self.path.push('z');
-            self.at = self.start;
-        }
-    }
-    let mut outline = Strokes { path: String::new(), at: [0, 0], start: [0, 0] };
+    let mut outline = Letters { builder: PathBuilder::new(), scale: 1.0, x: 0.0 };
     FONT.outline_glyph(glyph, &mut outline)?;
-    Some(outline.path)
+    let (mut text, mut at, mut start) = (String::new(), [0, 0], [0, 0]);
+    for segment in outline.builder.finish()?.segments() {
+        let (command, points) = match segment {
+            PathSegment::MoveTo(end) => ('m', vec![end]),
+            PathSegment::LineTo(end) => ('l', vec![end]),
+            PathSegment::QuadTo(control, end) => ('q', vec![control, end]),
+            PathSegment::CubicTo(first, second, end) => ('c', vec![first, second, end]),
+            PathSegment::Close => {
+                text.push('z');
+                at = start;
+                continue;
+            }
+        };
+        text.push(command);
+        // Each point is relative to the previous end, which takes fewer digits.
+        let ends: Vec<[i32; 2]> = points.iter().map(|end| [end.x, end.y].map(|at| at.round() as i32)).collect();
+        for (index, number) in ends.iter().flat_map(|end| [end[0] - at[0], end[1] - at[1]]).enumerate() {
+            // A minus sign separates numbers as well as a space does.
+            if index > 0 && number >= 0 {
+                text.push(' ');
+            }
+            text += &number.to_string();
+        }
+        at = *ends.last()?;
+        start = if command == 'm' { at } else { start };
+    }
+    Some(text)
 }
 
 /// Returns the outlines of a text whose baseline starts at `(start, 0)`, in millimetres. None if it has no visible
 /// glyph.
 pub fn letters(text: &str, size: f64, start: f64) -> Option<tiny_skia::Path> {
-    struct Letters {
-        builder: PathBuilder,
-        scale: f32,
-        x: f32,
-    }
-    impl Letters {
-        fn at(&self, x: f32, y: f32) -> (f32, f32) {
-            (self.x + x * self.scale, -y * self.scale)
-        }
-    }
-    impl OutlineBuilder for Letters {
-        fn move_to(&mut self, x: f32, y: f32) {
-            let (x, y) = self.at(x, y);
-            self.builder.move_to(x, y);
-        }
-        fn line_to(&mut self, x: f32, y: f32) {
-            let (x, y) = self.at(x, y);
-            self.builder.line_to(x, y);
-        }
-        fn quad_to(&mut self, x1: f32, y1: f32, x: f32, y: f32) {
-            let ((x1, y1), (x, y)) = (self.at(x1, y1), self.at(x, y));
-            self.builder.quad_to(x1, y1, x, y);
-        }
-        fn curve_to(&mut self, x1: f32, y1: f32, x2: f32, y2: f32, x: f32, y: f32) {
-            let ((x1, y1), (x2, y2), (x, y)) = (self.at(x1, y1), self.at(x2, y2), self.at(x, y));
-            self.builder.cubic_to(x1, y1, x2, y2, x, y);
-        }
-        fn close(&mut self) {
-            self.builder.close();
-        }
-    }
     let scale = size / units_per_em();
     let mut outline = Letters { builder: PathBuilder::new(), scale: scale as f32, x: 0.0 };
     for (glyph, place, _) in set(text).0 {
