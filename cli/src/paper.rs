@@ -14,7 +14,6 @@ use flotilla_app::ops::{BackendSource, Context};
 use flotilla_app::record::folder::ARMS;
 use flotilla_app::shell;
 use flotilla_studies::paper::run::{OUT, Request};
-use flotilla_studies::populations::layout;
 use flotilla_studies::questions::letter;
 use flotilla_studies::{influence, paper, populations, questions};
 
@@ -30,14 +29,15 @@ pub struct Args {
     /// Vary followers and the number of populations instead, on all layouts or some of generally-forward, strictly-forward,
     /// chaotic, coupling-6 (docs/results/populations.md)
     #[arg(long, value_name = "LAYOUTS", num_args = 0..=1, require_equals = true, value_delimiter = ',',
-        default_missing_value = "generally-forward,strictly-forward,chaotic,coupling-6", value_parser = layout,
+        default_missing_value = "generally-forward,strictly-forward,chaotic,coupling-6",
+        value_parser = one_of(&populations::LAYOUT_NAMES),
         conflicts_with = "questions")]
     populations: Vec<String>,
     /// Compare credits for rovers and UAVs instead, in all layouts or some of rover_uav, 3_rovers_1_uav, 3_rovers_3_uavs,
     /// 4_rovers_4_uavs, 3_rovers_3_uavs_random (docs/results/influence.md)
     #[arg(long, value_name = "LAYOUTS", num_args = 0..=1, require_equals = true, value_delimiter = ',',
         default_missing_value = "rover_uav,3_rovers_1_uav,3_rovers_3_uavs,4_rovers_4_uavs,3_rovers_3_uavs_random",
-        value_parser = influence::layout,
+        value_parser = one_of(influence::LAYOUT_NAMES),
         conflicts_with_all = ["questions", "populations"])]
     influence: Vec<String>,
     /// Independent repetitions [default: 5, or 30 with --questions or --influence]
@@ -59,6 +59,14 @@ pub struct Args {
     checkpoints: Checkpoints,
     #[command(flatten)]
     run: RunOptions,
+}
+
+/// Returns a parser of names.
+fn one_of(names: &'static [&'static str]) -> impl Fn(&str) -> Result<String, String> + Clone + Send + Sync {
+    move |text| match names.contains(&text) {
+        true => Ok(text.into()),
+        false => Err(format!("{text:?} is none of {}", names.join(", "))),
+    }
 }
 
 impl Args {

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use serde::Serialize;
 
-use crate::paper::run::Request;
+use crate::paper::run::{Request, check_trials};
 use crate::tasks::{EPISODES, SEEDS, mean};
 use flotilla::baseline::NAMES;
 use flotilla::escape::PathExt;
@@ -57,15 +57,6 @@ pub struct LayoutOutcome {
     pub baselines: [Vec<f64>; NAMES.len()],
 }
 
-/// Reads the name of a layout.
-///
-/// # Errors
-/// There is no such layout.
-pub fn layout(text: &str) -> Result<String, String> {
-    let known = || format!("{text:?} is none of {}", LAYOUT_NAMES.join(", "));
-    LAYOUT_NAMES.contains(&text).then(|| text.to_string()).ok_or_else(known)
-}
-
 /// Trains the sweep of each layout in a folder of its own, compares its credits, and plays baselines.
 ///
 /// # Errors
@@ -79,10 +70,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     });
     let sweeps: Vec<(&str, Sweep)> = sweeps.collect::<Result<_, Error>>()?;
     let configs = || sweeps.iter().flat_map(|(_, sweep)| &sweep.points).map(|point| &point.config);
-    if let Some(config) = configs().find(|config| config.learning.trials < 2) {
-        let trials = config.learning.trials;
-        return Err(Error::Usage(format!("--trials {trials}: intervals and tests take two trials or more").into()));
-    }
+    check_trials(configs().map(|config| &**config))?;
     for (name, sweep) in &sweeps {
         same_sweep(sweep, &out.join(name))?;
     }

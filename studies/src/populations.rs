@@ -8,7 +8,7 @@ use std::path::Path;
 
 use serde::Serialize;
 
-use crate::paper::run::Request;
+use crate::paper::run::{Request, check_trials};
 use crate::tasks;
 use flotilla::backend::Backend;
 use flotilla::config::{Choice, Config, Density, Fitness, LAYOUTS, Paradigm, Sharing, ValidConfig};
@@ -126,15 +126,6 @@ pub struct Row {
     pub p_holm: Option<f64>,
 }
 
-/// Reads a name of a layout.
-///
-/// # Errors
-/// There is no such layout.
-pub fn layout(text: &str) -> Result<String, String> {
-    let known = || format!("{text:?} is none of {}", LAYOUT_NAMES.join(", "));
-    LAYOUT_NAMES.contains(&text).then(|| text.to_string()).ok_or_else(known)
-}
-
 /// Returns the experiments on some layouts.
 fn cells(request: &Request) -> Result<Vec<Cell>, Error> {
     let mut cells = Vec::new();
@@ -174,10 +165,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let mut cells = cells(request)?;
     let configs: Vec<Config> = cells.iter().map(|cell| cell.config.clone()).collect();
     let learning = configs[0].learning.clone();
-    if learning.trials < 2 {
-        let trials = learning.trials;
-        return Err(Error::Usage(format!("--trials {trials}: intervals and tests take two trials or more").into()));
-    }
+    check_trials(&configs)?;
     let mut work = Work::default();
     configs.iter().for_each(|config| work += Work::of([config]));
     let (backend, on) = backends.open(work)?;

@@ -202,11 +202,7 @@ fn play_script(script: &Script, name: &str, config: &Config) -> Result<f64, Erro
     let invalid = |error: String| Error::Usage(format!("{name}: scripted team: {error}").into());
     script.check(config).map_err(invalid)?;
     let valid = config.validate()?;
-    let Learning { start_jitter: jitter, poi_jitter, .. } = valid.learning;
-    let starts = match moves(config) {
-        true => Starts::Drawn { episodes: EPISODES, seed: 0, jitter, poi_jitter },
-        false => Starts::Own,
-    };
+    let starts = if moves(config) { held_out(config) } else { Starts::Own };
     let (world, mut observed) = (World::new(&valid), 0);
     for episode in 0..starts.episodes() {
         let played = script.play_from(valid.as_ref(), &starts, episode).map_err(|error| invalid(error.to_string()))?;
@@ -219,6 +215,12 @@ fn play_script(script: &Script, name: &str, config: &Config) -> Result<f64, Erro
 /// Reports whether starts or POIs move.
 fn moves(config: &Config) -> bool {
     config.learning.start_jitter > 0.0 || config.learning.poi_jitter > 0.0
+}
+
+/// Returns the starts of held-out episodes.
+fn held_out(config: &Config) -> Starts {
+    let Learning { start_jitter: jitter, poi_jitter, .. } = config.learning;
+    Starts::Drawn { episodes: EPISODES, seed: 0, jitter, poi_jitter }
 }
 
 /// Trains one run of a task, unless it is finished.
@@ -260,13 +262,7 @@ fn measure(config: &Config, disk: &Disk, folder: &Path, backend: &mut dyn Backen
         }
     })?;
     if moves(config) {
-        let starts = Starts::Drawn {
-            episodes: EPISODES,
-            seed: 0,
-            jitter: learning.start_jitter,
-            poi_jitter: learning.poi_jitter,
-        };
-        trained.champion_g = play_champions(config, disk, folder, &starts, backend)?;
+        trained.champion_g = play_champions(config, disk, folder, &held_out(config), backend)?;
     }
     Ok(trained)
 }

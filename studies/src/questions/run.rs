@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
-use crate::paper::run::Request;
+use crate::paper::run::{Request, check_trials};
 use crate::questions::{self, Answer, OpenQuestion, QUESTIONS, Study, Warm};
 use flotilla::backend::OpenBackend;
 use flotilla::config::Config;
@@ -74,10 +74,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         .into_iter()
         .map(|part| Ok((part, part.sweep(&request.set)?)))
         .collect::<Result<_, Error>>()?;
-    if let Some((_, sweep)) = parts.iter().find(|(_, sweep)| sweep.points[0].config.learning.trials < 2) {
-        let trials = sweep.points[0].config.learning.trials;
-        return Err(Error::Usage(format!("--trials {trials}: intervals and tests take two trials or more").into()));
-    }
+    check_trials(parts.iter().map(|(_, sweep)| &*sweep.points[0].config))?;
     check_folder(&parts, out)?;
     let configs = || parts.iter().flat_map(|(_, sweep)| &sweep.points).map(|point| &point.config);
     let (backend, on) = backends.open(Work::of(configs().map(|config| &**config)))?;

@@ -8,7 +8,7 @@ use crate::paper::claims::Claim;
 use crate::paper::{self, Evidence, Experiment, Summary, Trajectory, claims, tables};
 use flotilla::backend::OpenBackend;
 use flotilla::baseline::{Baseline, Baselines};
-use flotilla::config::{Actions, Fitness, Override, Paradigm, ValidConfig};
+use flotilla::config::{Actions, Config, Fitness, Override, Paradigm, ValidConfig};
 use flotilla::escape::PathExt;
 use flotilla::memory;
 use flotilla::parallel::current_num_threads;
@@ -59,6 +59,16 @@ impl Request {
     /// Reports whether the user chose the folder.
     pub fn is_out_named(&self) -> bool {
         self.out != Path::new(OUT)
+    }
+}
+
+/// Fails if a config has fewer trials than intervals and tests need.
+pub(crate) fn check_trials<'a>(configs: impl IntoIterator<Item = &'a Config>) -> Result<(), Error> {
+    match configs.into_iter().map(|config| config.learning.trials).find(|&trials| trials < 2) {
+        None => Ok(()),
+        Some(trials) => {
+            Err(Error::Usage(format!("--trials {trials}: intervals and tests take two trials or more").into()))
+        }
     }
 }
 
