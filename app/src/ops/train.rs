@@ -1,7 +1,6 @@
 //! Trains the teams of a config in a run's folder.
 
 use std::collections::BTreeMap;
-use std::ffi::OsString;
 use std::io;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
@@ -10,7 +9,6 @@ use serde::Serialize;
 
 use super::{BackendSource, ConfigText, Context, Error, Event, ProcessorInfo, check_memory, escaped, with_remedy};
 use crate::choice::Work;
-use crate::record::RecordError;
 use crate::record::digests::Verification;
 use crate::record::disk::Disk;
 use crate::record::finished::{Finished, Storage};
@@ -18,7 +16,8 @@ use crate::record::folder::{self, CONFIG, FirstAndLastRows, METRICS, POLICIES, R
 use crate::record::ownership::{self, CURVES};
 use crate::record::policies::{self, Init};
 use crate::record::runs;
-use crate::report::runs::{RunMetrics, figure_of, figure_of_metrics};
+use crate::record::{RecordError, command_to_resume};
+use crate::report::runs::{RunMetrics, figure_of};
 use crate::report::scene::Scene;
 use crate::run::{Progress, RunError, Session, SessionEnd};
 use crate::shell;
@@ -154,13 +153,6 @@ impl Extremes {
 }
 
 impl TrainRequest {
-    /// Returns the command that resumes the run.
-    fn command_to_resume(&self, folder: &Path, context: Context<'_>) -> String {
-        let words: [OsString; 3] = ["flotilla".into(), "train".into(), shell::argument(&folder.join(CONFIG))];
-        let out = ["--out".into(), shell::argument(folder), "--resume".into()];
-        shell::command(words.into_iter().chain(out).chain(context.flags.iter().cloned()))
-    }
-
     /// Returns the run's folder.
     fn folder(&self) -> Result<PathBuf, Error> {
         let runs = Path::new(RUNS);
@@ -192,7 +184,7 @@ pub fn run(
         context.message(format_args!("training on {on}, into {}", folder.escaped()));
         (context.report)(Event::Begin(vec![(String::new(), config.pois())], from, config.learning.generations));
     }
-    let last = train(&mut session, request, &folder, backend, context)?;
+    let last = train(&mut session, &folder, backend, context)?;
     let (config, results) = (session.config(0), session.results(0).expect("the run is done"));
     let (disk, curves) = (session.disk(0), folder.join(CURVES));
     let (mut metrics, mut most) = (RunMetrics::default(), 0.0_f64);
@@ -206,7 +198,7 @@ pub fn run(
         svg.is_ok_and(|svg| Scene::shows(&svg, &results.digest))
     };
     if !was_done || !is_drawn() {
-        let svg = figure_of_metrics(config, metrics, &results.digest).scene().svg();
+        let svg = figure_of(config, metrics, &results.digest).scene().svg();
         let drawn = ownership::publish(disk, &curves, |output| output.write_all(svg.as_bytes()))
             .and_then(|()| disk.sync_folder(&folder).map_err(RecordError::write(&folder)));
         if let Err(error) = drawn.map_err(Error::from) {
@@ -282,7 +274,6 @@ fn open_session(
 /// Trains a run to its end, or until the user ends it. Returns the last generation, which is earlier in that case.
 fn train(
     session: &mut Session,
-    request: &TrainRequest,
     folder: &Path,
     backend: &mut OpenBackend,
     context: Context<'_>,
@@ -299,7 +290,7 @@ fn train(
             let next = session.generations()[0];
             let remedy = match session.disk(0).has_moved() {
                 true => format!("{} was moved: continue with --resume and its new path", folder.escaped()),
-                false => format!("continue with\n  {}", request.command_to_resume(folder, context)),
+                false => format!("continue with\n  {}", command_to_resume(folder, context.flags)),
             };
             let stopped = format!("before generation {next} of {last}, with everything saved");
             return Err(Error::Stopped(with_remedy(stopped, remedy)));
@@ -369,7 +360,8 @@ pub fn in_memory(
 pub fn save(finished: Finished<'_>, storage: &mut dyn Storage) -> Result<String, RecordError> {
     let (config, rows) = (finished.config, finished.rows);
     let digest = finished.write(storage)?;
-    let figure = figure_of(config, rows.iter().map(|(row, _)| row), &digest);
-    storage.publish(CURVES, figure.scene().svg().as_bytes())?;
+    let mut metrics = RunMetrics::default();
+    rows.iter().for_each(|(row, _)| metrics.add(row));
+    storage.publish(CURVES, figure_of(config, metrics, &digest).scene().svg().as_bytes())?;
     Ok(digest)
 }

@@ -18,6 +18,7 @@
 //! before they are used. Nothing in it can name another file.
 
 use std::collections::BTreeMap;
+use std::ffi::OsString;
 use std::fmt::Display;
 use std::io::{self, ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
@@ -259,12 +260,9 @@ impl RecordError {
                 path.display()
             ),
             RecordError::Differs(path) => {
-                let folder = file::folder(path);
-                let words = [folder.join(CONFIG), "--out".into(), folder.into(), "--resume".into()];
-                let command = shell::command([PathBuf::from("flotilla"), "train".into()].into_iter().chain(words));
                 let again = match path.ends_with(CONFIG) {
                     true => String::new(),
-                    false => format!(", make it again with `{command}`"),
+                    false => format!(", make it again with `{}`", command_to_resume(file::folder(path), &[])),
                 };
                 format!("restore it{again}, or read it all the same with --unverified")
             }
@@ -272,6 +270,13 @@ impl RecordError {
             RecordError::Damaged { .. } | RecordError::NoTrial { .. } => return None,
         })
     }
+}
+
+/// Returns the command that resumes the run in a folder with its own config.
+pub(crate) fn command_to_resume(folder: &Path, flags: &[OsString]) -> String {
+    let [config, out] = [&folder.join(CONFIG), folder].map(shell::argument);
+    let words = ["flotilla".into(), "train".into(), config, "--out".into(), out, "--resume".into()];
+    shell::command(words.iter().chain(flags))
 }
 
 /// Passes bytes on, and hashes them.

@@ -4,11 +4,11 @@ use std::ffi::OsString;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
-use super::RecordError;
 use super::digests::{Digests, Verification};
 use super::disk::Place;
 use super::folder::{self, CONFIG, METRICS, POLICIES, RUNS};
 use super::metrics;
+use super::{RecordError, command_to_resume};
 use super::{finished, policies};
 use crate::shell;
 use flotilla::config::{Config, ConfigError};
@@ -83,11 +83,7 @@ impl ReadError {
             ReadError::Config { .. } => {
                 "find a config that is whole, and repeat the run with `flotilla train CONFIG --out DIR`".into()
             }
-            ReadError::Unfinished { folder, .. } => {
-                let [config, out] = [&folder.join(CONFIG), folder].map(|path| shell::argument(path));
-                let words = ["flotilla".into(), "train".into(), config, "--out".into(), out, "--resume".into()];
-                format!("finish the run with `{}`", shell::command(words))
-            }
+            ReadError::Unfinished { folder, .. } => format!("finish the run with `{}`", command_to_resume(folder, &[])),
             ReadError::Record(error) => return error.help("try again"),
             ReadError::Collection { .. } => return None,
         })

@@ -103,7 +103,7 @@ impl RunMetrics {
         Ok(run)
     }
 
-    pub(crate) fn add(&mut self, row: &Row) {
+    pub fn add(&mut self, row: &Row) {
         let known = self.0.iter_mut().zip(TeamKind::ALL).filter_map(|(averages, kind)| Some((averages, kind.of(row)?)));
         for (averages, g) in known {
             if averages.len() <= row.generation {
@@ -151,15 +151,8 @@ pub fn figure(
     Ok(shown)
 }
 
-/// Returns the learning curves of one run as [`figure`] does, from its rows and its digest.
-pub(crate) fn figure_of<'a>(config: &Config, rows: impl Iterator<Item = &'a Row>, digest: &str) -> Figure {
-    let mut run = RunMetrics::default();
-    rows.for_each(|row| run.add(row));
-    figure_of_metrics(config, run, digest)
-}
-
 /// Returns the learning curves of one run as [`figure`] does, from its metrics and its digest.
-pub(crate) fn figure_of_metrics(config: &Config, run: RunMetrics, digest: &str) -> Figure {
+pub(crate) fn figure_of(config: &Config, run: RunMetrics, digest: &str) -> Figure {
     let figure = figure_of_runs(&[run], std::slice::from_ref(config), Vec::new, None);
     Figure { source: Some(digest.into()), ..figure }
 }
