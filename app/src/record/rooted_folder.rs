@@ -46,16 +46,6 @@ impl RootedFolder {
         &self.path
     }
 
-    /// Reports whether the path no longer leads to the folder. Always false on systems without handles.
-    pub fn has_moved(&self) -> bool {
-        system::has_moved(&self.handle, &self.path)
-    }
-
-    /// Returns the user ids `[owner, current user]`, or `None` on systems without user ids.
-    pub fn owners(&self) -> io::Result<Option<[u32; 2]>> {
-        system::owners(&self.handle)
-    }
-
     /// Returns the entry of a path, which must begin with the path of this folder. Fails if a folder on the way is a link
     /// or is missing.
     pub(crate) fn entry(&self, path: &Path) -> io::Result<FolderEntry> {
@@ -120,11 +110,6 @@ pub(crate) enum OpenAs {
 }
 
 impl FolderEntry {
-    /// Returns the type of the entry, or `None` if it does not exist.
-    pub fn kind(&self) -> io::Result<Option<FileKind>> {
-        system::kind(self)
-    }
-
     /// Fails if the entry exists and is not a plain file.
     fn only_file(&self) -> io::Result<()> {
         match self.kind()? {
@@ -143,23 +128,6 @@ impl FolderEntry {
             self.only_file()?;
         }
         system::open_file(self, how)
-    }
-
-    /// Creates a file without a name in the entry's folder. It disappears with its process, unless [`FolderEntry::link`]
-    /// names it. Returns `None` if the system cannot do this.
-    pub(crate) fn create_unnamed(&self) -> Option<File> {
-        system::create_unnamed(self)
-    }
-
-    /// Gives a file of [`FolderEntry::create_unnamed`] this name. Fails if the name is taken.
-    pub(crate) fn link(&self, file: &File) -> io::Result<()> {
-        system::link(self, file)
-    }
-
-    /// Returns the number of names of an open file, or 0 if it does not have this one, because another file replaced
-    /// it.
-    pub(crate) fn links(&self, file: &File) -> io::Result<u64> {
-        system::links(self, file)
     }
 
     /// Removes a plain file.
@@ -218,7 +186,7 @@ mod system {
 
     use rustix::fs::{self, AtFlags, FileType, Mode, OFlags};
 
-    use super::{FileKind, FolderEntry, Handle, OpenAs, not_a_folder};
+    use super::{FileKind, FolderEntry, Handle, OpenAs, RootedFolder, not_a_folder};
 
     const FOLDER: OFlags = OFlags::RDONLY.union(OFlags::DIRECTORY).union(OFlags::CLOEXEC);
     /// `NONBLOCK` prevents a hang if a pipe replaces a file between the check and the open.
@@ -235,13 +203,18 @@ mod system {
         Ok(Handle(handle.0.try_clone()?))
     }
 
-    pub fn has_moved(handle: &Handle, path: &Path) -> bool {
-        let id = |found: fs::Stat| (found.st_dev, found.st_ino);
-        fs::fstat(&handle.0).is_ok_and(|own| fs::stat(path).map_or(true, |there| id(there) != id(own)))
-    }
+    impl RootedFolder {
+        /// Reports whether the path no longer leads to the folder. Always false on systems without handles.
+        pub fn has_moved(&self) -> bool {
+            let id = |found: fs::Stat| (found.st_dev, found.st_ino);
+            let differs = |own| fs::stat(&self.path).map_or(true, |there| id(there) != id(own));
+            fs::fstat(&self.handle.0).is_ok_and(differs)
+        }
 
-    pub fn owners(handle: &Handle) -> io::Result<Option<[u32; 2]>> {
-        Ok(Some([fs::fstat(&handle.0)?.st_uid, rustix::process::geteuid().as_raw()]))
+        /// Returns the user ids `[owner, current user]`, or `None` on systems without user ids.
+        pub fn owners(&self) -> io::Result<Option<[u32; 2]>> {
+            Ok(Some([fs::fstat(&self.handle.0)?.st_uid, rustix::process::geteuid().as_raw()]))
+        }
     }
 
     pub(crate) fn step(entry: &FolderEntry) -> io::Result<Handle> {
@@ -253,16 +226,48 @@ mod system {
         Ok(fs::mkdirat(&entry.parent.0, &entry.name, FOLDER_MODE)?)
     }
 
-    pub(crate) fn kind(entry: &FolderEntry) -> io::Result<Option<FileKind>> {
-        match fs::statat(&entry.parent.0, &entry.name, AtFlags::SYMLINK_NOFOLLOW).map_err(io::Error::from) {
-            Ok(there) => Ok(Some(match FileType::from_raw_mode(there.st_mode) {
+    impl FolderEntry {
+        /// Returns the type of the entry, or `None` if it does not exist.
+        pub fn kind(&self) -> io::Result<Option<FileKind>> {
+            Ok(self.stat()?.map(|there| match FileType::from_raw_mode(there.st_mode) {
                 FileType::RegularFile => FileKind::File,
                 FileType::Directory => FileKind::Folder,
                 FileType::Symlink => FileKind::Link,
                 _ => FileKind::Other,
-            })),
-            Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
-            Err(error) => Err(error),
+            }))
+        }
+
+        /// Returns the number of names of an open file, or 0 if it does not have this one, because another file
+        /// replaced it.
+        pub(crate) fn links(&self, file: &File) -> io::Result<u64> {
+            let (open, there) = (fs::fstat(file)?, self.stat()?);
+            let same = there.is_some_and(|there| (open.st_dev, open.st_ino) == (there.st_dev, there.st_ino));
+            #[allow(clippy::unnecessary_cast, reason = "the type depends on the system")]
+            Ok(if same { open.st_nlink as u64 } else { 0 })
+        }
+
+        fn stat(&self) -> io::Result<Option<fs::Stat>> {
+            match fs::statat(&self.parent.0, &self.name, AtFlags::SYMLINK_NOFOLLOW).map_err(io::Error::from) {
+                Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
+                there => there.map(Some),
+            }
+        }
+    }
+
+    #[cfg(target_os = "linux")]
+    impl FolderEntry {
+        /// Creates a file without a name in the entry's folder. It disappears with its process, unless
+        /// [`FolderEntry::link`] names it. Returns `None` if the system cannot do this.
+        pub(crate) fn create_unnamed(&self) -> Option<File> {
+            let flags = OFlags::TMPFILE | OFlags::WRONLY | OFlags::CLOEXEC;
+            let file = File::from(fs::openat(&self.parent.0, c".", flags, FILE_MODE).ok()?);
+            // Naming it needs /proc.
+            Path::new(&path_of(&file)).exists().then_some(file)
+        }
+
+        /// Gives a file of [`FolderEntry::create_unnamed`] this name. Fails if the name is taken.
+        pub(crate) fn link(&self, file: &File) -> io::Result<()> {
+            Ok(fs::linkat(fs::CWD, path_of(file), &self.parent.0, &self.name, AtFlags::SYMLINK_FOLLOW)?)
         }
     }
 
@@ -277,25 +282,9 @@ mod system {
     }
 
     #[cfg(target_os = "linux")]
-    pub(crate) fn create_unnamed(entry: &FolderEntry) -> Option<File> {
-        let flags = OFlags::TMPFILE | OFlags::WRONLY | OFlags::CLOEXEC;
-        let file = File::from(fs::openat(&entry.parent.0, c".", flags, FILE_MODE).ok()?);
-        // Naming it needs /proc.
-        Path::new(&path_of(&file)).exists().then_some(file)
-    }
-
-    #[cfg(target_os = "linux")]
-    pub(crate) fn link(entry: &FolderEntry, file: &File) -> io::Result<()> {
-        Ok(fs::linkat(fs::CWD, path_of(file), &entry.parent.0, &entry.name, AtFlags::SYMLINK_FOLLOW)?)
-    }
-
-    #[cfg(target_os = "linux")]
     fn path_of(file: &File) -> String {
         format!("/proc/self/fd/{}", std::os::fd::AsRawFd::as_raw_fd(file))
     }
-
-    #[cfg(not(target_os = "linux"))]
-    pub(crate) use super::without_unnamed_files::{create_unnamed, link};
 
     pub(crate) fn remove(entry: &FolderEntry) -> io::Result<()> {
         Ok(fs::unlinkat(&entry.parent.0, &entry.name, AtFlags::empty())?)
@@ -315,30 +304,15 @@ mod system {
         let names = fs::Dir::read_from(&entry.parent.0)?.map(name).collect::<io::Result<Vec<OsString>>>()?;
         Ok(names.into_iter().filter(|name| name != "." && name != "..").collect())
     }
-
-    pub(crate) fn links(entry: &FolderEntry, file: &File) -> io::Result<u64> {
-        let open = fs::fstat(file)?;
-        let there = match fs::statat(&entry.parent.0, &entry.name, AtFlags::SYMLINK_NOFOLLOW) {
-            Err(error) if io::Error::from(error).kind() == ErrorKind::NotFound => return Ok(0),
-            there => there?,
-        };
-        let same = (open.st_dev, open.st_ino) == (there.st_dev, there.st_ino);
-        #[allow(clippy::unnecessary_cast, reason = "the type depends on the system")]
-        Ok(if same { open.st_nlink as u64 } else { 0 })
-    }
 }
 
 #[cfg(not(target_os = "linux"))]
-mod without_unnamed_files {
-    use super::FolderEntry;
-    use std::fs::File;
-    use std::io::{ErrorKind, Result};
-
-    pub(crate) fn create_unnamed(_: &FolderEntry) -> Option<File> {
+impl FolderEntry {
+    pub(crate) fn create_unnamed(&self) -> Option<File> {
         None
     }
 
-    pub(crate) fn link(_: &FolderEntry, _: &File) -> Result<()> {
+    pub(crate) fn link(&self, _: &File) -> io::Result<()> {
         Err(ErrorKind::Unsupported.into())
     }
 }
@@ -350,9 +324,7 @@ mod system {
     use std::io::{self, ErrorKind};
     use std::path::Path;
 
-    use super::{FileKind, FolderEntry, Handle, OpenAs, not_a_folder};
-
-    pub(crate) use super::without_unnamed_files::{create_unnamed, link};
+    use super::{FileKind, FolderEntry, Handle, OpenAs, RootedFolder, not_a_folder};
 
     pub fn open(path: &Path) -> io::Result<Handle> {
         match fs::metadata(path)?.is_dir() {
@@ -365,16 +337,18 @@ mod system {
         Ok(Handle())
     }
 
-    pub fn has_moved(_: &Handle, _: &Path) -> bool {
-        false
-    }
+    impl RootedFolder {
+        pub fn has_moved(&self) -> bool {
+            false
+        }
 
-    pub fn owners(_: &Handle) -> io::Result<Option<[u32; 2]>> {
-        Ok(None)
+        pub fn owners(&self) -> io::Result<Option<[u32; 2]>> {
+            Ok(None)
+        }
     }
 
     pub(crate) fn step(entry: &FolderEntry) -> io::Result<Handle> {
-        match kind(entry)? {
+        match entry.kind()? {
             Some(FileKind::Folder) => Ok(Handle()),
             _ => Err(not_a_folder(entry, ErrorKind::NotFound.into())),
         }
@@ -384,14 +358,20 @@ mod system {
         fs::create_dir(&entry.path)
     }
 
-    pub(crate) fn kind(entry: &FolderEntry) -> io::Result<Option<FileKind>> {
-        match fs::symlink_metadata(&entry.path) {
-            Ok(there) if there.is_symlink() => Ok(Some(FileKind::Link)),
-            Ok(there) if there.is_dir() => Ok(Some(FileKind::Folder)),
-            Ok(there) if there.is_file() => Ok(Some(FileKind::File)),
-            Ok(_) => Ok(Some(FileKind::Other)),
-            Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
-            Err(error) => Err(error),
+    impl FolderEntry {
+        pub fn kind(&self) -> io::Result<Option<FileKind>> {
+            match fs::symlink_metadata(&self.path) {
+                Ok(there) if there.is_symlink() => Ok(Some(FileKind::Link)),
+                Ok(there) if there.is_dir() => Ok(Some(FileKind::Folder)),
+                Ok(there) if there.is_file() => Ok(Some(FileKind::File)),
+                Ok(_) => Ok(Some(FileKind::Other)),
+                Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
+                Err(error) => Err(error),
+            }
+        }
+
+        pub(crate) fn links(&self, _: &File) -> io::Result<u64> {
+            Ok(1)
         }
     }
 
@@ -420,9 +400,5 @@ mod system {
 
     pub(crate) fn list(_: &FolderEntry, path: &Path) -> io::Result<Vec<OsString>> {
         fs::read_dir(path)?.map(|entry| Ok(entry?.file_name())).collect()
-    }
-
-    pub(crate) fn links(_: &FolderEntry, _: &File) -> io::Result<u64> {
-        Ok(1)
     }
 }
