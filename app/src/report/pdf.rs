@@ -16,78 +16,76 @@ const INFO: SystemInfo<'static> = SystemInfo { registry: Str(b"Adobe"), ordering
 impl Scene {
     /// Returns the picture as a PDF file.
     pub fn pdf(&self) -> Vec<u8> {
-        pdf(self)
-    }
-}
+        let [catalog, pages, page, contents, font, cid, descriptor, file, unicode, info] =
+            std::array::from_fn(|index| Ref::new(index as i32 + 1));
+        let mut page_of = Page::default();
+        let content = page_of.content(self);
 
-fn pdf(scene: &Scene) -> Vec<u8> {
-    let [catalog, pages, page, contents, font, cid, descriptor, file, unicode, info] =
-        std::array::from_fn(|index| Ref::new(index as i32 + 1));
-    let mut page_of = Page::default();
-    let content = page_of.content(scene);
+        let mut pdf = Pdf::new();
+        pdf.document_info(info)
+            .title(TextStr(&self.title))
+            .subject(TextStr(&self.description))
+            .creator(TextStr(concat!("flotilla ", env!("CARGO_PKG_VERSION"))));
+        let mut root = pdf.catalog(catalog);
+        root.pages(pages).lang(TextStr("en"));
+        root.viewer_preferences().display_doc_title(true);
+        root.finish();
+        pdf.pages(pages).kids([page]).count(1);
+        let mut sheet = pdf.page(page);
+        let [width, height] = [self.width, self.height].map(|side| (side * POINTS) as f32);
+        sheet.parent(pages).media_box(Rect::new(0.0, 0.0, width, height)).contents(contents);
+        let mut resources = sheet.resources();
+        resources.fonts().pair(FONT, font);
+        let mut states = resources.ext_g_states();
+        for &percent in &page_of.opacities {
+            let mut state =
+                states.insert(Name(state(percent).as_bytes())).start::<pdf_writer::writers::ExtGraphicsState>();
+            state.non_stroking_alpha(f32::from(percent) / 100.0).stroking_alpha(f32::from(percent) / 100.0);
+        }
+        states.finish();
+        resources.finish();
+        sheet.finish();
+        pdf.stream(contents, &packed(&content)).filter(Filter::FlateDecode);
 
-    let mut pdf = Pdf::new();
-    pdf.document_info(info)
-        .title(TextStr(&scene.title))
-        .subject(TextStr(&scene.description))
-        .creator(TextStr(concat!("flotilla ", env!("CARGO_PKG_VERSION"))));
-    let mut root = pdf.catalog(catalog);
-    root.pages(pages).lang(TextStr("en"));
-    root.viewer_preferences().display_doc_title(true);
-    root.finish();
-    pdf.pages(pages).kids([page]).count(1);
-    let mut sheet = pdf.page(page);
-    let [width, height] = [scene.width, scene.height].map(|side| (side * POINTS) as f32);
-    sheet.parent(pages).media_box(Rect::new(0.0, 0.0, width, height)).contents(contents);
-    let mut resources = sheet.resources();
-    resources.fonts().pair(FONT, font);
-    let mut states = resources.ext_g_states();
-    for &percent in &page_of.opacities {
-        let mut state = states.insert(Name(state(percent).as_bytes())).start::<pdf_writer::writers::ExtGraphicsState>();
-        state.non_stroking_alpha(f32::from(percent) / 100.0).stroking_alpha(f32::from(percent) / 100.0);
+        let face = letters::font();
+        let per_mille = |units: f64| (units * 1000.0 / letters::units_per_em()) as f32;
+        pdf.type0_font(font)
+            .base_font(FONT)
+            .encoding_predefined(Name(b"Identity-H"))
+            .descendant_font(cid)
+            .to_unicode(unicode);
+        let mut cid_font = pdf.cid_font(cid);
+        cid_font.subtype(CidFontType::Type2).base_font(FONT).system_info(INFO).font_descriptor(descriptor);
+        cid_font.cid_to_gid_map_predefined(Name(b"Identity")).default_width(0.0);
+        let mut widths = cid_font.widths();
+        for &glyph in page_of.glyphs.keys() {
+            let advance = face.glyph_hor_advance(ttf_parser::GlyphId(glyph)).unwrap_or(0);
+            widths.consecutive(glyph, [per_mille(f64::from(advance))]);
+        }
+        widths.finish();
+        cid_font.finish();
+        let bounds = face.global_bounding_box();
+        let [x0, y0, x1, y1] =
+            [bounds.x_min, bounds.y_min, bounds.x_max, bounds.y_max].map(|at| per_mille(f64::from(at)));
+        pdf.font_descriptor(descriptor)
+            .name(FONT)
+            .flags(FontFlags::SYMBOLIC)
+            .bbox(Rect::new(x0, y0, x1, y1))
+            .italic_angle(0.0)
+            .ascent(per_mille(f64::from(face.ascender())))
+            .descent(per_mille(f64::from(face.descender())))
+            .cap_height(729.0)
+            .stem_v(90.0)
+            .font_file2(file);
+        let packed_font = packed(letters::FILE);
+        let mut stream = pdf.stream(file, &packed_font);
+        stream.filter(Filter::FlateDecode).pair(Name(b"Length1"), letters::FILE.len() as i32);
+        stream.finish();
+        let mut map = UnicodeCmap::new(Name(b"Custom"), INFO);
+        page_of.glyphs.iter().for_each(|(&glyph, &c)| map.pair(glyph, c));
+        pdf.cmap(unicode, &map.finish());
+        pdf.finish()
     }
-    states.finish();
-    resources.finish();
-    sheet.finish();
-    pdf.stream(contents, &packed(&content)).filter(Filter::FlateDecode);
-
-    let face = letters::font();
-    let per_mille = |units: f64| (units * 1000.0 / letters::units_per_em()) as f32;
-    pdf.type0_font(font)
-        .base_font(FONT)
-        .encoding_predefined(Name(b"Identity-H"))
-        .descendant_font(cid)
-        .to_unicode(unicode);
-    let mut cid_font = pdf.cid_font(cid);
-    cid_font.subtype(CidFontType::Type2).base_font(FONT).system_info(INFO).font_descriptor(descriptor);
-    cid_font.cid_to_gid_map_predefined(Name(b"Identity")).default_width(0.0);
-    let mut widths = cid_font.widths();
-    for &glyph in page_of.glyphs.keys() {
-        let advance = face.glyph_hor_advance(ttf_parser::GlyphId(glyph)).unwrap_or(0);
-        widths.consecutive(glyph, [per_mille(f64::from(advance))]);
-    }
-    widths.finish();
-    cid_font.finish();
-    let bounds = face.global_bounding_box();
-    let [x0, y0, x1, y1] = [bounds.x_min, bounds.y_min, bounds.x_max, bounds.y_max].map(|at| per_mille(f64::from(at)));
-    pdf.font_descriptor(descriptor)
-        .name(FONT)
-        .flags(FontFlags::SYMBOLIC)
-        .bbox(Rect::new(x0, y0, x1, y1))
-        .italic_angle(0.0)
-        .ascent(per_mille(f64::from(face.ascender())))
-        .descent(per_mille(f64::from(face.descender())))
-        .cap_height(729.0)
-        .stem_v(90.0)
-        .font_file2(file);
-    let packed_font = packed(letters::FILE);
-    let mut stream = pdf.stream(file, &packed_font);
-    stream.filter(Filter::FlateDecode).pair(Name(b"Length1"), letters::FILE.len() as i32);
-    stream.finish();
-    let mut map = UnicodeCmap::new(Name(b"Custom"), INFO);
-    page_of.glyphs.iter().for_each(|(&glyph, &c)| map.pair(glyph, c));
-    pdf.cmap(unicode, &map.finish());
-    pdf.finish()
 }
 
 fn packed(bytes: &[u8]) -> Vec<u8> {
