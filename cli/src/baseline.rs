@@ -72,35 +72,28 @@ fn in_words(found: &BaselineOutcome) -> String {
         true => format!("Each team was chosen by {0} episodes and plays {0} held-out episodes.", found.episodes),
         false => "Every team plays from the config's starts.".into(),
     };
-    let all: Vec<bool> = found.constants.iter().map(|constant| constant.pois >= pois as f64).collect();
+    let solved: Vec<usize> =
+        (0..found.constants.len()).filter(|&index| found.constants[index].pois >= pois as f64).collect();
     format!(
         "{learners}, {}. Each search plays {teams} teams per seed, as many as one trial of training. \
          {played}\n\n{}\n{}\n",
         counted(seeds, "seed"),
         markdown(&rows),
-        solved(actions, &all)
+        described(actions, &solved)
     )
 }
 
-/// Returns a sentence about which constant actions observe every POI.
-fn solved(actions: Actions, solved: &[bool]) -> String {
+/// Returns a sentence about the constant actions that observe every POI, by their indices.
+fn described(actions: Actions, solved: &[usize]) -> String {
     let unit = |index: usize| match actions {
         Actions::Direct => format!("{} %", (index + 1) * 100 / SPEEDS),
         Actions::Behaviours => format!("{index}"),
     };
-    let mut ranges: Vec<String> = vec![];
-    let mut from = None;
-    for (index, &all) in solved.iter().chain([&false]).enumerate() {
-        match (all, from) {
-            (true, None) => from = Some(index),
-            (false, Some(first)) => {
-                let last = index - 1;
-                ranges.push(if first == last { unit(first) } else { format!("{} to {}", unit(first), unit(last)) });
-                from = None;
-            }
-            _ => {}
-        }
-    }
+    let range = |range: &[usize]| match *range {
+        [first, .., last] => format!("{} to {}", unit(first), unit(last)),
+        _ => unit(range[0]),
+    };
+    let ranges: Vec<String> = solved.chunk_by(|index, next| index + 1 == *next).map(range).collect();
     let ranges = ranges.join(", ");
     match (actions, ranges.is_empty()) {
         (Actions::Direct, true) => "No constant speed observes every POI.".into(),
