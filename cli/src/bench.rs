@@ -131,35 +131,31 @@ fn combinations(config: &Config, args: &Args) -> Result<Vec<Config>, Error> {
 }
 
 fn open(args: &Args) -> Result<(Subject, Machine), Error> {
-    let level = match &args.instructions {
-        None => Level::new(),
-        Some(_) if args.run.backend == BackendChoice::Gpu => {
-            return Err(Error::Usage(with_remedy("--instructions is for the CPU backend", "leave out --backend gpu")));
-        }
-        Some(name) => {
-            let levels = Cpu::levels();
-            let Some(&level) = levels.iter().find(|level| level_name(**level).eq_ignore_ascii_case(name)) else {
-                let names: Vec<_> = levels.iter().map(|level| level_name(*level)).collect();
-                let names = names.join(", ");
-                return Err(Error::Usage(format!("--instructions: found {name}, this processor has {names}").into()));
-            };
-            if args.run.adapter.is_some() || args.run.breed == Breed::Device {
-                return Err(Error::Usage(with_remedy(
-                    "--instructions is for the CPU backend",
-                    "leave out --adapter and --breed device",
-                )));
+    let cpu = |level| (Subject::Cpu(Cpu::at_level(level), level), front::cpu().1);
+    let Some(name) = &args.instructions else {
+        return Ok(match backend::open_gpu(&args.run, None)?.0 {
+            Some(gpu) => {
+                let machine = Machine::of_gpu(&gpu);
+                (Subject::Gpu(Box::new(gpu)), machine)
             }
-            backend::start_threads(args.run.threads);
-            return Ok((Subject::Cpu(Cpu::at_level(level), level), front::cpu().1));
-        }
+            None => cpu(Level::new()),
+        });
     };
-    Ok(match backend::open_gpu(&args.run, None)?.0 {
-        Some(gpu) => {
-            let machine = Machine::of_gpu(&gpu);
-            (Subject::Gpu(Box::new(gpu)), machine)
-        }
-        None => (Subject::Cpu(Cpu::at_level(level), level), front::cpu().1),
-    })
+    let refused = |advice| Err(Error::Usage(with_remedy("--instructions is for the CPU backend", advice)));
+    if args.run.backend == BackendChoice::Gpu {
+        return refused("leave out --backend gpu");
+    }
+    let levels = Cpu::levels();
+    let Some(&level) = levels.iter().find(|level| level_name(**level).eq_ignore_ascii_case(name)) else {
+        let names: Vec<_> = levels.iter().map(|level| level_name(*level)).collect();
+        let names = names.join(", ");
+        return Err(Error::Usage(format!("--instructions: found {name}, this processor has {names}").into()));
+    };
+    if args.run.adapter.is_some() || args.run.breed == Breed::Device {
+        return refused("leave out --adapter and --breed device");
+    }
+    backend::start_threads(args.run.threads);
+    Ok(cpu(level))
 }
 
 const HEADER: &str = "   teams  agents  steps   rollouts/s  team-steps/s  ns/agent-step  generations  of ceiling";
@@ -169,8 +165,8 @@ The ceiling is what chains of f32 sums and products in registers reach, none fus
 ";
 
 fn line(measure: &Timing, profile: Option<&Profile>) -> String {
-    let Timing { teams, steps, rollout, generation, .. } = measure;
-    let agents = measure.agents();
+    let Timing { teams, world, rollout, generation, .. } = measure;
+    let (agents, steps) = (world.agents(), world.steps());
     let generations =
         generation.as_ref().map_or("-".into(), |(generation, _)| format!("{:.0}%", 100.0 * rollout / generation));
     let mut line = format!(
@@ -237,15 +233,15 @@ fn traffic(profile: &Profile) -> Vec<(&'static str, bool, f64)> {
 }
 
 fn json(measure: &Timing, profile: Option<&Profile>) -> serde_json::Value {
-    let Timing { teams, leaders, followers, pois, steps, rollout, mean_g, reach, operations, ceiling, .. } = measure;
-    let agents = measure.agents();
+    let Timing { teams, world, rollout, mean_g, reach, operations, ceiling, .. } = measure;
+    let agents = world.agents();
     let mut object = json!({
         "teams": teams,
         "agents": agents,
-        "leaders": leaders,
-        "followers": followers,
-        "pois": pois,
-        "steps": steps,
+        "leaders": world.leaders(),
+        "followers": world.followers(),
+        "pois": world.pois.len(),
+        "steps": world.steps(),
         "rollouts_per_s": 1.0 / rollout,
         "team_steps_per_s": measure.team_steps() / rollout,
         "ns_per_agent_step": 1e9 * rollout / (measure.team_steps() * agents as f64),

@@ -71,14 +71,8 @@ type Peak = dyn FnMut() -> Result<f64, BackendError>;
 pub(crate) struct Timing {
     /// Teams that play at once.
     pub teams: usize,
-    /// Leaders per team.
-    pub leaders: usize,
-    /// Followers per team.
-    pub followers: usize,
-    /// POIs.
-    pub pois: usize,
-    /// Steps per episode.
-    pub steps: usize,
+    /// The world that they play in.
+    pub world: World,
     /// Seconds per rollout: episodes, record and scores.
     pub rollout: f64,
     /// Seconds per generation: a rollout, selection and mutation; and the time of generations by phase. `None` if only
@@ -107,14 +101,9 @@ pub(crate) struct Profile {
 }
 
 impl Timing {
-    /// Returns the agents per team.
-    pub fn agents(&self) -> usize {
-        self.leaders + self.followers
-    }
-
     /// Returns the steps of all teams together.
     pub(crate) fn team_steps(&self) -> f64 {
-        (self.teams * self.steps) as f64
+        (self.teams * self.world.steps()) as f64
     }
 
     /// Returns the share of the arithmetic ceiling that rollouts reach.
@@ -181,16 +170,13 @@ pub(crate) fn measure(
     let generation = if rollout_only { None } else { Some(generations(&mut trainer, subject)?) };
     Ok(Timing {
         teams: config.max_teams() - 1,
-        leaders: world.leaders(),
-        followers: world.followers(),
-        pois: world.pois.len(),
-        steps: world.steps(),
         rollout,
         generation,
         mean_g,
         operations: operations::per_team_step(&world, &reach),
         reach,
         ceiling,
+        world,
     })
 }
 
