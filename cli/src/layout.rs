@@ -41,12 +41,6 @@ pub(super) struct StartLayout {
     pub coupling: usize,
 }
 
-/// The position and heading of a group's leader at the start.
-struct LeaderStart {
-    place: DVec2,
-    heading: f64,
-}
-
 impl StartLayout {
     /// Returns an error message if a number is not allowed.
     pub fn problem(&self) -> Option<String> {
@@ -83,15 +77,14 @@ impl StartLayout {
         Config::parse(&text, "layout").map(|_| text)
     }
 
-    fn groups(&self) -> Vec<LeaderStart> {
+    /// Returns the position and heading of each group's leader at the start.
+    fn groups(&self) -> Vec<(DVec2, f64)> {
         let group = |index: usize| match self.shape {
             Pattern::Ring => {
                 let heading = TAU * index as f64 / self.groups as f64;
-                LeaderStart { place: DVec2::from_angle(heading) * self.radius(), heading }
+                (DVec2::from_angle(heading) * self.radius(), heading)
             }
-            Pattern::Row | Pattern::Grid => {
-                LeaderStart { place: DVec2::new(APART * index as f64, 0.0), heading: FRAC_PI_2 }
-            }
+            Pattern::Row | Pattern::Grid => (DVec2::new(APART * index as f64, 0.0), FRAC_PI_2),
         };
         (0..self.groups).map(group).collect()
     }
@@ -138,12 +131,12 @@ impl StartLayout {
 
     fn with_steps(&self, steps: usize) -> String {
         let groups = self.groups();
-        let followers = groups.iter().flat_map(|group| {
-            let turn = DVec2::from_angle(group.heading);
-            self.behind().into_iter().map(move |behind| group.place + turn.rotate(behind))
+        let followers = groups.iter().flat_map(|&(place, heading)| {
+            let turn = DVec2::from_angle(heading);
+            self.behind().into_iter().map(move |behind| place + turn.rotate(behind))
         });
         let (leaders, followers): (Vec<DVec2>, Vec<DVec2>) =
-            (groups.iter().map(|group| group.place).collect(), followers.collect());
+            (groups.iter().map(|(place, _)| *place).collect(), followers.collect());
         let pois = self.pois();
         let all = || leaders.iter().chain(&followers).chain(&pois);
         let corner = all().copied().reduce(DVec2::min).unwrap_or_default() - EDGE;
@@ -156,7 +149,7 @@ impl StartLayout {
             format!("[{}]", places.iter().map(one).collect::<Vec<_>>().join(", "))
         };
         let headings: Vec<_> =
-            groups.iter().map(|group| format!("{:?}", (group.heading * 1e6).round() / 1e6)).collect();
+            groups.iter().map(|(_, heading)| format!("{:?}", (heading * 1e6).round() / 1e6)).collect();
         let needed = self.coupling;
         let mut text = self.header(needed);
         let _ = write!(
