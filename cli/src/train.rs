@@ -44,9 +44,6 @@ pub fn run(args: Args) -> Result<(), Error> {
     printed.summary(&found, report)
 }
 
-/// The scores of a row, in order.
-const SCORES: [TeamKind; 4] = [TeamKind::Champion, TeamKind::Best, TeamKind::Mean, TeamKind::Test];
-
 /// Returns a time in seconds, or in milliseconds if it is short.
 fn time(seconds: f64) -> String {
     match seconds * 1000.0 {
@@ -78,7 +75,7 @@ fn report(found: &TrainOutcome) -> String {
     let pois = pois_of_all.unwrap_or(1);
     let mut text = format!("{trained}.\n\n{what}: mean over trials (lowest to highest trial)\n");
     let last = format!("generation {}", found.generations);
-    let known = SCORES.into_iter().filter(|score| ends.last.iter().all(|row| score.of(row).is_some()));
+    let known = TeamKind::ALL.into_iter().filter(|score| ends.last.iter().all(|row| score.of(row).is_some()));
     let known: Vec<TeamKind> = known.collect();
     let mut table = vec![[""].into_iter().chain(known.iter().map(|score| score.name())).map(String::from).collect()];
     let rows = [("start", &ends.first), (&*last, &ends.last)];

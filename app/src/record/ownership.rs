@@ -19,8 +19,10 @@ use serde::Deserialize;
 use sha2::{Digest, Sha256};
 
 use super::disk::{Disk, Place};
-use super::without_checkpoint;
-use super::{Hashing, RecordError, checkpoint, hash_rest, hex, load_config, metrics, policies, read_text, tensors};
+use super::{
+    Hashing, RecordError, checkpoint, config_digest, hash_rest, hex, load_config, metrics, policies, read_text,
+    tensors, without_checkpoint,
+};
 use flotilla::config::Config;
 use flotilla::file;
 
@@ -141,7 +143,7 @@ pub(crate) fn holds_run(folder: Place<'_>, config: &Config) -> Result<bool, Reco
         left = true;
     }
     if let Some(path) = find(POLICIES)? {
-        if !policies::belongs_to(folder.at(&path), config) {
+        if policies::digests_in(folder.at(&path)).0 != Some(config_digest(config)) {
             return refuse(path);
         }
         left = true;

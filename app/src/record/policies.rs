@@ -60,11 +60,6 @@ pub fn write(disk: &Disk, path: &Path, config: &Config, trials: &[impl AsRef<[f3
     Ok(checksum)
 }
 
-/// Reports whether a file can be read and belongs to a run of this config.
-pub(crate) fn belongs_to(place: Place<'_>, config: &Config) -> bool {
-    digests_in(place).0 == Some(super::config_digest(config))
-}
-
 /// Returns the config digest and the checksum in a file. Each is `None` if it is missing or the file cannot be read.
 pub(crate) fn digests_in(place: Place<'_>) -> (Option<String>, Option<String>) {
     let Ok(file) = tensors::open(place) else { return (None, None) };

@@ -7,6 +7,8 @@ use super::scene::{Anchor, BLACK, Color, Fill, GREY, LIGHT, Pen, Scene, WHITE, c
 /// Maximum width of a figure in millimetres. Further panels go to the next row.
 const WIDEST: f64 = 180.0;
 const GAP: f64 = 5.0;
+/// Room for labels below a panel.
+const BELOW: f64 = 15.0;
 
 /// A sequential palette of decreasing lightness (ColorBrewer's YlGnBu). It keeps its order for colour-blind readers and
 /// in greyscale.
@@ -85,7 +87,7 @@ impl HeatMap {
         let left = if self.y.values.is_empty() { 3.0 } else { 8.0 + longest(&self.y.values) };
         let key_label = self.key_label.iter().map(|label| text_width(label, SMALL)).fold(0.0, f64::max);
         let least = (text_width(&self.title, 3.2) * 1.1 + 6.0).max(left + KEY + 4.0 + key_label + 3.0);
-        let mut panels = Panels::new(self.panels.len(), wide * columns as f64, HIGH * rows as f64, left, 15.0);
+        let mut panels = Panels::new(self.panels.len(), wide * columns as f64, HIGH * rows as f64, left);
         panels.fill(least);
         panels.above -= if titles > 0.0 { 0.0 } else { 4.0 };
         let (width, height, wide) = (panels.width, panels.height, panels.width / columns as f64);
@@ -215,7 +217,7 @@ impl Curves {
         let labels = distinct(&self.by.values, WIDEST / 3.0, SMALL);
         let entries: Vec<f64> = labels.iter().map(|value| 9.0 + text_width(value, SMALL)).collect();
         let legend = text_width(&self.by.label, NORMAL) + 6.0;
-        let mut panels = Panels::new(self.panels.len(), least, HEIGHT, LEFT, 15.0);
+        let mut panels = Panels::new(self.panels.len(), least, HEIGHT, LEFT);
         if self.columns > 0 {
             panels.columns = panels.columns.min(self.columns);
         }
@@ -340,7 +342,7 @@ impl Dots {
         let rows: f64 = self.groups.iter().map(|(_, values)| 1.25 + values.len() as f64).sum();
         // The label below a panel may also use the width of the text beside the rows.
         let (plot, height) = (titles.max(34.0).max(text_width(&self.x_label, SMALL) - WRITTEN), HIGH * rows);
-        let mut panels = Panels::new(self.panels.len(), plot + WRITTEN, height, left, 15.0);
+        let mut panels = Panels::new(self.panels.len(), plot + WRITTEN, height, left);
         let whole = panels.width().max(text_width(&self.title, 3.2) * 1.1 + 6.0);
         panels.fill(whole);
         panels.above -= if titles > 0.0 { 0.0 } else { 4.0 };
@@ -398,20 +400,19 @@ struct Panels {
     height: f64,
     left: f64,
     above: f64,
-    below: f64,
 }
 
 impl Panels {
-    fn new(count: usize, width: f64, height: f64, left: f64, below: f64) -> Panels {
+    fn new(count: usize, width: f64, height: f64, left: f64) -> Panels {
         let fit = ((WIDEST - left) / (width + GAP)) as usize;
         // As few rows as fit, with panels spread evenly over them.
         let rows = count.div_ceil(fit.clamp(1, count.max(1))).max(1);
-        Panels { count, columns: count.div_ceil(rows).max(1), width, height, left, above: 12.0, below }
+        Panels { count, columns: count.div_ceil(rows).max(1), width, height, left, above: 12.0 }
     }
 
     fn place(&self, index: usize) -> [f64; 2] {
         let (row, column) = (index / self.columns, index % self.columns);
-        [self.left + (self.width + GAP) * column as f64, self.above + (self.height + self.below) * row as f64]
+        [self.left + (self.width + GAP) * column as f64, self.above + (self.height + BELOW) * row as f64]
     }
 
     /// Widens the panels so that a row of them is at least as wide as the picture.
@@ -429,7 +430,7 @@ impl Panels {
     }
 
     fn height(&self) -> f64 {
-        (self.height + self.below) * self.count.div_ceil(self.columns) as f64 - self.below + 9.0
+        (self.height + BELOW) * self.count.div_ceil(self.columns) as f64 - BELOW + 9.0
     }
 }
 

@@ -371,21 +371,18 @@ pub fn heading_of(world: &World, agent: usize, heading: DVec2) -> Option<DVec2> 
 
 /// Draws an agent's arrow, or a disc without a heading: filled for a leader, hollow for a follower.
 fn arrow(scene: &mut Scene, [px, py]: [f64; 2], heading: Option<DVec2>, size: f64, group: Option<usize>, leads: bool) {
+    let (fill, pen) = match leads {
+        // A thin outline leaves enough colour in small arrows.
+        true => (group_color(group), Pen::new(BLACK, (size * 0.1).min(0.2))),
+        false => (WHITE, group_pen(group, 0.35)),
+    };
     let Some(heading) = heading else {
-        let (fill, pen) = match leads {
-            true => (group_color(group).into(), Pen::new(BLACK, (size * 0.1).min(0.2))),
-            false => (WHITE.into(), group_pen(group, 0.35)),
-        };
-        return scene.circle([px, py], size * 0.7, Some(fill), Some(pen));
+        return scene.circle([px, py], size * 0.7, Some(fill.into()), Some(pen));
     };
     let [x, y] = heading.normalize_or(DVec2::Y).to_array();
     let corner = |ahead: f64, aside: f64| [px + size * (x * ahead - y * aside), py - size * (y * ahead + x * aside)];
     let corners = vec![corner(1.0, 0.0), corner(-0.75, 0.7), corner(-0.4, 0.0), corner(-0.75, -0.7)];
-    match leads {
-        // A thin outline leaves enough colour in small arrows.
-        true => scene.polygon(corners, Some(group_color(group).into()), Some(Pen::new(BLACK, (size * 0.1).min(0.2)))),
-        false => scene.polygon(corners, Some(WHITE.into()), Some(group_pen(group, 0.35))),
-    }
+    scene.polygon(corners, Some(fill.into()), Some(pen));
 }
 
 /// Draws a stroke across the arrow of an agent that does not observe.

@@ -98,11 +98,12 @@ pub fn data(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Val
     let unverified = if played.iter().any(|played| played.unverified) { " (unverified)" } else { "" };
     let sample = played.iter().find_map(|played| sample_note(&played.world));
     let sample = sample.map_or(String::new(), |note| format!(" ({note})"));
+    let fitnesses: Vec<String> = config.fitnesses().iter().map(Fitness::to_string).collect();
     let own_fitness = played.iter().any(|played| played.own_fitness);
     let mut data = json!({
         "run": format!("{name}{unverified}{sample}"),
         "paradigm": config.learning.paradigm,
-        "fitness": if own_fitness { OWN_FITNESS.into() } else { words(&config.fitnesses()) },
+        "fitness": if own_fitness { OWN_FITNESS.into() } else { fitnesses.join(" and ") },
         "map": world.map,
         "pois": pois,
         "observation_radius": world.observation_radius,
@@ -113,7 +114,7 @@ pub fn data(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Val
         "dt": world.dt,
         "steps": world.steps,
         "exact": exact,
-        "colors": colors(),
+        "colors": { "light": GROUPS.map(hex), "dark": GROUPS_DARK.map(hex) },
         "episodes": episodes,
     });
     for (key, value) in parts(config) {
@@ -181,16 +182,6 @@ pub fn parts(config: &Config) -> Vec<(&'static str, serde_json::Value)> {
         parts.extend(of_each(|group| group.value).map(|values| ("values", values)));
     }
     parts
-}
-
-/// Names fitnesses.
-fn words(fitnesses: &[Fitness]) -> String {
-    fitnesses.iter().map(Fitness::to_string).collect::<Vec<_>>().join(" and ")
-}
-
-/// Returns the colours of leaders and their followers for light and dark backgrounds.
-fn colors() -> serde_json::Value {
-    json!({ "light": GROUPS.map(hex), "dark": GROUPS_DARK.map(hex) })
 }
 
 /// Returns the words per follower and step of [`Replayed::led`].
