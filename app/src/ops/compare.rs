@@ -205,14 +205,13 @@ fn copies(folders: &[PathBuf], configs: &[Config]) -> Vec<String> {
 /// Returns the values of an axis as arms, for each combination of the other axes. Notes list the points without runs.
 fn of_sweep(out: &Path, args: &CompareRequest, notes: &mut Vec<String>) -> Result<Vec<Contest>, Error> {
     let sweep = Sweep::load(&out.join(SWEEP), &[], false)?;
-    let keys = || sweep.axes.iter().map(|axis| &*axis.key).collect::<Vec<_>>().join(", ");
     let by = match (&args.by, sweep.axes.len()) {
-        (Some(name), _) => sweep
-            .axis(name)
-            .ok_or_else(|| Error::Usage(format!("--by {name}: not an axis of the sweep; it has {}", keys()).into()))?,
+        (Some(name), _) => sweep.axis(name).ok_or_else(|| {
+            Error::Usage(format!("--by {name}: not an axis of the sweep; it has {}", sweep.keys()).into())
+        })?,
         (None, 1) => 0,
         (None, _) => {
-            return Err(Error::Usage(format!("the sweep has several axes; name one by --by: {}", keys()).into()));
+            return Err(Error::Usage(format!("the sweep has several axes; name one by --by: {}", sweep.keys()).into()));
         }
     };
     let verification = Verification::unless(args.unverified);

@@ -189,9 +189,9 @@ pub fn check_measure(sweep: &Sweep, measure: TeamKind) -> Result<(), Error> {
 /// Returns the axes that pictures have across and down.
 pub fn picture_axes(sweep: &Sweep, names: &[String]) -> Result<Vec<usize>, Error> {
     let find = |name: &String| {
-        let keys = || sweep.axes.iter().map(|axis| &*axis.key).collect::<Vec<_>>().join(", ");
-        let unknown = || Error::Usage(format!("--axes: {name} is not an axis of the grid; it has {}", keys()).into());
-        sweep.axis(name).ok_or_else(unknown)
+        sweep.axis(name).ok_or_else(|| {
+            Error::Usage(format!("--axes: {name} is not an axis of the grid; it has {}", sweep.keys()).into())
+        })
     };
     if !names.is_empty() && sweep.axes.iter().any(|axis| axis.varied) {
         return Err(Error::Usage("--axes: a sweep with [vary] has one picture, of all its keys".into()));

@@ -179,6 +179,11 @@ impl Sweep {
         Ok(Sweep { name, axes, skipped: total - points.len(), points, text })
     }
 
+    /// Lists the keys of all axes, for errors.
+    pub(crate) fn keys(&self) -> String {
+        self.axes.iter().map(|axis| &*axis.key).collect::<Vec<_>>().join(", ")
+    }
+
     /// Describes a point: `world.coupling = 3, learning.fitness = Df`.
     pub fn describe(&self, point: &Point) -> String {
         describe(self.axes.iter(), &point.values)
