@@ -15,10 +15,8 @@ const RUN: &[Row] = &[
     ("CCEA.num_workers", To::Nothing("training uses all cores, or as many as --threads says")),
     ("CCEA.config.BoidsEnv.render_mode", To::Only("none", "`flotilla replay` shows episodes")),
     ("load_population", To::Nothing("`flotilla train --init` starts from policies of a run")),
-    ("CCEA.nn_hidden", To::Code("")),
     ("CCEA.use_difference_rewards", To::Code("")),
     ("CCEA.use_difference_evaluations", To::Code("")),
-    ("CCEA.config.BoidsEnv.max_steps", To::Code("")),
     ("CCEA.config.BoidsEnv.config", To::Code("")),
 ];
 
