@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
-use crate::questions::champions;
+use crate::questions::{champions, play};
 use flotilla::backend::{Backend, OpenBackend};
 use flotilla::baseline::NAMES;
 use flotilla::config::{Config, Fitness, Learning, Override};
@@ -275,10 +275,7 @@ pub(crate) fn play_champions(
     starts: &Starts,
     backend: &mut dyn Backend,
 ) -> Result<Vec<f64>, Error> {
-    let weights = champions(disk.at(&folder.join(POLICIES)), config)?;
-    let played = flotilla::front::play(config, backend, config.learning.trials, &weights, starts)
-        .map_err(|error| Error::Refused(error.to_string().into()))?;
-    Ok(played.observed.iter().map(|observed| observed / config.poi_count() as f64).collect())
+    play(config, &champions(disk.at(&folder.join(POLICIES)), config)?, starts, backend)
 }
 
 /// Returns why a task is not admitted.

@@ -123,19 +123,6 @@ pub enum Error {
 }
 
 impl Error {
-    /// Converts the error of a training in memory.
-    pub(crate) fn of_training(error: Failure) -> Error {
-        match error {
-            Failure::Config(error) => error.into(),
-            Failure::Backend(error) => error.into(),
-            Failure::TooLittle(error) => Error::Run(error.into()),
-            Failure::Memory { what, bytes } => {
-                Error::Run(RunError::Memory { what, bytes: bytes.try_into().unwrap_or(u64::MAX) })
-            }
-            error => Error::Refused(error.to_string().into()),
-        }
-    }
-
     /// Returns the kind of the error as a word that stays the same from version to version.
     pub fn code(&self) -> &'static str {
         match self {
@@ -242,6 +229,20 @@ impl Error {
             ) => true,
             Error::Config(error) => error.is_usage(),
             _ => false,
+        }
+    }
+}
+
+impl From<Failure> for Error {
+    fn from(error: Failure) -> Error {
+        match error {
+            Failure::Config(error) => error.into(),
+            Failure::Backend(error) => error.into(),
+            Failure::TooLittle(error) => Error::Run(error.into()),
+            Failure::Memory { what, bytes } => {
+                Error::Run(RunError::Memory { what, bytes: bytes.try_into().unwrap_or(u64::MAX) })
+            }
+            error => Error::Refused(error.to_string().into()),
         }
     }
 }

@@ -344,10 +344,9 @@ pub fn in_memory(
         ControlFlow::Break(())
     };
     let trained = match champions {
-        true => front::train_with_champions(config, &mut *backend.0, watch),
-        false => front::train(config, &mut *backend.0, watch),
+        true => front::train_with_champions(config, &mut *backend.0, watch)?,
+        false => front::train(config, &mut *backend.0, watch)?,
     };
-    let trained = trained.map_err(Error::of_training)?;
     if stopped {
         return Err(Error::Stopped("before the last generation; nothing was saved".into()));
     }

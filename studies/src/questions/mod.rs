@@ -8,12 +8,12 @@
 
 use std::path::{Path, PathBuf};
 
-use flotilla::backend::{Backend, BackendError, Group};
+use flotilla::backend::{Backend, BackendError};
 use flotilla::baseline::{self, Baselines};
-use flotilla::config::{Config, ConfigError, Override, own_populations};
+use flotilla::config::{Config, ConfigError, Override};
 use flotilla::escape::PathExt;
-use flotilla::evaluate::{self, Starts};
-use flotilla::world::World;
+use flotilla::evaluate::Starts;
+use flotilla::front;
 use flotilla_app::ops::Error;
 use flotilla_app::record::RecordError;
 use flotilla_app::record::digests::Verification;
@@ -231,29 +231,12 @@ impl Study {
         for (poi_jitter, episodes) in [(0.0, 1), (jitter, EPISODES)] {
             let mut config = config.clone();
             config.learning.poi_jitter = poi_jitter;
-            let world = World::new(&config.validate().map_err(BackendError::from)?);
-            let teams = evaluate::aligned_teams(trials, world.leaders());
-            let seed = config.learning.seed;
             let starts = match episodes {
                 1 => Starts::Own,
-                _ => Starts::Drawn { episodes, seed, jitter: 0.0, poi_jitter },
+                _ => Starts::Drawn { episodes, seed: config.learning.seed, jitter: 0.0, poi_jitter },
             };
-            let mut of_arms = Vec::new();
-            for weights in &weights {
-                let group = Group {
-                    world: &world,
-                    starts: &world.starts,
-                    weights: weights[..].into(),
-                    policies: trials,
-                    populations: own_populations(world.leaders()),
-                    teams: &teams,
-                    fitnesses: evaluate::SCORES,
-                };
-                let played =
-                    evaluate::evaluate(backend, &group, &starts, &mut |_| std::ops::ControlFlow::Continue(()))?;
-                of_arms.push((0..trials).map(|team| played.team(team).mean / played.pois as f64).collect());
-            }
-            values.push((Measure::Played { poi_jitter, episodes }, of_arms));
+            let of_arms = weights.iter().map(|weights| play(&config, weights, &starts, backend));
+            values.push((Measure::Played { poi_jitter, episodes }, of_arms.collect::<Result<_, _>>()?));
         }
         Ok(comparison::of_values(place, config.learning.generations, named, values)?)
     }
@@ -272,6 +255,17 @@ fn best_constant(config: &Config, jitter: f64, backend: &mut dyn Backend) -> Res
     let mut policy = vec![0.0; config.parameters()];
     baseline::constant_policy(&baseline::constants(config.policy.actions)[outcome.best_constant], &mut policy);
     Ok(policy)
+}
+
+/// Plays one team per trial, `[leaders][trials][parameters]`, from all starts. Returns G of each.
+pub(crate) fn play(
+    config: &Config,
+    weights: &[f32],
+    starts: &Starts,
+    backend: &mut dyn Backend,
+) -> Result<Vec<f64>, Error> {
+    let played = front::play(config, backend, config.learning.trials, weights, starts)?;
+    Ok(played.observed.iter().map(|observed| observed / config.poi_count() as f64).collect())
 }
 
 /// Returns the champion of every trial as one team each, `[leaders][trials][parameters]`.
