@@ -258,19 +258,15 @@ impl TrialCurves<'_> {
         self.champion.iter().map(|trial| Some(trial.get(generation)? * self.pois as f64)).collect()
     }
 
-    /// Returns the POIs that the best team of a generation observed, per trial. None if the run is shorter.
-    pub(crate) fn observed_by_best(&self, generation: usize) -> Option<Vec<f64>> {
-        self.best.iter().map(|trial| Some(trial.get(generation)? * self.pois as f64)).collect()
-    }
-
     /// Returns the most POIs that champions observed so far, per trial. None if the run is shorter.
     pub(crate) fn observed_by(&self, generation: usize) -> Option<Vec<f64>> {
-        most_so_far(self.champion, generation, self.pois)
+        let most = |trial: &Vec<f64>| Some(trial.get(..=generation)?.iter().copied().fold(0.0, f64::max));
+        self.champion.iter().map(|trial| Some(most(trial)? * self.pois as f64)).collect()
     }
 
-    /// Returns the most POIs that any team observed so far, per trial. None if the run is shorter.
-    pub(crate) fn observed_by_any(&self, generation: usize) -> Option<Vec<f64>> {
-        most_so_far(self.best, generation, self.pois)
+    /// Returns these curves with the best team in place of the champion.
+    pub(crate) fn of_best(self) -> Self {
+        TrialCurves { champion: self.best, ..self }
     }
 
     /// Averages the champion's POIs over trials, per generation.
@@ -285,12 +281,6 @@ impl TrialCurves<'_> {
     fn curve(&self) -> Curve {
         Curve::new(&self.tallies(), self.pois as f64)
     }
-}
-
-/// Returns the largest of the first values of each trial, in POIs.
-fn most_so_far(trials: &[Vec<f64>], generation: usize, pois: usize) -> Option<Vec<f64>> {
-    let most = |trial: &Vec<f64>| Some(trial.get(..=generation)?.iter().copied().fold(0.0, f64::max));
-    trials.iter().map(|trial| Some(most(trial)? * pois as f64)).collect()
 }
 
 /// Returns a figure of the paper: one panel per paradigm, one curve per fitness, and the baselines without learning in
@@ -395,11 +385,7 @@ impl Trajectory {
                 pois: curves.pois,
                 curve: curves.curve(),
                 deviation: curves.tallies().iter().map(Average::deviation).collect(),
-                best_mean: TrialCurves { champion: curves.best, ..curves }
-                    .tallies()
-                    .iter()
-                    .map(Average::mean)
-                    .collect(),
+                best_mean: curves.of_best().tallies().iter().map(Average::mean).collect(),
             });
         };
         for layout in 0..LAYOUTS.len() {

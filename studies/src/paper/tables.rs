@@ -37,7 +37,7 @@ pub fn without_learning(results: Evidence<'_>) -> String {
                 let Some((curves, observed)) = curves(source).and_then(|c| Some((c, c.observed(last)?))) else {
                     return String::new();
                 };
-                let best = curves.observed_by_best(last).filter(|_| matches!(source, Source::Evolved(_)));
+                let best = curves.of_best().observed(last).filter(|_| matches!(source, Source::Evolved(_)));
                 let best = best.map(|best| format!(" ({:.2})", best.iter().collect::<Average>().mean()));
                 let champion = match statistics::bounded(&observed.iter().collect(), [0.0, pois as f64]) {
                     Some(mean) if !curves.certain => format!("{:.2} [{:.2}, {:.2}]", mean.value, mean.low, mean.high),
@@ -46,10 +46,11 @@ pub fn without_learning(results: Evidence<'_>) -> String {
                 champion + &best.unwrap_or_default()
             }));
             rows.push(row);
-            let random = curves(Source::Shared).and_then(|curves| curves.observed_by_any(last)).unwrap_or_default();
+            let random =
+                curves(Source::Shared).and_then(|curves| curves.of_best().observed_by(last)).unwrap_or_default();
             let mut race = vec![name.clone()];
             race.extend(SOURCES[BASELINES..].iter().map(|&source| {
-                let evolved = curves(source).and_then(|curves| curves.observed_by_any(last)).unwrap_or_default();
+                let evolved = curves(source).and_then(|curves| curves.of_best().observed_by(last)).unwrap_or_default();
                 let lead: Vec<f64> = evolved.iter().zip(&random).map(|(evolved, random)| evolved - random).collect();
                 let Some(mean) = statistics::paired(&lead.iter().collect(), pois as f64) else {
                     return "open: takes 2 trials".into();

@@ -267,7 +267,7 @@ pub(super) const TESTS: &[(usize, &[Test])] = &[
                 |view| {
                     let all = view.all()?;
                     Some(Criterion::Share(
-                        all.observed_by_best(0)?.iter().filter(|&&pois| pois > 0.0).count(),
+                        all.of_best().observed(0)?.iter().filter(|&&pois| pois > 0.0).count(),
                         all.trials(),
                         IN_MOST_TRIALS,
                     ))
