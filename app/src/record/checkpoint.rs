@@ -8,7 +8,6 @@
 //! `policies.safetensors`, put back into the order given by their fitness. With an evolution strategy or a hall of
 //! fame it has weights of its own, because the run continues from more than the policies.
 
-use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::io::{ErrorKind, Read, Seek, Write};
 use std::path::{Path, PathBuf};
@@ -101,19 +100,16 @@ impl<N: AsRef<[f32]>> Checkpoint<N> {
     /// Writes the content of a checkpoint file to a stream.
     pub fn put(&self, output: &mut dyn Write, of: &Config) -> std::io::Result<()> {
         let Checkpoint { config, init, seconds, metrics, snapshot } = self;
-        let mut metadata = BTreeMap::from(
-            [
-                ("config", config.clone()),
-                ("generation", snapshot.generation.to_string()),
-                (LAST, snapshot.last.to_string()),
-                ("seconds", seconds.to_string()),
-                ("metrics_bytes", metrics.bytes.to_string()),
-                ("metrics_sha256", metrics.sha256.clone()),
-                (tensors::VERSION, flotilla::version::VERSION.into()),
-            ]
-            .map(|(key, value)| (key.to_string(), value)),
-        );
-        metadata.extend(init.iter().map(|digest| (INIT.to_string(), digest.clone())));
+        let metadata = [
+            ("config", config.clone()),
+            ("generation", snapshot.generation.to_string()),
+            (LAST, snapshot.last.to_string()),
+            ("seconds", seconds.to_string()),
+            ("metrics_bytes", metrics.bytes.to_string()),
+            ("metrics_sha256", metrics.sha256.clone()),
+            (tensors::VERSION, flotilla::version::VERSION.into()),
+        ];
+        let metadata = metadata.into_iter().chain(init.clone().map(|digest| (INIT, digest)));
         let Shapes { weights, fitness, .. } = Shapes::of(of);
         let pending: Vec<f64> = snapshot.pending.iter().flatten().flat_map(known).collect();
         let mut list = Vec::new();
@@ -129,7 +125,7 @@ impl<N: AsRef<[f32]>> Checkpoint<N> {
         }
         let trials = snapshot.fitness.iter().map(AsRef::as_ref);
         list.push(Tensor::floats(FITNESS.into(), fitness.into(), trials));
-        tensors::put(output, KIND, &metadata, &list).map(drop)
+        tensors::put(output, KIND, metadata, &list).map(drop)
     }
 }
 

@@ -7,7 +7,6 @@
 //! The metadata key `layers` is the shape of the network, such as "8,10,2". The key `config` is the digest of the
 //! config of the training. Other programs may write such files too, also with a single tensor `weights`.
 
-use std::collections::BTreeMap;
 use std::io::{self, Read, Seek, Write};
 use std::path::Path;
 
@@ -71,9 +70,8 @@ pub fn put(output: &mut dyn Write, config: &Config, trials: &[impl AsRef<[f32]>]
     let shape = vec![config.populations(), config.learning.population, config.parameters()];
     let of_trial = |(trial, weights)| Tensor::floats(tensor(trial), shape.clone(), [weights]);
     let tensors: Vec<_> = trials.iter().map(AsRef::as_ref).enumerate().map(of_trial).collect();
-    let metadata =
-        BTreeMap::from([("layers".to_string(), layers(config)), (CONFIG.to_string(), super::config_digest(config))]);
-    tensors::put(output, KIND, &metadata, &tensors)
+    let metadata = [("layers", layers(config)), (CONFIG, super::config_digest(config))];
+    tensors::put(output, KIND, metadata, &tensors)
 }
 
 /// Reads the policies of one trial for teams of a config. Trial N is read from the tensor `weights.N`. Without a trial,

@@ -7,7 +7,6 @@
 //! Files of other programs have neither key and are read without a check. A single damaged byte cannot hide both keys,
 //! so it cannot disable the check.
 
-use std::collections::BTreeMap;
 use std::io::{self, BufReader, Read, Seek, SeekFrom, Write};
 
 use safetensors::tensor::{Dtype, Metadata, TensorInfo};
@@ -48,13 +47,13 @@ impl<'a> Tensor<'a> {
 }
 
 /// Writes the content of a file of a kind (such as "policies 1") to a stream. Returns its checksum.
-pub fn put(
+pub fn put<'a>(
     output: &mut dyn Write,
     kind: &str,
-    metadata: &BTreeMap<String, String>,
+    metadata: impl IntoIterator<Item = (&'a str, String)>,
     tensors: &[Tensor<'_>],
 ) -> io::Result<String> {
-    let mut metadata: Map<_, _> = metadata.iter().map(|(key, value)| (key.clone(), json!(value))).collect();
+    let mut metadata: Map<_, _> = metadata.into_iter().map(|(key, value)| (key.into(), value.into())).collect();
     metadata.insert(KIND.into(), kind.into());
     metadata.insert(CHECKSUM.into(), NO_CHECKSUM.into());
     let mut header = Map::from_iter([("__metadata__".to_string(), Value::Object(metadata))]);
