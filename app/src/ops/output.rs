@@ -58,9 +58,7 @@ impl Destination {
         match self {
             Destination::Named(path) => write_with(path, put),
             Destination::OfRun(path) => Ok(ownership::publish(&self.disk()?, path, put)?),
-            Destination::Here(path) => {
-                Ok(self.disk()?.replace_shared(path, put, || Ok(())).map_err(RecordError::write(path))?)
-            }
+            Destination::Here(path) => Ok(self.disk()?.replace_shared(path, put).map_err(RecordError::write(path))?),
         }
     }
 

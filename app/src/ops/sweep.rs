@@ -259,7 +259,7 @@ pub fn claim(disk: &Disk, sweep: &Sweep, out: &Path) -> Result<(), Error> {
     let disk = disk.within(out).map_err(RecordError::write(out))?;
     if disk.kind(&path).map_err(RecordError::write(&path))?.is_none() {
         let text = |output: &mut dyn io::Write| output.write_all(sweep.text.as_bytes());
-        disk.replace_shared(&path, text, || Ok(())).map_err(RecordError::write(&path))?;
+        disk.replace_shared(&path, text).map_err(RecordError::write(&path))?;
     }
     same_sweep(sweep, out)
 }

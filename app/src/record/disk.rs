@@ -216,7 +216,7 @@ impl Disk {
             return Ok(file);
         }
         let mut content = self.read(path)?;
-        self.replace_shared(path, |output| io::copy(&mut content, output).map(drop), || Ok(()))?;
+        self.replace_shared(path, |output| io::copy(&mut content, output).map(drop))?;
         self.entry(path)?.open(how)
     }
 
@@ -229,21 +229,20 @@ impl Disk {
         self.replace_by(path, temporary(path), open, content, || Ok(()))
     }
 
-    /// Replaces a file like [`Disk::replace`], but several processes may do so at the same time. `before` is called
-    /// after the new content is on the disk and before the file gets its name.
+    /// Replaces a file like [`Disk::replace`], but several processes may do so at the same time.
     ///
     /// On Linux the new content has no name until it is complete, so that nothing is left of an interrupted process.
     pub(crate) fn replace_shared(
         &self,
         path: &Path,
         content: impl FnOnce(&mut dyn Write) -> io::Result<()>,
-        before: impl FnOnce() -> io::Result<()>,
     ) -> io::Result<()> {
-        self.replace_with(path, None, content, before)
+        self.replace_with(path, None, content, || Ok(()))
     }
 
-    /// Replaces a file like [`Disk::replace_shared`]. `permissions` replaces those that new files have.
-    fn replace_with(
+    /// Replaces a file like [`Disk::replace_shared`]. `permissions` replaces those that new files have. `before` is
+    /// called after the new content is on the disk and before the file gets its name.
+    pub(crate) fn replace_with(
         &self,
         path: &Path,
         permissions: Option<Permissions>,
@@ -317,7 +316,7 @@ impl Disk {
                 // A link must not be replaced, nor a file without write permission.
                 self.entry(path)?.open(OpenAs::Write)?;
             }
-            return self.replace_shared(path, content, || Ok(()));
+            return self.replace_shared(path, content);
         }
         let existing = fs::metadata(path);
         if existing.as_ref().is_ok_and(|existing| !existing.is_file() && !existing.is_dir()) {

@@ -203,7 +203,7 @@ pub fn publish(
         let torn = listed.last().is_some_and(|last| !last.ends_with('\n'));
         disk.extend(&folder.join(LIST), format!("{}{line}", if torn { "\n" } else { "" }).as_bytes())?.sync()
     };
-    disk.replace_shared(path, content, list).map_err(RecordError::write(path))
+    disk.replace_with(path, None, content, list).map_err(RecordError::write(path))
 }
 
 /// Deletes a file made from runs. A file that flotilla did not create, or that has changed, is kept.
@@ -247,11 +247,9 @@ fn shorten_list(disk: &Disk, folder: &Path, new: &str) -> io::Result<()> {
             kept.push(&**text);
         }
     }
-    disk.replace_shared(
-        &folder.join(LIST),
-        |output| kept.into_iter().chain([new]).try_for_each(|line| output.write_all(line.as_bytes())),
-        || Ok(()),
-    )
+    disk.replace_shared(&folder.join(LIST), |output| {
+        kept.into_iter().chain([new]).try_for_each(|line| output.write_all(line.as_bytes()))
+    })
 }
 
 /// Reads the lines of the [`LIST`] in a folder.

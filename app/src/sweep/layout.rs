@@ -76,9 +76,8 @@ pub fn positions(places: &[[i32; 2]], followers: &[usize]) -> Positions {
 
 /// Returns the problems of the values of one of [`AXES`].
 pub(super) fn problems<'a>(key: &str, values: &'a [Value]) -> impl Iterator<Item = String> + 'a {
-    let allowed = if key == FOLLOWERS { 0..=MAX_FOLLOWERS } else { 1..=MAX_GROUPS };
-    let fits = move |value: &Value| count(value).is_some_and(|count| allowed.contains(&count));
     let (low, high) = if key == FOLLOWERS { (0, MAX_FOLLOWERS) } else { (1, MAX_GROUPS) };
+    let fits = move |value: &Value| count(value).is_some_and(|count| (low..=high).contains(&count));
     values
         .iter()
         .filter(move |value| !fits(value))
