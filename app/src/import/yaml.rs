@@ -8,16 +8,12 @@ use toml::Value;
 
 use flotilla::config::Problem;
 
+/// A value of a YAML file, with its line.
+pub(super) type Node = Spanned<Tree>;
+
 /// A value of a YAML file.
 #[derive(Clone, Debug)]
-pub(super) struct Node {
-    /// The line, from 1.
-    line: usize,
-    tree: Tree,
-}
-
-#[derive(Clone, Debug)]
-enum Tree {
+pub(super) enum Tree {
     Null,
     Scalar(Value),
     List(Vec<Node>),
@@ -74,16 +70,9 @@ impl<'de> Visitor<'de> for Reader {
     }
 }
 
-impl<'de> Deserialize<'de> for Node {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Node, D::Error> {
-        struct Bare(Tree);
-        impl<'de> Deserialize<'de> for Bare {
-            fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Bare, D::Error> {
-                deserializer.deserialize_any(Reader).map(Bare)
-            }
-        }
-        let Spanned { value: Bare(tree), referenced, .. } = Spanned::deserialize(deserializer)?;
-        Ok(Node { line: referenced.line() as usize, tree })
+impl<'de> Deserialize<'de> for Tree {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Tree, D::Error> {
+        deserializer.deserialize_any(Reader)
     }
 }
 
@@ -116,12 +105,12 @@ pub(super) fn parse(text: &str) -> Result<Node, Problem> {
     })
 }
 
-impl Node {
+impl Tree {
     /// Returns a value without tables and nulls as TOML.
-    fn value(&self) -> Option<Value> {
-        match &self.tree {
+    fn to_toml(&self) -> Option<Value> {
+        match self {
             Tree::Scalar(value) => Some(value.clone()),
-            Tree::List(items) => items.iter().map(Node::value).collect::<Option<_>>().map(Value::Array),
+            Tree::List(items) => items.iter().map(|item| item.value.to_toml()).collect::<Option<_>>().map(Value::Array),
             Tree::Null | Tree::Map(_) => None,
         }
     }
@@ -141,11 +130,11 @@ impl<'a> At<'a> {
     }
 
     pub fn line(&self) -> usize {
-        self.node.line
+        self.node.referenced.line() as usize
     }
 
     pub fn is_null(&self) -> bool {
-        matches!(self.node.tree, Tree::Null)
+        matches!(self.node.value, Tree::Null)
     }
 
     /// Returns a problem with this value.
@@ -166,7 +155,7 @@ impl<'a> At<'a> {
     pub fn get(&self, path: &str) -> Option<At<'a>> {
         let mut node = self.node;
         for key in path.split('.') {
-            let Tree::Map(entries) = &node.tree else { return None };
+            let Tree::Map(entries) = &node.value else { return None };
             node = entries.iter().find(|(other, _)| other == key).map(|(_, node)| node)?;
         }
         Some(self.below(path, node)).filter(|at| !at.is_null())
@@ -183,12 +172,12 @@ impl<'a> At<'a> {
     }
 
     pub fn items(&self) -> Result<Vec<At<'a>>, Problem> {
-        let Tree::List(items) = &self.node.tree else { return Err(self.wrong("a list")) };
+        let Tree::List(items) = &self.node.value else { return Err(self.wrong("a list")) };
         Ok(items.iter().enumerate().map(|(i, node)| At { node, path: format!("{}[{i}]", self.path) }).collect())
     }
 
     pub fn number(&self) -> Result<f64, Problem> {
-        match &self.node.tree {
+        match &self.node.value {
             Tree::Scalar(Value::Integer(number)) => Ok(*number as f64),
             Tree::Scalar(Value::Float(number)) => Ok(*number),
             _ => Err(self.wrong("a number")),
@@ -218,14 +207,14 @@ impl<'a> At<'a> {
 
     /// Returns a value without tables as TOML.
     pub fn value(&self) -> Result<Value, Problem> {
-        self.node.value().ok_or_else(|| self.wrong("a value or a list of values"))
+        self.node.value.to_toml().ok_or_else(|| self.wrong("a value or a list of values"))
     }
 
     /// Returns the value as people see it, shortened.
     pub fn shown(&self) -> String {
-        let text = match &self.node.tree {
+        let text = match &self.node.value {
             Tree::Null => "null".into(),
-            _ => self.node.value().map_or("a section".into(), |value| value.to_string()),
+            _ => self.node.value.to_toml().map_or("a section".into(), |value| value.to_string()),
         };
         let kept: String = text.replace('\n', " ").chars().take(60).collect();
         if kept.len() < text.len() { kept + "…" } else { kept }
@@ -233,11 +222,11 @@ impl<'a> At<'a> {
 
     /// Returns the values below this one that are not sections, or this value if it is none.
     pub fn leaves(&self) -> Vec<At<'a>> {
-        match &self.node.tree {
+        match &self.node.value {
             Tree::Map(entries) if !entries.is_empty() => {
                 entries.iter().flat_map(|(key, node)| self.below(key, node).leaves()).collect()
             }
-            Tree::List(_) if self.node.value().is_none() => {
+            Tree::List(_) if self.node.value.to_toml().is_none() => {
                 self.items().into_iter().flatten().flat_map(|item| item.leaves()).collect()
             }
             _ => vec![self.clone()],
