@@ -14,7 +14,7 @@ use serde_json::{Map, Value, json};
 use sha2::{Digest, Sha256};
 
 use super::disk::Place;
-use super::{RecordError, hex};
+use super::{RecordError, hash_rest, hex};
 
 /// Maximum size of a file's header in bytes.
 pub const MAX_HEADER_BYTES: u64 = 1 << 20;
@@ -139,15 +139,7 @@ impl<R: Read + Seek> TensorFile<R> {
         header[place..place + NO_CHECKSUM.len()].copy_from_slice(NO_CHECKSUM.as_bytes());
         let checksum = checksum.to_string();
         let mut hash = Sha256::new_with_prefix(length).chain_update(&header);
-        let mut chunk = vec![0; (1 << 18).min(self.header.data_len())];
-        loop {
-            match self.source.read(&mut chunk) {
-                Ok(0) => break,
-                Ok(read) => hash.update(&chunk[..read]),
-                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
-                Err(error) => return Err(format!("cannot be read: {error}")),
-            }
-        }
+        hash_rest(&mut self.source, &mut hash).map_err(|error| format!("cannot be read: {error}"))?;
         if hex(&hash.finalize()) == checksum { Ok(()) } else { Err(DAMAGED.into()) }
     }
 
