@@ -1,7 +1,6 @@
 //! `flotilla baseline`: plays teams that do not learn.
 
-use super::console::Console;
-use super::{ConfigFile, Error, Overrides, Printed, RunOptions, SetKeys, between, number};
+use super::{ConfigFile, Error, Overrides, Printed, RunOptions, SetKeys, between, console, number};
 use clap::builder::PossibleValuesParser as Words;
 use flotilla::baseline::{SEGMENTS, SPEEDS};
 use flotilla::config::{Actions, Choice, Paradigm};
@@ -42,8 +41,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     let overrides = Overrides { generations, population, paradigm, set, ..Overrides::default() };
     let config = config.text(overrides.list())?;
     let request = BaselineRequest { config, seeds, episodes };
-    let mut console = Console::new(&run, printed.quiet);
-    let found = console.play(|backends, context| baseline::run(&request, backends, context))?;
+    let found = console::play(&run, printed.quiet, |backends, context| baseline::run(&request, backends, context))?;
     printed.outcome(&found, in_words)
 }
 

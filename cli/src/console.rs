@@ -10,15 +10,13 @@ use flotilla::backend::OpenBackend;
 use flotilla_app::choice::Work;
 use flotilla_app::ops::{BackendSource, Context, Event};
 
-/// The flags of a command that concern every use case.
-pub struct Console<'a> {
+/// The backend that the flags choose, opened when it is needed.
+struct Machine<'a> {
     options: &'a RunOptions,
-    /// The backend that the flags choose, opened when it is needed.
     open: Option<(OpenBackend, String)>,
-    quiet: bool,
 }
 
-impl BackendSource for Console<'_> {
+impl BackendSource for Machine<'_> {
     fn open(&mut self, work: Work) -> Result<(&mut OpenBackend, String), Error> {
         let (open, description) = match &mut self.open {
             Some(open) => open,
@@ -28,36 +26,32 @@ impl BackendSource for Console<'_> {
     }
 }
 
-impl<'a> Console<'a> {
-    /// Returns a console with a command's flags.
-    pub fn new(options: &'a RunOptions, quiet: bool) -> Console<'a> {
-        Console { options, open: None, quiet }
-    }
+/// Runs a use case on the processor that the flags choose. Signals stop it.
+pub fn run<R>(
+    options: &RunOptions,
+    quiet: bool,
+    work: impl FnOnce(&mut dyn BackendSource, Context<'_>) -> Result<R, Error>,
+) -> Result<R, Error> {
+    run_on_machine(options, quiet, &Signals::listen()?, work)
+}
 
-    /// Runs a use case that signals stop.
-    pub fn run<R>(
-        &mut self,
-        work: impl FnOnce(&mut dyn BackendSource, Context<'_>) -> Result<R, Error>,
-    ) -> Result<R, Error> {
-        self.with(&Signals::listen()?, work)
-    }
+/// Runs a use case like [`run`]. Signals end it at once, because it leaves nothing to save.
+pub fn play<R>(
+    options: &RunOptions,
+    quiet: bool,
+    work: impl FnOnce(&mut dyn BackendSource, Context<'_>) -> Result<R, Error>,
+) -> Result<R, Error> {
+    run_on_machine(options, quiet, &Signals::default(), work)
+}
 
-    /// Runs a use case that signals end at once, because it leaves nothing to save.
-    pub fn play<R>(
-        &mut self,
-        work: impl FnOnce(&mut dyn BackendSource, Context<'_>) -> Result<R, Error>,
-    ) -> Result<R, Error> {
-        self.with(&Signals::default(), work)
-    }
-
-    fn with<R>(
-        &mut self,
-        signals: &Signals,
-        work: impl FnOnce(&mut dyn BackendSource, Context<'_>) -> Result<R, Error>,
-    ) -> Result<R, Error> {
-        let flags = recovery::words_of_machine(self.options);
-        run_reported(self.quiet, signals, &flags, |context| work(self, context))
-    }
+fn run_on_machine<R>(
+    options: &RunOptions,
+    quiet: bool,
+    signals: &Signals,
+    work: impl FnOnce(&mut dyn BackendSource, Context<'_>) -> Result<R, Error>,
+) -> Result<R, Error> {
+    let (mut machine, flags) = (Machine { options, open: None }, recovery::words_of_machine(options));
+    run_reported(quiet, signals, &flags, |context| work(&mut machine, context))
 }
 
 /// Runs a use case that needs no backend. A signal ends the process.

@@ -5,9 +5,8 @@ use std::path::PathBuf;
 
 use serde::Serialize;
 
-use super::console::Console;
 use super::recovery::{self, Checkpoints};
-use super::{Error, ExistingResults, Overrides, Printed, RunOptions, SetKeys, number};
+use super::{Error, ExistingResults, Overrides, Printed, RunOptions, SetKeys, console, number};
 use flotilla::config::Override;
 use flotilla::escape::PathExt;
 use flotilla_app::ops::{BackendSource, Context};
@@ -144,7 +143,7 @@ impl Args {
             populations: populations.clone(),
             influence: influence.clone(),
         };
-        let found = Console::new(&self.run, printed.quiet).run(|backends, context| study(&request, backends, context));
+        let found = console::run(&self.run, printed.quiet, |backends, context| study(&request, backends, context));
         let resume = |error: Error| error.or_advise(|| format!("continue with\n  {}", self.command_to_resume()));
         printed.outcome(&found.map_err(resume)?, text)
     }

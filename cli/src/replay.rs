@@ -2,8 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use super::console::Console;
-use super::{Error, Printed, RunOptions, between, whole, words};
+use super::{Error, Printed, RunOptions, between, console, whole, words};
 use flotilla::escape::PathExt;
 use flotilla_app::ops::replay::{self, ReplayOutcome, ReplayRequest, WhichTrial, Written};
 use flotilla_app::record::digests::UNVERIFIED;
@@ -56,8 +55,7 @@ pub fn run(args: Args) -> Result<(), Error> {
         refuse_video(out, fps)?;
     }
     let request = ReplayRequest { folder, trial, generation, team, compare, step, out, width, fps, unverified };
-    let mut console = Console::new(&run, printed.quiet);
-    let found = console.run(|backends, context| replay::run(&request, backends, context))?;
+    let found = console::run(&run, printed.quiet, |backends, context| replay::run(&request, backends, context))?;
     printed.summary(&found, in_words)
 }
 

@@ -4,8 +4,7 @@ use std::path::PathBuf;
 
 use clap::builder::PossibleValuesParser as Words;
 
-use super::console::Console;
-use super::{Error, Printed, RunOptions, SetKeys, between, canonical, real, whole};
+use super::{Error, Printed, RunOptions, SetKeys, between, canonical, console, real, whole};
 use flotilla::config::{Choice, Override, Paradigm};
 use flotilla::evaluate::{MAX_EPISODES, Spread};
 use flotilla_app::ops::rollout::{self, RolloutOutcome, RolloutRequest, counted};
@@ -77,8 +76,8 @@ pub fn run(args: Args) -> Result<(), Error> {
     ];
     let set = keys.into_iter().flatten().chain(set.set).collect();
     let request = RolloutRequest { path, set, policies, trial, stage, trace, scores, unverified, episodes, seed };
-    let mut console = Console::new(&args.run, args.printed.quiet);
-    let found = console.play(|backends, context| rollout::run(&request, backends, context))?;
+    let (quiet, run) = (args.printed.quiet, &args.run);
+    let found = console::play(run, quiet, |backends, context| rollout::run(&request, backends, context))?;
     args.printed.outcome(&found, in_words)
 }
 

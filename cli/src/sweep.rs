@@ -6,9 +6,7 @@ use std::path::{Path, PathBuf};
 
 use serde_json::json;
 
-use super::console::{self, Console};
-use super::recovery;
-use super::{Error, ExistingResults, Overrides, RunOptions, between, print, print_json, say, whole};
+use super::{Error, ExistingResults, Overrides, RunOptions, between, console, print, print_json, recovery, say, whole};
 use flotilla::config;
 use flotilla::escape::PathExt;
 use flotilla_app::ops::sweep::{SweepRequest, claim};
@@ -220,9 +218,10 @@ pub fn run(mut args: Args) -> Result<(), Error> {
     }
     let shard = if args.collect { None } else { args.shard()?.filter(|shard| shard.count > 1) };
     let request = args.request(&sweep, &out, shard);
-    let mut console = Console::new(&args.run, args.quiet);
     if !args.collect {
-        let trained = console.run(|backends, context| ops::sweep::train(&request, &sweep, backends, context));
+        let trained = console::run(&args.run, args.quiet, |backends, context| {
+            ops::sweep::train(&request, &sweep, backends, context)
+        });
         trained
             .map_err(|error| error.or_advise(|| format!("continue with\n  {}", args.command_to_resume(&out, shard))))?;
     }

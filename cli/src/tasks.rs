@@ -2,8 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use super::console::Console;
-use super::{ConfigFile, Error, ExistingResults, Printed, RunOptions, SetKeys, between};
+use super::{ConfigFile, Error, ExistingResults, Printed, RunOptions, SetKeys, between, console};
 use flotilla::baseline::NAMES;
 use flotilla::config;
 use flotilla::escape::PathExt;
@@ -50,9 +49,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     let tasks = configs.into_iter().map(task).collect::<Result<_, _>>()?;
     let (named, start) = (out != Path::new(OUT), existing.start());
     let request = Request { tasks, out, named, start, trials, population, seed };
-    let mut console = Console::new(&run, printed.quiet);
-    let found = console
-        .run(|backends, context| tasks::run(&request, backends, context))
+    let found = console::run(&run, printed.quiet, |backends, context| tasks::run(&request, backends, context))
         .map_err(|error| error.or_advise(|| "run the same command with --resume to continue".into()))?;
     printed.outcome(&found, in_words)?;
     found.refused().map_or(Ok(()), Err)

@@ -3,9 +3,8 @@
 use std::fmt::Write;
 use std::path::PathBuf;
 
-use super::console::Console;
 use super::recovery::{Checkpoints, quoted};
-use super::{ConfigArgs, Error, ExistingResults, Printed, RunOptions};
+use super::{ConfigArgs, Error, ExistingResults, Printed, RunOptions, console};
 use flotilla::escape::PathExt;
 use flotilla_app::ops::train::{self, Extremes, TrainOutcome, TrainRequest};
 use flotilla_app::record::folder::{CONFIG, METRICS, POLICIES, RUN};
@@ -39,8 +38,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     let Args { config, run, out, existing, init, printed, checkpoints } = args;
     let (name, start) = (config.name(), existing.start());
     let request = TrainRequest { config: config.text(checkpoints.list())?, name, out, start, init };
-    let mut console = Console::new(&run, printed.quiet);
-    let found = console.run(|backends, context| train::run(&request, backends, context))?;
+    let found = console::run(&run, printed.quiet, |backends, context| train::run(&request, backends, context))?;
     printed.summary(&found, report)
 }
 
