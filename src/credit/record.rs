@@ -52,12 +52,18 @@ impl RecordRequest<'_> {
 
     /// Reports whether the leader that each follower saw most is needed.
     pub fn owners(self) -> bool {
-        self.0.contains(&Fitness::Df)
+        self.0.iter().any(|fitness| match fitness {
+            Fitness::Df => true,
+            Fitness::G | Fitness::D | Fitness::Dpp | Fitness::Dt => false,
+        })
     }
 
     /// Reports whether the leaders that each follower saw at each step are needed.
     pub(crate) fn sights(self) -> bool {
-        self.0.contains(&Fitness::Dt)
+        self.0.iter().any(|fitness| match fitness {
+            Fitness::Dt => true,
+            Fitness::G | Fitness::D | Fitness::Df | Fitness::Dpp => false,
+        })
     }
 }
 
