@@ -4,10 +4,10 @@ use std::ops::Range;
 
 use fearless_simd::{Simd, prelude::*};
 
+use super::arrays::{StepArrays, write_columns};
 use super::batch::WorldBatch;
 use super::block::Block;
 use super::network::Network;
-use super::steps::{StepArrays, write_columns};
 use super::together::{Observer, Together};
 use super::{Moment, ScoreTable};
 use crate::config::Fitness;

@@ -17,6 +17,7 @@ use crate::parallel::*;
 use crate::world::{OUTPUTS, World};
 
 mod agent;
+mod arrays;
 mod batch;
 mod block;
 mod episode;
@@ -30,10 +31,11 @@ mod together;
 mod transpose;
 
 pub(crate) use agent::Agent;
+pub use arrays::StepArrays;
+pub(crate) use arrays::step_sizes;
 pub(crate) use block::{Block, BlockState};
 pub use forward::forward;
-pub(crate) use steps::step_sizes;
-pub use steps::{Noise, StepArrays};
+pub use steps::Noise;
 pub(crate) use swarm::{Recorded, Swarm};
 pub(crate) use transpose::transpose_rows;
 

@@ -5,8 +5,8 @@ use std::ops::Range;
 
 use fearless_simd::Simd;
 
+use super::arrays::StepArrays;
 use super::batch::WorldBatch;
-use super::steps::StepArrays;
 use super::{Moment, ScoreTable};
 use crate::credit::Episode;
 use crate::world::OUTPUTS;
@@ -83,7 +83,7 @@ pub(super) fn play_together<'a, S: Simd, T: Together<S>>(
     observer: &mut impl Observer<S, T>,
     scores: &ScoreTable<'_>,
 ) -> &'a T {
-    let kept = workspace.take().and_then(|kept| kept.downcast().ok()).filter(|kept: &Box<T>| kept.fits(batch));
+    let kept = workspace.take().filter(|kept| kept.downcast_ref().is_some_and(|kept: &T| kept.fits(batch)));
     let kept = workspace.insert(kept.unwrap_or_else(|| Box::new(T::allocate(simd, batch, false))));
     let together: &mut T = kept.downcast_mut().expect("it was just inserted");
     simd.vectorize(
