@@ -23,7 +23,7 @@ use flotilla_app::sweep::shard::{self, MAX_SHARDS, Shard};
 use flotilla_app::sweep::slurm::Job;
 
 const SCALE_OUT: &str = "Many processes (docs/how-to/clusters.md)";
-const RESULTS: &str = "ResultOptions";
+const RESULTS: &str = "Results";
 
 #[derive(clap::Args)]
 pub struct Args {
