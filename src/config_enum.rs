@@ -22,8 +22,8 @@ pub trait ConstDispatch {
     fn with<const WORD: u32>(self) -> Self::Output;
 }
 
-/// Defines an enum whose variants are words in configs and messages, and constants in shaders. For `Density::Linear`, `wgsl` returns
-/// `const DENSITY_LINEAR: u32 = 0u;`.
+/// Defines an enum whose variants are words in configs and messages, and constants in shaders. For `Density::Linear`, `wgsl`
+/// returns `const DENSITY_LINEAR: u32 = 0u;`.
 macro_rules! config_enum {
     ($(#[$doc:meta])* $name:ident { $($(#[$variant_doc:meta])* $variant:ident = $word:literal,)* }) => {
         $(#[$doc])*

@@ -474,7 +474,8 @@ fn the_page_on_swarms_agrees_with_its_files() {
                 format!("{g:.2} [{low:.2}, {high:.2}]")
             })
         });
-        let trials = if means[0]["trials"] == "10" { "" } else { ", five trials" };
+        let trials = &means[0]["trials"];
+        let trials = if trials == "10" { String::new() } else { format!(", {trials} trials") };
         let line = format!("| {}{trials} | {} |", means[0]["followers_per_leader"], cells.join(" | "));
         assert!(page.contains(&line), "{line}");
     }

@@ -187,6 +187,7 @@ impl ClassShape {
     }
 
     /// Reports whether its agents cannot leave a part of the map, or move only near others.
+    #[cfg(feature = "gpu")]
     pub(crate) fn is_confined(&self) -> bool {
         self.boxed != 0 || self.end_near > 0
     }

@@ -316,8 +316,8 @@ impl CheckpointWriter {
         CheckpointWriter { disk, folder, config: Arc::new(config), kept, writing: None, last, cost: 0.0 }
     }
 
-    /// Reports whether a checkpoint is due before a generation is played. After so many generations, training waits if
-    /// the previous checkpoint is still being written. After so many seconds, it does not.
+    /// Reports whether a checkpoint is due before a generation is played. By time, none is due while the
+    /// previous one is being written, and the interval grows, up to tenfold, until writing takes at most 1/20 of it.
     pub fn is_due(&self, schedule: &CheckpointConfig, generation: usize) -> bool {
         let (last, moment) = self.last;
         if generation == last {

@@ -25,13 +25,13 @@ use flotilla::trainer::Row;
 pub struct ResultOptions {
     /// Generations per row of `results.csv`. The last generation always has a row.
     pub every: usize,
-    /// G whose first generation is reported, 0 to 1.
+    /// The G, 0 to 1, whose first generation is reported.
     pub reach: f64,
     /// Whether files that differ from their digests are read.
     pub unverified: bool,
     /// The axes of the pictures, across and down. The first two by default.
     pub axes: Vec<String>,
-    /// Team whose G the pictures show, and whose first generation with a G is reported.
+    /// The team whose G the pictures show and must reach [`ResultOptions::reach`].
     pub measure: TeamKind,
     /// Range that pictures show around a mean.
     pub band: Band,

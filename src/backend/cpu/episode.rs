@@ -71,7 +71,7 @@ impl<S: Simd> EpisodeBlock<S> {
 }
 
 impl<S: Simd> Together<S> for EpisodeBlock<S> {
-    const MOST: usize = S::f32s::LEN;
+    const MAX_TEAMS: usize = S::f32s::LEN;
 
     fn allocate(simd: S, batch: &WorldBatch<'_>, _: bool) -> EpisodeBlock<S> {
         let world = batch.world;
@@ -155,7 +155,7 @@ impl<S: Simd> Together<S> for EpisodeBlock<S> {
     }
 
     #[inline(always)]
-    fn place(leader: usize) -> (usize, usize) {
+    fn outputs_at(leader: usize) -> (usize, usize) {
         (leader, 0)
     }
 

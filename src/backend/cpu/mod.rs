@@ -218,7 +218,7 @@ impl<S: Simd, T: Together<S>> Observer<S, T> for Playing<'_> {
         self.batch.prefetch(self.ahead.clone(), step);
         let Some(actions) = self.actions else { return };
         for leader in 0..self.batch.world.leaders() {
-            let (index, first) = T::place(leader);
+            let (index, first) = T::outputs_at(leader);
             let outputs = &mut teams.outputs()[index];
             for (lane, team) in (first..).zip(self.playing.clone()) {
                 outputs.iter_mut().zip(actions(team, leader, step)).for_each(|(to, action)| to[lane] = action);
@@ -231,8 +231,8 @@ impl<S: Simd, T: Together<S>> Observer<S, T> for Playing<'_> {
 fn trace<S: Simd, T: Together<S>>(simd: S, group: &Group<'_>) -> Trace {
     let batch = WorldBatch::new(std::slice::from_ref(group), 0);
     let (mut trace, mut together) = (Trace::of_zeros(group), T::allocate(simd, &batch, true));
-    for first in (0..batch.teams).step_by(T::MOST) {
-        let teams = first..batch.teams.min(first + T::MOST);
+    for first in (0..batch.teams).step_by(T::MAX_TEAMS) {
+        let teams = first..batch.teams.min(first + T::MAX_TEAMS);
         together.play(&batch, teams.clone(), &mut Moments { trace: &mut trace, playing: teams.clone() });
         for team in teams {
             trace.store(team, &together.episode_of(&batch, team - first));

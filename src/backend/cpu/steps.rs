@@ -74,13 +74,13 @@ fn record<S: Simd, T: Together<S>>(
     let (world, steps) = (batch.world, batch.world.steps());
     let sizes = step_sizes(world, steps + 1, steps);
     let part = |first: usize| {
-        let teams = first..batch.teams.min(first + T::MOST);
+        let teams = first..batch.teams.min(first + T::MAX_TEAMS);
         (teams.clone(), arrays.split(sizes, teams.len()))
     };
-    let mut parts: Vec<(Range<usize>, StepArrays<'_>)> = (0..batch.teams).step_by(T::MOST).map(part).collect();
+    let mut parts: Vec<(Range<usize>, StepArrays<'_>)> = (0..batch.teams).step_by(T::MAX_TEAMS).map(part).collect();
     // One workspace for several large teams, because it is large.
     let parts_per_task =
-        if T::MOST == 1 { parts.len().div_ceil(current_num_threads()).max(1) } else { VECTORS_PER_TASK };
+        if T::MAX_TEAMS == 1 { parts.len().div_ceil(current_num_threads()).max(1) } else { VECTORS_PER_TASK };
     parts.par_chunks_mut(parts_per_task).for_each(|parts| {
         let mut workspace = None;
         for (teams, arrays) in parts {
@@ -123,10 +123,10 @@ impl<S: Simd, T: Together<S>> Observer<S, T> for Recorder<'_, '_, S> {
             let numbers = S::u32s::from_fn(simd, |lane| number.wrapping_add((self.first + lane) as u32));
             for (leader, deviations) in deviations.iter().enumerate() {
                 let drawn = evolve::noise::<S>(key, step, leader, numbers);
-                let (index, lane) = T::place(leader);
+                let (index, lane) = T::outputs_at(leader);
                 for ((output, &deviation), drawn) in teams.outputs()[index].iter_mut().zip(deviations).zip(drawn) {
                     let noise = drawn * splat(simd, deviation);
-                    let outputs = &mut output.as_mut_slice()[lane..lane + T::MOST];
+                    let outputs = &mut output.as_mut_slice()[lane..lane + T::MAX_TEAMS];
                     outputs.iter_mut().zip(noise.as_slice()).for_each(|(output, noise)| *output += noise);
                 }
             }

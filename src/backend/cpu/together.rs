@@ -15,7 +15,7 @@ use crate::world::OUTPUTS;
 /// large team ([`Swarm`](super::swarm::Swarm)).
 pub(super) trait Together<S: Simd>: Send + Sized + 'static {
     /// Maximum number of teams.
-    const MOST: usize;
+    const MAX_TEAMS: usize;
 
     /// Returns memory for teams of a batch. A trace also needs all counts and forces.
     fn allocate(simd: S, batch: &WorldBatch<'_>, traced: bool) -> Self;
@@ -36,7 +36,7 @@ pub(super) trait Together<S: Simd>: Send + Sized + 'static {
     fn outputs(&mut self) -> &mut [[S::f32s; OUTPUTS]];
 
     /// Returns where the outputs of a leader are: their index, and the lane of the first team.
-    fn place(leader: usize) -> (usize, usize);
+    fn outputs_at(leader: usize) -> (usize, usize);
 
     /// Writes the moments of one team's agents, and the inputs of its leaders, `[leaders][inputs]`. Before the first step
     /// nothing has been sensed.

@@ -534,7 +534,7 @@ fn part<T>(array: &mut [T], (row, rows): (usize, usize)) -> &mut [T] {
 }
 
 impl<S: Simd> Together<S> for Swarm<S> {
-    const MOST: usize = 1;
+    const MAX_TEAMS: usize = 1;
 
     fn allocate(simd: S, batch: &WorldBatch<'_>, traced: bool) -> Swarm<S> {
         let recorded = Recorded { counts: batch.counted || traced, sights: batch.sighted, forces: traced };
@@ -583,7 +583,7 @@ impl<S: Simd> Together<S> for Swarm<S> {
         &mut self.outputs
     }
 
-    fn place(leader: usize) -> (usize, usize) {
+    fn outputs_at(leader: usize) -> (usize, usize) {
         (leader / S::f32s::LEN, leader % S::f32s::LEN)
     }
 
