@@ -16,7 +16,7 @@ use fearless_simd::Level;
 use flotilla::backend::cpu::{Cpu, level_name};
 use flotilla::backend::{Backend, Group};
 use flotilla::config::{Config, own_populations};
-use flotilla::evolve::{Key, Purpose, random_policy};
+use flotilla::evolve::{Key, Purpose, aligned_teams, random_policy};
 use flotilla::stepping::{Recording, Stepper};
 use flotilla::world::{OUTPUTS, World};
 
@@ -40,7 +40,7 @@ fn measure(config: &Config, level: Level, teams: usize, rounds: usize) -> Result
     let (world, small) = (World::new(&config.validate()?), World::new(&small.validate()?));
     let leaders = world.leaders();
     let weights = [&world, &small].map(|world| constant(world, teams, config.learning.seed));
-    let order: Vec<u32> = (0..teams as u32).flat_map(|team| vec![team; leaders]).collect();
+    let order = aligned_teams(teams, leaders);
     let group =
         |world, weights| Group { populations: own_populations(leaders), ..Group::new(world, weights, teams, &order) };
     let groups = [group(&world, &weights[0][..]), group(&small, &weights[1][..])];

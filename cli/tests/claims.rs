@@ -259,8 +259,8 @@ fn random_baselines_equal_the_best_teams_that_a_backend_plays() {
 /// Returns the number of POIs that each team observes. Team j has policy j of every leader.
 fn observed(world: &World, weights: &[f32], policies: usize) -> Vec<u32> {
     let teams = evolve::aligned_teams(policies, world.leaders());
-    let (weights, starts, populations) = (weights.into(), &world.starts, own_populations(world.leaders()));
-    let group = Group { world, starts, weights, policies, populations, teams: &teams, fitnesses: &[] };
+    let populations = own_populations(world.leaders());
+    let group = Group { populations, ..Group::new(world, weights, policies, &teams) };
     Cpu::default().play(&[group]).unwrap().remove(0).observed
 }
 
@@ -301,8 +301,8 @@ fn baselines_with_moved_pois_are_measured_from_held_out_starts() {
         baseline::constant_policy(&constants[place % policies], policy);
     }
     let teams = evolve::aligned_teams(policies, world.leaders());
-    let (weights, starts, populations) = (weights[..].into(), &world.starts, own_populations(world.leaders()));
-    let group = Group { world: &world, starts, weights, policies, populations, teams: &teams, fitnesses: &[] };
+    let populations = own_populations(world.leaders());
+    let group = Group { populations, ..Group::new(&world, &weights[..], policies, &teams) };
     let held_out = Starts::Drawn { episodes: 30, seed: 0, jitter: 0.0, poi_jitter: 5.0 };
     let played =
         evaluate::evaluate(&mut Cpu::default(), &group, &held_out, &mut |_| std::ops::ControlFlow::Continue(()))

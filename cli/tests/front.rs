@@ -11,6 +11,7 @@ use flotilla::backend::{Backend, Group};
 use flotilla::config::own_populations;
 use flotilla::config::{Fitness, MAX_LEARNERS, MAX_POPULATION, MAX_STEPS, Stage};
 use flotilla::evaluate::Starts;
+use flotilla::evolve::aligned_teams;
 use flotilla::front::{self, Coevolution, Failure, Processor};
 use flotilla::sample;
 use flotilla::stepping::StepError;
@@ -287,16 +288,9 @@ fn play_and_trace_treat_each_team_separately() {
 
         let traced = flotilla::trace(&config, teams, &weights, &starts, 3).expect("valid weights");
         let episode_starts = starts.of(3, &world);
-        let order: Vec<u32> = (0..teams as u32).flat_map(|team| vec![team; leaders]).collect();
-        let group = Group {
-            world: &world,
-            starts: &episode_starts,
-            weights: weights[..].into(),
-            policies: teams,
-            populations: own_populations(world.leaders()),
-            teams: &order,
-            fitnesses: &[],
-        };
+        let order = aligned_teams(teams, leaders);
+        let populations = own_populations(leaders);
+        let group = Group { starts: &episode_starts, populations, ..Group::new(&world, &weights[..], teams, &order) };
         let trace = backend.trace(&group).expect("a valid group");
         let (agents, steps) = (world.agents(), world.steps());
         for (step, team, agent) in

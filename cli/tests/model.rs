@@ -17,6 +17,7 @@ use flotilla::config::{
     Actions, AgentClass, Channel, Combine, Config, Control, Coupling, Density, Fitness, Measure, Mobility, Paradigm,
     Sectors, own_populations,
 };
+use flotilla::evolve::aligned_teams;
 use flotilla::sample;
 use flotilla::stepping::{Recording, Stepper};
 use flotilla::world::{GRID, World, on_grid};
@@ -405,13 +406,10 @@ fn check(cpu: &mut Cpu, world: &Config, model: &Model, seed: u64) -> Tally {
     let moved: Vec<Vec2> = model.moved.iter().flatten().map(|poi| poi.as_vec2()).collect();
     let places = [&starts[..], &moved].concat();
     let group = Group {
-        world: &compiled,
         starts: &places,
-        weights: weights[..].into(),
-        policies,
         populations: own_populations(compiled.leaders()),
-        teams: &teams,
         fitnesses: &[Fitness::Dt],
+        ..Group::new(&compiled, &weights[..], policies, &teams)
     };
     let trace = cpu.trace(&group).unwrap();
     assert_eq!((trace.teams, trace.agents), (TEAMS, model.agents));
@@ -610,15 +608,7 @@ actions = 'behaviours'";
         let biases = weights.len() - 5;
         largest.iter().for_each(|&behaviour| weights[biases + behaviour] = 0.5);
         let (weights, teams) = (weights.repeat(2), [0, 0]);
-        let group = Group {
-            world: &world,
-            starts: &world.starts,
-            weights: weights[..].into(),
-            policies: 1,
-            populations: own_populations(world.leaders()),
-            teams: &teams,
-            fitnesses: &[],
-        };
+        let group = Group::new(&world, &weights[..], 1, &teams);
         for level in Cpu::levels() {
             let trace = Cpu::at_level(level).trace(&group).unwrap();
             assert_eq!(trace.moment(1, 0, 0).outputs, expected, "{largest:?}, {}", level_name(level));
@@ -630,15 +620,7 @@ actions = 'behaviours'";
     let mut weights = vec![0.0; world.parameters() * 2];
     let biases = world.parameters() - 5;
     weights[biases + 1] = 0.5;
-    let group = Group {
-        world: &world,
-        starts: &world.starts,
-        weights: weights[..].into(),
-        policies: 1,
-        populations: own_populations(world.leaders()),
-        teams: &[0, 0],
-        fitnesses: &[],
-    };
+    let group = Group::new(&world, &weights[..], 1, &[0, 0]);
     let trace = Cpu::default().trace(&group).unwrap();
     assert_eq!(trace.moment(1, 0, 0).outputs, front_right);
     let inputs = trace.inputs_of(1, 0, 0);
@@ -899,16 +881,9 @@ fn agents_move_to_others_and_sense_each_as_described() {
         let described = Described { class_of: config.classes().class_of_each(), config };
         let (leaders, steps) = (world.leaders(), world.steps());
         let weights = sample::weights(&world, TEAMS, seed);
-        let teams: Vec<u32> = (0..TEAMS as u32).flat_map(|team| vec![team; leaders]).collect();
-        let group = Group {
-            world: &world,
-            starts: &world.starts,
-            weights: weights[..].into(),
-            policies: TEAMS,
-            populations: own_populations(leaders),
-            teams: &teams,
-            fitnesses: &[],
-        };
+        let teams = aligned_teams(TEAMS, leaders);
+        let populations = own_populations(leaders);
+        let group = Group { populations, ..Group::new(&world, &weights[..], TEAMS, &teams) };
         let trace = Cpu::default().trace(&group).unwrap();
         let mut gone = vec![];
         for (team, step) in (0..TEAMS).flat_map(|team| (1..=steps).map(move |step| (team, step))) {
@@ -1030,15 +1005,7 @@ motion = { kind = 'free', max_speed = 1 }
         let mut weights = vec![0.0; world.parameters()];
         let biases = weights.len() - 4;
         largest.iter().for_each(|&output| weights[biases + output] = 0.5);
-        let group = Group {
-            world: &world,
-            starts: &world.starts,
-            weights: weights[..].into(),
-            policies: 1,
-            populations: own_populations(1),
-            teams: &[0],
-            fitnesses: &[],
-        };
+        let group = Group::new(&world, &weights[..], 1, &[0]);
         let trace = Cpu::default().trace(&group).unwrap();
         let of = |agent: usize| trace.moment(1, 0, agent).position;
         (trace.moment(1, 0, 0).outputs[0], of(0), [of(4), of(5), of(6)])

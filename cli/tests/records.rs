@@ -35,9 +35,8 @@ impl Teams {
     }
 
     fn group(&self, fitnesses: &'static [Fitness]) -> Group<'_> {
-        let (world, populations) = (&self.world, own_populations(self.world.leaders()));
-        let (starts, weights, teams) = (&world.starts, self.weights[..].into(), &self.choice[..]);
-        Group { world, starts, weights, policies: 5, populations, teams, fitnesses }
+        let populations = own_populations(self.world.leaders());
+        Group { populations, fitnesses, ..Group::new(&self.world, &self.weights[..], 5, &self.choice) }
     }
 
     /// Returns the size of the unpacked record in bytes.

@@ -339,15 +339,8 @@ fn play(
     let teams: Vec<Vec<u32>> = rounds.iter().map(teams).collect();
     let mut groups = Vec::new();
     for (round, teams) in rounds.iter().zip(&teams) {
-        groups.extend(round.starts.iter().map(|starts| Group {
-            world: round.world,
-            starts,
-            weights: round.weights.into(),
-            policies: round.teams,
-            populations: &round.world.populations,
-            teams,
-            fitnesses: &[],
-        }));
+        let group = Group::new(round.world, round.weights, round.teams, teams);
+        groups.extend(round.starts.iter().map(|starts| Group { starts, ..group }));
     }
     let mut scores = backend(&groups)?.into_iter();
     let of_round = |round: &Round<'_>| {

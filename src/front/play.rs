@@ -271,6 +271,6 @@ impl<'a> CheckedTeams<'a> {
 
     fn group<'b>(&'b self, starts: &'b [glam::Vec2]) -> Group<'b> {
         let &CheckedTeams { ref world, ref weights, policies, ref populations, ref teams } = self;
-        Group { world, starts, weights: weights[..].into(), policies, populations, teams, fitnesses: &[] }
+        Group { starts, populations, ..Group::new(world, &weights[..], policies, teams) }
     }
 }

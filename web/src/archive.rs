@@ -213,15 +213,8 @@ pub fn play(config: &Config, policies: usize, mut weights: Vec<f32>) -> Result<V
     let Some(populations) = populations.filter(|_| evolve::flush_and_validate(&mut weights).is_none()) else {
         return Err(refuse("these policies are not for this config"));
     };
-    let group = Group {
-        world: &world,
-        starts: &world.starts,
-        policies,
-        populations: &populations,
-        weights: weights[..].into(),
-        teams: &vec![0; world.leaders()],
-        fitnesses: flotilla::evaluate::scores_beside(config),
-    };
+    let (teams, fitnesses) = (vec![0; world.leaders()], flotilla::evaluate::scores_beside(config));
+    let group = Group { populations: &populations, fitnesses, ..Group::new(&world, &weights[..], policies, &teams) };
     let played = replay::one(&group, &mut Cpu::default()).map_err(refuse)?;
     let generation = config.learning.generations;
     Ok(replay::detailed("", config, &[replay::Replayed { generation, ..played }]))

@@ -175,14 +175,10 @@ pub fn run(
     context.message(format_args!("playing on {on}"));
     let teams = evaluate::aligned_teams(policies.policies, world.leaders());
     let group = Group {
-        world: &world,
-        starts: &world.starts,
-        weights: policies.weights[..].into(),
-        policies: policies.policies,
-        teams: &teams,
         // The config may be that of another layout, so the file decides which leaders share a policy.
         populations: &policies.populations,
         fitnesses: if request.scores.is_some() { evaluate::SCORES_AND_DT } else { evaluate::SCORES },
+        ..Group::new(&world, &policies.weights[..], policies.policies, &teams)
     };
     let playing = format!("playing {}", counted(policies.policies, starts.episodes()));
     let each = &mut |batch: Batch<'_>| {

@@ -217,15 +217,7 @@ fn rollout(
     let held = backend.hold(weights, [config.populations(), policies, world.parameters()])?;
     let played = held.as_deref().map_or(weights.into(), Weights::OnDevice);
     let fitnesses = config.fitnesses();
-    let group = Group {
-        world,
-        starts: &world.starts,
-        weights: played,
-        policies,
-        populations: &world.populations,
-        teams: &teams,
-        fitnesses: &fitnesses,
-    };
+    let group = Group { fitnesses: &fitnesses, ..Group::new(world, played, policies, &teams) };
     let mut observed = 0;
     let play = || {
         observed = backend

@@ -258,6 +258,7 @@ mod tests {
     use flotilla::backend::cpu::Cpu;
     use flotilla::backend::{Backend, Group};
     use flotilla::config::Config;
+    use flotilla::evolve::aligned_teams;
     use flotilla::sample;
 
     fn world(text: &str) -> World {
@@ -266,16 +267,8 @@ mod tests {
 
     fn reach(world: &World, teams: usize) -> Reach {
         let weights = sample::weights(world, teams, 0);
-        let order: Vec<u32> = (0..teams as u32).flat_map(|team| vec![team; world.leaders()]).collect();
-        let group = Group {
-            world,
-            starts: &world.starts,
-            weights: weights[..].into(),
-            policies: teams,
-            populations: &world.populations,
-            teams: &order,
-            fitnesses: &[],
-        };
+        let order = aligned_teams(teams, world.leaders());
+        let group = Group::new(world, &weights[..], teams, &order);
         Reach::of(world, &Cpu::default().trace(&group).expect("the CPU plays"))
     }
 

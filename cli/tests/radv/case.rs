@@ -5,6 +5,7 @@ use flotilla::backend::gpu::episode::{Kernel, WorkgroupBuffers, workgroup_of};
 use flotilla::backend::gpu::exact::Pass;
 use flotilla::backend::{Backend, Group};
 use flotilla::config::own_populations;
+use flotilla::evolve::aligned_teams;
 use flotilla::sample;
 use flotilla::world::World;
 use flotilla_cli::measure::operations::{self, Reach};
@@ -57,15 +58,10 @@ impl Case {
     fn new(name: &str, world: &World, kernel: Kernel, threads: usize) -> Case {
         const MAX_TEAMS: usize = 64;
         let weights = sample::weights(world, MAX_TEAMS, 1);
-        let choice: Vec<u32> = (0..MAX_TEAMS * world.leaders()).map(|seat| (seat / world.leaders()) as u32).collect();
+        let choice = aligned_teams(MAX_TEAMS, world.leaders());
         let group = |teams: usize| Group {
-            world,
-            starts: &world.starts,
-            weights: weights[..].into(),
-            policies: MAX_TEAMS,
             populations: own_populations(world.leaders()),
-            teams: &choice[..teams * world.leaders()],
-            fitnesses: &[],
+            ..Group::new(world, &weights[..], MAX_TEAMS, &choice[..teams * world.leaders()])
         };
         let name = format!("{name}, {kernel}, {threads}");
         let workgroup =

@@ -398,15 +398,10 @@ impl<'a> Episodes<'a> {
 
     /// Returns the group of some of the teams in one episode, with sightings if the fitness needs them.
     fn group<'b>(&'b self, episode: usize, teams: &'b [u32]) -> Group<'b> {
-        let learning = &self.config.learning;
         Group {
-            world: self.world,
             starts: &self.starts[episode],
-            weights: self.weights.into(),
-            policies: learning.slots(),
-            populations: &self.world.populations,
-            teams,
             fitnesses: flotilla::evaluate::scores_beside(self.config),
+            ..Group::new(self.world, self.weights, self.config.learning.slots(), teams)
         }
     }
 
