@@ -21,12 +21,11 @@ mod replay;
 pub use assignment::{UNASSIGNED, assign};
 pub use assignment::{find_leading, is_led_by};
 pub(crate) use lanes::LaneCredit;
+pub(crate) use paths::PathCredit;
 pub use record::{Episode, Paths, RecordRequest, Seen, Strided, owner_bits};
 pub use replay::observed_at;
 
 use fearless_simd::{Level, dispatch};
-
-use paths::PathCredit;
 
 use crate::config::Fitness;
 use crate::world::World;

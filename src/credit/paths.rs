@@ -1,7 +1,6 @@
 //! Scores from paths: for POIs that count by distance or by when, and for learners that lead learners.
 
 use fearless_simd::{Simd, prelude::*};
-use glam::Vec2;
 
 use super::assignment::{first_most, lead};
 use super::{Paths, each_bit, share, stepping_stone};
@@ -11,31 +10,52 @@ use crate::kernels::{larger, select, smaller, splat};
 use crate::model::couple::observes;
 use crate::world::{PathRule, World};
 
-/// Scratch memory for scores from paths. Moment m of an episode is its state after m steps. Vectors have neighbouring
-/// moments, so rows have as many as fill whole vectors.
+/// Scores from paths, with scratch memory for the next. Moment m of an episode is its state after m steps. A vector has
+/// neighbouring moments of one team, or one moment of as many teams. Rows are `[moments][teams]`, filled up to whole
+/// vectors.
 #[derive(Clone, Debug, Default)]
-pub(super) struct PathCredit {
-    /// The moments of a row.
+pub(crate) struct PathCredit {
+    /// The teams of a vector: one, or as many as it has lanes.
+    teams: usize,
+    /// The length of a row.
     width: usize,
-    /// `[2][agents][width]`.
-    positions: Vec<f32>,
-    /// The learners that influence each agent, and those that lead it, `[words of leaders][agents][width + 1]`: a vector may
-    /// be written one moment later. Empty if those that are taken out are the same at all moments.
+    /// The positions of one team, f32 as bits, `[2][agents][width]`; empty for several.
+    positions: Vec<u32>,
+    /// `[pois][2][lanes]`.
+    pois: Vec<f32>,
+    /// The learners that influence each agent, and those that lead it, `[words of leaders][agents][width + teams]`: a vector
+    /// may be written one moment later. Under Df, `led` is the same at all moments: `[words of leaders][agents][lanes]`. Empty
+    /// if it is the same in all lanes, too.
     sights: Vec<u32>,
     led: Vec<u32>,
-    /// The number of moments at which each agent was influenced by each learner, `[agents][leaders]`.
+    /// The number of moments at which one agent was influenced by each learner, `[leaders][teams]`.
     counts: Vec<u32>,
-    /// The agents that are taken out for each learner at any moment, `[leaders][words]`.
+    /// The agents that are taken out for each learner at any moment in any team, `[leaders][words]`.
     ever_taken: Vec<u32>,
     /// Agents that are ever near the POI and count there, and at each moment their squared distance, infinite unless it
     /// is near and the moment counts: `[observers]`, `[observers][width]`.
     observers: Vec<usize>,
     near: Vec<f32>,
+    /// Whether anyone is near the POI, in each lane of a row, all bits or none, and where the vectors begin in which
+    /// someone is.
+    is_anyone_near: Vec<u32>,
+    vectors: Vec<usize>,
+    /// The observers of the team that a value is computed for.
+    counted: Vec<Counted>,
     /// The squared distances of the nearest observers, `[coupling][lanes]`.
     nearest: Vec<f32>,
-    /// The worth that each learner would lose, `[leaders]`, and gain by so many copies, `[leaders][copies]`.
+    /// Sums over moments, `[teams]`.
+    sums: Vec<u64>,
+    /// What the POI counts for in the team as it was, and in a changed one, `[teams]`.
+    whole: Vec<Worth>,
+    changed: Vec<Worth>,
+    /// What the team observed, `[teams]`, what each learner would lose, `[leaders][teams]`, and gain by so many copies,
+    /// `[leaders][copies][teams]`: in units of worth.
+    observed: Vec<u32>,
     lost: Vec<u32>,
     gains: Vec<u32>,
+    /// `[teams][leaders]`.
+    scores: Vec<f32>,
 }
 
 /// A change of the team.
@@ -48,8 +68,57 @@ enum Change {
     With(usize, u32),
 }
 
+/// An observer that counts, at least at some moments.
+#[derive(Clone, Copy, Debug)]
+struct Counted {
+    /// The beginning of its row in [`PathCredit::near`].
+    near: usize,
+    /// How often it counts.
+    times: u32,
+    /// If it is taken out: the beginning of its row in [`PathCredit::led`], whose bits tell when, and the distance of vectors.
+    led: Option<[usize; 2]>,
+}
+
+/// What a POI counts for.
+#[derive(Clone, Copy, Debug)]
+struct Worth {
+    /// The square of the distance, 1 or more, that determines it; NaN for a mean.
+    squared: f32,
+    /// In units of its worth.
+    value: u32,
+}
+
+/// The teams of a vector, and what they are scored by.
+struct Scored<'a> {
+    positions: Positions<'a>,
+    teams: usize,
+    world: &'a World,
+    rule: &'a PathRule,
+    fitness: Fitness,
+}
+
+/// Where positions are: the vector at `first` of an agent's row is at `first * apart + agent * agents + axis * axes`.
+struct Positions<'a> {
+    words: &'a [u32],
+    apart: usize,
+    agents: usize,
+    axes: usize,
+}
+
+impl Positions<'_> {
+    /// Returns a vector of an agent's row: its x and y.
+    #[inline(always)]
+    fn at<S: Simd>(&self, simd: S, agent: usize, first: usize) -> [S::f32s; 2] {
+        let start = first * self.apart + agent * self.agents;
+        [0, self.axes].map(
+            #[inline(always)]
+            |axis| S::u32s::from_slice(simd, &self.words[start + axis..][..S::f32s::LEN]).bitcast(),
+        )
+    }
+}
+
 impl PathCredit {
-    /// Scores every learner of a team by `fitness` into `scores`, `[leaders]`, and returns what the POIs are worth that
+    /// Scores every learner of one team by `fitness` into `scores`, `[leaders]`, and returns what the POIs are worth that
     /// the team observed.
     pub(super) fn score<S: Simd>(
         &mut self,
@@ -60,162 +129,215 @@ impl PathCredit {
         fitness: Fitness,
         scores: &mut [f32],
     ) -> u32 {
+        self.pois.clear();
+        for axis in paths.pois.iter().flat_map(|at| at.to_array()) {
+            self.pois.extend(std::iter::repeat_n(axis, S::f32s::LEN));
+        }
+        let (agents, width) = (world.agents(), (world.steps() + 1).next_multiple_of(S::f32s::LEN));
+        let words = self.load(paths, agents, width);
+        let positions = Positions { words: &words, apart: 1, agents: width, axes: agents * width };
+        self.score_vector(simd, &Scored { positions, teams: 1, world, rule, fitness });
+        self.positions = words;
+        scores.iter_mut().zip(&self.scores).for_each(|(to, score)| *to = *score);
+        self.observed[0]
+    }
+
+    /// Scores every learner of a vector of teams. `positions` are at the start and after each step in units, f32 as bits,
+    /// `[steps + 1][agents][2][lanes]`, and `pois` are those of the POIs.
+    pub(crate) fn score_teams<S: Simd>(
+        &mut self,
+        simd: S,
+        positions: &[u32],
+        pois: &[[S::f32s; 2]],
+        world: &World,
+        rule: &PathRule,
+        fitness: Fitness,
+    ) {
+        self.pois.clear();
+        pois.as_flattened().iter().for_each(|axis| self.pois.extend_from_slice(axis.as_slice()));
+        let (teams, agents) = (S::f32s::LEN, world.agents());
+        let positions = Positions { words: positions, apart: 2 * agents, agents: 2 * teams, axes: teams };
+        self.score_vector(simd, &Scored { positions, teams, world, rule, fitness });
+    }
+
+    /// Returns what the POIs are worth that one of the teams observed.
+    pub(crate) fn observed(&self, team: usize) -> u32 {
+        self.observed[team]
+    }
+
+    /// Returns the scores of one team's leaders.
+    pub(crate) fn scores(&self, team: usize) -> impl Iterator<Item = f32> {
+        let leaders = self.scores.len() / self.teams;
+        self.scores[team * leaders..][..leaders].iter().copied()
+    }
+
+    fn score_vector<S: Simd>(&mut self, simd: S, scored: &Scored<'_>) {
+        let &Scored { teams, world, fitness, .. } = scored;
         let (leaders, words) = (world.leaders(), world.constants.words as usize);
-        self.load::<S>(paths, world);
+        self.teams = teams;
+        self.width = ((world.steps() + 1) * teams).next_multiple_of(S::f32s::LEN);
         if fitness != Fitness::G {
-            self.take_out(simd, world, rule, fitness);
+            self.take_out(simd, scored);
         }
         let most = if fitness == Fitness::Dpp { world.coupling.iter().copied().max().unwrap_or(0) } else { 0 };
         let row = most as usize + 1;
-        self.lost.clear();
-        self.lost.resize(leaders, 0);
-        self.gains.clear();
-        self.gains.resize(leaders * row, 0);
-        let mut observed = 0;
-        for (poi, &at) in paths.pois.iter().enumerate() {
+        refill(&mut self.observed, teams);
+        refill(&mut self.lost, leaders * teams);
+        refill(&mut self.gains, leaders * row * teams);
+        for poi in 0..world.pois.len() {
             simd.vectorize(
                 #[inline(always)]
-                || self.find_observers(simd, world, rule, poi, at),
+                || self.find_observers(simd, scored, poi),
             );
             if self.observers.is_empty() {
                 continue;
             }
-            let value = self.value(simd, world, rule, poi, Change::None);
-            observed += value;
+            self.whole.clear();
+            self.value(simd, scored, poi, Change::None);
+            std::mem::swap(&mut self.whole, &mut self.changed);
+            self.observed.iter_mut().zip(&self.whole).for_each(|(observed, whole)| *observed += whole.value);
             if fitness == Fitness::G {
                 continue;
             }
+            let is_worth = self.whole.iter().any(|whole| whole.value > 0);
             for leader in 0..leaders {
                 let ever = &self.ever_taken[leader * words..][..words];
                 let is_taken = |&agent: &usize| ever[agent / 32] >> (agent % 32) & 1 != 0;
-                if value > 0 && self.observers.iter().any(is_taken) {
-                    self.lost[leader] += value - self.value(simd, world, rule, poi, Change::Without(leader));
+                if is_worth && self.observers.iter().any(is_taken) {
+                    self.value(simd, scored, poi, Change::Without(leader));
+                    add_differences(&mut self.lost[leader * teams..], &self.whole, &self.changed);
                 }
                 if self.observers.contains(&leader) {
                     for copies in 1..=most {
-                        let gain = self.value(simd, world, rule, poi, Change::With(leader, copies)) - value;
-                        self.gains[leader * row + copies as usize] += gain;
+                        self.value(simd, scored, poi, Change::With(leader, copies));
+                        let gains = &mut self.gains[(leader * row + copies as usize) * teams..];
+                        add_differences(gains, &self.changed, &self.whole);
                     }
                 }
             }
         }
         let total = world.total_worth;
-        for (leader, score) in scores.iter_mut().enumerate().take(leaders) {
-            let (lost, gains) = (self.lost[leader], &self.gains[leader * row..][..row]);
-            *score = match fitness {
-                Fitness::G => share(observed, total.into()),
+        self.scores.clear();
+        for (team, leader) in (0..teams).flat_map(|team| (0..leaders).map(move |leader| (team, leader))) {
+            let (lost, gains) = (self.lost[leader * teams + team], &self.gains[leader * row * teams + team..]);
+            self.scores.push(match fitness {
+                Fitness::G => share(self.observed[team], total.into()),
                 Fitness::D | Fitness::Df | Fitness::Dt => share(lost, total.into()),
                 Fitness::Dpp => {
-                    stepping_stone(lost, most, gains[most as usize], total, |copies| gains[copies as usize])
+                    let gain = |copies: u32| gains[copies as usize * teams];
+                    stepping_stone(lost, most, gain(most), total, gain)
                 }
-            };
+            });
         }
-        observed
     }
 
-    /// Copies positions, so that the moments of an agent follow each other.
-    fn load<S: Simd>(&mut self, paths: &Paths<'_>, world: &World) {
-        let (agents, moments) = (world.agents(), world.steps() + 1);
-        let width = moments.next_multiple_of(S::f32s::LEN);
-        self.width = width;
-        self.positions.resize(2 * agents * width, 0.0);
-        let (x, y) = self.positions.split_at_mut(agents * width);
+    /// Returns a copy of a team's positions in rows: the moments of an agent follow each other.
+    fn load(&mut self, paths: &Paths<'_>, agents: usize, width: usize) -> Vec<u32> {
+        let mut words = std::mem::take(&mut self.positions);
+        words.resize(2 * agents * width, 0);
+        let (x, y) = words.split_at_mut(agents * width);
         let mut from = paths.positions.iter();
-        for (moment, agent) in (0..moments).flat_map(|moment| (0..agents).map(move |agent| (moment, agent))) {
-            for axis in [&mut *x, &mut *y] {
-                axis[agent * width + moment] = f32::from_bits(from.next().expect("a path has every moment"));
-            }
+        for (moment, agent) in (0..).flat_map(|moment| (0..agents).map(move |agent| (moment, agent))) {
+            let [Some(at_x), Some(at_y)] = [from.next(), from.next()] else { break };
+            (x[agent * width + moment], y[agent * width + moment]) = (at_x, at_y);
         }
-    }
-
-    /// Returns some neighbouring moments of an agent: its x and y.
-    #[inline(always)]
-    fn at<S: Simd>(&self, simd: S, agents: usize, agent: usize, first: usize) -> [S::f32s; 2] {
-        let row = |axis: usize| &self.positions[(axis * agents + agent) * self.width + first..][..S::f32s::LEN];
-        [S::f32s::from_slice(simd, row(0)), S::f32s::from_slice(simd, row(1))]
+        words
     }
 
     /// Finds whom each learner takes out, and when.
-    fn take_out<S: Simd>(&mut self, simd: S, world: &World, rule: &PathRule, fitness: Fitness) {
+    fn take_out<S: Simd>(&mut self, simd: S, scored: &Scored<'_>) {
+        let &Scored { world, rule, fitness, .. } = scored;
         let (leaders, agents, words) = (world.leaders(), world.agents(), world.constants.words as usize);
-        self.ever_taken.clear();
-        self.ever_taken.resize(leaders * words, 0);
+        refill(&mut self.ever_taken, leaders * words);
         match fitness {
             Fitness::D if !rule.removes.is_empty() => self.ever_taken.copy_from_slice(&rule.removes),
             _ => (0..leaders).for_each(|leader| self.ever_taken[leader * words + leader / 32] |= 1 << (leader % 32)),
         }
-        self.sights.clear();
-        self.led.clear();
-        if !matches!(fitness, Fitness::Df | Fitness::Dt) {
-            return;
+        let rows = world.leader_words() * agents;
+        let places = if fitness == Fitness::Dt { rows * (self.width + self.teams) } else { 0 };
+        refill(&mut self.sights, places);
+        refill(&mut self.led, if fitness == Fitness::Df && self.teams > 1 { rows * S::f32s::LEN } else { places });
+        if matches!(fitness, Fitness::Df | Fitness::Dt) {
+            simd.vectorize(
+                #[inline(always)]
+                || self.find_influences(simd, scored),
+            );
         }
         if fitness == Fitness::Dt {
-            let places = world.leader_words() * agents * (self.width + 1);
-            self.sights.resize(places, 0);
-            self.led.resize(places, 0);
-        }
-        simd.vectorize(
-            #[inline(always)]
-            || self.find_influences(simd, world, rule),
-        );
-        if fitness == Fitness::Dt {
-            return self.find_leading(world);
-        }
-        for (agent, counts) in self.counts.chunks_exact(leaders).enumerate() {
-            if let Some(leader) = first_most(counts.iter().copied()) {
-                self.ever_taken[leader * words + agent / 32] |= 1 << (agent % 32);
-            }
+            self.find_leading(world);
         }
     }
 
     /// Finds which learners lead each agent at each moment.
     fn find_leading(&mut self, world: &World) {
         let (leaders, agents, words) = (world.leaders(), world.agents(), world.constants.words as usize);
-        let (row, moments) = (self.width + 1, world.steps() + 1);
-        let place = |moment: usize, agent: usize, word: usize| (word * agents + agent) * row + moment;
+        let (teams, row, moments) = (self.teams, self.width + self.teams, world.steps() + 1);
+        let place = |moment: usize, agent: usize, word: usize| {
+            (word * agents + agent / teams) * row + moment * teams + agent % teams
+        };
         let sights = &self.sights;
-        lead(|place| sights[place], &mut self.led, [moments, agents, leaders], world.led, place);
+        lead(|place| sights[place], &mut self.led, [moments, agents * teams, leaders], world.led, place);
         for (place, led) in self.led.chunks_exact(row).enumerate() {
             let (word, agent) = (place / agents, place % agents);
-            for bit in each_bit(led[..moments].iter().fold(0, |ever, led| ever | led)) {
+            for bit in each_bit(led[..moments * teams].iter().fold(0, |ever, led| ever | led)) {
                 self.ever_taken[(word * 32 + bit) * words + agent / 32] |= 1 << (agent % 32);
             }
         }
     }
 
-    /// Finds which learners influence each agent at each moment, and how often.
+    /// Finds which learners influence each agent at each moment, or under Df which influences it most often.
     ///
     /// If the start counts, influence and observation are of the same moment. Otherwise agents influence others before they
     /// move, as the leaders that followers see.
     #[inline(always)]
-    fn find_influences<S: Simd>(&mut self, simd: S, world: &World, rule: &PathRule) {
-        let (leaders, agents, row) = (world.leaders(), world.agents(), self.width + 1);
-        let later = usize::from(!rule.start_counts);
-        let counted = world.steps() + 1 - later;
-        self.counts.clear();
-        self.counts.resize(agents * leaders, 0);
-        for (class, led) in world.classes.iter().enumerate() {
+    fn find_influences<S: Simd>(&mut self, simd: S, scored: &Scored<'_>) {
+        let &Scored { ref positions, teams, world, rule, fitness } = scored;
+        let (leaders, agents) = (world.leaders(), world.agents());
+        let (row, later) = (self.width + teams, if rule.start_counts { 0 } else { teams });
+        let end = (world.steps() + 1) * teams - later;
+        let agents_led = |class: usize| world.classes[class].agents().map(move |agent| (class, agent));
+        for (class, agent) in (0..world.classes.len()).flat_map(agents_led) {
+            refill(&mut self.counts, leaders * teams);
             for leading in &world.classes {
                 let influence2 = leading.constants.influence2[class];
-                let learners = leading.agents().take_while(|&agent| agent < leaders && influence2 >= 0.0);
-                for (leader, agent) in learners.flat_map(|leader| led.agents().map(move |agent| (leader, agent))) {
-                    if leader == agent {
-                        continue;
-                    }
-                    for first in (0..counted).step_by(S::f32s::LEN) {
+                let learners = leading.agents().take_while(|&learner| learner < leaders && influence2 >= 0.0);
+                for leader in learners.filter(|&leader| leader != agent) {
+                    let mut counts = S::u32s::splat(simd, 0);
+                    for first in (0..end).step_by(S::f32s::LEN) {
                         let ([x, y], [led_x, led_y]) =
-                            (self.at(simd, agents, leader, first), self.at(simd, agents, agent, first));
+                            (positions.at(simd, leader, first), positions.at(simd, agent, first));
                         let sees = within::<S>(x - led_x, y - led_y, splat(simd, influence2));
-                        let all = (counted - first).min(S::f32s::LEN);
-                        let counts = sees.to_bitmask() & (u64::MAX >> (64 - all));
-                        self.counts[agent * leaders + leader] += counts.count_ones();
+                        let mut sees = sees.to_vector().bitcast::<S::u32s>();
+                        if end - first < S::f32s::LEN {
+                            sees &= S::u32s::from_fn(simd, |lane| if first + lane < end { u32::MAX } else { 0 });
+                        }
+                        counts -= sees;
                         let place = (leader / 32 * agents + agent) * row + first + later;
                         if let Some(sights) = self.sights.get_mut(place..place + S::f32s::LEN) {
                             let bit = S::u32s::splat(simd, 1 << (leader % 32));
-                            let seen = sees.to_vector().bitcast::<S::u32s>() & bit;
-                            (S::u32s::from_slice(simd, sights) | seen).store_slice(sights);
+                            (S::u32s::from_slice(simd, sights) | sees & bit).store_slice(sights);
                         }
                     }
+                    for (lane, count) in counts.as_slice().iter().enumerate() {
+                        self.counts[leader * teams + lane % teams] += count;
+                    }
+                }
+            }
+            if fitness == Fitness::Df {
+                self.find_owners(world, agent, S::f32s::LEN);
+            }
+        }
+    }
+
+    /// Finds the learner that influences an agent most often, in each team.
+    fn find_owners(&mut self, world: &World, agent: usize, lanes: usize) {
+        for team in 0..self.teams {
+            let counts = self.counts[team..].iter().step_by(self.teams);
+            if let Some(leader) = first_most(counts.copied()) {
+                let words = world.constants.words as usize;
+                self.ever_taken[leader * words + agent / 32] |= 1 << (agent % 32);
+                if let Some(led) = self.led.get_mut((leader / 32 * world.agents() + agent) * lanes + team) {
+                    *led |= 1 << (leader % 32);
                 }
             }
         }
@@ -223,7 +345,8 @@ impl PathCredit {
 
     /// Finds the observers that are ever near a POI, and when.
     #[inline(always)]
-    fn find_observers<S: Simd>(&mut self, simd: S, world: &World, rule: &PathRule, poi: usize, at: Vec2) {
+    fn find_observers<S: Simd>(&mut self, simd: S, scored: &Scored<'_>, poi: usize) {
+        let &Scored { ref positions, teams, world, rule, .. } = scored;
         let (agents, width) = (world.agents(), self.width);
         // A window of all steps includes the start, if that counts. POIs without one have it if others have windows.
         let window = world.rule.window(poi).filter(|&window| window != [1, world.constants.steps]);
@@ -231,124 +354,159 @@ impl PathCredit {
         let first = first.max(usize::from(!rule.start_counts));
         self.observers.clear();
         self.near.clear();
-        let radius2 = splat(simd, world.radii2[poi]);
+        refill(&mut self.is_anyone_near, width);
+        let (poi_x, poi_y) = self.pois[poi * 2 * S::f32s::LEN..][..2 * S::f32s::LEN].split_at(S::f32s::LEN);
+        let (poi_x, poi_y) = (S::f32s::from_slice(simd, poi_x), S::f32s::from_slice(simd, poi_y));
+        let (radius2, infinity) = (splat(simd, world.radii2[poi]), splat(simd, f32::INFINITY));
         for agent in (0..agents).filter(|&agent| world.rule.counts_at(poi, agent)) {
             let start = self.near.len();
-            self.near.resize(start + width, f32::INFINITY);
-            let mut ever = false;
-            for chunk in (0..width).step_by(S::f32s::LEN) {
-                let [x, y] = self.at(simd, agents, agent, chunk);
-                let (dx, dy) = (x - at.x, y - at.y);
+            self.near.resize(start + width, 0.0);
+            let mut ever = S::u32s::splat(simd, 0);
+            let rows = self.near[start..].chunks_exact_mut(S::f32s::LEN);
+            let rows = rows.zip(self.is_anyone_near.chunks_exact_mut(S::f32s::LEN)).enumerate();
+            for (vector, (near, is_anyone_near)) in rows {
+                let [x, y] = positions.at(simd, agent, vector * S::f32s::LEN);
+                let (dx, dy) = (x - poi_x, y - poi_y);
                 let is_near = observes::<S>(radius2, dx, dy);
-                if is_near.any_true() {
-                    let near = select::<S>(splat(simd, f32::INFINITY), dx * dx + dy * dy, is_near);
-                    near.store_slice(&mut self.near[start + chunk..][..S::f32s::LEN]);
-                    ever = true;
-                }
+                select::<S>(infinity, dx * dx + dy * dy, is_near).store_slice(near);
+                let is_near = is_near.to_vector().bitcast::<S::u32s>();
+                ever |= is_near;
+                (S::u32s::from_slice(simd, is_anyone_near) | is_near).store_slice(is_anyone_near);
             }
-            if ever {
+            if ever.simd_gt(0).any_true() {
                 let near = &mut self.near[start..];
-                near[..first].fill(f32::INFINITY);
-                near[last + 1..].fill(f32::INFINITY);
+                near[..first * teams].fill(f32::INFINITY);
+                near[(last + 1) * teams..].fill(f32::INFINITY);
                 self.observers.push(agent);
             } else {
                 self.near.truncate(start);
             }
         }
+        let vectors = self.is_anyone_near.chunks_exact(S::f32s::LEN).enumerate();
+        let busy = vectors.filter(|(_, near)| S::u32s::from_slice(simd, near).simd_gt(0).any_true());
+        self.vectors.clear();
+        self.vectors.extend(busy.map(|(vector, _)| vector * S::f32s::LEN));
     }
 
-    /// Returns what a POI counts for, in units of its worth.
-    fn value<S: Simd>(&mut self, simd: S, world: &World, rule: &PathRule, poi: usize, change: Change) -> u32 {
+    /// Finds what a POI counts for in each team after a change.
+    fn value<S: Simd>(&mut self, simd: S, scored: &Scored<'_>, poi: usize, change: Change) {
+        let (world, agents) = (scored.world, scored.world.agents());
+        self.counted.clear();
+        for (index, &agent) in self.observers.iter().enumerate() {
+            let mut counted = Counted { near: index * self.width, times: 1, led: None };
+            match change {
+                Change::Without(leader) => {
+                    let of_leader = &self.ever_taken[leader * world.constants.words as usize..];
+                    if of_leader[agent / 32] >> (agent % 32) & 1 != 0 {
+                        if self.led.is_empty() || agent == leader {
+                            continue;
+                        }
+                        let row = self.led.len() / (world.leader_words() * agents);
+                        let apart = usize::from(row > S::f32s::LEN);
+                        counted.led = Some([(leader / 32 * agents + agent) * row, apart]);
+                    }
+                }
+                Change::With(leader, copies) if leader == agent => counted.times += copies,
+                Change::With(..) | Change::None => {}
+            }
+            self.counted.push(counted);
+        }
         simd.vectorize(
             #[inline(always)]
-            || self.value_of(simd, world, rule, poi, change),
-        )
+            || self.value_of(simd, scored, poi, change),
+        );
     }
 
     #[inline(always)]
-    fn value_of<S: Simd>(&mut self, simd: S, world: &World, rule: &PathRule, poi: usize, change: Change) -> u32 {
+    fn value_of<S: Simd>(&mut self, simd: S, scored: &Scored<'_>, poi: usize, change: Change) {
+        let &Scored { teams, world, rule, .. } = scored;
         let ((score, when), coupling) = (rule.scores[poi], world.coupling[poi] as usize);
         let value = |squared: f32| match squared.is_finite() {
             true => (f64::from(world.worth[poi]) / f64::from(squared).sqrt()).round() as u32,
             false => 0,
         };
-        let (mut best, mut sum, steps) = (splat(simd, f32::INFINITY), 0_u64, world.steps());
-        // The last vector has the last moment.
-        let from = if when == When::End { self.width - S::f32s::LEN } else { 0 };
-        for first in (from..self.width).step_by(S::f32s::LEN) {
+        let end = world.steps() * teams;
+        let bit = match change {
+            Change::Without(leader) => 1 << (leader % 32),
+            _ => 0,
+        };
+        let mut best = splat(simd, f32::INFINITY);
+        refill(&mut self.sums, teams);
+        for index in 0..self.vectors.len() {
+            let first = self.vectors[index];
+            // The last vector has the last moment.
+            if when == When::End && first + S::f32s::LEN < self.width {
+                continue;
+            }
             let squared = match (score, coupling) {
-                (Score::Observed, _) => self.observed::<S>(simd, world, coupling as u32, first, change),
-                (Score::Closeness, 1) => self.closest::<S>(simd, world, first, change),
-                (Score::Closeness, _) => self.close::<S>(simd, world, coupling, first, change),
+                (Score::Observed, _) => self.observed_at::<S>(simd, coupling as u32, first, bit),
+                (Score::Closeness, 1) => self.closest::<S>(simd, first, bit),
+                (Score::Closeness, _) => self.close::<S>(simd, coupling, first, bit),
             };
             match when {
                 When::Ever => best = smaller::<S>(squared, best),
-                When::End => best = splat(simd, squared.as_slice()[steps - first]),
-                When::Mean => sum += squared.as_slice().iter().map(|&squared| u64::from(value(squared))).sum::<u64>(),
+                When::End => best = S::f32s::from_fn(simd, |lane| squared[end - first + lane % teams]),
+                When::Mean => {
+                    for (lane, &squared) in squared.as_slice().iter().enumerate() {
+                        self.sums[lane % teams] += u64::from(value(squared));
+                    }
+                }
             }
         }
-        if when == When::Mean {
-            let moments = steps as u64 + u64::from(rule.start_counts);
-            return ((sum + moments / 2) / moments) as u32;
+        self.changed.clear();
+        for (team, &sum) in self.sums.iter().enumerate() {
+            if when == When::Mean {
+                let moments = world.steps() as u64 + u64::from(rule.start_counts);
+                self.changed.push(Worth { squared: f32::NAN, value: ((sum + moments / 2) / moments) as u32 });
+                continue;
+            }
+            let squared = best.as_slice()[team..].iter().step_by(teams).copied().fold(f32::INFINITY, f32::min);
+            let same = self.whole.get(team).filter(|whole| whole.squared == squared);
+            self.changed.push(same.copied().unwrap_or_else(|| Worth { squared, value: value(squared) }));
         }
-        value(best.as_slice().iter().copied().fold(f32::INFINITY, f32::min))
     }
 
-    /// Returns the squared distance of an observer, infinite if it is not near or taken out, and how often it counts.
+    /// Returns the squared distance of an observer, infinite if it is not near or taken out. `bit` is of the learner for whom
+    /// it is.
     #[inline(always)]
-    fn near<S: Simd>(&self, simd: S, world: &World, index: usize, first: usize, change: Change) -> (S::f32s, u32) {
-        let agent = self.observers[index];
-        let near = S::f32s::from_slice(simd, &self.near[index * self.width + first..][..S::f32s::LEN]);
-        match change {
-            Change::Without(leader) => {
-                let of_leader = &self.ever_taken[leader * world.constants.words as usize..];
-                if of_leader[agent / 32] >> (agent % 32) & 1 == 0 {
-                    return (near, 1);
-                }
-                if self.led.is_empty() || agent == leader {
-                    return (splat(simd, f32::INFINITY), 1);
-                }
-                let place = (leader / 32 * world.agents() + agent) * (self.width + 1) + first;
-                let led = S::u32s::from_slice(simd, &self.led[place..][..S::f32s::LEN]);
-                let stays = (led & S::u32s::splat(simd, 1 << (leader % 32))).simd_eq(0);
-                (select::<S>(splat(simd, f32::INFINITY), near, stays), 1)
-            }
-            Change::With(leader, copies) if leader == agent => (near, 1 + copies),
-            Change::With(..) | Change::None => (near, 1),
-        }
+    fn near<S: Simd>(&self, simd: S, counted: &Counted, first: usize, bit: u32) -> S::f32s {
+        let near = S::f32s::from_slice(simd, &self.near[counted.near + first..][..S::f32s::LEN]);
+        let Some([row, apart]) = counted.led else { return near };
+        let led = S::u32s::from_slice(simd, &self.led[row + first * apart..][..S::f32s::LEN]);
+        let stays = (led & S::u32s::splat(simd, bit)).simd_eq(0);
+        select::<S>(splat(simd, f32::INFINITY), near, stays)
     }
 
     /// Returns 1 at moments with enough observers, else infinity.
     #[inline(always)]
-    fn observed<S: Simd>(&self, simd: S, world: &World, coupling: u32, first: usize, change: Change) -> S::f32s {
+    fn observed_at<S: Simd>(&self, simd: S, coupling: u32, first: usize, bit: u32) -> S::f32s {
         let (infinity, mut count) = (splat(simd, f32::INFINITY), S::u32s::splat(simd, 0));
-        for index in 0..self.observers.len() {
-            let (near, times) = self.near(simd, world, index, first, change);
-            count += near.simd_lt(infinity).to_vector().bitcast::<S::u32s>() & S::u32s::splat(simd, times);
+        for counted in &self.counted {
+            let is_near = self.near(simd, counted, first, bit).simd_lt(infinity);
+            count += is_near.to_vector().bitcast::<S::u32s>() & S::u32s::splat(simd, counted.times);
         }
         select::<S>(infinity, splat(simd, 1.0), count.simd_ge(coupling))
     }
 
     /// Returns the square of max(d, 1) for the distance d of the nearest observer.
     #[inline(always)]
-    fn closest<S: Simd>(&self, simd: S, world: &World, first: usize, change: Change) -> S::f32s {
+    fn closest<S: Simd>(&self, simd: S, first: usize, bit: u32) -> S::f32s {
         let mut closest = splat(simd, f32::INFINITY);
-        for index in 0..self.observers.len() {
-            closest = smaller::<S>(self.near(simd, world, index, first, change).0, closest);
+        for counted in &self.counted {
+            closest = smaller::<S>(self.near(simd, counted, first, bit), closest);
         }
         larger::<S>(closest, splat(simd, 1.0))
     }
 
     /// Returns the product of the squares of max(d, 1) over the distances d of so many nearest observers.
     #[inline(always)]
-    fn close<S: Simd>(&mut self, simd: S, world: &World, coupling: usize, first: usize, change: Change) -> S::f32s {
+    fn close<S: Simd>(&mut self, simd: S, coupling: usize, first: usize, bit: u32) -> S::f32s {
         let mut nearest = std::mem::take(&mut self.nearest);
         nearest.clear();
         nearest.resize(coupling * S::f32s::LEN, f32::INFINITY);
-        for index in 0..self.observers.len() {
-            let (near, times) = self.near(simd, world, index, first, change);
-            for _ in 0..times {
-                let mut farther = near;
+        for counted in &self.counted {
+            for _ in 0..counted.times {
+                let mut farther = self.near(simd, counted, first, bit);
                 for row in nearest.chunks_exact_mut(S::f32s::LEN) {
                     let kept = S::f32s::from_slice(simd, row);
                     smaller::<S>(farther, kept).store_slice(row);
@@ -363,4 +521,15 @@ impl PathCredit {
         self.nearest = nearest;
         product
     }
+}
+
+/// Adds what a POI counts for more in some teams than in others.
+fn add_differences(to: &mut [u32], more: &[Worth], less: &[Worth]) {
+    to.iter_mut().zip(more.iter().zip(less)).for_each(|(to, (more, less))| *to += more.value - less.value);
+}
+
+/// Makes an array so many zeros.
+fn refill<T: Clone + Default>(array: &mut Vec<T>, length: usize) {
+    array.clear();
+    array.resize(length, T::default());
 }

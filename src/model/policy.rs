@@ -123,11 +123,11 @@ impl PolicyConstants {
 
 /// Computes some units before tanh: the bias, plus the weighted inputs in order.
 ///
-/// `weights` has one row of `UNITS` per input, then the biases.
+/// `weights` has one row of `UNITS` per input, then the biases. Inputs may end early if the rest are 0.
 #[inline(always)]
 pub(crate) fn affine<S: Simd, const UNITS: usize>(inputs: &[S::f32s], weights: &[S::f32s]) -> [S::f32s; UNITS] {
     let (rows, _) = weights.as_chunks::<UNITS>();
-    let mut sums = rows[inputs.len()];
+    let mut sums = rows[rows.len() - 1];
     for (&input, row) in inputs.iter().zip(rows) {
         for (sum, &weight) in sums.iter_mut().zip(row) {
             *sum += input * weight;

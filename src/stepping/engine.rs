@@ -348,7 +348,7 @@ impl<S: Simd> Workspace<S> {
         }
         let records_sights = world.paths.is_none() && !trail.is_empty();
         let seen = if records_sights { &mut self.sights } else { &mut [][..] };
-        self.block.step(seen, &mut self.sets);
+        self.block.step(seen, Some(&mut self.sets));
         if is_partial {
             for (lane, _) in lanes::<S>(teams).filter(|&(_, team)| steps[team] >= last) {
                 keep(&mut self.block, &self.kept, lane);

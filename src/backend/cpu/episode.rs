@@ -11,7 +11,7 @@ use super::network::Network;
 use super::together::{Observer, Together};
 use super::{Moment, ScoreTable};
 use crate::config::Fitness;
-use crate::credit::{Episode, LaneCredit, Paths, Seen, Strided};
+use crate::credit::{Episode, LaneCredit, PathCredit, Paths, Seen, Strided};
 use crate::model::class::Class;
 use crate::world::{OUTPUTS, World};
 
@@ -31,6 +31,7 @@ pub(super) struct EpisodeBlock<S: Simd> {
     /// need them.
     paths: Vec<u32>,
     credit: LaneCredit<S>,
+    path_credit: PathCredit,
 }
 
 /// Returns the words of a team's sightings: 0 unless recorded.
@@ -74,17 +75,19 @@ impl<S: Simd> Together<S> for EpisodeBlock<S> {
     const MAX_TEAMS: usize = S::f32s::LEN;
 
     fn allocate(simd: S, batch: &WorldBatch<'_>, _: bool) -> EpisodeBlock<S> {
-        let world = batch.world;
+        let (world, policy) = (batch.world, &batch.world.constants.policy);
+        let used = (0..world.leaders()).map(|leader| world.class_of(leader).inputs()).collect();
         EpisodeBlock {
             classes: world.classes.clone(),
             block: Block::new(simd, world),
-            network: Network::new(simd, &world.constants.policy, world.choices()),
+            network: Network::new(simd, policy, world.choices(), used),
             places: Vec::with_capacity(S::f32s::LEN),
             sets: vec![0; world.set_words() * S::f32s::LEN],
             seen: vec![0; world.followers() * world.leaders() * S::f32s::LEN],
             sights: vec![0; sight_words(world, batch.sighted) * S::f32s::LEN],
             paths: vec![0; if world.paths.is_some() { world.path_words() * S::f32s::LEN } else { 0 }],
             credit: LaneCredit::new(simd, world),
+            path_credit: PathCredit::default(),
         }
     }
 
@@ -99,10 +102,11 @@ impl<S: Simd> Together<S> for EpisodeBlock<S> {
     }
 
     #[inline(always)]
-    fn play(&mut self, batch: &WorldBatch<'_>, teams: Range<usize>, observer: &mut impl Observer<S, Self>) {
+    fn play<O: Observer<S, Self>>(&mut self, batch: &WorldBatch<'_>, teams: Range<usize>, observer: &mut O) {
         self.load(batch, teams);
         let steps = batch.world.steps();
         let [sets_per_step, sights_per_step] = [self.sets.len() / steps, self.sights.len() / steps];
+        let needs_sets = O::READS_SETS || batch.world.paths.is_none();
         observer.started(self);
         self.record_positions(0);
         for step in 0..steps {
@@ -110,7 +114,8 @@ impl<S: Simd> Together<S> for EpisodeBlock<S> {
             self.network.decide(&self.block.inputs, &mut self.block.outputs);
             observer.decided(self, step);
             let sights = &mut self.sights[step * sights_per_step..][..sights_per_step];
-            self.block.step(sights, &mut self.sets[step * sets_per_step..][..sets_per_step]);
+            let sets = &mut self.sets[step * sets_per_step..][..sets_per_step];
+            self.block.step(sights, needs_sets.then_some(sets));
             observer.moved(self, step);
             self.record_positions(step + 1);
         }
@@ -124,7 +129,8 @@ impl<S: Simd> Together<S> for EpisodeBlock<S> {
     fn score(&mut self, batch: &WorldBatch<'_>, teams: Range<usize>, scores: &ScoreTable<'_>) {
         // Without a fitness, only the observed POIs are wanted.
         let counted = batch.fitnesses.map(|fitnesses| if fitnesses.is_empty() { &[Fitness::G] } else { fitnesses });
-        let in_lanes = |fitness: &Fitness| LaneCredit::<S>::can_score(batch.world, *fitness);
+        let in_lanes =
+            |fitness: &Fitness| batch.world.paths.is_some() || LaneCredit::<S>::can_score(batch.world, *fitness);
         let Some(counted) = counted.filter(|fitnesses| fitnesses.iter().all(in_lanes)) else {
             for lane in 0..teams.len() {
                 let (group, team) = self.places[lane];
@@ -132,11 +138,18 @@ impl<S: Simd> Together<S> for EpisodeBlock<S> {
             }
             return;
         };
+        let EpisodeBlock { block, places, sets, paths, credit, path_credit, .. } = self;
         for (row, &fitness) in counted.iter().enumerate() {
-            self.credit.score(&self.sets, &self.block.counts, batch.world, fitness);
-            for (lane, &(group, team)) in self.places[..teams.len()].iter().enumerate() {
+            match &batch.world.paths {
+                Some(rule) => path_credit.score_teams(block.simd, paths, &block.pois, batch.world, rule, fitness),
+                None => credit.score(sets, &block.counts, batch.world, fitness),
+            }
+            for (lane, &(group, team)) in places[..teams.len()].iter().enumerate() {
                 let place = (batch.first + group, team);
-                scores.put(place, row, self.credit.observed(lane), self.credit.scores(lane));
+                match batch.world.paths {
+                    Some(_) => scores.put(place, row, path_credit.observed(lane), path_credit.scores(lane)),
+                    None => scores.put(place, row, credit.observed(lane), credit.scores(lane)),
+                }
             }
         }
     }

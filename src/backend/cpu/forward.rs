@@ -43,7 +43,7 @@ fn forward_rows<S: Simd>(
 ) {
     outputs.par_chunks_mut(ROWS_PER_TASK * OUTPUTS).enumerate().for_each(|(part, outputs)| {
         let (width, size, parameters) = (S::f32s::LEN, policy.inputs(), policy.parameters as usize);
-        let mut network = Network::new(simd, policy, vec![choices]);
+        let mut network = Network::new(simd, policy, vec![choices], vec![size]);
         let (mut loaded, mut sensed) = (None, vec![splat(simd, 0.0); size]);
         let zero = splat(simd, 0.0);
         for (chunk, outputs) in outputs.chunks_mut(width * OUTPUTS).enumerate() {

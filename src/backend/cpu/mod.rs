@@ -213,6 +213,8 @@ struct Playing<'a> {
 }
 
 impl<S: Simd, T: Together<S>> Observer<S, T> for Playing<'_> {
+    const READS_SETS: bool = false;
+
     #[inline(always)]
     fn decided(&mut self, teams: &mut T, step: usize) {
         self.batch.prefetch(self.ahead.clone(), step);
@@ -287,19 +289,19 @@ pub(crate) fn block_bytes(world: &World, fitness: Fitness) -> u64 {
     let counted = if is_large && fitness != Fitness::Df { 0 } else { followers * leaders };
     let record = world.set_words() + counted + sight_words(world, fitness == Fitness::Dt) + paths;
     let policies = leaders * world.constants.policy.words();
-    // Scores from paths copy these, and under Dt find who leads whom at each moment.
-    let moments = world.steps() + 1 + lanes() as usize;
-    let led = 2 * agents * leaders.div_ceil(32) + leaders * world.constants.words as usize;
+    // Scores from paths need each agent's distance from a POI, and under Dt who leads whom, at each moment. Those of one
+    // large team copy its paths.
+    let (copied, moments) = if is_large { (2, world.steps() + 1 + lanes() as usize) } else { (0, world.steps() + 2) };
     let scratch = match (paths, fitness) {
         (0, _) => 0,
-        (_, Fitness::Dt) => moments * (3 * agents + led),
-        _ => moments * 3 * agents,
+        (_, Fitness::Dt) => moments * agents * (copied + 1 + 2 * world.leader_words()),
+        _ => moments * agents * (copied + 1),
     };
     if is_large {
         return (4 * (policies + record + scratch) + swarm::bytes(agents)) as u64;
     }
-    let words = 8 * agents + policies + 3 * followers + record;
-    words as u64 * lanes() * 4 + (8 * world.parameters() + agents * agents.div_ceil(64) * 8 + 4 * scratch) as u64
+    let words = 8 * agents + policies + 3 * followers + record + scratch;
+    words as u64 * lanes() * 4 + (8 * world.parameters() + agents * agents.div_ceil(64) * 8) as u64
 }
 
 #[cfg(test)]

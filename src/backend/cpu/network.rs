@@ -13,6 +13,8 @@ pub(super) struct Network<S: Simd> {
     simd: S,
     /// The number of agents among which each leader chooses, `[leaders]`: 0 unless it chooses agents.
     choices: Vec<usize>,
+    /// The number of inputs that each leader has, `[leaders]`. The rest are 0.
+    used: Vec<usize>,
     constants: PolicyConstants,
     /// `[leaders][parameters]`, layer by layer. Units that are computed together (see [`together`]) form a block: one
     /// row per input, then the biases.
@@ -24,7 +26,7 @@ pub(super) struct Network<S: Simd> {
 }
 
 impl<S: Simd> Network<S> {
-    pub(super) fn new(simd: S, policy: &PolicyConstants, choices: Vec<usize>) -> Network<S> {
+    pub(super) fn new(simd: S, policy: &PolicyConstants, choices: Vec<usize>, used: Vec<usize>) -> Network<S> {
         let leaders = choices.len();
         let (zero, widest, parameters) = (splat(simd, 0.0), policy.widest(), policy.parameters as usize);
         let mut slots = vec![0; parameters];
@@ -45,6 +47,7 @@ impl<S: Simd> Network<S> {
         Network {
             simd,
             choices,
+            used,
             constants: *policy,
             weights: vec![zero; leaders * parameters],
             slots,
@@ -86,7 +89,7 @@ impl<S: Simd> Network<S> {
 
     #[inline(always)]
     fn answer(&mut self, inputs: &[S::f32s], outputs: &mut [[S::f32s; OUTPUTS]]) {
-        let Network { weights, hidden, choices, constants, .. } = self;
+        let Network { weights, hidden, choices, used, constants, .. } = self;
         let (leaders, &mut PolicyConstants { layers, widths, parameters, .. }) = (choices.len(), &mut *constants);
         let mut first = 0;
         let [mut to, mut from] = hidden.each_mut().map(|units| &mut units[..]);
@@ -101,8 +104,8 @@ impl<S: Simd> Network<S> {
                 (10, OUTPUTS) => affine_layer::<S, 10, OUTPUTS>(inputs, units, weights),
                 _ => {
                     let leaders = inputs.chunks_exact(rows).zip(units.chunks_exact_mut(columns));
-                    for ((inputs, units), weights) in leaders.zip(weights) {
-                        affine::<S>(inputs, units, weights);
+                    for (((inputs, units), weights), &used) in leaders.zip(weights).zip(&*used) {
+                        affine::<S>(inputs, if layer == 0 { used } else { rows }, units, weights);
                     }
                 }
             }
@@ -168,14 +171,15 @@ fn affine_layer<'a, S: Simd, const INPUTS: usize, const UNITS: usize>(
     }
 }
 
-/// Computes one leader's units of one layer, before tanh.
+/// Computes one leader's units of one layer from the first `used` inputs, before tanh.
 #[inline(always)]
-fn affine<S: Simd>(inputs: &[S::f32s], mut units: &mut [S::f32s], mut weights: &[S::f32s]) {
+fn affine<S: Simd>(inputs: &[S::f32s], used: usize, mut units: &mut [S::f32s], mut weights: &[S::f32s]) {
     while !units.is_empty() {
         let count = together(units.len());
         let (these, weights_of_these);
         (these, units) = units.split_at_mut(count);
         (weights_of_these, weights) = weights.split_at((inputs.len() + 1) * count);
+        let inputs = &inputs[..used];
         match count {
             10 => these.copy_from_slice(&policy::affine::<S, 10>(inputs, weights_of_these)),
             4 => these.copy_from_slice(&policy::affine::<S, 4>(inputs, weights_of_these)),

@@ -24,7 +24,7 @@ pub(super) trait Together<S: Simd>: Send + Sized + 'static {
     fn fits(&self, batch: &WorldBatch<'_>) -> bool;
 
     /// Plays the whole episodes of some teams of the batch.
-    fn play(&mut self, batch: &WorldBatch<'_>, teams: Range<usize>, observer: &mut impl Observer<S, Self>);
+    fn play<O: Observer<S, Self>>(&mut self, batch: &WorldBatch<'_>, teams: Range<usize>, observer: &mut O);
 
     /// Scores the teams that were played.
     fn score(&mut self, batch: &WorldBatch<'_>, teams: Range<usize>, scores: &ScoreTable<'_>);
@@ -57,6 +57,9 @@ pub(super) trait Together<S: Simd>: Send + Sized + 'static {
 
 /// Follows the episodes of teams that play together. By default nothing is done.
 pub(super) trait Observer<S: Simd, T: Together<S>> {
+    /// Whether it reads the agents at each POI even if scores do not need them.
+    const READS_SETS: bool = true;
+
     /// The teams are at their start.
     #[inline(always)]
     fn started(&mut self, _: &mut T) {}

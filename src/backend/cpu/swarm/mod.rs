@@ -123,7 +123,7 @@ impl<S: Simd> Swarm<S> {
             cells: world.classes.iter().map(cells).collect(),
             pois: world.pois.clone(),
             gone: vec![false; world.pois.len()],
-            network: Network::new(simd, &world.constants.policy, vec![0; vectors]),
+            network: Network::new(simd, &world.constants.policy, vec![0; vectors], vec![world.inputs(); vectors]),
             inputs: vec![zero; vectors * world.inputs()],
             outputs: vec![[zero; OUTPUTS]; vectors],
             forces: vec![[0.0; 2]; if recorded.forces { followers } else { 0 }],
@@ -551,7 +551,7 @@ impl<S: Simd> Together<S> for Swarm<S> {
             && self.paths.is_empty() == world.paths.is_none()
     }
 
-    fn play(&mut self, batch: &WorldBatch<'_>, teams: Range<usize>, observer: &mut impl Observer<S, Self>) {
+    fn play<O: Observer<S, Self>>(&mut self, batch: &WorldBatch<'_>, teams: Range<usize>, observer: &mut O) {
         let place = batch.locate(teams.start);
         let group = &batch.groups[place.0];
         let (leaders, steps) = (batch.world.leaders(), batch.world.steps());
@@ -681,7 +681,7 @@ impl<S: Simd> Sensing<'_, S> {
         let (measured, within) = sense::measured::<S>(self.channel, measure, splat(simd, value), offset[0], offset[1]);
         let measured = (measured & counts.to_vector(), within & counts);
         match self.in_quadrants {
-            true => self.quadrants.add::<false>(measured, offset, self.heading),
+            true => self.quadrants.add::<false, false>(measured, offset, self.heading),
             false => self.sectors.add(self.channel, measured, offset, self.heading),
         }
     }
