@@ -547,11 +547,17 @@ fn the_page_on_rovers_and_uavs_agrees_with_its_files() {
         }
     }
     assert_eq!((pairs, uncorrected), (84, 1));
-    let g: Vec<f64> =
-        read("3_rovers_3_uavs_2000.csv".into()).iter().map(|row| row["champion_g"].parse().unwrap()).collect();
-    let [least, most] = [g.iter().copied().fold(1.0, f64::min), g.iter().copied().fold(0.0, f64::max)];
-    assert!(page.contains(&format!("champions of ten trials reach {least:.2} to {most:.2}")), "{g:?}");
-    assert!(read("3_rovers_3_uavs_2000_pairs.csv".into()).iter().all(|row| row["p_holm"] == "1"));
+    let large = read("3_rovers_3_uavs_2000.csv".into());
+    let range = |values: &mut dyn Iterator<Item = f64>| values.fold([1.0, 0.0], |[a, b], g| [g.min(a), g.max(b)]);
+    let [least, most] = range(&mut large.iter().map(|row| row["champion_g"].parse().unwrap()));
+    assert!(page.contains(&format!("champions of 30 trials reach {least:.2} to {most:.2}")), "{least} {most}");
+    let reached = large.iter().map(|row| (&*row["learning.fitness"], &*row["credit.led_by"], &*row["reached"]));
+    let reached: Vec<_> = reached.filter(|(fitness, led_by, _)| *fitness != "Dt" || *led_by != "any-seen").collect();
+    assert!(reached.len() == 6 && large.iter().all(|row| row["trials"] == "30"));
+    assert!(reached.iter().all(|&(fitness, _, trials)| trials == if fitness == "Dt" { "7" } else { "0" }));
+    let pairs = read("3_rovers_3_uavs_2000_pairs.csv".into());
+    let [p, holm] = ["p", "p_holm"].map(|key| range(&mut pairs.iter().map(|row| row[key].parse().unwrap()))[0]);
+    assert!(page.contains(&format!("the smallest p is {p:.3}, and {holm:.2} by Holm")) && holm >= 0.05, "{p} {holm}");
     let page = page + &fs::read_to_string(folder.join("influence-drawn.md")).unwrap();
     let studies = ["3_rovers_3_uavs_random_pairs.csv", "random_again.csv"].map(|name| read(name.into()));
     let near = read("near.csv".into());
