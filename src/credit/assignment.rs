@@ -1,6 +1,6 @@
 //! Assignment of followers to leaders: over the episode (Df), or at each step (Dt).
 
-use super::{Seen, Strided, each_bit, owner_bits};
+use super::{Seen, Strided, each_bit, fill_with_zeros, owner_bits};
 use crate::config::LedBy;
 use crate::world::{Led, World};
 
@@ -42,8 +42,7 @@ pub(super) fn first_most(numbers: impl Iterator<Item = u32>) -> Option<usize> {
 /// Writes the agents that belong to each leader, one bit per agent, `[leaders][words]`.
 pub(super) fn gather(owner: &[u32], world: &World, groups: &mut Vec<u32>) {
     let words = world.constants.words as usize;
-    groups.clear();
-    groups.resize(world.leaders() * words, 0);
+    fill_with_zeros(groups, world.leaders() * words);
     for (agent, &leader) in owner.iter().enumerate().filter(|&(_, &leader)| leader != UNASSIGNED) {
         groups[leader as usize * words + agent / 32] |= 1 << (agent % 32);
     }
@@ -53,8 +52,7 @@ pub(super) fn gather(owner: &[u32], world: &World, groups: &mut Vec<u32>) {
 /// `sights` has the leaders that each follower saw, in the same shape.
 pub fn find_leading(sights: &Strided<'_>, world: &World, led: &mut Vec<u32>) {
     let (followers, leaders, words) = (world.followers(), world.leaders(), world.leader_words());
-    led.clear();
-    led.resize(sights.len(), 0);
+    fill_with_zeros(led, sights.len());
     let place = |step: usize, follower: usize, word: usize| (step * followers + follower) * words + word;
     let steps = sights.len() / (followers * words).max(1);
     lead(|place| sights.get(place), led, [steps, followers, leaders], world.led, place);

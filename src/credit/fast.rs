@@ -1,7 +1,7 @@
 //! The fast path: every fitness but Dt, unless it matters when agents are at a POI, in one pass over the sets.
 
 use super::assignment::{assign, gather};
-use super::{Credit, Episode, Strided, each_bit, stepping_stone};
+use super::{Credit, Episode, Strided, each_bit, fill_with_zeros, stepping_stone};
 use crate::world::World;
 
 impl Credit {
@@ -58,8 +58,7 @@ impl Credit {
     pub(super) fn find_critical_leaders_and_largest_sets(&mut self, episode: &Episode<'_>, world: &World) {
         self.mark_all_critical(world);
         let leaders = world.leaders();
-        self.largest_set_with.clear();
-        self.largest_set_with.resize(world.pois.len() * leaders, 0);
+        fill_with_zeros(&mut self.largest_set_with, world.pois.len() * leaders);
         let Credit { observed, critical, largest_set_with, sets, .. } = self;
         each_set(
             &episode.sets,
@@ -83,8 +82,7 @@ impl Credit {
     /// Returns D++ of one leader.
     pub(super) fn dpp(&mut self, world: &World, leader: usize) -> f32 {
         let most = world.coupling.iter().copied().max().unwrap_or(0);
-        self.completed.clear();
-        self.completed.resize(most as usize + 1, 0);
+        fill_with_zeros(&mut self.completed, most as usize + 1);
         let mut at_most = 0u32;
         for (poi, &coupling) in world.coupling.iter().enumerate() {
             let largest_set_with = self.largest_set_with[poi * world.leaders() + leader];
@@ -119,8 +117,7 @@ impl Credit {
     /// Adds up what the observed POIs are worth that each leader is critical to.
     pub(super) fn count_lost(&mut self, world: &World) {
         let (leaders, words) = (world.leaders(), world.constants.words as usize);
-        self.lost.clear();
-        self.lost.resize(leaders, 0);
+        fill_with_zeros(&mut self.lost, leaders);
         let pois = self.critical.chunks_exact(words).zip(&world.worth).zip(&self.observed);
         for ((critical, worth), _) in pois.filter(|(_, observed)| **observed) {
             bits(critical).for_each(|leader| self.lost[leader] += worth);
@@ -142,8 +139,7 @@ fn each_set(
     if sets.is_empty() {
         return;
     }
-    scratch.clear();
-    scratch.resize(2 * words, 0);
+    fill_with_zeros(scratch, 2 * words);
     for poi in 0..pois {
         let enough = enough(poi);
         let steps = sets.words[poi * words * sets.stride + sets.offset..].chunks(pois * words * sets.stride);

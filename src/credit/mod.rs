@@ -89,8 +89,7 @@ impl Credit {
         if world.rule.is_timed() || fitness == Fitness::Dt {
             return self.replay(episode, world, fitness, scores);
         }
-        self.observed.clear();
-        self.observed.resize(world.pois.len(), false);
+        fill_with_zeros(&mut self.observed, world.pois.len());
         let total = world.total_worth;
         match fitness {
             Fitness::G => {
@@ -167,4 +166,10 @@ fn each_bit(word: u32) -> impl Iterator<Item = usize> {
     std::iter::successors(Some(word), |word| Some(word & word.wrapping_sub(1)))
         .take_while(|&word| word != 0)
         .map(|word| word.trailing_zeros() as usize)
+}
+
+/// Makes an array have this length, and only zeros or `false`.
+fn fill_with_zeros<T: Clone + Default>(array: &mut Vec<T>, length: usize) {
+    array.clear();
+    array.resize(length, T::default());
 }

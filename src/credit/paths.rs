@@ -3,7 +3,7 @@
 use fearless_simd::{Simd, prelude::*};
 
 use super::assignment::{first_most, lead};
-use super::{Paths, each_bit, share, stepping_stone};
+use super::{Paths, each_bit, fill_with_zeros, share, stepping_stone};
 use crate::config::{Fitness, Score, When};
 use crate::kernels::math::within;
 use crate::kernels::{larger, select, smaller, splat};
@@ -11,48 +11,46 @@ use crate::model::couple::observes;
 use crate::world::{PathRule, World};
 
 /// Scores from paths, with scratch memory for the next. Moment m of an episode is its state after m steps. A vector has
-/// neighbouring moments of one team, or one moment of as many teams. Rows are `[moments][teams]`, filled up to whole
-/// vectors.
+/// neighbouring moments of one team, or one moment of as many teams as it has lanes. Rows are `[moments][teams]`, filled up
+/// to whole vectors.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct PathCredit {
-    /// The teams of a vector: one, or as many as it has lanes.
-    teams: usize,
     /// The length of a row.
     width: usize,
-    /// The positions of one team, f32 as bits, `[2][agents][width]`; empty for several.
+    /// A copy of one team's positions, f32 as bits, `[2][agents][width]`; not used for several teams.
     positions: Vec<u32>,
     /// `[pois][2][lanes]`.
     pois: Vec<f32>,
-    /// The learners that influence each agent, and those that lead it, `[words of leaders][agents][width + teams]`: a vector
-    /// may be written one moment later. Under Df, `led` is the same at all moments: `[words of leaders][agents][lanes]`. Empty
-    /// if it is the same in all lanes, too.
+    /// The learners that influence each agent under Dt, `[words of leaders][agents][width + teams]`, because a vector may be
+    /// written one moment later.
     sights: Vec<u32>,
+    /// The learners that lead each agent. Under Dt it has the shape of `sights`. Under Df nothing depends on the moment:
+    /// `[words of leaders][agents][lanes]`. Empty if [`PathCredit::ever_taken`] is enough, as for one team.
     led: Vec<u32>,
     /// The number of moments at which one agent was influenced by each learner, `[leaders][teams]`.
     counts: Vec<u32>,
     /// The agents that are taken out for each learner at any moment in any team, `[leaders][words]`.
     ever_taken: Vec<u32>,
-    /// Agents that are ever near the POI and count there, and at each moment their squared distance, infinite unless it
-    /// is near and the moment counts: `[observers]`, `[observers][width]`.
+    /// Agents that are ever near the POI and count there, `[observers]`.
     observers: Vec<usize>,
+    /// Their squared distance at each moment, infinite unless it is near and the moment counts, `[observers][width]`.
     near: Vec<f32>,
-    /// Whether anyone is near the POI, in each lane of a row, all bits or none, and where the vectors begin in which
-    /// someone is.
-    is_anyone_near: Vec<u32>,
+    /// The beginning of each vector in which an observer is near.
     vectors: Vec<usize>,
-    /// The observers of the team that a value is computed for.
+    /// The observers of the team whose worth is computed.
     counted: Vec<Counted>,
     /// The squared distances of the nearest observers, `[coupling][lanes]`.
     nearest: Vec<f32>,
     /// Sums over moments, `[teams]`.
     sums: Vec<u64>,
-    /// What the POI counts for in the team as it was, and in a changed one, `[teams]`.
+    /// The worth of the POI to each team, `[teams]`, and to the team after a [`Change`].
     whole: Vec<Worth>,
     changed: Vec<Worth>,
-    /// What the team observed, `[teams]`, what each learner would lose, `[leaders][teams]`, and gain by so many copies,
-    /// `[leaders][copies][teams]`: in units of worth.
+    /// The summed worth of all POIs to each team, `[teams]`.
     observed: Vec<u32>,
+    /// The summed worth that is lost without each learner, `[leaders][teams]`.
     lost: Vec<u32>,
+    /// The summed worth that this number of copies of a learner adds, `[leaders][copies][teams]`.
     gains: Vec<u32>,
     /// `[teams][leaders]`.
     scores: Vec<f32>,
@@ -75,42 +73,43 @@ struct Counted {
     near: usize,
     /// How often it counts.
     times: u32,
-    /// If it is taken out: the beginning of its row in [`PathCredit::led`], whose bits tell when, and the distance of vectors.
+    /// The beginning and the stride of its row in [`PathCredit::led`], if bits there determine when it is taken out.
     led: Option<[usize; 2]>,
 }
 
-/// What a POI counts for.
+/// The worth of a POI to one team.
 #[derive(Clone, Copy, Debug)]
 struct Worth {
-    /// The square of the distance, 1 or more, that determines it; NaN for a mean.
+    /// The square of the distance that determines it, at least 1; NaN for a mean.
     squared: f32,
-    /// In units of its worth.
+    /// The worth, see [`WorldParts::worth`](crate::world::WorldParts::worth).
     value: u32,
 }
 
-/// The teams of a vector, and what they are scored by.
+/// The teams of a vector, and the rules by which they are scored.
 struct Scored<'a> {
     positions: Positions<'a>,
+    /// One, or as many as there are lanes.
     teams: usize,
     world: &'a World,
     rule: &'a PathRule,
     fitness: Fitness,
 }
 
-/// Where positions are: the vector at `first` of an agent's row is at `first * apart + agent * agents + axis * axes`.
+/// Positions of every agent and moment, f32 as bits. The strides are those of a row's elements, of agents and of axes.
 struct Positions<'a> {
     words: &'a [u32],
-    apart: usize,
-    agents: usize,
-    axes: usize,
+    stride: usize,
+    agent_stride: usize,
+    axis_stride: usize,
 }
 
 impl Positions<'_> {
     /// Returns a vector of an agent's row: its x and y.
     #[inline(always)]
     fn at<S: Simd>(&self, simd: S, agent: usize, first: usize) -> [S::f32s; 2] {
-        let start = first * self.apart + agent * self.agents;
-        [0, self.axes].map(
+        let start = first * self.stride + agent * self.agent_stride;
+        [0, self.axis_stride].map(
             #[inline(always)]
             |axis| S::u32s::from_slice(simd, &self.words[start + axis..][..S::f32s::LEN]).bitcast(),
         )
@@ -133,9 +132,18 @@ impl PathCredit {
         for axis in paths.pois.iter().flat_map(|at| at.to_array()) {
             self.pois.extend(std::iter::repeat_n(axis, S::f32s::LEN));
         }
-        let (agents, width) = (world.agents(), (world.steps() + 1).next_multiple_of(S::f32s::LEN));
-        let words = self.load(paths, agents, width);
-        let positions = Positions { words: &words, apart: 1, agents: width, axes: agents * width };
+        let (agents, moments) = (world.agents(), world.steps() + 1);
+        let width = moments.next_multiple_of(S::f32s::LEN);
+        let mut words = std::mem::take(&mut self.positions);
+        words.resize(2 * agents * width, 0);
+        let (x, y) = words.split_at_mut(agents * width);
+        let mut from = paths.positions.iter();
+        for (moment, agent) in (0..moments).flat_map(|moment| (0..agents).map(move |agent| (moment, agent))) {
+            for axis in [&mut *x, &mut *y] {
+                axis[agent * width + moment] = from.next().expect("a path has every moment");
+            }
+        }
+        let positions = Positions { words: &words, stride: 1, agent_stride: width, axis_stride: agents * width };
         self.score_vector(simd, &Scored { positions, teams: 1, world, rule, fitness });
         self.positions = words;
         scores.iter_mut().zip(&self.scores).for_each(|(to, score)| *to = *score);
@@ -156,7 +164,8 @@ impl PathCredit {
         self.pois.clear();
         pois.as_flattened().iter().for_each(|axis| self.pois.extend_from_slice(axis.as_slice()));
         let (teams, agents) = (S::f32s::LEN, world.agents());
-        let positions = Positions { words: positions, apart: 2 * agents, agents: 2 * teams, axes: teams };
+        let (stride, agent_stride) = (2 * agents, 2 * teams);
+        let positions = Positions { words: positions, stride, agent_stride, axis_stride: teams };
         self.score_vector(simd, &Scored { positions, teams, world, rule, fitness });
     }
 
@@ -167,23 +176,22 @@ impl PathCredit {
 
     /// Returns the scores of one team's leaders.
     pub(crate) fn scores(&self, team: usize) -> impl Iterator<Item = f32> {
-        let leaders = self.scores.len() / self.teams;
+        let leaders = self.scores.len() / self.observed.len();
         self.scores[team * leaders..][..leaders].iter().copied()
     }
 
     fn score_vector<S: Simd>(&mut self, simd: S, scored: &Scored<'_>) {
         let &Scored { teams, world, fitness, .. } = scored;
         let (leaders, words) = (world.leaders(), world.constants.words as usize);
-        self.teams = teams;
         self.width = ((world.steps() + 1) * teams).next_multiple_of(S::f32s::LEN);
         if fitness != Fitness::G {
             self.take_out(simd, scored);
         }
         let most = if fitness == Fitness::Dpp { world.coupling.iter().copied().max().unwrap_or(0) } else { 0 };
         let row = most as usize + 1;
-        refill(&mut self.observed, teams);
-        refill(&mut self.lost, leaders * teams);
-        refill(&mut self.gains, leaders * row * teams);
+        fill_with_zeros(&mut self.observed, teams);
+        fill_with_zeros(&mut self.lost, leaders * teams);
+        fill_with_zeros(&mut self.gains, leaders * row * teams);
         for poi in 0..world.pois.len() {
             simd.vectorize(
                 #[inline(always)]
@@ -193,7 +201,7 @@ impl PathCredit {
                 continue;
             }
             self.whole.clear();
-            self.value(simd, scored, poi, Change::None);
+            self.find_worth(simd, scored, poi, Change::None);
             std::mem::swap(&mut self.whole, &mut self.changed);
             self.observed.iter_mut().zip(&self.whole).for_each(|(observed, whole)| *observed += whole.value);
             if fitness == Fitness::G {
@@ -204,12 +212,12 @@ impl PathCredit {
                 let ever = &self.ever_taken[leader * words..][..words];
                 let is_taken = |&agent: &usize| ever[agent / 32] >> (agent % 32) & 1 != 0;
                 if is_worth && self.observers.iter().any(is_taken) {
-                    self.value(simd, scored, poi, Change::Without(leader));
+                    self.find_worth(simd, scored, poi, Change::Without(leader));
                     add_differences(&mut self.lost[leader * teams..], &self.whole, &self.changed);
                 }
                 if self.observers.contains(&leader) {
                     for copies in 1..=most {
-                        self.value(simd, scored, poi, Change::With(leader, copies));
+                        self.find_worth(simd, scored, poi, Change::With(leader, copies));
                         let gains = &mut self.gains[(leader * row + copies as usize) * teams..];
                         add_differences(gains, &self.changed, &self.whole);
                     }
@@ -231,32 +239,19 @@ impl PathCredit {
         }
     }
 
-    /// Returns a copy of a team's positions in rows: the moments of an agent follow each other.
-    fn load(&mut self, paths: &Paths<'_>, agents: usize, width: usize) -> Vec<u32> {
-        let mut words = std::mem::take(&mut self.positions);
-        words.resize(2 * agents * width, 0);
-        let (x, y) = words.split_at_mut(agents * width);
-        let mut from = paths.positions.iter();
-        for (moment, agent) in (0..).flat_map(|moment| (0..agents).map(move |agent| (moment, agent))) {
-            let [Some(at_x), Some(at_y)] = [from.next(), from.next()] else { break };
-            (x[agent * width + moment], y[agent * width + moment]) = (at_x, at_y);
-        }
-        words
-    }
-
     /// Finds whom each learner takes out, and when.
     fn take_out<S: Simd>(&mut self, simd: S, scored: &Scored<'_>) {
-        let &Scored { world, rule, fitness, .. } = scored;
+        let &Scored { teams, world, rule, fitness, .. } = scored;
         let (leaders, agents, words) = (world.leaders(), world.agents(), world.constants.words as usize);
-        refill(&mut self.ever_taken, leaders * words);
+        fill_with_zeros(&mut self.ever_taken, leaders * words);
         match fitness {
             Fitness::D if !rule.removes.is_empty() => self.ever_taken.copy_from_slice(&rule.removes),
             _ => (0..leaders).for_each(|leader| self.ever_taken[leader * words + leader / 32] |= 1 << (leader % 32)),
         }
         let rows = world.leader_words() * agents;
-        let places = if fitness == Fitness::Dt { rows * (self.width + self.teams) } else { 0 };
-        refill(&mut self.sights, places);
-        refill(&mut self.led, if fitness == Fitness::Df && self.teams > 1 { rows * S::f32s::LEN } else { places });
+        let places = if fitness == Fitness::Dt { rows * (self.width + teams) } else { 0 };
+        fill_with_zeros(&mut self.sights, places);
+        fill_with_zeros(&mut self.led, if fitness == Fitness::Df && teams > 1 { rows * S::f32s::LEN } else { places });
         if matches!(fitness, Fitness::Df | Fitness::Dt) {
             simd.vectorize(
                 #[inline(always)]
@@ -264,14 +259,15 @@ impl PathCredit {
             );
         }
         if fitness == Fitness::Dt {
-            self.find_leading(world);
+            self.find_leading(scored);
         }
     }
 
     /// Finds which learners lead each agent at each moment.
-    fn find_leading(&mut self, world: &World) {
+    fn find_leading(&mut self, scored: &Scored<'_>) {
+        let &Scored { teams, world, .. } = scored;
         let (leaders, agents, words) = (world.leaders(), world.agents(), world.constants.words as usize);
-        let (teams, row, moments) = (self.teams, self.width + self.teams, world.steps() + 1);
+        let (row, moments) = (self.width + teams, world.steps() + 1);
         let place = |moment: usize, agent: usize, word: usize| {
             (word * agents + agent / teams) * row + moment * teams + agent % teams
         };
@@ -297,7 +293,7 @@ impl PathCredit {
         let end = (world.steps() + 1) * teams - later;
         let agents_led = |class: usize| world.classes[class].agents().map(move |agent| (class, agent));
         for (class, agent) in (0..world.classes.len()).flat_map(agents_led) {
-            refill(&mut self.counts, leaders * teams);
+            fill_with_zeros(&mut self.counts, leaders * teams);
             for leading in &world.classes {
                 let influence2 = leading.constants.influence2[class];
                 let learners = leading.agents().take_while(|&learner| learner < leaders && influence2 >= 0.0);
@@ -324,15 +320,16 @@ impl PathCredit {
                 }
             }
             if fitness == Fitness::Df {
-                self.find_owners(world, agent, S::f32s::LEN);
+                self.find_owners(scored, agent, S::f32s::LEN);
             }
         }
     }
 
     /// Finds the learner that influences an agent most often, in each team.
-    fn find_owners(&mut self, world: &World, agent: usize, lanes: usize) {
-        for team in 0..self.teams {
-            let counts = self.counts[team..].iter().step_by(self.teams);
+    fn find_owners(&mut self, scored: &Scored<'_>, agent: usize, lanes: usize) {
+        let &Scored { teams, world, .. } = scored;
+        for team in 0..teams {
+            let counts = self.counts[team..].iter().step_by(teams);
             if let Some(leader) = first_most(counts.copied()) {
                 let words = world.constants.words as usize;
                 self.ever_taken[leader * words + agent / 32] |= 1 << (agent % 32);
@@ -354,7 +351,6 @@ impl PathCredit {
         let first = first.max(usize::from(!rule.start_counts));
         self.observers.clear();
         self.near.clear();
-        refill(&mut self.is_anyone_near, width);
         let (poi_x, poi_y) = self.pois[poi * 2 * S::f32s::LEN..][..2 * S::f32s::LEN].split_at(S::f32s::LEN);
         let (poi_x, poi_y) = (S::f32s::from_slice(simd, poi_x), S::f32s::from_slice(simd, poi_y));
         let (radius2, infinity) = (splat(simd, world.radii2[poi]), splat(simd, f32::INFINITY));
@@ -362,16 +358,12 @@ impl PathCredit {
             let start = self.near.len();
             self.near.resize(start + width, 0.0);
             let mut ever = S::u32s::splat(simd, 0);
-            let rows = self.near[start..].chunks_exact_mut(S::f32s::LEN);
-            let rows = rows.zip(self.is_anyone_near.chunks_exact_mut(S::f32s::LEN)).enumerate();
-            for (vector, (near, is_anyone_near)) in rows {
+            for (vector, near) in self.near[start..].chunks_exact_mut(S::f32s::LEN).enumerate() {
                 let [x, y] = positions.at(simd, agent, vector * S::f32s::LEN);
                 let (dx, dy) = (x - poi_x, y - poi_y);
                 let is_near = observes::<S>(radius2, dx, dy);
                 select::<S>(infinity, dx * dx + dy * dy, is_near).store_slice(near);
-                let is_near = is_near.to_vector().bitcast::<S::u32s>();
-                ever |= is_near;
-                (S::u32s::from_slice(simd, is_anyone_near) | is_near).store_slice(is_anyone_near);
+                ever |= is_near.to_vector().bitcast::<S::u32s>();
             }
             if ever.simd_gt(0).any_true() {
                 let near = &mut self.near[start..];
@@ -382,14 +374,15 @@ impl PathCredit {
                 self.near.truncate(start);
             }
         }
-        let vectors = self.is_anyone_near.chunks_exact(S::f32s::LEN).enumerate();
-        let busy = vectors.filter(|(_, near)| S::u32s::from_slice(simd, near).simd_gt(0).any_true());
+        let row = |index: usize, first: usize| &self.near[index * width + first..][..S::f32s::LEN];
+        let is_near = |index: usize, first: usize| S::f32s::from_slice(simd, row(index, first)).simd_lt(infinity);
+        let is_anyone_near = |&first: &usize| (0..self.observers.len()).any(|index| is_near(index, first).any_true());
         self.vectors.clear();
-        self.vectors.extend(busy.map(|(vector, _)| vector * S::f32s::LEN));
+        self.vectors.extend((0..width).step_by(S::f32s::LEN).filter(is_anyone_near));
     }
 
-    /// Finds what a POI counts for in each team after a change.
-    fn value<S: Simd>(&mut self, simd: S, scored: &Scored<'_>, poi: usize, change: Change) {
+    /// Finds the worth of a POI to each team after a change.
+    fn find_worth<S: Simd>(&mut self, simd: S, scored: &Scored<'_>, poi: usize, change: Change) {
         let (world, agents) = (scored.world, scored.world.agents());
         self.counted.clear();
         for (index, &agent) in self.observers.iter().enumerate() {
@@ -402,8 +395,8 @@ impl PathCredit {
                             continue;
                         }
                         let row = self.led.len() / (world.leader_words() * agents);
-                        let apart = usize::from(row > S::f32s::LEN);
-                        counted.led = Some([(leader / 32 * agents + agent) * row, apart]);
+                        let stride = usize::from(row > S::f32s::LEN);
+                        counted.led = Some([(leader / 32 * agents + agent) * row, stride]);
                     }
                 }
                 Change::With(leader, copies) if leader == agent => counted.times += copies,
@@ -413,12 +406,13 @@ impl PathCredit {
         }
         simd.vectorize(
             #[inline(always)]
-            || self.value_of(simd, scored, poi, change),
+            || self.find_worth_of_counted(simd, scored, poi, change),
         );
     }
 
+    /// Finds the worth of a POI that is observed by those who count.
     #[inline(always)]
-    fn value_of<S: Simd>(&mut self, simd: S, scored: &Scored<'_>, poi: usize, change: Change) {
+    fn find_worth_of_counted<S: Simd>(&mut self, simd: S, scored: &Scored<'_>, poi: usize, change: Change) {
         let &Scored { teams, world, rule, .. } = scored;
         let ((score, when), coupling) = (rule.scores[poi], world.coupling[poi] as usize);
         let value = |squared: f32| match squared.is_finite() {
@@ -431,7 +425,7 @@ impl PathCredit {
             _ => 0,
         };
         let mut best = splat(simd, f32::INFINITY);
-        refill(&mut self.sums, teams);
+        fill_with_zeros(&mut self.sums, teams);
         for index in 0..self.vectors.len() {
             let first = self.vectors[index];
             // The last vector has the last moment.
@@ -466,13 +460,13 @@ impl PathCredit {
         }
     }
 
-    /// Returns the squared distance of an observer, infinite if it is not near or taken out. `bit` is of the learner for whom
-    /// it is.
+    /// Returns the squared distance of an observer, infinite if it is not near or taken out. `bit` is that of the learner for
+    /// whom it is taken out.
     #[inline(always)]
     fn near<S: Simd>(&self, simd: S, counted: &Counted, first: usize, bit: u32) -> S::f32s {
         let near = S::f32s::from_slice(simd, &self.near[counted.near + first..][..S::f32s::LEN]);
-        let Some([row, apart]) = counted.led else { return near };
-        let led = S::u32s::from_slice(simd, &self.led[row + first * apart..][..S::f32s::LEN]);
+        let Some([row, stride]) = counted.led else { return near };
+        let led = S::u32s::from_slice(simd, &self.led[row + first * stride..][..S::f32s::LEN]);
         let stays = (led & S::u32s::splat(simd, bit)).simd_eq(0);
         select::<S>(splat(simd, f32::INFINITY), near, stays)
     }
@@ -523,13 +517,7 @@ impl PathCredit {
     }
 }
 
-/// Adds what a POI counts for more in some teams than in others.
+/// Adds the difference of two worths of each team.
 fn add_differences(to: &mut [u32], more: &[Worth], less: &[Worth]) {
     to.iter_mut().zip(more.iter().zip(less)).for_each(|(to, (more, less))| *to += more.value - less.value);
-}
-
-/// Makes an array so many zeros.
-fn refill<T: Clone + Default>(array: &mut Vec<T>, length: usize) {
-    array.clear();
-    array.resize(length, T::default());
 }

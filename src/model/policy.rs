@@ -123,7 +123,7 @@ impl PolicyConstants {
 
 /// Computes some units before tanh: the bias, plus the weighted inputs in order.
 ///
-/// `weights` has one row of `UNITS` per input, then the biases. Inputs may end early if the rest are 0.
+/// `weights` has one row of `UNITS` per input, then the biases. Inputs at the end that are 0 may be left out.
 #[inline(always)]
 pub(crate) fn affine<S: Simd, const UNITS: usize>(inputs: &[S::f32s], weights: &[S::f32s]) -> [S::f32s; UNITS] {
     let (rows, _) = weights.as_chunks::<UNITS>();

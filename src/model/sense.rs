@@ -299,18 +299,18 @@ impl<S: Simd> Quadrants<S> {
     }
 
     /// Adds an entity with this measure at an offset from an agent with this [heading](ChannelLanes::heading). `PLAIN`
-    /// channels count no entities, and sectors of those on the `MAP` are fixed to it.
+    /// channels count no entities.
     ///
     /// The signs of the offset along the heading and to its left determine the quadrant. A tie goes to the
     /// counterclockwise quadrant, so that each boundary belongs to exactly one.
     #[inline(always)]
-    pub(crate) fn add<const PLAIN: bool, const MAP: bool>(
+    pub(crate) fn add<const PLAIN: bool>(
         &mut self,
         (measured, within): (S::i32s, S::mask32s),
         offset: [S::f32s; 2],
         heading: [S::f32s; 2],
     ) {
-        let (fx, fy) = if MAP { (offset[0], offset[1]) } else { turned::<S>(offset, heading) };
+        let (fx, fy) = turned::<S>(offset, heading);
         let zero = splat(fx.token(), 0.0);
         let left = (fy.simd_gt(zero) | (fy.simd_ge(zero) & fx.simd_ge(zero))).to_vector();
         let front = (fx.simd_gt(zero) | (fx.simd_ge(zero) & !fy.simd_gt(zero))).to_vector();

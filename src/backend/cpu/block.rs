@@ -8,7 +8,7 @@ use glam::Vec2;
 use super::agent::Agent;
 use super::neighbours::{self, Bounds, Masks, masks};
 use crate::backend::Moment;
-use crate::config::{Combine, ControlKind, Frame, Measure};
+use crate::config::{Combine, ControlKind, Measure};
 use crate::config_enum::ConstDispatch;
 use crate::kernels::math::{on_lattice, within};
 use crate::kernels::{clamp_to, select, splat};
@@ -514,21 +514,21 @@ impl<S: Simd> Scene<'_, S> {
         sense::measured::<S>(self.channel, const { Measure::of(MEASURE) }, value, dx, dy)
     }
 
-    /// Senses by quadrants. `PLAIN` channels count no entities, and sense POIs of value 1 only; those on the `MAP` have fixed
-    /// sectors. It is a function of its own, so that registers hold its constants.
-    fn sense_quadrants<const MEASURE: u32, const PLAIN: bool, const MAP: bool>(
+    /// Senses by quadrants. `PLAIN` channels count no entities, and sense POIs of value 1 only. It is a function of its own,
+    /// so that registers hold its constants.
+    fn sense_quadrants<const MEASURE: u32, const PLAIN: bool>(
         &self,
         observers: Range<usize>,
         mut inputs: Inputs<'_, S>,
     ) {
         self.simd.vectorize(
             #[inline(always)]
-            || self.sense_each_quadrant::<MEASURE, PLAIN, MAP>(observers, &mut inputs),
+            || self.sense_each_quadrant::<MEASURE, PLAIN>(observers, &mut inputs),
         );
     }
 
     #[inline(always)]
-    fn sense_each_quadrant<const MEASURE: u32, const PLAIN: bool, const MAP: bool>(
+    fn sense_each_quadrant<const MEASURE: u32, const PLAIN: bool>(
         &self,
         observers: Range<usize>,
         inputs: &mut Inputs<'_, S>,
@@ -547,7 +547,7 @@ impl<S: Simd> Scene<'_, S> {
                 |_, other| {
                     let offset = [other.x - x, other.y - y];
                     let measured = self.measured::<MEASURE, true>(1.0, offset);
-                    quadrants.add::<PLAIN, MAP>(measured, offset, heading);
+                    quadrants.add::<PLAIN>(measured, offset, heading);
                 },
             );
             for range in &plan.pois {
@@ -565,12 +565,12 @@ impl<S: Simd> Scene<'_, S> {
                     }
                     for index in 0..4 {
                         let measured = (measures[index], within[index]);
-                        quadrants.add::<PLAIN, MAP>(measured, offset(pois[index], x, y), heading);
+                        quadrants.add::<PLAIN>(measured, offset(pois[index], x, y), heading);
                     }
                 }
                 for (poi, &value) in rest.iter().zip(last) {
                     let offset = offset(*poi, x, y);
-                    quadrants.add::<PLAIN, MAP>(self.measured::<MEASURE, PLAIN>(value, offset), offset, heading);
+                    quadrants.add::<PLAIN>(self.measured::<MEASURE, PLAIN>(value, offset), offset, heading);
                 }
             }
             let inputs = inputs.of(observer, channel).as_chunks_mut().0;
@@ -643,11 +643,9 @@ impl<S: Simd> ConstDispatch for Quartering<'_, '_, S> {
 
     #[inline(always)]
     fn with<const MEASURE: u32>(self) {
-        let is_on_map = self.scene.channel.shape.frame == Frame::Map as u32;
-        match (self.scene.plan.is_plain, is_on_map) {
-            (true, true) => self.scene.sense_quadrants::<MEASURE, true, true>(self.observers, self.inputs),
-            (true, false) => self.scene.sense_quadrants::<MEASURE, true, false>(self.observers, self.inputs),
-            (false, _) => self.scene.sense_quadrants::<MEASURE, false, false>(self.observers, self.inputs),
+        match self.scene.plan.is_plain {
+            true => self.scene.sense_quadrants::<MEASURE, true>(self.observers, self.inputs),
+            false => self.scene.sense_quadrants::<MEASURE, false>(self.observers, self.inputs),
         }
     }
 }

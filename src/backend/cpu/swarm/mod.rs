@@ -681,7 +681,7 @@ impl<S: Simd> Sensing<'_, S> {
         let (measured, within) = sense::measured::<S>(self.channel, measure, splat(simd, value), offset[0], offset[1]);
         let measured = (measured & counts.to_vector(), within & counts);
         match self.in_quadrants {
-            true => self.quadrants.add::<false, false>(measured, offset, self.heading),
+            true => self.quadrants.add::<false>(measured, offset, self.heading),
             false => self.sectors.add(self.channel, measured, offset, self.heading),
         }
     }
