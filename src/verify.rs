@@ -162,7 +162,7 @@ fn compare_kinds(
     reference: &mut dyn Backend,
     backend: &mut dyn Backend,
 ) -> Result<Option<(usize, String)>, BackendError> {
-    // A batch is packed only if all its groups can be, so those that cannot are separate.
+    // A device counts a batch's records only if it can count all, so the others are separate.
     let mut batches: [Vec<(usize, Group<'_>)>; 3] = Default::default();
     for (index, group) in groups.iter().enumerate() {
         let fitnesses = KINDS[(turn * groups.len() + index) % KINDS.len()];

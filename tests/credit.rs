@@ -6,7 +6,7 @@ use crate::support;
 use flotilla::backend::cpu::Cpu;
 use flotilla::backend::{Backend, Group, GroupScores};
 use flotilla::config::{Choice, Config, Coupling, Fitness, LedBy, MAX_LEARNERS, Observers, Score, When, WorldConfig};
-use flotilla::credit::{Credit, Episode, RecordRequest, Scores, Seen, Strided, owner_bits};
+use flotilla::credit::{Credit, Episode, Scores, Strided};
 use flotilla::evolve::aligned_teams;
 use flotilla::front;
 use flotilla::sample;
@@ -105,40 +105,6 @@ impl Record {
             (0..words).for_each(|word| sights[(index * words + word) * stride + offset] = set(seen, word));
         }
         [sets, seen, sights]
-    }
-
-    /// Packs the record for a request. Keeps, per POI, the sets that are large enough and not contained in another set.
-    /// Keeps, per follower, the leader that it saw most.
-    fn packed(&self, request: RecordRequest<'_>) -> (Vec<u32>, Vec<u32>) {
-        let (pois, words) = (self.coupling.len(), (self.leaders + self.followers).div_ceil(32));
-        let contains = |a: &[usize], b: &[usize]| b.iter().all(|agent| a.contains(agent));
-        let kept = |poi: usize| {
-            let steps: Vec<&Vec<usize>> = self.near.iter().map(|sets| &sets[poi]).collect();
-            let least = request.min_agents(self.coupling[poi]).unwrap() as usize;
-            let redundant = |index: usize| {
-                let larger = |(other, set): (usize, &&Vec<usize>)| {
-                    other != index && contains(set, steps[index]) && (other < index || !contains(steps[index], set))
-                };
-                steps[index].len() < least || steps.iter().enumerate().any(larger)
-            };
-            (0..steps.len()).filter(|&index| !redundant(index)).map(|index| steps[index].clone()).collect::<Vec<_>>()
-        };
-        let kept: Vec<Vec<Vec<usize>>> = (0..pois).map(kept).collect();
-        let rows = kept.iter().map(Vec::len).max().unwrap();
-        let mut sets = vec![0; rows * pois * words];
-        for (poi, kept) in kept.iter().enumerate() {
-            for (row, set) in kept.iter().enumerate() {
-                set.iter().for_each(|agent| sets[(row * pois + poi) * words + agent / 32] |= 1 << (agent % 32));
-            }
-        }
-        let bits = owner_bits(self.leaders as u32);
-        let per_word = (32 / bits) as usize;
-        let mut owners = vec![0; self.followers.div_ceil(per_word)];
-        for follower in 0..self.followers {
-            let owner = self.owner(self.leaders + follower).map_or((1 << bits) - 1, |owner| owner as u32);
-            owners[follower / per_word] |= owner << (follower % per_word * bits as usize);
-        }
-        (sets, if request.owners() { owners } else { vec![] })
     }
 
     /// Counts the observed POIs if each agent counts `weight(step, agent)` times, with steps from 0. A POI that is
@@ -323,13 +289,13 @@ fn with_random_rule(rng: &mut ChaCha8Rng, record: Record) -> Record {
     record.with_enough_observers()
 }
 
-/// Compares the scores of a record with their definition, for strided and packed words. Returns them.
+/// Compares the scores of a record with their definition. Returns them.
 fn compare(record: &Record, credit: &mut Credit, rng: &mut ChaCha8Rng, stride: usize) -> Scores {
     let world = record.world();
     let offset = rng.random_range(0..stride);
     let [sets, seen, sights] = record.words(stride, offset, rng);
     let strided = |words| Strided { words, stride, offset };
-    let (sights, seen) = (strided(&sights), Seen::Counts(strided(&seen)));
+    let (sights, seen) = (strided(&sights), strided(&seen));
     let episode = Episode { sets: strided(&sets), seen, sights, paths: None };
     let expected = record.scores();
     assert_eq!(credit.all(&episode, &world), expected);
@@ -342,32 +308,6 @@ fn compare(record: &Record, credit: &mut Credit, rng: &mut ChaCha8Rng, stride: u
     let mut dt = vec![f32::NAN; record.leaders];
     assert_eq!(credit.score(&episode, &world, Fitness::Dt, &mut dt), expected.observed);
     assert_eq!(dt, expected.dt);
-    if world.rule.is_timed() {
-        return expected;
-    }
-    let single = Fitness::ALL.iter().map(|&(_, fitness)| vec![fitness]).filter(|request| request != &[Fitness::Dt]);
-    for request in [vec![Fitness::D, Fitness::Df, Fitness::Dpp]].into_iter().chain(single) {
-        let (sets, owners) = record.packed(RecordRequest(&request));
-        let contiguous = |words| Strided { words, stride: 1, offset: 0 };
-        let seen = Seen::Owners(contiguous(&owners));
-        let episode = Episode { sets: contiguous(&sets), seen, sights: Strided::NONE, paths: None };
-        let [fitness] = request[..] else {
-            let found = Scores { dt: expected.dt.clone(), ..credit.all(&episode, &world) };
-            assert_eq!(found, expected, "packed record");
-            continue;
-        };
-        let mut scores = vec![f32::NAN; record.leaders];
-        assert_eq!(credit.score(&episode, &world, fitness, &mut scores), expected.observed, "{request:?}");
-        let g = vec![expected.g; record.leaders];
-        let expected_scores = match fitness {
-            Fitness::G => &g,
-            Fitness::D => &expected.d,
-            Fitness::Df => &expected.df,
-            Fitness::Dpp => &expected.dpp,
-            Fitness::Dt => unreachable!("Dt is tested by itself"),
-        };
-        assert_eq!(&scores, expected_scores, "{request:?}");
-    }
     expected
 }
 

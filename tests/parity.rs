@@ -23,14 +23,14 @@ use flotilla::{backend::gpu, sample};
 /// The specialised kernel plays fewer worlds, because software drivers need a second to compile it for each world.
 const KERNELS: [Kernel; 2] = [Kernel::Generic, Kernel::Specialised];
 
-/// Opens a GPU that holds all populations and packs all records.
+/// Opens a GPU that holds all populations and adds up all records.
 fn open(request: &Request, pass: Pass, kernel: Kernel) -> GpuBackend {
     let gpu = gpu::open(Request { pass: Some(pass), ..request.clone() }).unwrap();
     GpuBackend::new(gpu)
         .unwrap()
         .with_kernel(kernel)
         .with_residency(ResidencyPolicy::Always)
-        .with_records(Records::Packed)
+        .with_records(Records::CountedFrom(0))
 }
 
 /// Returns a group of teams with separate policies per leader, scored by every fitness.
@@ -66,7 +66,7 @@ fn checked_shaders_and_default_limits_agree() {
             for (kernel, seeds) in KERNELS.into_iter().zip([100..112, 100..102]) {
                 let gpu = gpu::open(request.clone()).unwrap();
                 let backend = GpuBackend::new(gpu).unwrap().with_kernel(kernel);
-                let backend = backend.with_residency(ResidencyPolicy::Always).with_records(Records::Packed);
+                let backend = backend.with_residency(ResidencyPolicy::Always).with_records(Records::CountedFrom(0));
                 assert_eq!(check(&Plan::random(seeds, 5), backend).mismatch, None, "{info}, {kernel}, {request:?}");
             }
         }
@@ -136,7 +136,7 @@ fn large_worlds_agree() {
     for (request, info) in support::adapters("large_worlds_agree") {
         let worlds = vec![("crowd".into(), crowd.clone()), ("leaders only".into(), leaders_only.clone())];
         let plan = Plan { worlds, teams: 2, seed: 0, generations: 0 };
-        let backend = GpuBackend::new(gpu::open(request).unwrap()).unwrap().with_records(Records::Packed);
+        let backend = GpuBackend::new(gpu::open(request).unwrap()).unwrap().with_records(Records::CountedFrom(0));
         // Training would take minutes on software drivers, so these worlds are only traced and played in batches.
         let plan = Plan { worlds: plan.worlds.into_iter().map(small_population).collect(), ..plan };
         assert_eq!(check(&plan, backend).mismatch, None, "{info}");
@@ -158,7 +158,7 @@ fn long_episodes_agree() {
         for kernel in KERNELS {
             let plan = Plan { worlds: vec![("long".into(), config.clone())], teams: 9, seed: 0, generations: 0 };
             let backend = GpuBackend::new(gpu::open(request.clone()).unwrap()).unwrap().with_kernel(kernel);
-            let backend = backend.with_records(Records::Packed);
+            let backend = backend.with_records(Records::CountedFrom(0));
             assert_eq!(check(&plan, backend).mismatch, None, "{info}, {kernel}");
         }
     }
@@ -460,7 +460,7 @@ fn own_headings_and_ranges_of_zero_agree() {
         for kernel in KERNELS {
             let plan = Plan { worlds: worlds.clone(), teams: 9, seed: 3, generations: 2 };
             let backend = GpuBackend::new(gpu::open(request.clone()).unwrap()).unwrap().with_kernel(kernel);
-            assert_eq!(check(&plan, backend.with_records(Records::Packed)).mismatch, None, "{info}, {kernel}");
+            assert_eq!(check(&plan, backend.with_records(Records::CountedFrom(0))).mismatch, None, "{info}, {kernel}");
         }
     }
 }

@@ -309,7 +309,7 @@ fn declared(text: &str) -> (Vec<String>, String) {
 fn every_shader_names_the_files_that_it_uses() {
     const EPISODE: [&str; 9] =
         ["lib/layout", "lib/math", "generic", "sense", "policy", "follow", "motion", "couple", "episode"];
-    let joined: [&[&str]; 3] = [&EPISODE, &["lib/layout", "pack"], &["lib/math", "population"]];
+    let joined: [&[&str]; 3] = [&EPISODE, &["lib/layout", "count"], &["lib/math", "population"]];
     let read = |name: &str| fs::read_to_string(format!("shaders/{name}.wgsl")).unwrap();
     let mut uses = 0;
     for files in joined {

@@ -107,7 +107,7 @@ fn a_swarm_is_equal_with_a_grid_and_without() {
 fn check_gpus(adapters: Vec<(Request, AdapterInfo)>, plan: &Plan, edit: fn(GpuBackend) -> GpuBackend) {
     for (request, info) in adapters {
         let backend = GpuBackend::new(gpu::open(request).unwrap()).unwrap();
-        let mut swarms = edit(backend.with_large_from(0).with_records(Records::Packed));
+        let mut swarms = edit(backend.with_large_from(0).with_records(Records::CountedFrom(0)));
         let outcome = compare(plan, &mut Cpu::default().with_large_from(usize::MAX), &mut swarms, |_| ()).unwrap();
         println!("{info}: {} worlds, {} agent-steps", outcome.worlds, outcome.agent_steps);
         assert_eq!(outcome.mismatch, None, "{info}");

@@ -45,9 +45,9 @@ fn open_gpu(request: &Request) -> Gpu {
 /// All combinations of where populations are kept and how records are copied.
 const MODES: [(ResidencyPolicy, Records); 4] = [
     (ResidencyPolicy::Never, Records::Whole),
-    (ResidencyPolicy::Never, Records::Packed),
+    (ResidencyPolicy::Never, Records::CountedFrom(0)),
     (ResidencyPolicy::Always, Records::Whole),
-    (ResidencyPolicy::Always, Records::Packed),
+    (ResidencyPolicy::Always, Records::CountedFrom(0)),
 ];
 
 fn backend(gpu: Gpu, (holding, records): (ResidencyPolicy, Records)) -> GpuBackend {
@@ -290,7 +290,7 @@ impl Faults for OutOfMemory {
 fn a_device_out_of_memory_is_not_reported_as_inexact() {
     for (request, info) in support::adapters("a_device_out_of_memory_is_not_reported_as_inexact") {
         let gpu = open_gpu(&request);
-        for what in ["input", "record", "packed", "policies(0)"] {
+        for what in ["input", "record", "counted", "policies(0)"] {
             let error =
                 self_test::find_exact(with_faults(&gpu, &Arc::new(OutOfMemory(what))), &[gpu.pass]).unwrap_err();
             assert!(matches!(error, DeviceError::OutOfMemory { .. }), "{info}, {what}: {error}");
@@ -312,7 +312,7 @@ impl Faults for Edited {
 #[test]
 fn opening_detects_an_edit_of_any_kernel() {
     type Edit = fn(String) -> String;
-    let edits: [(&str, Edit); 18] = [
+    let edits: [(&str, Edit); 19] = [
         ("linear density", |text| {
             text.replace("base - exact_sqrt(d2) * (gauge.slope * value)", "base - exact_sqrt(d2)")
         }),
@@ -337,8 +337,9 @@ fn opening_detects_an_edit_of_any_kernel() {
         ("chosen agent", |text| text.replace("f32(choice) * own.choice_step", "f32(choice + 1u) * own.choice_step")),
         ("moves near others", |text| text.replace("own.near2, me)", "0.3 * own.near2, me)")),
         ("box", |text| text.replace("vec4(own.low_x, own.low_y,", "vec4(own.low_x, own.low_y + 0.5,")),
-        ("pack", |text| text.replace("size >= enough", "size > enough")),
-        ("pack", |text| text.replace("if steps > most", "if steps >= most")),
+        ("count", |text| text.replace("size >= coupling", "size > coupling")),
+        ("count", |text| text.replace("if most > 0u", "if most >= 0u")),
+        ("count", |text| text.replace("completed[coupling - largest] += value", "completed[1] += value")),
         ("gather", |text| text.replace("vec4(tile[start], tile[start + 1u]", "vec4(tile[start + 1u], tile[start]")),
         ("breed", |text| text.replace("* breed_job.sigma", "* 1.0000001 * breed_job.sigma")),
         ("generic kernel", |text| text.replace("sum += inputs[row] * weight", "sum -= inputs[row] * weight")),

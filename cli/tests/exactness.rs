@@ -19,7 +19,7 @@ use wgpu::BufferUsages;
 
 const BOTH: [Pass; 2] = [Pass::NoContraction, Pass::Guarded];
 /// The only shader without floats.
-const INTEGERS: &str = "pack";
+const INTEGERS: &str = "count";
 
 /// Returns a shader that computes one expression of the floats x, y, the vectors v, u, the matrix values.m and the
 /// integers i, j.

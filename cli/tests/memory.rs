@@ -167,19 +167,20 @@ fn the_largest_stage_determines_the_peak() {
     }
 }
 
-/// Records that are large enough to be packed on a GPU count twice, because packed records may be as large.
+/// A GPU that adds up records takes memory for the sums, and one that holds populations for these.
 #[test]
-fn packed_records_and_populations_are_counted() {
+fn sums_and_populations_on_a_gpu_are_counted() {
     let adapter = |population| {
         let config = Config::parse(&config_text(population, 2, 1, "generations = 0"), "config").unwrap();
         peaks(&[&config], 1).adapter
     };
-    // Per team, weights and record: 4 leaders of 112 weights; 25 steps of 4 POIs, and 8 followers with 4 leaders each.
-    let (weights, record) = (4 * 112 * 4, (25 * 4 + 8 * 4) * 4);
+    // Per team, weights and record: 4 leaders of 112 weights; 25 steps of 4 POIs, 8 followers with 4 leaders each, and
+    // five sums.
+    let (weights, record) = (4 * 112 * 4, (25 * 4 + 8 * 4 + 5) * 4);
     assert_eq!(adapter(50), 2 * 51 * (weights + record));
     // Populations of this size stay on the device, which takes five more sets of weights per team, and the parents.
     let population = 5 * 112 * 4 + 4 * 4;
-    assert_eq!(adapter(2000), 2 * 2001 * (weights + 2 * record + population));
+    assert_eq!(adapter(2000), 2 * 2001 * (weights + record + population));
 }
 
 /// Episodes of large teams take several dispatches on a GPU. The agents' states between them must count, too.
@@ -190,8 +191,9 @@ fn states_between_dispatches_are_counted() {
         format!("[world]\nleaders = [[1, 1]]\nfollowers = [{followers}]\npois = [[9, 9]]\n[learning]\ntrials = 1\n")
     };
     let config = Config::parse(&text(1024), "config").unwrap();
-    // Per team, weights, record and states: 112 weights; 25 steps of 32 words, and 1023 followers with one leader.
-    let (weights, record, states) = (112 * 4, (25 * 32 + 1023) * 4, 1024 * 20);
+    // Per team, weights, record and states: 112 weights; 25 steps of 32 words, 1023 followers with one leader, and two
+    // sums.
+    let (weights, record, states) = (112 * 4, (25 * 32 + 1023 + 2) * 4, 1024 * 20);
     assert_eq!(peaks(&[&config], 1).adapter, 2 * 51 * (weights + record + states) / 2);
 }
 

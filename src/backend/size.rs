@@ -9,10 +9,6 @@ use crate::world::World;
 /// from 230 KB on, and about the same at 90 KB (`benches/README.md`). Software renderers hold none.
 pub const HELD_FROM: u64 = 1 << 17;
 
-/// Default minimum bytes of a batch's records to be packed on a GPU: about what the bus transfers in the time of one
-/// more dispatch. An estimate, not a measurement. Software renderers pack none.
-pub const PACKED_FROM: u64 = 1 << 20;
-
 /// Target bytes of one buffer of a batch on a GPU: enough to fill the device, small enough to overlap batches.
 pub const BATCH_BYTES: u64 = 256 << 20;
 /// Weights per vector. A GPU thread loads one vector at a time.
@@ -28,10 +24,12 @@ pub(super) fn record_words(world: &World, records: RecordRequest<'_>) -> usize {
     world.set_words() + world.leaders() * world.followers() + sights + gone
 }
 
-/// Returns the bytes of the record of a team that is scored by a fitness, with its trace if scores need paths.
+/// Returns the bytes of the record of a team that is scored by a fitness, with its trace if scores need paths, and with the
+/// sums that a GPU may count of it.
 pub fn record_bytes(world: &World, fitness: Fitness) -> u64 {
     let traced = if world.paths.is_some() { (world.steps() + 1) * traced_words(world) } else { 0 };
-    ((record_words(world, RecordRequest(&[fitness])) + traced) * size_of::<u32>()) as u64
+    let sums = 1 + world.leaders();
+    ((record_words(world, RecordRequest(&[fitness])) + traced + sums) * size_of::<u32>()) as u64
 }
 
 /// Returns the words of one step of a team's trace: moments, then inputs.

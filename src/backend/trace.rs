@@ -81,7 +81,7 @@ impl Trace {
     /// Stores the record of one team.
     pub(super) fn store(&mut self, team: usize, episode: &Episode<'_>) {
         let Trace { sets, seen, trail, .. } = self;
-        for (all, words) in [(sets, episode.sets), (seen, episode.seen.words()), (trail, episode.trail())] {
+        for (all, words) in [(sets, episode.sets), (seen, episode.seen), (trail, episode.trail())] {
             let to = all[team * words.len()..].iter_mut();
             to.zip(words.iter()).for_each(|(to, word)| *to = word);
         }

@@ -1,6 +1,6 @@
 //! Assignment of followers to leaders: over the episode (Df), or at each step (Dt).
 
-use super::{Seen, Strided, each_bit, fill_with_zeros, owner_bits};
+use super::{Strided, each_bit, fill_with_zeros};
 use crate::config::LedBy;
 use crate::world::{Led, World};
 
@@ -11,26 +11,14 @@ pub const UNASSIGNED: u32 = u32::MAX;
 /// leader get [`UNASSIGNED`].
 ///
 /// Writes the owner of every agent, `[agents]`. A leader owns itself.
-pub fn assign(seen: &Seen<'_>, world: &World, owner: &mut Vec<u32>) {
+pub fn assign(seen: &Strided<'_>, world: &World, owner: &mut Vec<u32>) {
     let leaders = world.constants.leaders;
     owner.clear();
     owner.extend(0..leaders);
-    let followers = 0..world.followers();
-    match seen {
-        Seen::Counts(seen) => owner.extend(followers.map(|follower| {
-            let steps = (0..leaders as usize).map(|leader| seen.get(follower * leaders as usize + leader));
-            first_most(steps).map_or(UNASSIGNED, |leader| leader as u32)
-        })),
-        Seen::Owners(owners) => {
-            let bits = owner_bits(leaders);
-            let (owners_per_word, nobody) = ((32 / bits) as usize, (1 << bits) - 1);
-            owner.extend(followers.map(|follower| {
-                let owner =
-                    owners.get(follower / owners_per_word) >> (follower % owners_per_word * bits as usize) & nobody;
-                if owner == nobody { UNASSIGNED } else { owner }
-            }));
-        }
-    }
+    owner.extend((0..world.followers()).map(|follower| {
+        let steps = (0..leaders as usize).map(|leader| seen.get(follower * leaders as usize + leader));
+        first_most(steps).map_or(UNASSIGNED, |leader| leader as u32)
+    }));
 }
 
 /// Returns the index of the largest number, the first of equal ones. `None` if all are 0.

@@ -242,7 +242,7 @@ mod tests {
 
     use super::*;
     use crate::backend::cpu::Cpu;
-    use crate::credit::{Credit, Episode, Seen, Strided};
+    use crate::credit::{Credit, Episode, Strided};
     use crate::sample;
 
     /// Compares the scores of random records with the plain twin. Counts those in which single agents matter.
@@ -275,7 +275,7 @@ mod tests {
                 vector.score(&sets, &seen, &world, fitness);
                 for lane in 0..lanes {
                     let strided = |words| Strided { words, stride: lanes, offset: lane };
-                    let seen = Seen::Counts(strided(&words));
+                    let seen = strided(&words);
                     let episode = Episode { sets: strided(&sets), seen, sights: Strided::NONE, paths: None };
                     let observed = plain.score(&episode, &world, fitness, &mut scores);
                     assert_eq!(vector.observed(lane), observed, "world {seed}, lane {lane}");

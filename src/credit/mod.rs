@@ -8,8 +8,7 @@
 //! Under the default [rule](crate::model::rule::Rule) no fitness but Dt depends on when or how often a set of agents
 //! was at a POI. A set changes nothing if another set of the same POI contains it: the larger set still has at least
 //! as many agents after any removal or copy. So only the maximal sets of each POI matter and, except for D++, only
-//! those with at least as many agents as the POI needs. A record may lack the others, see [`RecordRequest`].
-//! Dt, and rules with windows or orders, need the whole record.
+//! those with at least as many agents as the POI needs.
 
 mod assignment;
 mod fast;
@@ -22,7 +21,7 @@ pub use assignment::{UNASSIGNED, assign};
 pub use assignment::{find_leading, is_led_by};
 pub(crate) use lanes::LaneCredit;
 pub(crate) use paths::PathCredit;
-pub use record::{Episode, Paths, RecordRequest, Seen, Strided, owner_bits};
+pub use record::{Episode, Paths, RecordRequest, Strided};
 pub use replay::observed_at;
 
 use fearless_simd::{Level, dispatch};
@@ -157,7 +156,7 @@ fn stepping_stone(lost: u32, most: u32, at_most: u32, total: u32, mut gain: impl
 }
 
 /// Returns a ratio of two numbers, each exact in f32 up to 2^24.
-fn share(count: u32, of: u64) -> f32 {
+pub(crate) fn share(count: u32, of: u64) -> f32 {
     count as f32 / of as f32
 }
 

@@ -7,11 +7,10 @@ use crate::config::Fitness;
 /// The record of one team's episode. Credit is computed from it.
 #[derive(Clone, Copy, Debug)]
 pub struct Episode<'a> {
-    /// The agents at each POI after each step, one bit per agent, `[steps][pois][words]`. There may be fewer steps,
-    /// down to none, whose sets give the same scores; see [`RecordRequest`].
+    /// The agents at each POI after each step, one bit per agent, `[steps][pois][words]`.
     pub sets: Strided<'a>,
-    /// The leaders that the followers saw.
-    pub seen: Seen<'a>,
+    /// The number of steps at which each follower saw each leader, `[followers][leaders]`.
+    pub seen: Strided<'a>,
     /// The leaders that each follower saw before the move of each step, one bit per leader, `[steps][followers][words
     /// of leaders]`. Empty unless [needed](RecordRequest::sights).
     pub sights: Strided<'a>,
@@ -23,7 +22,7 @@ impl<'a> Episode<'a> {
     /// Returns the record of a team whose words are not interleaved with those of other teams.
     pub fn whole(sets: &'a [u32], counts: &'a [u32], sights: &'a [u32]) -> Episode<'a> {
         let [sets, counts, sights] = [sets, counts, sights].map(Strided::contiguous);
-        Episode { sets, seen: Seen::Counts(counts), sights, paths: None }
+        Episode { sets, seen: counts, sights, paths: None }
     }
 
     /// Returns the sightings, or the positions of its paths.
@@ -37,19 +36,6 @@ impl<'a> Episode<'a> {
 pub struct RecordRequest<'a>(pub &'a [Fitness]);
 
 impl RecordRequest<'_> {
-    /// Returns the minimum number of agents in a set that can affect a score, at a POI of this coupling. `None` if the
-    /// sets of all steps are needed.
-    pub fn min_agents(self, coupling: u32) -> Option<u32> {
-        let min_agents = |fitness: &Fitness| match fitness {
-            // Dt depends on when sets occur.
-            Fitness::Dt => None,
-            // D++ depends on how many agents are missing.
-            Fitness::Dpp => Some(1),
-            Fitness::G | Fitness::D | Fitness::Df => Some(coupling),
-        };
-        self.0.iter().map(min_agents).try_fold(coupling, |min, needed| Some(min.min(needed?)))
-    }
-
     /// Reports whether the leader that each follower saw most is needed.
     pub fn owners(self) -> bool {
         self.0.iter().any(|fitness| match fitness {
@@ -65,30 +51,6 @@ impl RecordRequest<'_> {
             Fitness::G | Fitness::D | Fitness::Df | Fitness::Dpp => false,
         })
     }
-}
-
-/// The leaders that the followers of one team saw.
-#[derive(Clone, Copy, Debug)]
-pub enum Seen<'a> {
-    /// The number of steps at which each follower saw each leader, `[followers][leaders]`.
-    Counts(Strided<'a>),
-    /// The leader that each follower saw at most steps, see [`assign`](super::assign): [`owner_bits`] bits per
-    /// follower, from the lowest of a word, all ones for nobody. Empty unless [needed](RecordRequest::owners).
-    Owners(Strided<'a>),
-}
-
-impl<'a> Seen<'a> {
-    /// Returns the words of either form.
-    pub fn words(self) -> Strided<'a> {
-        match self {
-            Seen::Counts(words) | Seen::Owners(words) => words,
-        }
-    }
-}
-
-/// Returns the bits per follower in [`Seen::Owners`].
-pub fn owner_bits(leaders: u32) -> u32 {
-    if leaders < 255 { 8 } else { 16 }
 }
 
 /// The paths of one team: where its agents were.

@@ -5,7 +5,7 @@
 //! Nothing else is as large. Checkpoints and policies are written directly from the populations or from a single copy,
 //! see [`copies_checkpoint`]. A sweep limits its batches to half of the available memory.
 
-use crate::backend::{self, BATCH_BYTES, PACKED_FROM, cpu};
+use crate::backend::{self, BATCH_BYTES, cpu};
 use crate::config::{Config, Fitness, Method, StageConfig, ValidConfig};
 use crate::world::World;
 
@@ -167,8 +167,7 @@ impl Peaks {
                 u128::from(bytes) * u128::from(BATCH_BYTES) / u128::from(weights.max(record).max(states).max(1));
             bytes.min(batch as u64 * batches)
         };
-        // The packed form of a record takes at most as much again. If it does not fit, the whole record is read back.
-        let records = share(record, 2) * if record < PACKED_FROM { 1 } else { 2 };
+        let records = share(record, 2);
         Peaks {
             host: always + playing.max(ending),
             checkpoint,

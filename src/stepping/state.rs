@@ -62,7 +62,7 @@ impl Stepper {
         let (mut seen, mut sets, mut trail) = (Vec::new(), Vec::new(), Vec::new());
         for team in 0..self.teams() {
             if let Some(episode) = self.vectors.episode(team, &self.world, &self.moved, &mut seen) {
-                words.extend(episode.seen.words().iter());
+                words.extend(episode.seen.iter());
                 sets.extend(episode.sets.iter());
                 trail.extend(episode.trail().iter());
             }

@@ -194,7 +194,7 @@ fn verify(worlds: u64, teams: usize, seed: u64, pass: Option<&str>) -> Result<Va
     if let Some(mismatch) = gpu::self_test(&gpu).map_err(refuse)? {
         return Ok(json!({ "worlds": 0, "agent_steps": 0, "mismatch": mismatch.to_string() }));
     }
-    let mut gpu = episodes(gpu)?.with_residency(ResidencyPolicy::Always).with_records(Records::Packed);
+    let mut gpu = episodes(gpu)?.with_residency(ResidencyPolicy::Always).with_records(Records::CountedFrom(0));
     let plan = Plan::random(seed..seed + worlds, teams);
     let told = |outcome: &verify::Agreement| {
         crate::progress(json!({ "verified": outcome.worlds, "worlds": worlds }));

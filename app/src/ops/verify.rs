@@ -253,7 +253,7 @@ fn gpus<'a>(name: Option<&str>, args: &VerifyRequest) -> Result<Vec<Combination<
                         return Ok(Err(mismatch.to_string()));
                     }
                     let gpu = GpuBackend::new(gpu)?.with_kernel(kernel).with_residency(ResidencyPolicy::Always);
-                    Ok(Ok(Box::new(gpu.with_records(Records::Packed))))
+                    Ok(Ok(Box::new(gpu.with_records(Records::CountedFrom(0)))))
                 };
                 combinations.push(Combination {
                     names: [info.to_string(), format!("{}, {pass} pass, {kernel} kernel", info.name)],

@@ -71,7 +71,7 @@ impl Case {
         let mut record = vec![0; workgroup.buffers[RECORD].len()];
         for team in 0..teams {
             let episode = trace.episode(world, team);
-            for (index, word) in episode.sets.iter().chain(episode.seen.words().iter()).enumerate() {
+            for (index, word) in episode.sets.iter().chain(episode.seen.iter()).enumerate() {
                 record[index * teams + team] = word;
             }
         }

@@ -11,7 +11,7 @@ use super::network::Network;
 use super::together::{Observer, Together};
 use super::{Moment, ScoreTable};
 use crate::config::Fitness;
-use crate::credit::{Episode, LaneCredit, PathCredit, Paths, Seen, Strided};
+use crate::credit::{Episode, LaneCredit, PathCredit, Paths, Strided};
 use crate::model::class::Class;
 use crate::world::{OUTPUTS, World};
 
@@ -156,7 +156,7 @@ impl<S: Simd> Together<S> for EpisodeBlock<S> {
 
     fn episode_of<'a>(&'a self, batch: &WorldBatch<'a>, team: usize) -> Episode<'a> {
         let strided = |words| Strided { words, stride: S::f32s::LEN, offset: team };
-        let seen = Seen::Counts(strided(&self.seen));
+        let seen = strided(&self.seen);
         let pois = batch.groups[self.places[team].0].pois();
         let paths = batch.world.paths.is_some().then(|| Paths { positions: strided(&self.paths), pois });
         Episode { sets: strided(&self.sets), seen, sights: strided(&self.sights), paths }

@@ -43,10 +43,10 @@ pub enum Buffer {
     Classes,
     /// The agents' states between two dispatches.
     States,
-    /// The minimum sizes of packed sets.
-    Minimums,
-    /// The packed record of a batch.
-    Packed,
+    /// What the scores of POIs depend on.
+    Scoring,
+    /// The sums that are counted of a batch's records.
+    Counted,
     /// The jobs of gathering or breeding, each aligned.
     Jobs,
     /// The policies that the teams of a batch play.

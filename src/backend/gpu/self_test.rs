@@ -148,7 +148,7 @@ fn episode(executor: &Executor) -> Result<Option<String>, BackendError> {
 }
 
 /// Tests what a generation of training uses: populations on the device, from which teams are gathered, both kernels, and
-/// packed records.
+/// sums of their records.
 fn training(executor: &Executor) -> Result<Option<String>, BackendError> {
     const TEAMS: usize = 64;
     let (world, config) = world(Density::ALL[0].1);
@@ -156,16 +156,20 @@ fn training(executor: &Executor) -> Result<Option<String>, BackendError> {
     let weights = sample::weights(&world, TEAMS, 1);
     let place = |place: usize| ((place / leaders * (2 * (place % leaders) + 1) + place % leaders) % TEAMS) as u32;
     let teams: Vec<u32> = (0..TEAMS * leaders).map(place).collect();
-    // Scores show what packing drops if just enough agents are at a POI, and if followers at one saw no leader. So each
-    // POI has three agents, two of them only followers.
+    // Wrong sums show if just enough agents are at a POI, and if followers at one saw no leader. So each POI has three
+    // agents, two of them only followers. D++ shows what copies add, so one POI has only a leader there.
     const POI_OF_AGENT: [usize; 12] = [1, 1, 2, 2, 0, 0, 0, 3, 3, 3, 1, 2];
     let start = |(agent, &poi): (usize, &usize)| {
         world.pois[poi] + Vec2::new((agent % 3) as f32, 0.5 * (agent / leaders) as f32)
     };
-    let starts: Vec<Vec2> = POI_OF_AGENT.iter().enumerate().map(start).collect();
-    let group = Group { starts: &starts, ..Group::new(&world, &weights[..], TEAMS, &teams) };
-    let fitnesses: [&[Fitness]; 2] = [&[Fitness::D, Fitness::Df], &[Fitness::Dpp]];
-    let groups = fitnesses.map(|fitnesses| Group { fitnesses, ..group });
+    let together: Vec<Vec2> = POI_OF_AGENT.iter().enumerate().map(start).collect();
+    let away = |(agent, &start): (usize, &Vec2)| if agent % 3 == 2 { start + Vec2::new(0.0, 20.0) } else { start };
+    let apart: Vec<Vec2> = together.iter().enumerate().map(away).collect();
+    let group = Group::new(&world, &weights[..], TEAMS, &teams);
+    let groups = [
+        Group { starts: &together, fitnesses: &[Fitness::D, Fitness::Df], ..group },
+        Group { starts: &apart, fitnesses: &[Fitness::Dpp], ..group },
+    ];
     let expected = Cpu::default().play(&groups)?;
     let learning = Learning { mutation_probability: 0.5, ..config.learning };
     // Software renderers play by the generic kernel, see [`GpuBackend::with_kernel`].
@@ -173,7 +177,7 @@ fn training(executor: &Executor) -> Result<Option<String>, BackendError> {
     let kernels = if executor.gpu.adapter.kind == Kind::Software { &kernels[..1] } else { &kernels };
     for &kernel in kernels {
         let backend = GpuBackend::with_executor(executor.clone()).with_kernel(kernel);
-        let mut backend = backend.with_residency(ResidencyPolicy::Always).with_records(Records::Packed);
+        let mut backend = backend.with_residency(ResidencyPolicy::Always).with_records(Records::CountedFrom(0));
         if let Some(mismatch) = compare_breeding(&weights, sizes, &learning, &mut backend)? {
             return Ok(Some(format!("breeding differs: {mismatch}")));
         }

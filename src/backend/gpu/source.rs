@@ -4,7 +4,7 @@ use std::collections::HashSet;
 use std::fmt::Write;
 
 use super::exact;
-use super::shape::{Capacity, ClassKind, MAX_THREADS, ROLE, Recorded, Shape, Sizes, TEAMS, Uses, WIDTHS, WORKGROUPS};
+use super::shape::{Capacity, ClassKind, MAX_THREADS, ROLE, Recorded, Shape, Sizes, Uses, WIDTHS, WORKGROUPS};
 use crate::backend::grid::LARGE_FROM;
 use crate::backend::{MOMENT_WORDS, VECTOR};
 use crate::config::{Config, MAX_CLASSES, MAX_SECTORS, Policy};
@@ -27,8 +27,8 @@ const MAX_COUNTED_LEADERS: usize = 8;
 /// Maximum loop iterations per thread and dispatch, over all loops: Mesa's llvmpipe 22.3 abandons every loop after 65 535
 /// iterations, and drivers stop a dispatch that runs for seconds.
 pub(super) const MAX_ITERATIONS: usize = 60_000;
-/// Threads per workgroup of the pipelines that pack records, and of those that work on populations.
-pub(super) const PACK_WORKGROUP: usize = 64;
+/// Threads per workgroup of the pipeline that counts, and of those that work on populations.
+pub(super) const COUNT_WORKGROUP: usize = 64;
 pub(super) const POPULATION_WORKGROUP: usize = 256;
 /// Rows and columns of the tile that a workgroup transposes when it gathers policies.
 const TILE: usize = 32;
@@ -37,6 +37,14 @@ const TILE: usize = 32;
 pub(super) const LEADERS_PER_GATHER: usize = 4;
 /// Sentinel: no offset.
 pub(super) const NOWHERE: u32 = u32::MAX;
+/// Who is taken out for a sum of `shaders/count.wgsl`, or added: a leader (D), a leader with its followers (Df), copies of a
+/// leader (D++). 0 stands for nobody.
+pub(super) const LEADER: u32 = 1;
+pub(super) const GROUP: u32 = 2;
+pub(super) const COPIES: u32 = 3;
+/// Copies that D++ may need on a device, and one more; and where a sum has their number.
+pub(super) const MAX_COPIES: usize = 64;
+pub(super) const COPIES_SHIFT: u32 = 25;
 
 gpu_struct! {
     /// The work of one workgroup: some teams of one group. All offsets are in elements.
@@ -64,12 +72,12 @@ gpu_struct! {
         pub first: u32,
         /// The step before which a dispatch ends.
         pub end: u32,
-        /// The offset of the minimum size of each POI's sets, for packing (`shaders/pack.wgsl`).
-        pub minimums: u32,
-        /// The offset of the table of packed sets, which packing writes.
-        pub table: u32,
-        /// The offset of the leaders that followers saw most, which packing writes, or all ones for nowhere.
-        pub owners: u32,
+        /// The offset of what the scores of POIs depend on, for `shaders/count.wgsl`.
+        pub scoring: u32,
+        /// The kinds of sums that are counted, two bits each.
+        pub kinds: u32,
+        /// The offset of the sums, or all ones if nothing is counted.
+        pub counted: u32,
         /// The offset of the status word in the record. The first dispatch writes the nonce there; each later one adds
         /// 1.
         pub status: u32,
@@ -163,8 +171,8 @@ pub enum Pipeline {
     Breed,
     /// Gathers the policies of a batch's teams.
     Gather,
-    /// Packs records.
-    Pack,
+    /// Adds up what scores depend on of each record.
+    Count,
     /// Plays episodes.
     Episode(Shape),
     /// Plays a part of a step of large teams.
@@ -198,7 +206,7 @@ impl Pipeline {
             Pipeline::Ceiling => "ceiling",
             Pipeline::Breed => "breed",
             Pipeline::Gather => "gather",
-            Pipeline::Pack => "pack",
+            Pipeline::Count => "count_task",
             Pipeline::Episode(_) => "episode",
             Pipeline::Swarm(part, _) => SwarmPart::ALL[part as usize].0,
         }
@@ -220,7 +228,7 @@ impl Pipeline {
             Pipeline::Ceiling => &[Read, Read, Write],
             Pipeline::Breed => &[Read, Read, Read, Write, Write],
             Pipeline::Gather => &[Read, Read, Read, Write, Read, Read, Read],
-            Pipeline::Pack => &[Read, Read, Read, Write, Write],
+            Pipeline::Count => &[Read, Read, Read, Write, Write],
             Pipeline::Episode(_) | Pipeline::Swarm(..) => &[Read, Read, Read, Read, Write, Write, Write, Read],
         }
     }
@@ -236,16 +244,12 @@ impl Pipeline {
                 include_str!("../../../shaders/lib/math.wgsl"),
                 include_str!("../../../shaders/population.wgsl"),
             ]),
-            Pipeline::Pack => exact::assemble(&[
+            Pipeline::Count => exact::assemble(&[
                 &declarations(),
                 RECORD_WORD,
-                &gpu_constants!(
-                    WORKGROUP = PACK_WORKGROUP,
-                    TEAMS = WORKGROUPS[WORKGROUPS.len() - 1].max(TEAMS[0]),
-                    NOWHERE
-                ),
+                &gpu_constants!(WORKGROUP = COUNT_WORKGROUP, MAX_COPIES, COPIES_SHIFT, LEADER, GROUP, COPIES),
                 include_str!("../../../shaders/lib/layout.wgsl"),
-                include_str!("../../../shaders/pack.wgsl"),
+                include_str!("../../../shaders/count.wgsl"),
             ]),
             Pipeline::Episode(shape) | Pipeline::Swarm(_, shape) => episode(shape),
         }
@@ -465,7 +469,7 @@ pub fn shaders() -> Vec<(&'static str, String)> {
         ("episode, specialised, traced", specialised(TRACE, Actions::Direct)),
         ("swarm", swarm(PLAIN)),
         ("swarm, traced", swarm(TRACE)),
-        ("pack", Pipeline::Pack),
+        ("count", Pipeline::Count),
         ("population", Pipeline::Breed),
     ];
     all.map(|(name, pipeline)| (name, pipeline.text())).into()

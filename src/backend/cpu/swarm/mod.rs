@@ -15,7 +15,7 @@ use super::network::Network;
 use super::together::{Observer, Together};
 use super::{Moment, ScoreTable, StepArrays};
 use crate::config::{Combine, ControlKind, Measure};
-use crate::credit::{Episode, Paths, Seen, Strided};
+use crate::credit::{Episode, Paths, Strided};
 use crate::kernels::math::on_lattice;
 use crate::kernels::{clamp_to, splat};
 use crate::model::class::{Class, ClassLanes};
@@ -205,7 +205,7 @@ impl<S: Simd> Swarm<S> {
         let paths = (!self.paths.is_empty()).then_some(Paths { positions, pois: &self.pois });
         Episode {
             sets: Strided::contiguous(&self.sets),
-            seen: Seen::Counts(Strided::contiguous(&self.counts)),
+            seen: Strided::contiguous(&self.counts),
             sights: Strided::contiguous(&self.sights),
             paths,
         }

@@ -3,6 +3,7 @@
 //! | file | holds |
 //! |---|---|
 //! | `plan` | teams cut into tasks, tasks into batches, and the recording of each batch |
+//! | `count` | what a device adds up of each record, and the scores that follow |
 //! | `check` | the test of the kernel of large teams |
 //! | `inspect` | shaders and inputs of one workgroup, to see what compilers make of them |
 //!
@@ -11,10 +12,9 @@
 //! their own, `shaders/swarm.wgsl`, with several dispatches per step.
 //!
 //! While the GPU plays one batch, the CPU reads the record of the batch before it. If only scores are requested, the
-//! GPU keeps the record and returns only what the scores depend on, see [`Records`].
+//! GPU keeps the record, and returns only sums that the scores follow from, see [`Records`].
 
 use std::any::Any;
-use std::ops::Range;
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
@@ -22,18 +22,19 @@ use super::device::{DeviceError, Executor, Gpu, Kind, Traffic, Workspace};
 use super::population::{Held, Population};
 use super::recording::{Readback, iterations};
 use super::shape::{Capacity, MAX_OFFSET, specialised_shapes};
-use super::source::{NOWHERE, Pipeline, Task};
+use super::source::{Pipeline, Task};
 use crate::backend::grid::LARGE_FROM;
 use crate::backend::scores::ScoreTable;
 use crate::backend::{
-    BATCH_BYTES, Backend, BackendError, DevicePopulation, Group, GroupScores, HELD_FROM, MOMENT_WORDS, Moment,
-    PACKED_FROM, Trace, WeightVector, Weights, check_sizes,
+    BATCH_BYTES, Backend, BackendError, DevicePopulation, Group, GroupScores, HELD_FROM, MOMENT_WORDS, Moment, Trace,
+    WeightVector, Weights, check_sizes,
 };
-use crate::credit::{Episode, Paths, Seen, Strided};
+use crate::credit::{Episode, Paths, Strided};
 use crate::host::Instant;
 use crate::parallel::*;
 
 mod check;
+mod count;
 mod inspect;
 mod plan;
 
@@ -41,8 +42,11 @@ pub use super::shape::Kernel;
 pub use inspect::{WorkgroupBuffers, shader_of, workgroup_of};
 pub(crate) use plan::state_bytes;
 
-use plan::{BatchPlan, BatchReadback, PACKED_HEAD, PlannedTask, RecordingOptions, owner_words, plan};
+use plan::{BatchPlan, BatchReadback, PlannedTask, RecordingOptions, plan};
 
+/// Default minimum bytes of a batch's records of which a GPU counts what scores depend on: about what the bus transfers in
+/// the time of one more dispatch. An estimate, not a measurement. Software renderers count nothing.
+const COUNTED_FROM: u64 = 1 << 20;
 /// Target time of a submission, in seconds: no watchdog ends it, even if its kernels are several times as slow as others.
 /// Windows ends a submission after 2 s, other systems even earlier.
 const SUBMISSION_TIME: f64 = 0.1;
@@ -50,8 +54,6 @@ const SUBMISSION_TIME: f64 = 0.1;
 const MIN_CAP: u64 = 1 << 24;
 /// A batch that took less time, or for which the host hardly waited, shows only that the device is at least so fast.
 const SHORT: Duration = Duration::from_millis(5);
-/// Initial share of all sets that a packed record has room for.
-const KEPT_SHARE: f64 = 1.0 / 16.0;
 
 /// Selects the populations that a device holds between generations. Results do not depend on it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -67,23 +69,17 @@ pub enum ResidencyPolicy {
 /// How records are copied to the host if only scores are requested. Results do not depend on it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Records {
-    /// Unpacked.
+    /// As they are.
     Whole,
-    /// Batches with records of at least so many bytes are packed on the device first. Packing drops the sets that
-    /// another set of the same POI contains, and of the counts it keeps only the leader that each follower saw most.
-    PackedFrom(u64),
-    /// All are packed, with room for as much as a whole record, so that the whole is rarely copied.
-    Packed,
+    /// Of records of at least so many bytes per batch, the device adds up what is lost without each leader, and only that
+    /// is copied. Records of which that is not enough are copied whole.
+    CountedFrom(u64),
 }
 
 impl Records {
-    /// Reports whether a record of so many bytes is packed.
-    fn packs(self, bytes: u64) -> bool {
-        match self {
-            Records::Whole => false,
-            Records::PackedFrom(minimum) => bytes >= minimum,
-            Records::Packed => true,
-        }
+    /// Reports whether the device counts what a record of so many bytes has.
+    fn counts(self, bytes: u64) -> bool {
+        matches!(self, Records::CountedFrom(minimum) if bytes >= minimum)
     }
 }
 
@@ -109,22 +105,11 @@ pub struct GpuBackend {
     cap: u64,
     /// When the last batch finished.
     done_at: Option<Instant>,
-    /// The share of all sets that packed records have room for.
-    kept_share: f64,
     times: PhaseTimes,
 }
 
-/// The record of a batch, in the host's memory.
-#[derive(Clone, Copy)]
-enum RecordWords<'a> {
-    /// The whole record.
-    Whole(&'a [u32]),
-    /// The part that the scores depend on, as `shaders/pack.wgsl` writes it.
-    Packed(&'a [u32]),
-}
-
-/// Called for each task with the record and the trace of its batch.
-type Done<'a> = dyn Fn(&PlannedTask, RecordWords<'_>, &[f32]) + Sync + 'a;
+/// Called for each task with the trace of its batch, and what was counted of it or its record.
+type Done<'a> = dyn Fn(&PlannedTask, &[u32], &[f32]) + Sync + 'a;
 
 /// A submitted batch.
 struct Submitted<'a> {
@@ -133,7 +118,6 @@ struct Submitted<'a> {
     workspace: usize,
     last: wgpu::SubmissionIndex,
     start: Instant,
-    nonce: u32,
     /// The estimated work, and the number of submissions.
     iterations: u64,
     submissions: usize,
@@ -180,7 +164,7 @@ impl GpuBackend {
             executor,
             kernel: if software { Kernel::Generic } else { Kernel::Best },
             residency: if software { ResidencyPolicy::Never } else { ResidencyPolicy::From(HELD_FROM) },
-            records: if software { Records::Whole } else { Records::PackedFrom(PACKED_FROM) },
+            records: if software { Records::Whole } else { Records::CountedFrom(COUNTED_FROM) },
             batch_bytes: BATCH_BYTES,
             large_from: LARGE_FROM,
             tests_large: false,
@@ -189,7 +173,6 @@ impl GpuBackend {
             staging: Vec::new(),
             cap: MIN_CAP,
             done_at: None,
-            kept_share: KEPT_SHARE,
             times: PhaseTimes::default(),
         }
     }
@@ -338,8 +321,6 @@ impl GpuBackend {
             nonce,
             cap: self.cap,
             most_workgroups: self.gpu().limits.max_compute_workgroups_per_dimension,
-            records: self.records,
-            kept_share: self.kept_share,
         };
         let (recording, ranges) = plan.record(&options);
         let (iterations, submissions) = (iterations(&recording.commands), recording.submissions().count());
@@ -351,30 +332,17 @@ impl GpuBackend {
         self.times.gather += gathered - start;
         self.times.upload += gathered.elapsed();
         let (start, readback) = (submission, recording.readback);
-        Ok(Submitted { plan, workspace, last, start, nonce, iterations, submissions, readback, ranges })
+        Ok(Submitted { plan, workspace, last, start, iterations, submissions, readback, ranges })
     }
 
     /// Waits for one batch, and passes its record on.
-    fn collect(&mut self, mut submitted: Submitted<'_>, done: &Done<'_>) -> Result<(), DeviceError> {
+    fn collect(&mut self, submitted: Submitted<'_>, done: &Done<'_>) -> Result<(), DeviceError> {
         let start = Instant::now();
         self.gpu().wait_for(Some(submitted.last.clone()))?;
         let waited = start.elapsed();
         let elapsed = self.measure(&submitted, waited);
         let clock = self.executor.clock(&self.workspaces[submitted.workspace])?;
-        let (used, mut score) = self.score(&submitted, done)?;
-        if score.is_none() {
-            // More was kept than the packed record has room for.
-            let (recording, ranges) = submitted.plan.record_of_played(submitted.nonce);
-            submitted.last = self.executor.run(&recording, &mut self.workspaces[submitted.workspace], &[])?;
-            (submitted.readback, submitted.ranges) = (recording.readback, ranges);
-            score = self.score(&submitted, done)?.1;
-        }
-        let score = score.unwrap_or_default();
-        if let (Some(used), Some(head)) = (used, submitted.plan.head) {
-            // The next generation may keep more, so there is room for half as much again. The room shrinks slowly.
-            let kept = 1.5 * used.saturating_sub(head) as f64 / submitted.plan.sets as f64;
-            self.kept_share = kept.max(0.9 * self.kept_share);
-        }
+        let score = self.score(&submitted, done)?;
         self.times.gpu += clock.unwrap_or_default();
         self.times.longest = self.times.longest.max(clock.unwrap_or(elapsed) / submitted.submissions as u32);
         self.times.wait += waited;
@@ -399,29 +367,15 @@ impl GpuBackend {
         elapsed
     }
 
-    /// Passes the record of a batch on, if it was read back. Returns the words that packing needed, and how long that
-    /// took.
-    fn score(
-        &self,
-        submitted: &Submitted<'_>,
-        done: &Done<'_>,
-    ) -> Result<(Option<usize>, Option<Duration>), DeviceError> {
-        let Submitted { plan, workspace, last, readback, ranges: BatchReadback { traced, packed, record }, .. } =
-            submitted;
+    /// Passes the results of a batch on. Returns how long that took.
+    fn score(&self, submitted: &Submitted<'_>, done: &Done<'_>) -> Result<Duration, DeviceError> {
+        let Submitted { plan, workspace, last, readback, ranges: BatchReadback { traced, words }, .. } = submitted;
         self.executor.read(last.clone(), &self.workspaces[*workspace], readback, |bytes| {
-            let words = |range: &Range<usize>| bytemuck::cast_slice::<u8, u32>(&bytes[range.clone()]);
-            let packed = packed.as_ref().map(|(room, range)| (*room, words(range)));
-            let used = packed.map(|(_, words)| words[0] as usize);
-            let record = match (packed, record) {
-                (Some((room, words)), _) if used <= Some(room) && words.len() > PACKED_HEAD => {
-                    RecordWords::Packed(&words[PACKED_HEAD..])
-                }
-                (_, Some(range)) => RecordWords::Whole(words(range)),
-                _ => return (used, None),
-            };
-            let (start, traced) = (Instant::now(), bytemuck::cast_slice(&bytes[traced.clone()]));
-            plan.tasks.par_iter().for_each(|planned| done(planned, record, traced));
-            (used, Some(start.elapsed()))
+            let start = Instant::now();
+            let words = bytemuck::cast_slice(&bytes[words.clone()]);
+            let traced = bytemuck::cast_slice(&bytes[traced.clone()]);
+            plan.tasks.par_iter().for_each(|planned| done(planned, words, traced));
+            start.elapsed()
         })
     }
 }
@@ -430,49 +384,33 @@ impl GpuBackend {
 fn each_episode(
     groups: &[Group<'_>],
     planned: &PlannedTask,
-    record: RecordWords<'_>,
+    words: &[u32],
     traced: &[f32],
     mut visit: impl FnMut(usize, &Episode<'_>),
 ) {
     let (group, world) = (&groups[planned.group], groups[planned.group].world);
     const POSITION: usize = std::mem::offset_of!(Moment, position) / size_of::<f32>();
-    let Task { sets, counts, table, owners, .. } = planned.task;
+    let Task { sets, counts, .. } = planned.task;
     let stride = planned.task.teams as usize;
-    match record {
-        RecordWords::Whole(words) => {
-            let sets = &words[sets as usize..][..world.set_words() * stride];
-            let sight_words = if group.records().sights() { world.sight_words() } else { 0 };
-            let (counts, sights) = words[counts as usize..].split_at(world.leaders() * world.followers() * stride);
-            let sights = &sights[..sight_words * stride];
-            let (traced, mut positions) = (&traced[planned.task.traced as usize..], Vec::new());
-            for offset in 0..stride {
-                let strided = |words| Strided { words, stride, offset };
-                let (sets, seen, sights) = (strided(sets), Seen::Counts(strided(counts)), strided(sights));
-                let paths = world.paths.is_some().then(|| {
-                    positions.clear();
-                    let moment = world.agents() * MOMENT_WORDS;
-                    for moment in traced[offset * moment..].chunks(stride * moment).take(world.steps() + 1) {
-                        let agents = moment.chunks_exact(MOMENT_WORDS).take(world.agents());
-                        let places = agents.flat_map(|agent| [agent[POSITION], agent[POSITION + 1]]);
-                        positions.extend(places.map(f32::to_bits));
-                    }
-                    Paths { positions: Strided::contiguous(&positions), pois: group.pois() }
-                });
-                visit(planned.first_team + offset, &Episode { sets, seen, sights, paths });
+    let sets = &words[sets as usize..][..world.set_words() * stride];
+    let sight_words = if group.records().sights() { world.sight_words() } else { 0 };
+    let (counts, sights) = words[counts as usize..].split_at(world.leaders() * world.followers() * stride);
+    let sights = &sights[..sight_words * stride];
+    let (traced, mut positions) = (&traced[planned.task.traced as usize..], Vec::new());
+    for offset in 0..stride {
+        let strided = |words| Strided { words, stride, offset };
+        let (sets, seen, sights) = (strided(sets), strided(counts), strided(sights));
+        let paths = world.paths.is_some().then(|| {
+            positions.clear();
+            let moment = world.agents() * MOMENT_WORDS;
+            for moment in traced[offset * moment..].chunks(stride * moment).take(world.steps() + 1) {
+                let agents = moment.chunks_exact(MOMENT_WORDS).take(world.agents());
+                let places = agents.flat_map(|agent| [agent[POSITION], agent[POSITION + 1]]);
+                positions.extend(places.map(f32::to_bits));
             }
-        }
-        RecordWords::Packed(words) => {
-            let table = &words[table as usize..][..=stride];
-            let owners = match owners {
-                NOWHERE => &[],
-                owners => &words[owners as usize..][..owner_words(world) * stride],
-            };
-            for (offset, ends) in table.windows(2).enumerate() {
-                let sets = Strided::contiguous(&words[ends[0] as usize..ends[1] as usize]);
-                let seen = Seen::Owners(Strided { words: owners, stride, offset });
-                visit(planned.first_team + offset, &Episode { sets, seen, sights: Strided::NONE, paths: None });
-            }
-        }
+            Paths { positions: Strided::contiguous(&positions), pois: group.pois() }
+        });
+        visit(planned.first_team + offset, &Episode { sets, seen, sights, paths });
     }
 }
 
@@ -482,8 +420,11 @@ impl Backend for GpuBackend {
         let scores = ScoreTable::new(groups);
         // Paths are read from traces.
         let trace = groups.iter().any(|group| group.world.paths.is_some());
-        self.play_tasks(groups, trace, &|planned, record, traced| {
-            each_episode(groups, planned, record, traced, |team, episode| scores.score(planned.group, team, episode));
+        self.play_tasks(groups, trace, &|planned, words, traced| match planned.counting(groups) {
+            Some(counting) => counting.score(words, &planned.task, (planned.group, planned.first_team), &scores),
+            None => each_episode(groups, planned, words, traced, |team, episode| {
+                scores.score(planned.group, team, episode);
+            }),
         })?;
         Ok(scores.finish())
     }
@@ -492,9 +433,9 @@ impl Backend for GpuBackend {
         group.check()?;
         let (world, groups) = (group.world, std::slice::from_ref(group));
         let trace = Mutex::new(Trace::of_zeros(group));
-        self.play_tasks(groups, true, &|planned, record, traced| {
+        self.play_tasks(groups, true, &|planned, words, traced| {
             let all = &mut *lock(&trace);
-            each_episode(groups, planned, record, traced, |team, episode| all.store(team, episode));
+            each_episode(groups, planned, words, traced, |team, episode| all.store(team, episode));
             // The moments of all steps, then the inputs.
             let stride = planned.task.teams as usize;
             let mut from = &traced[planned.task.traced as usize..];

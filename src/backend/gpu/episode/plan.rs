@@ -6,16 +6,17 @@ use std::ops::Range;
 use glam::Vec2;
 
 use super::Records;
+use super::count::Counting;
 use crate::backend::gpu::population::Held;
 use crate::backend::gpu::recording::{BINDING_ALIGNMENT, Buffer, Command, Recording, Slice, grid};
 use crate::backend::gpu::shape::{Capacity, MAX_THREADS, Recorded, Shape, WORKGROUPS, Workgroup};
 use crate::backend::gpu::source::{
-    GatherJob, LEADERS_PER_GATHER, MAX_ITERATIONS, NOWHERE, PACK_WORKGROUP, Pipeline, State, SwarmPart, Task,
+    GatherJob, LEADERS_PER_GATHER, MAX_ITERATIONS, NOWHERE, Pipeline, State, SwarmPart, Task,
 };
 use crate::backend::grid::{Grid, LARGE_FROM, is_large};
 use crate::backend::{BackendError, Group, VECTOR, WeightVector, Weights, record_words, traced_words, weight_vectors};
 use crate::config::{Choice, MAX_CLASSES};
-use crate::credit::{RecordRequest, owner_bits};
+use crate::credit::RecordRequest;
 use crate::model::Constants;
 use crate::model::class::Class;
 use crate::model::policy::PolicyConstants;
@@ -23,15 +24,11 @@ use crate::model::sense::{ChannelConstants, NOTHING};
 use crate::parallel::*;
 use crate::world::{GoneWithin, World};
 
-/// Words before the others in a packed record (`struct Packed` in the shader): words used, and words available.
-pub(super) const PACKED_HEAD: usize = 2;
 /// Words of a task's status.
 const STATUS: usize = 1;
 /// Alignment of each kernel's first task, in tasks, so that a binding may start there.
 const TASK_ALIGNMENT: usize = BINDING_ALIGNMENT / size_of::<Task>();
 const _: () = assert!(BINDING_ALIGNMENT.is_multiple_of(size_of::<Task>()));
-/// Words of a packed record beyond the share of sets that it has room for.
-const SPARE_PACKED_WORDS: usize = 256;
 
 /// Words of a cell of a large team, see `shaders/swarm.wgsl`.
 const CELL_WORDS: usize = 3;
@@ -159,9 +156,17 @@ impl PlannedTask {
         (first < end).then_some(Task { first, end, nonce, ..self.task })
     }
 
-    /// Returns the offset of the status word in a packed record. It follows the table.
-    fn packed_status(&self) -> usize {
-        (self.task.table + self.task.teams) as usize + 1
+    /// Returns what the device counts, unless it returns the whole record.
+    pub(super) fn counting<'a>(&self, groups: &'a [Group<'a>]) -> Option<Counting<'a>> {
+        Counting::of(&groups[self.group]).filter(|_| self.task.counted != NOWHERE)
+    }
+
+    /// Returns the offset of the status word in what is read back.
+    fn status(&self, groups: &[Group<'_>]) -> usize {
+        match self.counting(groups) {
+            Some(counting) => self.task.counted as usize + counting.words(self.task.teams as usize),
+            None => self.task.status as usize,
+        }
     }
 
     /// Returns the value of the status word after the last round.
@@ -273,11 +278,9 @@ pub(super) struct BatchPlan {
     pub(super) places: Vec<Vec2>,
     /// The elements that its tasks use.
     used: Elements,
-    /// Words of all sets in the record.
-    pub(super) sets: usize,
-    /// If the record is packed: the words of tables and owners, and the minimum size of a set, `[pois]` per group.
-    pub(super) head: Option<usize>,
-    minimums: Vec<u32>,
+    /// The words of all sums and status words, 0 if nothing is counted, and what the scores of POIs depend on.
+    counted: usize,
+    scoring: Vec<u32>,
 }
 
 impl BatchPlan {
@@ -327,7 +330,7 @@ impl BatchPlan {
         self.worlds.push(Constants { first_class: self.classes.len() as u32, ..world.constants });
         self.classes.extend(&world.classes);
         let (pois, end) = (first + world.agents() as u32, world.constants.steps);
-        Task { world: index, starts: first, pois, end, ..Task::default() }
+        Task { world: index, starts: first, pois, end, counted: NOWHERE, ..Task::default() }
     }
 
     /// Adds a task. `stored` refers to its group's world.
@@ -347,38 +350,28 @@ impl BatchPlan {
         used.weights += per_team.weights * teams;
         used.traced += per_team.traced * teams;
         used.states += per_team.states * teams;
-        self.sets += sets;
         self.tasks.push(PlannedTask { first_team, task, ..plan.template });
     }
 
-    /// Lays out the packed record, unless the whole record is requested, the rule depends on when sets occur, packing
-    /// would take too long for one dispatch, or it would save nothing.
-    fn pack(&mut self, groups: &[Group<'_>], records: Records) {
-        let packs = |planned: &PlannedTask| {
-            let (world, need) = (groups[planned.group].world, groups[planned.group].records());
-            need.min_agents(1).is_some() && !world.rule.is_timed() && pack_iterations(groups, planned) <= MAX_ITERATIONS
-        };
-        // The first task of a group is the largest.
-        let all_pack = self.tasks.chunk_by(|a, b| a.group == b.group).all(|tasks| packs(&tasks[0]));
-        if !records.packs(self.used.bytes()[0]) || !all_pack {
-            return;
-        }
-        let mut head = 0;
-        for tasks in self.tasks.chunk_by_mut(|a, b| a.group == b.group) {
-            let (world, need) = (groups[tasks[0].group].world, groups[tasks[0].group].records());
-            let minimums = self.minimums.len() as u32;
-            self.minimums.extend(world.coupling.iter().filter_map(|&coupling| need.min_agents(coupling)));
+    /// Lays out what is counted, unless the whole record is requested, scores depend on more, counting would take too long
+    /// for one dispatch, or it would save nothing.
+    fn count(&mut self, groups: &[Group<'_>], records: Records) {
+        let (mut tasks, mut scoring, mut end) = (self.tasks.clone(), vec![], 0);
+        for tasks in tasks.chunk_by_mut(|a, b| a.group == b.group) {
+            // The first task of a group is the largest.
+            let most = tasks[0].task.teams as usize;
+            let fits = |counting: &Counting<'_>| counting.iterations(most) <= MAX_ITERATIONS;
+            let Some(counting) = Counting::of(&groups[tasks[0].group]).filter(fits) else { return };
+            let first = scoring.len() as u32;
+            counting.extend(&mut scoring);
             for PlannedTask { task, .. } in tasks {
-                let teams = task.teams as usize;
-                (task.minimums, task.table, task.owners) = (minimums, head as u32, NOWHERE);
-                head += teams + 2;
-                if need.owners() && world.followers() > 0 {
-                    task.owners = head as u32;
-                    head += owner_words(world) * teams;
-                }
+                (task.scoring, task.kinds, task.counted) = (first, counting.kinds(), end as u32);
+                end += counting.words(task.teams as usize) + STATUS;
             }
         }
-        self.head = Some(head).filter(|head| head + PACKED_HEAD < self.used.record);
+        if records.counts(self.used.bytes()[0]) && end < self.used.record {
+            *self = BatchPlan { tasks, scoring, counted: end, ..std::mem::take(self) };
+        }
     }
 
     /// Returns the number of nonces that its status words need.
@@ -427,15 +420,13 @@ impl BatchPlan {
             }
         }
         self.record_gathering(options, weights.clone(), &mut recording);
-        let packed = self.head.map(|head| {
-            let room = self.packed_room(head, options);
-            let packed = recording.buffer(Buffer::Packed, words(PACKED_HEAD + room));
-            recording.upload(Buffer::Packed, 0, vec![head as u32, room as u32]);
-            (room, packed, recording.input(Buffer::Minimums, &self.minimums))
+        let counting = (self.counted > 0).then(|| {
+            let counted = recording.buffer(Buffer::Counted, words(self.counted));
+            (counted, recording.input(Buffer::Scoring, &self.scoring))
         });
-        // The dispatches, in submissions of at most `cap` iterations, and then those that pack.
+        // The dispatches, in submissions of at most `cap` iterations, and then those that count.
         let most = options.most_workgroups as usize / TASK_ALIGNMENT * TASK_ALIGNMENT;
-        let (mut packing, mut load, mut is_split) = (Vec::new(), 0, false);
+        let (mut count, mut load, mut is_split) = (Vec::new(), 0, false);
         for Run { dispatches, is_first_round, mut tasks, iterations: per_task } in runs {
             while !tasks.is_empty() {
                 let allowed = (options.cap.saturating_sub(load) / per_task) as usize / TASK_ALIGNMENT * TASK_ALIGNMENT;
@@ -448,28 +439,28 @@ impl BatchPlan {
                 tasks.start = part.end;
                 let work = part.len() as u64 * per_task;
                 load += work;
-                let count = part.len() as u32;
+                let workgroups = part.len() as u32;
                 let bytes = (part.start * size_of::<Task>()) as u64..(part.end * size_of::<Task>()) as u64;
                 let tasks = Slice { buffer: Buffer::Tasks, bytes };
-                if let (Some((_, packed, minimums)), true) = (&packed, is_first_round) {
-                    let bindings = [&worlds, &tasks, minimums, packed, &record].map(Slice::clone).into();
-                    let grid = [count, 1, 1];
-                    packing.push(Command::Dispatch { pipeline: Pipeline::Pack, bindings, grid, iterations: 0 });
+                if let (Some((counted, scoring)), true) = (&counting, is_first_round) {
+                    let bindings = [&worlds, &tasks, scoring, counted, &record].map(Slice::clone).into();
+                    let grid = [workgroups, 1, 1];
+                    count.push(Command::Dispatch { pipeline: Pipeline::Count, bindings, grid, iterations: 0 });
                 }
-                for (index, &(pipeline, workgroups)) in dispatches.iter().enumerate() {
+                for (index, &(pipeline, several)) in dispatches.iter().enumerate() {
                     let bindings = [&worlds, &tasks, &places, &weights, &record, &traced, &states, &classes];
                     let bindings = bindings.map(Slice::clone).into();
-                    let grid = workgroups.map_or([count, 1, 1], |workgroups| [workgroups as u32, count, 1]);
+                    let grid = several.map_or([workgroups, 1, 1], |several| [several as u32, workgroups, 1]);
                     let iterations = if index + 1 == dispatches.len() { work } else { 0 };
                     recording.commands.push(Command::Dispatch { pipeline, bindings, grid, iterations });
                 }
             }
         }
-        if is_split && !packing.is_empty() {
+        if is_split && !count.is_empty() {
             recording.commands.push(Command::Submit);
         }
-        recording.commands.extend(packing);
-        // The record is read back last, because its status words stand for everything before it.
+        recording.commands.extend(count);
+        // Its status words stand for everything before it, so this is read back last.
         let [.., traced_bytes, _] = self.used.bytes();
         let traced = if trace { recording.read_back(first(Buffer::Traced, traced_bytes)) } else { 0..0 };
         for tasks in self.tasks.chunk_by(|a, b| a.group == b.group) {
@@ -477,51 +468,15 @@ impl BatchPlan {
                 recording.read_status(Buffer::GroupStatus(tasks[0].group), &held.status);
             }
         }
-        let mut readback = BatchReadback { traced, ..BatchReadback::default() };
-        if let Some((room, ..)) = packed {
-            // If nearly all sets are kept, packing only measures when that changes.
-            let kept = if Some(room) == self.head { 0 } else { room };
-            let packed = recording.read_back(first(Buffer::Packed, words(PACKED_HEAD + kept)));
-            if kept > 0 {
-                self.expect(
-                    &mut recording,
-                    nonce,
-                    packed.start + words(PACKED_HEAD) as usize,
-                    PlannedTask::packed_status,
-                );
-            }
-            readback.packed = Some((room, packed));
-        }
-        if packed.is_none_or(|(room, ..)| Some(room) == self.head) {
-            readback.record = Some(self.read_record(&mut recording, nonce));
-        }
-        (recording, readback)
-    }
-
-    /// Copies the whole record to the host. Returns where it is.
-    fn read_record(&self, recording: &mut Recording<'_>, nonce: u32) -> Range<usize> {
-        let record = recording.read_back(first(Buffer::Record, self.used.bytes()[0]));
-        self.expect(recording, nonce, record.start, |planned| planned.task.status as usize);
-        record
-    }
-
-    /// Expects the status word of every task. `at` returns its offset, in words after `start` bytes. It stays as it is if
-    /// the device did not play the task.
-    fn expect(&self, recording: &mut Recording<'_>, nonce: u32, start: usize, at: impl Fn(&PlannedTask) -> usize) {
-        let status = |planned| (start + words(at(planned)) as usize, planned.final_status(nonce));
+        let read = match self.counted {
+            0 => recording.read_back(first(Buffer::Record, self.used.bytes()[0])),
+            counted => recording.read_back(first(Buffer::Counted, words(counted))),
+        };
+        // A status word stays as it is if the device did not play the task.
+        let status =
+            |planned: &PlannedTask| (read.start + words(planned.status(groups)) as usize, planned.final_status(nonce));
         recording.readback.status.extend(self.tasks.iter().map(status));
-    }
-
-    /// Returns how many words a packed record has room for, including tables and owners, or only `head` if nearly all
-    /// sets are kept.
-    fn packed_room(&self, head: usize, options: &RecordingOptions<'_>) -> usize {
-        let most = self.used.record - PACKED_HEAD - 1;
-        let room = head + (self.sets as f64 * options.kept_share) as usize + SPARE_PACKED_WORDS;
-        match options.records {
-            Records::Packed => most,
-            _ if room <= most => room,
-            _ => head,
-        }
+        (recording, BatchReadback { traced, words: read })
     }
 
     /// Lays out the tasks of all rounds. In each round the tasks of a shape are consecutive, and the first is at an
@@ -607,13 +562,6 @@ impl BatchPlan {
             });
         }
     }
-
-    /// Returns what copies the whole record of a batch that was played.
-    pub(super) fn record_of_played(&self, nonce: u32) -> (Recording<'static>, BatchReadback) {
-        let mut recording = Recording::new("reading back");
-        let record = Some(self.read_record(&mut recording, nonce));
-        (recording, BatchReadback { record, ..BatchReadback::default() })
-    }
 }
 
 /// Tasks of one shape and round.
@@ -641,19 +589,14 @@ pub(super) struct RecordingOptions<'a> {
     pub(super) cap: u64,
     /// Maximum workgroups in each dimension of a dispatch.
     pub(super) most_workgroups: u32,
-    pub(super) records: Records,
-    /// The share of all sets that packed records have room for.
-    pub(super) kept_share: f64,
 }
 
 /// The places of a batch's results in [`Buffer::Readback`], in bytes.
 #[derive(Default)]
 pub(super) struct BatchReadback {
     pub(super) traced: Range<usize>,
-    /// The words that a packed record has room for, and what is copied of it: all of it, or only its header.
-    pub(super) packed: Option<(usize, Range<usize>)>,
-    /// The whole record.
-    pub(super) record: Option<Range<usize>>,
+    /// What was counted, or the whole record.
+    pub(super) words: Range<usize>,
 }
 
 /// Returns the first bytes of a buffer.
@@ -668,20 +611,6 @@ fn words(count: usize) -> u64 {
 
 fn is_on_host(groups: &[Group<'_>], planned: &PlannedTask) -> bool {
     matches!(groups[planned.group].weights, Weights::OnHost(_))
-}
-
-/// Returns the words per team for the leader that each follower saw most.
-pub(super) fn owner_words(world: &World) -> usize {
-    world.followers().div_ceil((32 / owner_bits(world.constants.leaders)) as usize)
-}
-
-/// Returns the maximum loop iterations per thread to pack a task.
-fn pack_iterations(groups: &[Group<'_>], planned: &PlannedTask) -> usize {
-    let (world, teams) = (groups[planned.group].world, planned.task.teams as usize);
-    let sets = (world.pois.len() * teams).div_ceil(PACK_WORKGROUP);
-    let owners = (owner_words(world) * teams).div_ceil(PACK_WORKGROUP) * 4 * (world.leaders() + 2);
-    // Each set is read twice, and at most as many are written or skipped.
-    sets * 4 * world.steps() * (world.constants.words as usize + 1) + owners + 3 * teams
 }
 
 /// Cuts the groups' teams into tasks, and the tasks into batches. Worlds with one of the `specialised` shapes get that
@@ -715,7 +644,7 @@ pub(super) fn plan(
     }
     batches.retain(|batch| !batch.tasks.is_empty());
     if !trace {
-        batches.iter_mut().for_each(|batch| batch.pack(groups, records));
+        batches.iter_mut().for_each(|batch| batch.count(groups, records));
     }
     Ok(batches)
 }
@@ -790,35 +719,30 @@ mod tests {
         for batch in &batches {
             batch.stage(&groups, &mut weights);
             let (groups, held, weights) = (&groups[..], &held[..], &weights[..]);
-            let options = RecordingOptions {
-                groups,
-                held,
-                weights,
-                trace: false,
-                nonce: 5,
-                cap,
-                most_workgroups,
-                records,
-                kept_share: 0.1,
-            };
-            let (recording, readback) = batch.record(&options);
-            let copies = 1 + usize::from(readback.packed.is_some() && readback.record.is_some());
+            let options = RecordingOptions { groups, held, weights, trace: false, nonce: 5, cap, most_workgroups };
+            let (recording, _) = batch.record(&options);
             let held = if is_held { 2 * batch.worlds.len() } else { 0 };
-            assert_eq!((recording.readback.status.len(), copies), (batch.tasks.len() + held, 1));
+            assert_eq!(recording.readback.status.len(), batch.tasks.len() + held);
             counts[1] += recording.submissions().count();
-            counts[2] += check_recording(&recording, batch, [cap, buffer], most_workgroups);
+            counts[2] += check_recording(&recording, batch, groups, [cap, buffer], most_workgroups);
         }
         counts
     }
 
     /// Checks one recording. Returns its dispatches that play.
-    fn check_recording(recording: &Recording<'_>, batch: &BatchPlan, [cap, buffer]: [u64; 2], most: u32) -> usize {
+    fn check_recording(
+        recording: &Recording<'_>,
+        batch: &BatchPlan,
+        groups: &[Group<'_>],
+        [cap, buffer]: [u64; 2],
+        most: u32,
+    ) -> usize {
         let bytes_of = |buffer| recording.buffers.iter().find(|(other, _)| *other == buffer).map(|(_, bytes)| *bytes);
         let fits = |slice: &Slice| bytes_of(slice.buffer).is_none_or(|bytes| slice.bytes.end <= bytes);
         let too_large = recording.buffers.iter().find(|(id, bytes)| *id != Buffer::Tasks && *bytes > buffer);
         assert_eq!(too_large, None);
         let (mut tasks, mut played): (Vec<Task>, Vec<Task>) = Default::default();
-        let (mut packed, mut copied, mut dispatches) = (0, 0, 0);
+        let (mut counted, mut copied, mut dispatches) = (0, 0, 0);
         for command in &recording.commands {
             match command {
                 Command::Upload { to, offset, bytes } => {
@@ -835,8 +759,8 @@ mod tests {
                     let [start, end] = [slice.bytes.start, slice.bytes.end].map(|at| at as usize / size_of::<Task>());
                     let per_task = if let Pipeline::Swarm(..) = pipeline { grid[0] } else { 1 };
                     assert_eq!(grid.iter().product::<u32>() as usize, (end - start) * per_task as usize);
-                    if *pipeline == Pipeline::Pack {
-                        packed += tasks[start..end].iter().map(|task| task.teams).sum::<u32>();
+                    if *pipeline == Pipeline::Count {
+                        counted += tasks[start..end].iter().map(|task| task.teams).sum::<u32>();
                     } else if let Pipeline::Swarm(part, _) = pipeline {
                         // The last of each step has its work.
                         played.extend(tasks[start..end].iter().filter(|_| *part == SwarmPart::ObeyRule));
@@ -867,13 +791,13 @@ mod tests {
             assert_eq!(last, planned.task.end);
         }
         let teams: u32 = batch.tasks.iter().map(|planned| planned.task.teams).sum();
-        assert_eq!(packed, if batch.head.is_some() { teams } else { 0 });
+        assert_eq!(counted, if batch.counted > 0 { teams } else { 0 });
         // Tasks follow each other in every buffer, without overlap.
         for pair in batch.tasks.windows(2) {
             let [before, after] = [pair[0].task, pair[1].task];
             assert!(before.sets < before.counts && before.counts < before.status && before.status < after.sets);
             assert!(before.weights < after.weights && before.states <= after.states);
-            assert!(batch.head.is_none() || pair[0].packed_status() < after.table as usize);
+            assert!(batch.counted == 0 || pair[0].status(groups) + STATUS == after.counted as usize);
         }
         dispatches
     }
@@ -888,13 +812,13 @@ mod tests {
         // Batches, submissions, and dispatches that play.
         let found = [
             check(&[(3, &short)], 1 << 20, FREE, Records::Whole, false),
-            check(&[(3, &short)], 1 << 20, FREE, Records::Packed, true),
+            check(&[(3, &short)], 1 << 20, FREE, Records::CountedFrom(0), true),
             // The long episode takes a second round.
-            check(&both, 1 << 24, FREE, Records::Packed, false),
+            check(&both, 1 << 24, FREE, Records::CountedFrom(0), false),
             // 300 tasks in dispatches of 8, then 150.
             check(&both, 1 << 24, [u64::MAX, 8], Records::Whole, true),
-            // The smallest dispatches have 4 tasks. Packing is a submission of its own.
-            check(&both, 1 << 24, [1, 65_535], Records::Packed, true),
+            // The smallest dispatches have 4 tasks. Counting is a submission of its own.
+            check(&both, 1 << 24, [1, 65_535], Records::CountedFrom(0), true),
             // 4 tasks of the first round stay below the cap, or 12 of the second.
             check(&both, 1 << 24, [1 << 26, 65_535], Records::Whole, false),
             // Agents that wait between two dispatches count towards a batch, too.
