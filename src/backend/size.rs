@@ -24,12 +24,15 @@ pub(super) fn record_words(world: &World, records: RecordRequest<'_>) -> usize {
     world.set_words() + world.leaders() * world.followers() + sights + gone
 }
 
-/// Returns the bytes of the record of a team that is scored by a fitness, with its trace if scores need paths, and with the
-/// sums that a GPU may count of it.
+/// Returns the bytes of the record of a team that is scored by a fitness, with its trace if scores need paths.
 pub fn record_bytes(world: &World, fitness: Fitness) -> u64 {
     let traced = if world.paths.is_some() { (world.steps() + 1) * traced_words(world) } else { 0 };
-    let sums = 1 + world.leaders();
-    ((record_words(world, RecordRequest(&[fitness])) + traced + sums) * size_of::<u32>()) as u64
+    ((record_words(world, RecordRequest(&[fitness])) + traced) * size_of::<u32>()) as u64
+}
+
+/// Returns the maximum bytes of the sums that a GPU counts of a team's record.
+pub fn sum_bytes(world: &World) -> u64 {
+    ((1 + world.leaders()) * size_of::<u32>()) as u64
 }
 
 /// Returns the words of one step of a team's trace: moments, then inputs.

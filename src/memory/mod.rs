@@ -70,7 +70,8 @@ impl StageBytes {
             + if is_summed { 2 * populations * policies } else { 0 }
             + (episodes + tests) * EPISODE_WORDS;
         let played = trials * (episodes * teams).max(tests);
-        let of_team = [backend::weight_bytes(&world), largest(backend::record_bytes), largest(backend::state_bytes)];
+        let record = largest(backend::record_bytes) + backend::sum_bytes(&world);
+        let of_team = [backend::weight_bytes(&world), record, largest(backend::state_bytes)];
         StageBytes {
             training: 4 * trials * words_of_trial + schedules,
             schedules,

@@ -44,7 +44,7 @@ pub fn workgroup_of(group: &Group<'_>, kernel: Kernel, threads: usize) -> Result
     let specialised = specialised_shapes(&[*group], false, kernel, capacity, &|_| false);
     let batches = plan(&[*group], false, Records::Whole, capacity, &specialised)?;
     let batch = &batches[0];
-    let PlannedTask { task, shape, .. } = batch.tasks[0];
+    let (PlannedTask { task, .. }, shape) = (batch.tasks[0], batch.parts[0].shape);
     let mut weights = Vec::new();
     batch.stage(&[*group], &mut weights);
     weights.truncate(task.teams as usize * weight_vectors(group.world));

@@ -22,7 +22,7 @@ use super::device::{DeviceError, Executor, Gpu, Kind, Traffic, Workspace};
 use super::population::{Held, Population};
 use super::recording::{Readback, iterations};
 use super::shape::{Capacity, MAX_OFFSET, specialised_shapes};
-use super::source::{Pipeline, Task};
+use super::source::{NOWHERE, Pipeline, Task};
 use crate::backend::grid::LARGE_FROM;
 use crate::backend::scores::ScoreTable;
 use crate::backend::{
@@ -42,6 +42,7 @@ pub use super::shape::Kernel;
 pub use inspect::{WorkgroupBuffers, shader_of, workgroup_of};
 pub(crate) use plan::state_bytes;
 
+use count::Counting;
 use plan::{BatchPlan, BatchReadback, PlannedTask, RecordingOptions, plan};
 
 /// Default minimum bytes of a batch's records of which a GPU counts what scores depend on: about what the bus transfers in
@@ -276,7 +277,7 @@ impl GpuBackend {
         let is_compiled = |shape| compiled.contains_key(&Pipeline::Episode(shape));
         let specialised = specialised_shapes(groups, trace, self.kernel, capacity, &is_compiled);
         let batches = plan(groups, trace, self.records, capacity, &specialised)?;
-        if self.tests_large && batches.iter().flat_map(|batch| &batch.tasks).any(|planned| planned.shape.is_large()) {
+        if self.tests_large && batches.iter().flat_map(|batch| &batch.parts).any(|part| part.shape.is_large()) {
             if let Some(mismatch) = check::large_teams(&self.executor)? {
                 let (adapter, failures) = (self.gpu().adapter.to_string(), vec![(self.gpu().pass, mismatch)]);
                 return Err(DeviceError::Inexact { adapter, failures }.into());
@@ -420,9 +421,11 @@ impl Backend for GpuBackend {
         let scores = ScoreTable::new(groups);
         // Paths are read from traces.
         let trace = groups.iter().any(|group| group.world.paths.is_some());
-        self.play_tasks(groups, trace, &|planned, words, traced| match planned.counting(groups) {
-            Some(counting) => counting.score(words, &planned.task, (planned.group, planned.first_team), &scores),
-            None => each_episode(groups, planned, words, traced, |team, episode| {
+        self.play_tasks(groups, trace, &|planned, words, traced| match Counting::of(&groups[planned.group]) {
+            Some(counting) if planned.task.counted != NOWHERE => {
+                counting.score(words, &planned.task, (planned.group, planned.first_team), &scores)
+            }
+            _ => each_episode(groups, planned, words, traced, |team, episode| {
                 scores.score(planned.group, team, episode);
             }),
         })?;
