@@ -69,14 +69,15 @@ impl<'a> Counting<'a> {
         (self.rows() * teams * self.bits()).div_ceil(32)
     }
 
-    /// Writes what the shader has to know: `scoring` there.
-    pub(super) fn extend(&self, scoring: &mut Vec<u32>) {
+    /// Returns what the shader has to know of the group: `scoring` there.
+    pub(super) fn scoring(&self) -> Vec<u32> {
         let world = self.world;
-        scoring.push(self.bits() as u32);
+        let mut scoring = vec![self.bits() as u32];
         for (poi, (&coupling, &worth)) in world.coupling.iter().zip(&world.worth).enumerate() {
             scoring.extend([coupling, worth]);
             scoring.extend((0..world.constants.words as usize).map(|word| world.rule.counted(poi, word, u32::MAX)));
         }
+        scoring
     }
 
     /// Returns the maximum loop iterations per thread to count so many teams.

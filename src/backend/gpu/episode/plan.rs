@@ -353,15 +353,17 @@ impl BatchPlan {
             let of_task = |planned: &PlannedTask| counting.words(planned.task.teams as usize) + STATUS;
             self.tasks[part.tasks.clone()].iter().map(of_task).sum::<usize>()
         };
-        let counted = countings.iter().zip(&self.parts).map(words_of).sum();
-        if !records.counts(self.used.bytes()[0]) || counted >= self.used.record {
+        let counted: usize = countings.iter().zip(&self.parts).map(words_of).sum();
+        let tables: Vec<Vec<u32>> = countings.iter().map(Counting::scoring).collect();
+        let copied = counted + tables.iter().map(Vec::len).sum::<usize>();
+        if !records.counts(self.used.bytes()[0]) || copied >= self.used.record {
             return;
         }
         self.counted = counted;
         let mut end = 0;
-        for (counting, part) in countings.iter().zip(&self.parts) {
+        for ((counting, part), table) in countings.iter().zip(&self.parts).zip(tables) {
             let (scoring, kinds) = (self.scoring.len() as u32, counting.kinds());
-            counting.extend(&mut self.scoring);
+            self.scoring.extend(table);
             for PlannedTask { task, .. } in &mut self.tasks[part.tasks.clone()] {
                 (task.scoring, task.kinds, task.counted) = (scoring, kinds, end as u32);
                 end += counting.words(task.teams as usize) + STATUS;
