@@ -5,7 +5,7 @@
 //
 // The host prepends:
 //   WORKGROUP       threads per workgroup
-//   MAX_COPIES      copies of a leader that D++ may need, and one more
+//   MAX_COPIES      coupling from which D++ needs too many copies
 //   COPIES_SHIFT    position of the number of copies in a sum of D++
 //   LEADER, GROUP, COPIES
 //                   who is taken out or added for a sum: a leader (D), a leader with its followers (Df), copies of a
@@ -74,8 +74,8 @@ fn members(task: Task, sizes: Sizes, team: u32, kind: u32, leader: u32, word: u3
     return bits;
 }
 
-// Returns what the observed POIs are worth if nobody is taken out, else what those are worth that are lost. D++ is two
-// numbers, see `stepping_stone`.
+// Returns the worth of the observed POIs if nobody is taken out, else the worth of those that are lost. For D++ it returns
+// two numbers, see `stepping_stone`.
 fn count(task: Task, sizes: Sizes, team: u32, kind: u32, leader: u32) -> u32 {
     let zeroth = members(task, sizes, team, kind, leader, 0u);
     let row = sizes.pois * sizes.words * task.teams;
@@ -127,8 +127,8 @@ fn count(task: Task, sizes: Sizes, team: u32, kind: u32, leader: u32) -> u32 {
     return worth;
 }
 
-// Returns a sum and by how many copies to divide it, see `stepping_stone` in src/credit/mod.rs. No product exceeds u32,
-// because all POIs together are worth at most 2^24.
+// Returns a sum, and the number of copies by which the host divides it. src/credit/mod.rs has the plain twin. No product
+// exceeds u32, because all POIs together are worth at most 2^24.
 fn stepping_stone(lost: u32, most: u32, at_most: u32) -> u32 {
     if lost * most >= at_most {
         return lost | (1u << COPIES_SHIFT);

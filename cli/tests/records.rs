@@ -17,7 +17,7 @@ use flotilla::verify::KINDS;
 use flotilla::world::World;
 use flotilla_app::sweep::Sweep;
 
-/// Teams of one world, of five policies with random weights or with all weights 0.
+/// Teams of one world, of five policies with random weights.
 struct Teams {
     world: World,
     weights: Vec<f32>,
@@ -25,12 +25,9 @@ struct Teams {
 }
 
 impl Teams {
-    fn new(config: &Config, teams: usize, random: bool) -> Teams {
+    fn new(config: &Config, teams: usize) -> Teams {
         let world = World::new(&config.validate().unwrap());
-        let mut weights = sample::weights(&world, 5, config.learning.seed);
-        if !random {
-            weights.fill(0.0);
-        }
+        let weights = sample::weights(&world, 5, config.learning.seed);
         Teams { choice: (0..teams * world.leaders()).map(|place| (place * 7 % 5) as u32).collect(), weights, world }
     }
 
@@ -84,11 +81,6 @@ fn expected(batch: &[Teams], first: usize) -> Vec<GroupScores> {
         scores
     };
     batch.iter().enumerate().map(group_scores).collect()
-}
-
-/// Whether every team observed this many POIs.
-fn all_observed(scores: &[GroupScores], pois: u32) -> bool {
-    scores.iter().flat_map(|scores| &scores.observed).all(|&observed| observed == pois)
 }
 
 fn open(request: &Request, records: Records) -> GpuBackend {
@@ -158,7 +150,7 @@ fn worlds() -> Vec<Config> {
 
 #[test]
 fn scores_are_the_same_from_sums_and_whole_records() {
-    let batch: Vec<Teams> = worlds().iter().map(|config| Teams::new(config, 37, true)).collect();
+    let batch: Vec<Teams> = worlds().iter().map(|config| Teams::new(config, 37)).collect();
     let expected: Vec<Vec<GroupScores>> = (0..2).map(|first| expected(&batch, first)).collect();
     let observing = expected[0].iter().flat_map(|scores| &scores.observed).filter(|&&observed| observed > 0).count();
     assert!(observing > 100, "only {observing} teams observe a POI");
@@ -199,7 +191,7 @@ fn an_edited_sum_changes_scores() {
         |text| text.replace("next * copies <= now", "next * copies < now"),
         |text| text.replace("own = members", "own = zeroth | members"),
     ];
-    let batch: Vec<Teams> = worlds().iter().map(|config| Teams::new(config, 37, true)).collect();
+    let batch: Vec<Teams> = worlds().iter().map(|config| Teams::new(config, 37)).collect();
     let expected: Vec<_> = (0..5).map(|first| expected(&batch, first)).collect();
     for (request, info) in support::adapters("an_edited_sum_changes_scores") {
         for (index, edit) in edits.into_iter().enumerate() {
@@ -212,7 +204,8 @@ fn an_edited_sum_changes_scores() {
     }
 }
 
-/// A record is copied whole if one dispatch cannot count it, or if that would save too little.
+/// A record is copied whole if one dispatch cannot count it, if that would save too little, or if D++ may need too many
+/// copies.
 #[test]
 fn very_long_episodes_and_small_batches_are_copied_whole() {
     let text = |steps: usize| {
@@ -221,8 +214,15 @@ fn very_long_episodes_and_small_batches_are_copied_whole() {
              pois = [[10.0, 15.0], [30.0, 40.0]]\nsteps = {steps}\ncoupling = 1\n[policy]\nhidden = []"
         )
     };
-    let teams_with_steps = |steps: usize| vec![Teams::new(&config(&text(steps)), 20, true)];
+    let teams_with_steps = |steps: usize| vec![Teams::new(&config(&text(steps)), 20)];
     let (short, long, longest) = (teams_with_steps(100), teams_with_steps(3000), teams_with_steps(10_000));
+    let large = format!(
+        "[world]\nleaders = {}\npois = [[20.0, 8.0]]\nsteps = 3\ncoupling = 64\n[policy]\nhidden = []",
+        line(64, [10.0, 5.0], [0.3, 0.0])
+    );
+    // The fitness is D++.
+    let (large, dpp) = (vec![Teams::new(&config(&large), 20)], 4);
+    let for_large = expected(&large, dpp);
     let [for_short, for_long, for_longest] = [&short, &long, &longest].map(|teams| expected(teams, 0));
     for (request, info) in support::adapters("very_long_episodes_and_small_batches_are_copied_whole") {
         let mut backend = open(&request, COUNTED).with_kernel(Kernel::Generic);
@@ -231,6 +231,8 @@ fn very_long_episodes_and_small_batches_are_copied_whole() {
         assert!(downloaded(&mut backend) < long[0].whole_bytes(), "{info}: 3000 steps");
         assert!(scores(&mut backend, &longest, 0) == for_longest, "{info}");
         assert_eq!(downloaded(&mut backend), longest[0].whole_bytes() + status(2), "{info}: 10 000 steps");
+        assert!(scores(&mut backend, &large, dpp) == for_large, "{info}");
+        assert!(downloaded(&mut backend) > large[0].whole_bytes(), "{info}: a coupling of 64");
         let mut small = open(&request, Records::CountedFrom(1 << 20)).with_kernel(Kernel::Generic);
         assert!(scores(&mut small, &short, 0) == for_short, "{info}");
         assert_eq!(downloaded(&mut small), short[0].whole_bytes() + status(2), "{info}: not worth counting");
@@ -280,7 +282,7 @@ fn nothing_is_counted_if_times_matter() {
         let mut config = config(include_str!("../../configs/generally_forward.toml"));
         config.world.steps = 60;
         change(&mut config);
-        vec![Teams::new(&config, 200, true)]
+        vec![Teams::new(&config, 200)]
     };
     let cases: [(_, _, fn(&mut Config)); 4] = [
         ("default rules", true, |_| ()),
@@ -294,7 +296,7 @@ fn nothing_is_counted_if_times_matter() {
         for (name, counted, change) in cases {
             let batch = teams_with(change);
             let expected = expected(&batch, 0);
-            assert!(!all_observed(&expected, 0), "{name}: nothing is observed");
+            assert!(expected[0].observed.iter().any(|&observed| observed > 0), "{name}: nothing is observed");
             let mut backend = open(&request, COUNTED).with_kernel(Kernel::Generic);
             assert!(scores(&mut backend, &batch, 0) == expected, "{info}, {name}");
             let bytes = downloaded(&mut backend);

@@ -43,9 +43,9 @@ pub enum Buffer {
     Classes,
     /// The agents' states between two dispatches.
     States,
-    /// What the scores of POIs depend on.
+    /// The coupling, worth and observers of POIs.
     Scoring,
-    /// The sums that are counted of a batch's records.
+    /// The sums of a batch's records.
     Counted,
     /// The jobs of gathering or breeding, each aligned.
     Jobs,

@@ -37,13 +37,14 @@ const TILE: usize = 32;
 pub(super) const LEADERS_PER_GATHER: usize = 4;
 /// Sentinel: no offset.
 pub(super) const NOWHERE: u32 = u32::MAX;
-/// Who is taken out for a sum of `shaders/count.wgsl`, or added: a leader (D), a leader with its followers (Df), copies of a
-/// leader (D++). 0 stands for nobody.
+/// Agents that are taken out or added for a sum of `shaders/count.wgsl`: a leader (D), a leader with its followers (Df), or
+/// copies of a leader (D++). 0 means nobody.
 pub(super) const LEADER: u32 = 1;
 pub(super) const GROUP: u32 = 2;
 pub(super) const COPIES: u32 = 3;
-/// Copies that D++ may need on a device, and one more; and where a sum has their number.
+/// Coupling from which D++ needs too many copies for a device.
 pub(super) const MAX_COPIES: usize = 64;
+/// Position of the number of copies in a sum of D++.
 pub(super) const COPIES_SHIFT: u32 = 25;
 
 gpu_struct! {
@@ -72,11 +73,11 @@ gpu_struct! {
         pub first: u32,
         /// The step before which a dispatch ends.
         pub end: u32,
-        /// The offset of what the scores of POIs depend on, for `shaders/count.wgsl`.
+        /// The offset of the coupling, worth and observers of POIs, for `shaders/count.wgsl`.
         pub scoring: u32,
-        /// The kinds of sums that are counted, two bits each.
+        /// The kinds of sums, two bits each.
         pub kinds: u32,
-        /// The offset of the sums, or all ones if nothing is counted.
+        /// The offset of the sums, or all ones if the whole record is copied.
         pub counted: u32,
         /// The offset of the status word in the record. The first dispatch writes the nonce there; each later one adds
         /// 1.
@@ -171,7 +172,7 @@ pub enum Pipeline {
     Breed,
     /// Gathers the policies of a batch's teams.
     Gather,
-    /// Adds up what scores depend on of each record.
+    /// Computes the sums that scores follow from.
     Count,
     /// Plays episodes.
     Episode(Shape),

@@ -1,4 +1,4 @@
-//! What a device adds up of each team's record, and the scores that follow. `shaders/count.wgsl` does it.
+//! Sums that a device computes from each team's record (`shaders/count.wgsl`), and the scores that follow from them.
 
 use crate::backend::Group;
 use crate::backend::gpu::source::{COPIES, COPIES_SHIFT, COUNT_WORKGROUP, GROUP, LEADER, MAX_COPIES, Task};
@@ -19,7 +19,8 @@ pub(super) struct Counting<'a> {
 }
 
 impl<'a> Counting<'a> {
-    /// Returns the sums of a group, or `None` if scores depend on when agents are at a POI, or on very many copies.
+    /// Returns the sums of a group. Returns `None` if a device cannot compute them: scores depend on when agents are at a
+    /// POI, or D++ may need too many copies.
     pub(super) fn of(group: &'a Group<'a>) -> Option<Counting<'a>> {
         let Group { world, fitnesses, .. } = *group;
         let can_count = |fitness: &Fitness| match fitness {
@@ -28,8 +29,8 @@ impl<'a> Counting<'a> {
             Fitness::Dt => false,
         };
         let timed = world.paths.is_some() || world.rule.is_timed();
-        let can_count = !timed && fitnesses.len() <= MAX_FITNESSES && fitnesses.iter().all(can_count);
-        can_count.then_some(Counting { group, world })
+        let all = !timed && fitnesses.len() <= MAX_FITNESSES && fitnesses.iter().all(can_count);
+        all.then_some(Counting { group, world })
     }
 
     /// Returns who is taken out or added for a fitness, 0 for nobody.
@@ -69,7 +70,7 @@ impl<'a> Counting<'a> {
         (self.rows() * teams * self.bits()).div_ceil(32)
     }
 
-    /// Returns what the shader has to know of the group: `scoring` there.
+    /// Returns the group's part of `scoring` in the shader.
     pub(super) fn scoring(&self) -> Vec<u32> {
         let world = self.world;
         let mut scoring = vec![self.bits() as u32];

@@ -3,7 +3,7 @@
 //! | file | holds |
 //! |---|---|
 //! | `plan` | teams cut into tasks, tasks into batches, and the recording of each batch |
-//! | `count` | what a device adds up of each record, and the scores that follow |
+//! | `count` | sums that a device computes from each record, and the scores that follow |
 //! | `check` | the test of the kernel of large teams |
 //! | `inspect` | shaders and inputs of one workgroup, to see what compilers make of them |
 //!
@@ -72,8 +72,8 @@ pub enum ResidencyPolicy {
 pub enum Records {
     /// As they are.
     Whole,
-    /// Of records of at least so many bytes per batch, the device adds up what is lost without each leader, and only that
-    /// is copied. Records of which that is not enough are copied whole.
+    /// Sums, if the records of a batch have at least so many bytes: the device adds up what is lost without each leader.
+    /// Records whose scores need more are copied whole.
     CountedFrom(u64),
 }
 

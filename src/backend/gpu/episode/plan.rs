@@ -133,7 +133,7 @@ pub(super) struct PlannedTask {
     pub(super) task: Task,
 }
 
-/// What the tasks of a group have in common in a batch.
+/// The tasks of one group in a batch, and what they have in common.
 #[derive(Clone)]
 pub(super) struct Part {
     group: usize,
@@ -263,7 +263,7 @@ pub(super) struct BatchPlan {
     pub(super) places: Vec<Vec2>,
     /// The elements that its tasks use.
     used: Elements,
-    /// The words of all sums and status words, 0 if nothing is counted, and what the scores of POIs depend on.
+    /// The words of all sums and their status words, 0 if the whole record is copied; and the `scoring` of the shader.
     counted: usize,
     scoring: Vec<u32>,
 }
@@ -340,8 +340,8 @@ impl BatchPlan {
         self.parts.last_mut().expect("a part has begun").tasks.end = self.tasks.len();
     }
 
-    /// Lays out what is counted, unless the whole record is requested, scores depend on more, counting would take too long
-    /// for one dispatch, or it would save nothing.
+    /// Lays out the sums, unless the whole record is requested, scores need more, one dispatch would take too long, or the
+    /// sums would be no smaller.
     fn count(&mut self, groups: &[Group<'_>], records: Records) {
         let largest = |part: &Part| self.tasks[part.tasks.start].task.teams as usize;
         let of_part = |part: &Part| {
@@ -604,7 +604,7 @@ pub(super) struct RecordingOptions<'a> {
 #[derive(Default)]
 pub(super) struct BatchReadback {
     pub(super) traced: Range<usize>,
-    /// What was counted, or the whole record.
+    /// The sums, or the whole record.
     pub(super) words: Range<usize>,
 }
 
