@@ -217,7 +217,7 @@ fn very_long_episodes_and_small_batches_are_copied_whole() {
     let teams_with_steps = |steps: usize| vec![Teams::new(&config(&text(steps)), 20)];
     let (short, long, longest) = (teams_with_steps(100), teams_with_steps(3000), teams_with_steps(10_000));
     let large = format!(
-        "[world]\nleaders = {}\npois = [[20.0, 8.0]]\nsteps = 3\ncoupling = 64\n[policy]\nhidden = []",
+        "[world]\nleaders = {}\npois = [[20.0, 8.0]]\nsteps = 100\ncoupling = 64\n[policy]\nhidden = []",
         line(64, [10.0, 5.0], [0.3, 0.0])
     );
     // The fitness is D++.
