@@ -245,14 +245,13 @@ fn assign_fitness(
         let contemporary = partners * population;
         let with_past = contemporary + index * population;
         let with_past = with_past..with_past + if hall { population } else { 0 };
-        let teams = (0..contemporary).into_par_iter().chain(with_past);
-        let scores: Vec<(usize, f64)> = teams.with_min_len(MIN_POLICIES_PER_TASK).map(in_team).collect();
+        let scores = (0..contemporary).chain(with_past).map(in_team);
         match leniency {
-            _ if played == 1 => scores.into_iter().for_each(|(policy, score)| fitness[policy] = score as f32),
+            _ if played == 1 => scores.for_each(|(policy, score)| fitness[policy] = score as f32),
             Leniency::Max => {
                 fitness.fill(f32::NEG_INFINITY);
                 // Not `f32::max`, which may return either of two zeros.
-                scores.into_iter().for_each(|(policy, score)| {
+                scores.for_each(|(policy, score)| {
                     if score as f32 > fitness[policy] {
                         fitness[policy] = score as f32;
                     }
@@ -260,7 +259,7 @@ fn assign_fitness(
             }
             Leniency::Mean => {
                 let mut totals = vec![0.0; population];
-                scores.into_iter().for_each(|(policy, score)| totals[policy] += score);
+                scores.for_each(|(policy, score)| totals[policy] += score);
                 fitness.iter_mut().zip(totals).for_each(|(mean, total)| *mean = (total / played as f64) as f32);
             }
         }
