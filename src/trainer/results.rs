@@ -8,7 +8,7 @@ use glam::Vec2;
 use super::Row;
 use super::experiment::{ExperimentState, TrialState};
 use super::residency::Residency;
-use super::schedule::{MIN_POLICIES_PER_TASK, TeamSchedule, min_populations_per_task};
+use super::schedule::{TeamSchedule, min_populations_per_task};
 use super::stages::{Stage, observed};
 use crate::backend::{Backend, BackendError, Group, GroupScores, Weights};
 use crate::config::{Fitness, Learning, Leniency};

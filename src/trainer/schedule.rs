@@ -12,7 +12,7 @@ use crate::evolve::{self, Episodes};
 use crate::parallel::*;
 
 /// Minimum number of policies per rayon task for cheap work. Fewer are finished before another thread wakes up.
-pub(super) const MIN_POLICIES_PER_TASK: usize = 2048;
+const MIN_POLICIES_PER_TASK: usize = 2048;
 
 /// Returns the number of populations that have [`MIN_POLICIES_PER_TASK`] policies together.
 pub(super) fn min_populations_per_task(population: usize) -> usize {
