@@ -11,12 +11,12 @@ pub(crate) fn prefetch(numbers: &[f32]) {
         use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
         const LINE: usize = 64 / size_of::<f32>();
         // The last number may be in one more line.
-        for number in numbers.iter().step_by(LINE).chain(numbers.last()) {
+        numbers.chunks(LINE).filter_map(<[f32]>::first).chain(numbers.last()).for_each(|number| {
             #[expect(unsafe_code, reason = "a hint, which reads nothing")]
             unsafe {
                 _mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(number).cast());
             }
-        }
+        });
     }
     #[cfg(not(target_arch = "x86_64"))]
     let _ = numbers;

@@ -68,8 +68,8 @@ fn every_problem_names_key_line_found_and_allowed() {
     let steps = "steps = 20";
     let replaced = |list: &str| {
         format!(
-            "found in a config with [[{list}]], which replaces this key; to write a config in full, use `flotilla check \
-             --expand`"
+            "found in a config with [[{list}]], which replaces this key: remove one of the two; without [[{list}]], \
+             `flotilla check --expand` writes it from the other keys"
         )
     };
     let [agents, groups] = ["agents", "pois"].map(replaced);
@@ -650,8 +650,8 @@ fn flags_set_keys_of_classes_and_groups() {
             "--set: found no 2 in a list of 2",
             "--set: found 200000 parts after `agents`, allowed up to 8",
             "--set: found 'x', allowed a number, 0 to 50 (the map)",
-            "--set: found in a config with [[agents]], which replaces this key; to write a config in full, use `flotilla \
-             check --expand`",
+            "--set: found in a config with [[agents]], which replaces this key: remove one of the two; without \
+             [[agents]], `flotilla check --expand` writes it from the other keys",
         ]
     );
     let set = Override::of_text("agents.leader.speed", "3", "--set");

@@ -46,9 +46,9 @@ pub fn run(args: Args) -> Result<(), Error> {
 }
 
 fn in_words(found: &BaselineOutcome) -> String {
-    let &BaselineOutcome { pois, seeds, teams, ref learners, by_value, actions, .. } = found;
+    let &BaselineOutcome { pois, seeds, teams, ref learners, weighted_by, actions, .. } = found;
     let head =
-        [&format!("POIs observed, of {pois}{}", weighted(by_value)), "mean [95 % interval]", "lowest", "highest"];
+        [&format!("POIs observed, of {pois}{}", weighted(weighted_by)), "mean [95 % interval]", "lowest", "highest"];
     let mut rows = vec![head.map(|head| head.to_string()).to_vec()];
     let constants = match actions {
         Actions::Direct => format!("best of {SPEEDS} constant speeds, straight ahead"),

@@ -13,8 +13,8 @@ use flotilla_app::ops::output;
 
 /// The paper's layouts. Each has the name of the argument, the name of the config file, and the file's text.
 const LAYOUTS: [([&str; 2], &str); 3] = [
-    (["generally-forward", "generally_forward"], config::LAYOUTS[0].1),
-    (["strictly-forward", "strictly_forward"], config::LAYOUTS[1].1),
+    (["generally_forward", "generally-forward"], config::LAYOUTS[0].1),
+    (["strictly_forward", "strictly-forward"], config::LAYOUTS[1].1),
     (["chaotic"; 2], config::LAYOUTS[2].1),
 ];
 /// Maximum number of characters in a line.
@@ -84,7 +84,8 @@ fn template(args: &Args) -> Result<String, Error> {
     };
     let (groups, followers) = (args.groups.unwrap_or(4), args.followers.unwrap_or(3));
     let coupling = args.coupling.unwrap_or(followers.saturating_add(1));
-    let layout = StartLayout { shape, groups, followers, pois: args.pois.unwrap_or(groups), coupling };
+    let layout =
+        StartLayout { shape, groups, followers, pois: args.pois.unwrap_or(groups.min(config::MAX_POIS)), coupling };
     match layout.problem() {
         Some(problem) => Err(Error::Usage(problem.into())),
         None => Ok(layout.text()?),

@@ -84,11 +84,11 @@ pub fn run(args: Args) -> Result<(), Error> {
 fn in_words(found: &RolloutOutcome) -> String {
     let RolloutOutcome { teams, pois, episodes, team_0, best, mean, unverified, .. } = found;
     let mark = if *unverified { format!("{UNVERIFIED}\n") } else { String::new() };
-    let (counted, by_value) = (counted(*teams, *episodes), weighted(found.by_value));
+    let (counted, weighted) = (counted(*teams, *episodes), weighted(found.weighted_by));
     if *episodes == 1 {
         let [team, most, mean] = [team_0, &best.spread, mean].map(|spread| spread.mean);
         return format!(
-            "{counted}, POIs observed of {pois}{by_value}: team 0 {team:.2}, best {most:.2} (team {}), mean {mean:.2}\n{mark}",
+            "{counted}, POIs observed of {pois}{weighted}: team 0 {team:.2}, best {most:.2} (team {}), mean {mean:.2}\n{mark}",
             best.team
         );
     }
@@ -102,7 +102,7 @@ fn in_words(found: &RolloutOutcome) -> String {
     };
     let names = ["team 0".into(), format!("best (team {})", best.team), "mean of all teams".into()];
     let mut text = format!(
-        "{counted}{from}. POIs observed, of {pois}{by_value}:\n  {:<20}{:>6}{:>22}   95 % interval of the mean\n",
+        "{counted}{from}. POIs observed, of {pois}{weighted}:\n  {:<20}{:>6}{:>22}   95 % interval of the mean\n",
         "", "mean", "standard deviation"
     );
     for (name, Spread { mean, deviation, interval }) in names.iter().zip([team_0, &best.spread, mean]) {

@@ -67,9 +67,9 @@ fn report(found: &TrainOutcome) -> String {
     };
     // `None` if stages have different numbers of POIs.
     let pois_of_all = found.pois;
-    let by_value = weighted(found.by_value);
+    let weighted = weighted(found.weighted_by);
     let what = pois_of_all.map_or("Share of POIs observed".into(), |pois| format!("POIs observed, of {pois}"));
-    let what = what + by_value;
+    let what = what + &weighted;
     let pois = pois_of_all.unwrap_or(1);
     let mut text = format!("{trained}.\n\n{what}: mean over trials (lowest to highest trial)\n");
     let last = format!("generation {}", found.generations);
@@ -101,7 +101,7 @@ fn report(found: &TrainOutcome) -> String {
     let (best, observed) = best.map_or((0, 0.0), |row| (row.trial, row.champion_g * pois as f64));
     let what = pois_of_all.map_or("share of POIs".into(), |pois| format!("of {}", counted(pois, "POI")));
     let _ = match observed > 0.0 {
-        true => write!(text, "\nThe best champion is that of trial {best}: {observed:.2} {what}{by_value}.\n"),
+        true => write!(text, "\nThe best champion is that of trial {best}: {observed:.2} {what}{weighted}.\n"),
         false => write!(text, "\nNo champion observed any POI. The film below shows what that of trial {best} does.\n"),
     };
     let _ = write!(

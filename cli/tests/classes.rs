@@ -69,7 +69,7 @@ fn check_prints_a_config_in_full_and_nothing_else() {
     let seeded = place.good("check --expand chaotic.toml --seed 7").0;
     assert!(seeded.contains("seed = 7\n"));
     let refused = place.refused(2, "check full.toml --set world.coupling=2");
-    assert!(refused.contains("to write a config in full, use `flotilla check --expand`"), "{refused}");
+    assert!(refused.contains("`flotilla check --expand` writes it from the other keys"), "{refused}");
     let staged = format!("{chaotic}[[stages]]\nfrom = 3\nset = {{ \"world.coupling\" = 3 }}\n");
     std::fs::write(place.path("staged.toml"), staged).unwrap();
     let (full, noted) = place.good("check --expand staged.toml");
@@ -143,6 +143,45 @@ fn g_weighs_pois_by_value_in_metrics_replays_and_rollouts() {
     let most = place.read("scores.csv").lines().skip(1).map(g).fold(0.0, f64::max);
     assert!(text.contains(", POIs observed of 3, weighted by value: team 0 "), "{text}");
     assert!(most > 0.0 && text.contains(&format!("best {:.2} ", most * 3.0)), "{most}: {text}");
+}
+
+/// A team that passes a POI, and cannot stop.
+const PASSING: &str = r#"
+[world]
+steps = 60
+
+[[agents]]
+name = "boat"
+at = [[10, 5]]
+motion = { min_speed = 3, max_speed = 3, max_turn_rate = 0 }
+speed = 3
+senses = [{ of = "pois" }]
+
+[[pois]]
+name = "buoy"
+at = [[10, 15]]
+coupling = 1
+radius = 3
+when = "end"
+
+[learning]
+population = 4
+generations = 1
+trials = 1
+"#;
+
+#[test]
+fn a_poi_that_counts_at_the_end_is_observed_only_then() {
+    let ever = PASSING.replace("when = \"end\"", "when = \"ever\"");
+    let place = Place::new(&[("end.toml", PASSING), ("ever.toml", &ever)]);
+    for (when, observed) in [("end", 0), ("ever", 1)] {
+        let (_, warned) = place.good(&*format!("train {when}.toml --out {when}"));
+        assert_eq!(warned.contains("only the last step counts"), observed == 0, "{warned}");
+        let (text, _) = place.good(&*format!("replay {when} --out {when}.svg"));
+        assert!(text.contains(&format!("observed {observed} of 1 POIs, as in metrics.csv")), "{text}");
+        let picture = place.read(&format!("{when}.svg"));
+        assert!(picture.contains(&format!("POIs observed: {observed} of 1")), "{picture}");
+    }
 }
 
 #[test]

@@ -127,7 +127,7 @@ fn pictures_are_labelled_with_the_team_they_show() {
     place.write("one.toml", SMALL.replace("coupling = 3", "coupling = 1"));
     place.good("train one.toml --out one");
     place.good("replay one -o one.svg");
-    assert!(place.read("one.svg").contains("1/1: 1 agent near of 1 needed"));
+    assert!(place.read("one.svg").contains("0/1: 0 agents near of 1 needed"));
     place.good("replay run --trial 1 --team champion");
     assert!(place.read("run/replay.html").contains("\"name\":\"Champion\""));
 }

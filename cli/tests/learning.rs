@@ -134,7 +134,7 @@ fn every_command_takes_starts_and_pois_in_regions() {
     let (checked, warnings) = place.good("check x.toml --out layout.svg");
     assert!(checked.contains("of which 3 learn") && !warnings.contains("cannot be reached"), "{checked} {warnings}");
     let layout = fs::read_to_string(place.path("layout.svg")).unwrap();
-    assert!(layout.contains("long dashes: regions from which rover, POIs of ring"));
+    assert!(layout.contains("long dashes: regions from which agents of rover, POIs of ring"));
     assert_eq!(layout.matches("stroke-dasharray=\"18 10").count(), 3);
     let (full, _) = place.good("check x.toml --expand");
     assert!(full.contains("in = { circle = [25.0, 25.0, 10.0] }"), "{full}");

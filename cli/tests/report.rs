@@ -247,6 +247,8 @@ fn an_unfinished_run_plots_and_replays_up_to_its_last_whole_generation() {
     let stdout = succeed(&["replay", &run.text(), "--backend", "cpu"]);
     assert!(stdout.contains("generation 3"), "{stdout}");
     fail_with(2, &["replay", &run.text(), "--generation", "5", "--backend", "cpu"], &["generation 5", "newest is 3"]);
+    fs::remove_file(run.file("policies.safetensors")).unwrap();
+    fail(&["rollout", &run.text()], &["has no policies.safetensors yet", "finish the run with `flotilla train"]);
 }
 
 #[test]

@@ -64,9 +64,17 @@ impl Config {
         }
     }
 
-    /// Reports whether POIs have different values. If they do, G times the number of POIs is not how many are observed.
-    pub fn values_differ(&self) -> bool {
-        self.pois.windows(2).any(|pair| pair[0].value != pair[1].value)
+    /// Returns by what G weights the observed POIs: their values if these differ, and their scores by distance or by time.
+    /// `None` means that G times the number of POIs is how many are observed.
+    pub fn weighted_by(&self) -> Option<&'static str> {
+        let values = self.pois.windows(2).any(|pair| pair[0].value != pair[1].value);
+        let scores = self.pois.iter().any(|group| group.score != Score::Observed || group.when == When::Mean);
+        match (values, scores) {
+            (true, true) => Some("value and score"),
+            (true, false) => Some("value"),
+            (false, true) => Some("score"),
+            (false, false) => None,
+        }
     }
 
     /// Returns the number of inputs of a policy: the most that the policies of any class use.

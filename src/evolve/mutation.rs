@@ -181,12 +181,10 @@ const MAX_LANES: usize = 16;
 #[inline(always)]
 fn copy<S: Simd>(simd: S, from: &[f32], to: &mut [f32]) {
     let whole = from.len() / S::f32s::LEN * S::f32s::LEN;
-    for at in (0..whole).step_by(S::f32s::LEN) {
-        S::f32s::from_slice(simd, &from[at..at + S::f32s::LEN]).store_slice(&mut to[at..at + S::f32s::LEN]);
+    for (from, to) in from.chunks_exact(S::f32s::LEN).zip(to.chunks_exact_mut(S::f32s::LEN)) {
+        S::f32s::from_slice(simd, from).store_slice(to);
     }
-    if whole < from.len() {
-        to[whole..].copy_from_slice(&from[whole..]);
-    }
+    to[whole..].copy_from_slice(&from[whole..]);
 }
 
 /// The weights that mutate, of one policy or several, collected so that no lane is idle.
@@ -279,13 +277,14 @@ impl<'a> MutationList<'a> {
     #[inline(always)]
     fn fill_positions<S: Simd>(&mut self, simd: S, policy: usize, (first, end): (usize, usize), noises: Key) {
         let first_weight = (policy * self.parameters) as u32;
-        for at in (first..end).step_by(S::f32s::LEN) {
-            let vector = at..at + S::f32s::LEN;
-            let index = S::u32s::from_slice(simd, &self.indices[vector.clone()]);
-            (index + first_weight).store_slice(&mut self.positions[vector.clone()]);
-            for (to, word) in self.keys.iter_mut().zip(noises.0) {
-                S::u32s::simd_from(simd, word).store_slice(&mut to[vector.clone()]);
-            }
+        let listed = first..first + (end - first).next_multiple_of(S::f32s::LEN);
+        let positions = self.positions[listed.clone()].chunks_exact_mut(S::f32s::LEN);
+        for (index, position) in self.indices[listed.clone()].chunks_exact(S::f32s::LEN).zip(positions) {
+            (S::u32s::from_slice(simd, index) + first_weight).store_slice(position);
+        }
+        for (to, word) in self.keys.iter_mut().zip(noises.0) {
+            let word = S::u32s::simd_from(simd, word);
+            to[listed.clone()].chunks_exact_mut(S::f32s::LEN).for_each(|to| word.store_slice(to));
         }
     }
 
@@ -297,27 +296,28 @@ impl<'a> MutationList<'a> {
         for (bits, &position) in bits[..count].iter_mut().zip(&*positions) {
             *bits = weights[position as usize].to_bits();
         }
-        let vectors = || (0..count).step_by(S::f32s::LEN).map(|at| at..at + S::f32s::LEN);
+        let whole = count.next_multiple_of(S::f32s::LEN);
         let load = |from: &[u32]| S::u32s::from_slice(simd, from);
+        let vectors = |from: &'a [u32]| from[..whole].chunks_exact(S::f32s::LEN);
+        let [x, y] = [x, y].map(|words| &mut words[..whole]);
+        let drawn = x.chunks_exact_mut(S::f32s::LEN).zip(y.chunks_exact_mut(S::f32s::LEN));
         // Several short loops: out-of-order execution overlaps iterations only if they are short.
-        for at in vectors() {
-            let counter = load(&w[at.clone()]) ^ load(&indices[at.clone()]);
-            let [a, b, ..] =
-                math::pcg4d::<S>(load(&x[at.clone()]), load(&y[at.clone()]), load(&z[at.clone()]), counter);
-            a.store_slice(&mut x[at.clone()]);
-            b.store_slice(&mut y[at]);
+        for ((((x, y), z), w), indices) in drawn.zip(vectors(z)).zip(vectors(w)).zip(vectors(indices)) {
+            let [a, b, ..] = math::pcg4d::<S>(load(x), load(y), load(z), load(w) ^ load(indices));
+            a.store_slice(x);
+            b.store_slice(y);
         }
-        for at in vectors() {
-            let radius: S::u32s = math::normal_radius::<S>(load(&x[at.clone()])).bitcast();
-            radius.store_slice(&mut x[at]);
+        for x in x.chunks_exact_mut(S::f32s::LEN) {
+            let radius: S::u32s = math::normal_radius::<S>(load(x)).bitcast();
+            radius.store_slice(x);
         }
-        for at in vectors() {
-            let weight: S::f32s = load(&bits[at.clone()]).bitcast();
-            let radius: S::f32s = load(&x[at.clone()]).bitcast();
-            let noise = math::normal_of::<S>(radius, math::normal_cosine::<S>(load(&y[at.clone()]))) * sigma;
+        let drawn = x.chunks_exact(S::f32s::LEN).zip(y.chunks_exact(S::f32s::LEN));
+        for (bits, (x, y)) in bits[..whole].chunks_exact_mut(S::f32s::LEN).zip(drawn) {
+            let (weight, radius): (S::f32s, S::f32s) = (load(bits).bitcast(), load(x).bitcast());
+            let noise = math::normal_of::<S>(radius, math::normal_cosine::<S>(load(y))) * sigma;
             let noise = if learning.mutation == Mutation::Scaled { noise * weight } else { noise };
             let mutated: S::u32s = within_limits(simd, weight + noise).bitcast();
-            mutated.store_slice(&mut bits[at]);
+            mutated.store_slice(bits);
         }
         for (&bits, &position) in bits[..count].iter().zip(&*positions) {
             weights[position as usize] = f32::from_bits(bits);

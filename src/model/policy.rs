@@ -25,7 +25,7 @@ section! {
     /// `[policy]`: the leaders' network, `inputs, hidden…, outputs`.
     #[derive(Eq)]
     Policy = "policy" {
-        /// hidden layers of a policy, between 8 inputs and 2 outputs, or 5 that choose a behaviour
+        /// hidden layers of a policy, between its inputs and 2 outputs, or 5 that choose a behaviour
         hidden: Vec<usize> = "units of a layer", "2.4, 3.1",
         /// what the outputs are: a wanted turn and speed, or how much each of 5 behaviours is wanted: hold, towards or
         /// away from most POIs, towards or away from most agents

@@ -431,8 +431,8 @@ impl<'a> Reader<'a> {
         match self.replaced.iter().find(|(replaced, _)| self.scope.is_none() && includes(replaced, key)) {
             Some((_, list)) => {
                 let message = format!(
-                    "found in a config with [[{list}]], which replaces this key; to write a config in full, use \
-                     `flotilla check --expand`"
+                    "found in a config with [[{list}]], which replaces this key: remove one of the two; without \
+                     [[{list}]], `flotilla check --expand` writes it from the other keys"
                 );
                 self.report(entry.place(), &entry.name, message);
                 None

@@ -59,9 +59,9 @@ pub struct BaselineOutcome {
     /// Who learns, for people: the paradigm, or the classes that learn.
     #[serde(skip)]
     pub learners: String,
-    /// Whether POIs have different values, so that the POIs observed are weighted by them.
+    /// See [`Config::weighted_by`].
     #[serde(skip)]
-    pub by_value: bool,
+    pub weighted_by: Option<&'static str>,
     /// Whether starts or POIs move. If they do, some episodes choose a team and others measure it.
     #[serde(skip)]
     pub moves: bool,
@@ -132,7 +132,7 @@ pub fn run(
     let classes: Vec<_> = classes.map(|class| format!("{} × {}", class.size(), class.name)).collect();
     Ok(BaselineOutcome {
         learners: if classes.is_empty() { learning.paradigm.to_string() } else { classes.join(", ") },
-        by_value: config.values_differ(),
+        weighted_by: config.weighted_by(),
         paradigm: learning.paradigm,
         pois,
         teams: learning.team_count() * (learning.generations + 1),

@@ -102,14 +102,14 @@ pub struct Episode {
 }
 
 impl Episode {
-    fn of(played: &Replayed) -> Episode {
+    fn of(config: &Config, played: &Replayed) -> Episode {
         let &Replayed { trial, generation, which, team, team_g, .. } = played;
         let (which, team, g) = match which {
             Which::Best => ("best", Some(team), "best_g"),
             Which::Champion => ("champion", None, "champion_g"),
             Which::Number(_) => ("number", Some(team), "g"),
         };
-        Episode { trial, generation, which, team, g: [(g, team_g)].into(), text: described(played) }
+        Episode { trial, generation, which, team, g: [(g, team_g)].into(), text: described(config, played) }
     }
 }
 
@@ -203,12 +203,12 @@ pub fn run(
         }
         Form::Film(numbered) => {
             let written = write_film(&numbered, out, &replay::Frames::new(&config, &played, motion))?;
-            return Ok(outcome(written, &played));
+            return Ok(outcome(written, &config, &played));
         }
     };
     let content = content.map_err(RecordError::write(out))?;
     place.write(&content)?;
-    Ok(outcome(Written::File { out: out.into(), bytes: content.len() }, &played))
+    Ok(outcome(Written::File { out: out.into(), bytes: content.len() }, &config, &played))
 }
 
 /// Replayed episodes, and the config of their stage.
@@ -276,9 +276,9 @@ fn prepare_output(place: &Destination, kind: &Form, run: &Path) -> Result<(), Er
     output::check(&[("--out", Some(out.as_path()))], &[run])
 }
 
-fn outcome(written: Written, played: &[Replayed]) -> ReplayOutcome {
+fn outcome(written: Written, config: &Config, played: &[Replayed]) -> ReplayOutcome {
     let unverified = played.iter().any(|played| played.unverified);
-    ReplayOutcome { written, episodes: played.iter().map(Episode::of).collect(), unverified }
+    ReplayOutcome { written, episodes: played.iter().map(|played| Episode::of(config, played)).collect(), unverified }
 }
 
 /// Writes one numbered picture per moment. The folder must exist.
@@ -301,14 +301,13 @@ fn write_film(numbered: &Numbered, out: &Path, frames: &replay::Frames<'_>) -> R
 }
 
 /// Returns what was played, for people.
-fn described(played: &Replayed) -> String {
+fn described(config: &Config, played: &Replayed) -> String {
     let Replayed { team_g, episodes, world, which, .. } = played;
     let pois = world.pois.len();
-    // With different values, G times the number of POIs is no count.
-    let by_value = map::weighted(map::values_differ(world));
-    let digits = if *episodes > 1 || !by_value.is_empty() { 2 } else { 0 };
+    let weighted = map::weighted(config.weighted_by());
+    let digits = if *episodes > 1 || !weighted.is_empty() { 2 } else { 0 };
     format!(
-        "{} of {}: observed {:.digits$} of {pois} POIs{by_value}{}{}",
+        "{} of {}: observed {:.digits$} of {pois} POIs{weighted}{}{}",
         played.name(),
         played.place(),
         team_g * pois as f64,

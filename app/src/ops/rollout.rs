@@ -96,9 +96,9 @@ pub struct RolloutOutcome {
     pub mean: Spread,
     /// Whether files were read that differ from their digests.
     pub unverified: bool,
-    /// Whether POIs have different values, so that the POIs observed are weighted by them.
+    /// See [`Config::weighted_by`].
     #[serde(skip)]
-    pub by_value: bool,
+    pub weighted_by: Option<&'static str>,
     /// The processor.
     #[serde(flatten)]
     pub processor: ProcessorInfo,
@@ -140,7 +140,12 @@ pub fn run(
     let (config_path, trained) = match path.is_dir() {
         true => {
             points::config(path, Verification::unless(request.unverified))?;
-            (path.join(folder::CONFIG), Some(path.join(folder::POLICIES)))
+            let policies = path.join(folder::POLICIES);
+            if request.policies.is_none() && !policies.exists() {
+                let reason = format!("it has no {} yet", folder::POLICIES);
+                return Err(ReadError::Unfinished { folder: path.clone(), reason }.into());
+            }
+            (path.join(folder::CONFIG), Some(policies))
         }
         false if file::is_zip(path) => return Err(ReadError::NoFolder(path.clone()).into()),
         false => (path.clone(), None),
@@ -212,7 +217,7 @@ pub fn run(
         best: Best { team: best, spread: evaluation.team(best) },
         mean: evaluation.mean(),
         unverified: request.unverified,
-        by_value: config.values_differ(),
+        weighted_by: config.weighted_by(),
         processor: ProcessorInfo::of(machine, &backend.describe()),
     })
 }

@@ -22,7 +22,7 @@ use crate::report::scene::Scene;
 use crate::run::{Progress, RunError, Session, SessionEnd};
 use crate::shell;
 use flotilla::backend::OpenBackend;
-use flotilla::config::Config;
+use flotilla::config::{Config, When};
 use flotilla::escape::PathExt;
 use flotilla::file;
 use flotilla::front::{self, Generation, Trained};
@@ -89,9 +89,9 @@ pub struct TrainOutcome {
     /// Number of teams per generation.
     #[serde(skip)]
     pub teams: usize,
-    /// Whether POIs have different values, so that the POIs observed are weighted by them.
+    /// See [`Config::weighted_by`].
     #[serde(skip)]
-    pub by_value: bool,
+    pub weighted_by: Option<&'static str>,
     /// The processor in words, or `None` if the run was finished before.
     #[serde(skip)]
     pub trained_on: Option<String>,
@@ -207,7 +207,7 @@ pub fn run(
         }
     }
     if most == 0.0 {
-        warn_that_nothing_was_observed(&folder, context);
+        warn_that_nothing_was_observed(&folder, config, context);
     }
     let learning = &config.learning;
     Ok(TrainOutcome {
@@ -227,7 +227,7 @@ pub fn run(
         processor: ProcessorInfo::of_run(session.run(0)),
         rows: results.rows.clone(),
         teams: config.max_teams() - 1,
-        by_value: config.values_differ(),
+        weighted_by: config.weighted_by(),
         trained_on: (!was_done).then_some(on),
         folder,
     })
@@ -301,9 +301,13 @@ fn train(
 }
 
 /// Warns that no team observed a POI in any generation.
-fn warn_that_nothing_was_observed(folder: &Path, context: Context<'_>) {
+fn warn_that_nothing_was_observed(folder: &Path, config: &Config, context: Context<'_>) {
+    let at_the_end = match config.pois.iter().any(|group| group.when == When::End) {
+        true => " (if `when` is \"end\", only the last step counts)",
+        false => "",
+    };
     context.warn(format_args!(
-        "warning: no team observed any POI in any generation, so there was nothing to learn from; try more \
+        "warning: no team observed any POI in any generation{at_the_end}, so there was nothing to learn from; try more \
          world.steps, a smaller world.coupling, POIs nearer to the starts, or a larger learning.population; \
          `flotilla replay {}` shows what teams do",
         shell::quoted(shell::argument(folder))

@@ -84,7 +84,7 @@ pub fn layout(name: &str, config: &StageConfig) -> Scene {
         legend.note(observers.join("; "));
     }
     sample_note(&world).into_iter().for_each(|note| legend.note(note));
-    let agents = config.agents.iter().filter_map(|class| Some((class.name.clone(), class.region?)));
+    let agents = config.agents.iter().filter_map(|class| Some((format!("agents of {}", class.name), class.region?)));
     let pois = config.pois.iter().filter_map(|group| Some((format!("POIs of {}", group.name), group.region?)));
     let regions: Vec<(String, Region)> = agents.chain(pois).collect();
     let drawn = regions.iter().map(|(name, _)| name.as_str()).collect::<Vec<_>>().join(", ");

@@ -85,9 +85,9 @@ pub(crate) fn values_differ(world: &World) -> bool {
     world.values.windows(2).any(|pair| pair[0] != pair[1])
 }
 
-/// Returns what follows a number of observed POIs if it is weighted by their values.
-pub fn weighted(by_value: bool) -> &'static str {
-    if by_value { ", weighted by value" } else { "" }
+/// Returns what follows a number of observed POIs if it is weighted, see [`Config::weighted_by`].
+pub fn weighted(by: Option<&str>) -> String {
+    by.map_or(String::new(), |by| format!(", weighted by {by}"))
 }
 
 /// Returns the part of a POI's label that has its value, empty if all have the same value.

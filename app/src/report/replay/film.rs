@@ -85,6 +85,8 @@ struct Screen<'a> {
     view: Viewport,
     width: f64,
     legend: Legend,
+    /// Whether G is more than a count of POIs.
+    weighted: bool,
 }
 
 impl<'a> Screen<'a> {
@@ -106,14 +108,14 @@ impl<'a> Screen<'a> {
         let who = if played.iter().all(all_count) { "agents" } else { "observers" };
         let timed = played.iter().any(|played| played.world.rule.is_timed());
         let needed = played.first().and_then(|played| played.world.coupling.first()).map_or(1, |&needed| needed);
-        let near = needed.saturating_sub(1).max(1);
+        let near = needed.saturating_sub(1);
         let who = if near == 1 { &who[..who.len() - 1] } else { who };
         let label = if timed { format!("0: {near}/{needed}: POI 0,") } else { format!("{near}/{needed}:") };
         let mut legend = Legend::new(config, &view, &teams, &format!("{label} {near} {who} near of {needed} needed"));
         let unverified = played.iter().any(|played| played.unverified).then(|| UNVERIFIED.to_string());
         let sample = played.iter().find_map(|played| sample_note(&played.world));
         note.into_iter().chain(unverified).chain(sample).for_each(|note| legend.note(note));
-        Screen { played, view, width, legend }
+        Screen { played, view, width, legend, weighted: config.weighted_by().is_some() }
     }
 
     /// Draws the picture `place` steps from the start. Motion between steps is interpolated linearly.
@@ -132,7 +134,11 @@ impl<'a> Screen<'a> {
             let steps = played.world.steps();
             scene.bold([left, 4.0], played.name(), 3.2, Anchor::Start, BLACK);
             scene.text([left, 7.6], played.place(), 2.6, Anchor::Start, FAINT);
-            let state = format!("step {step} of {steps}   POIs observed: {by_now} of {pois}");
+            let g = match self.weighted && step == steps {
+                true => format!("   G = {:.2}", played.scores.g),
+                false => String::new(),
+            };
+            let state = format!("step {step} of {steps}   POIs observed: {by_now} of {pois}{g}");
             scene.text([left, 11.2], state, 2.6, Anchor::Start, FAINT);
             let view = self.view.moved_to([left, Self::HEAD]);
             view.draw(&mut scene, &played.team(place));

@@ -17,7 +17,7 @@ use crate::record::digests::Verification;
 use crate::record::folder::{CHECKPOINTS, METRICS, POLICIES, RUN, Run};
 use crate::record::metrics;
 use flotilla::backend::{Backend, BackendError, Group, Trace};
-use flotilla::config::{Config, StageConfig};
+use flotilla::config::{Config, StageConfig, When};
 use flotilla::credit::{self, Credit, Scores, Strided};
 use flotilla::escape::PathExt;
 use flotilla::evolve;
@@ -434,7 +434,7 @@ pub fn one(group: &Group<'_>, backend: &mut dyn Backend) -> Result<Replayed, Bac
     credit::assign(&episode.seen, world, &mut owner);
     let mut led = Vec::new();
     credit::find_leading(&episode.sights, world, &mut led);
-    let observed = credit::observed_at(episode.sets, world);
+    let observed = observed_at(&episode.sets, world);
     let team_g = f64::from(scores.observed) / f64::from(world.total_worth);
     // POIs are drawn where this episode had them.
     let world = world.clone().with_pois(group.moved_pois().unwrap_or(&world.pois));
@@ -461,6 +461,19 @@ pub fn one(group: &Group<'_>, backend: &mut dyn Backend) -> Result<Replayed, Bac
 fn near(world: &World, sets: &Strided<'_>, set: usize) -> u32 {
     let words = world.constants.words as usize;
     world.rule.count(set % world.pois.len(), (set * words..(set + 1) * words).map(|word| sets.get(word)))
+}
+
+/// Returns the step at which each POI is observed, the last one if only that counts, `[pois]`.
+fn observed_at(sets: &Strided<'_>, world: &World) -> Vec<Option<usize>> {
+    let (pois, steps) = (world.pois.len(), world.steps());
+    let mut observed = credit::observed_at(*sets, world);
+    let scores = world.paths.iter().flat_map(|rule| &rule.scores);
+    for (poi, _) in scores.enumerate().filter(|(_, (_, when))| *when == When::End) {
+        let is_open = world.rule.is_open(poi, steps as u32, &vec![true; pois]);
+        let is_enough = is_open && near(world, sets, (steps - 1) * pois + poi) >= world.coupling[poi];
+        observed[poi] = is_enough.then_some(steps);
+    }
+    observed
 }
 
 /// An episode without some agents: the same motion, and what the others observe.
@@ -510,7 +523,7 @@ impl Replayed {
             let removed = (0..world.agents()).filter(|&agent| agent == leader || group && follows(at / pois, agent));
             removed.for_each(|agent| set[agent / 32] &= !(1 << (agent % 32)));
         }
-        let observed = credit::observed_at(Strided { words: &sets, stride: 1, offset: 0 }, world);
+        let observed = observed_at(&Strided { words: &sets, stride: 1, offset: 0 }, world);
         Counterfactual { world, sets, observed }
     }
 

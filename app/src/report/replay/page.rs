@@ -149,6 +149,9 @@ pub fn parts(config: &Config) -> Vec<(&'static str, serde_json::Value)> {
     if config.agent_count() == config.learners() && config.populations() < config.learners() {
         parts.push(("populations", json!(config.population_of_each())));
     }
+    if config.weighted_by().is_some() {
+        parts.push(("weighted", true.into()));
+    }
     if !config.agents.is_empty() {
         let class = |(index, class): (usize, &AgentClass)| {
             let free = matches!(class.motion, Mobility::Free { .. });
