@@ -158,7 +158,8 @@ impl Progress {
         if self.terminal.is_some() {
             return self.whole.set_message(describe());
         }
-        let left = if part > 0.0 { format!(", {} s left", self.whole.eta().as_secs()) } else { String::new() };
+        let left =
+            if self.whole.position() > 0 { format!(", {} s left", self.whole.eta().as_secs()) } else { String::new() };
         self.line(&format!("{}, {:.0} %{left}", describe(), part * 100.0));
     }
 

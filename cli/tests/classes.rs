@@ -179,7 +179,7 @@ fn a_poi_that_counts_at_the_end_is_observed_only_then() {
         assert_eq!(warned.contains("only the last step counts"), observed == 0, "{warned}");
         let (text, _) = place.good(&*format!("replay {when} --out {when}.svg"));
         assert!(text.contains(&format!("observed {observed} of 1 POIs, as in metrics.csv")), "{text}");
-        let picture = place.read(&format!("{when}.svg"));
+        let picture = place.read(format!("{when}.svg"));
         assert!(picture.contains(&format!("POIs observed: {observed} of 1")), "{picture}");
     }
 }

@@ -324,7 +324,17 @@ fn bad_input_is_refused_with_its_line() {
         "fixed: 30",
         "env.agents.rovers[0].position.fixed: found 30, allowed a list",
     );
-    fails(INFLUENCE, "manual: [0, 3]", "manual: [0, 99]", "credit.removes");
+    for manual in ["[0, 99]", "[0, -2]", "[0, 1.5]"] {
+        let manual = format!("manual: {manual}");
+        let message = at("manual: [0, 3]", "env.agents.uavs[1].IndirectDifference.manual[1]: found ");
+        fails(INFLUENCE, "manual: [0, 3]", &manual, &message);
+    }
+    fails(
+        LEADERS,
+        "num_followers: 3",
+        "num_followers: 9",
+        "num_followers: found 9, but there are 3 follower_positions",
+    );
     fails(INFLUENCE, "    rovers:", "    cars:", "env.agents.rovers");
     fails(INFLUENCE, "num_steps: 40", "num_steps: 40\n  num_steps: 41", "duplicate");
     fails(INFLUENCE, "env:", "env: [", "config.yaml:3: not YAML that can be read");
@@ -334,6 +344,9 @@ fn bad_input_is_refused_with_its_line() {
 
     let many = format!("    - *rover\n{}", "    - {a: 1}\n".repeat(2000));
     fails(INFLUENCE, "    - *rover\n", &many, "env.agents.rovers: found 2003 items, allowed up to 1024");
+
+    let (config, ..) = import(&INFLUENCE.replace("    - *rover\n", &"    - *rover\n".repeat(200)));
+    assert_eq!(config.agent_count(), 204);
 
     let place = Place::new(&[]);
     let unknown: String = (0..60_000).map(|key| format!("key{key}: 1\n")).collect();

@@ -70,6 +70,7 @@ fn outputs_do_not_replace_inputs_or_files_of_a_run() {
         (&["--trace", "link.csv"], "is part of the run, sweep or paper in"),
         (&["--trace", "run/run.json"], "is part of the run, sweep or paper in"),
         (&["--trace", "run/.lock"], "is part of the run, sweep or paper in"),
+        (&["--trace", "run/.flotilla.sha256"], "is part of the run, sweep or paper in"),
         (&["--trace", "run/checkpoints/x"], "is part of the run, sweep or paper in"),
         (&["--scores", "x.csv", "--trace", "./x.csv"], "is written by --scores"),
     ] {
@@ -640,28 +641,36 @@ fn a_training_works_with_fewer_threads_than_requested() {
 #[cfg(target_os = "linux")]
 #[test]
 fn too_little_address_space_is_reported() {
-    let place = Place::new(&[("small.toml", TINY)]);
-    let mut refused = 0;
-    for mib in (30..=120).step_by(10) {
-        let line = "flotilla train small.toml --backend cpu --threads 4 --quiet --out run";
-        let output = place.shell(&format!("ulimit -v {}; exec {line}{mib}", mib << 10));
-        let stderr = String::from_utf8(output.stderr).unwrap();
-        match output.status.code() {
-            Some(0) => {}
-            Some(1) => {
-                assert!(
-                    stderr.contains("error: ") && stderr.contains("memory") && stderr.contains("ulimit -v"),
-                    "{stderr}"
-                );
-                refused += 1;
+    let swarm = include_str!("../../configs/swarm.toml").replace("population = 20", "population = 2");
+    let place = Place::new(&[("small.toml", TINY), ("swarm.toml", &swarm)]);
+    place.good("train swarm.toml --set learning.generations=0 --set world.steps=20 --quiet --out large");
+    for line in [
+        "train small.toml --backend cpu --threads 4 --quiet --out run",
+        "replay large --backend cpu --threads 1 --out replay.svg",
+        "rollout large --backend cpu --threads 1 --trace trace.csv",
+    ] {
+        let mut refused = 0;
+        for mib in (30..=120).step_by(10) {
+            let line = line.replace("--out run", &format!("--out run{mib}"));
+            let output = place.shell(&format!("ulimit -v {}; exec flotilla {line}", mib << 10));
+            let stderr = String::from_utf8(output.stderr).unwrap();
+            match output.status.code() {
+                Some(0) => {}
+                Some(1) => {
+                    assert!(
+                        stderr.contains("error: ") && stderr.contains("memory") && stderr.contains("ulimit -v"),
+                        "{stderr}"
+                    );
+                    refused += 1;
+                }
+                // The system could not even load the program.
+                Some(127) if stderr.contains("shared libraries") => {}
+                // The program was loaded, but what is left does not even hold the stack for signals or its command line.
+                None if refused == 0 && stderr.contains("failed to allocate an alternative stack") => {}
+                None if refused == 0 && stderr.starts_with("memory allocation of") => {}
+                other => panic!("{mib} MiB, {line}: {other:?}: {stderr}"),
             }
-            // The system could not even load the program.
-            Some(127) if stderr.contains("shared libraries") => {}
-            // The program was loaded, but what is left does not even hold the stack for signals or its command line.
-            None if refused == 0 && stderr.contains("failed to allocate an alternative stack") => {}
-            None if refused == 0 && stderr.starts_with("memory allocation of") => {}
-            other => panic!("{mib} MiB: {other:?}: {stderr}"),
         }
+        assert!(refused > 0, "no limit was too small for {line}");
     }
-    assert!(refused > 0, "no limit was too small");
 }

@@ -128,7 +128,7 @@ fn a_run_without_enough_memory_does_not_start() {
     let output = train.arg("train").arg(&path).args(["--backend", "cpu", "--out"]).arg(&out).output().unwrap();
     assert_eq!(output.status.code(), Some(1));
     let stderr = String::from_utf8(output.stderr).unwrap();
-    for part in ["GiB of memory at its peak", "is available", "smaller population", "fewer trials"] {
+    for part in ["GiB of memory at its peak", "is available", "choose fewer policies"] {
         assert!(stderr.contains(part), "{stderr}");
     }
     assert!(

@@ -50,6 +50,7 @@ template <class T> struct alignas(4 * sizeof(T)) four {
 };
 using float2 = pair<float>; using float4 = four<float>;
 using uint2 = pair<uint>; using uint3 = triple<uint>; using uint4 = four<uint>;
+using int2 = pair<int>; using int4 = four<int>; using bool4 = four<bool>;
 #define COMPONENTS(op) \\
   template <class T> INLINE pair<T> operator op(pair<T> a, pair<T> b) { return {a.x op b.x, a.y op b.y}; } \\
   template <class T> INLINE four<T> operator op(four<T> a, four<T> b) { \\
@@ -58,8 +59,11 @@ using uint2 = pair<uint>; using uint3 = triple<uint>; using uint4 = four<uint>;
   template <class T> INLINE four<T> operator op(four<T> a, T b) { return a op four<T>(b); }
 COMPONENTS(+) COMPONENTS(-) COMPONENTS(*) COMPONENTS(^) COMPONENTS(|) COMPONENTS(&) COMPONENTS(>>) COMPONENTS(<<)
 template <class T> INLINE T select(T no, T yes, bool which) { return which ? yes : no; }
+template <class T> INLINE four<T> select(four<T> no, four<T> yes, bool4 which) {
+  return {which.x ? yes.x : no.x, which.y ? yes.y : no.y, which.z ? yes.z : no.z, which.w ? yes.w : no.w}; }
 template <class T> INLINE T min(T a, T b) { return b < a ? b : a; }
 template <class T> INLINE T max(T a, T b) { return a < b ? b : a; }
+template <class T> INLINE T clamp(T x, T low, T high) { return min(max(x, low), high); }
 __device__ inline float abs(float x) { return fabsf(x); }
 __device__ inline float floor(float x) { return floorf(x); }
 __device__ inline uint ctz(uint x) { return __clz(__brev(x)); }

@@ -112,7 +112,7 @@ fn errors_in_stages_name_their_line() {
         ),
         (stage("0", "'world.leaders' = [[1, 1]]"), 3, "stages[0].set.world.leaders: 1 leaders learn in this stage, 2"),
         (stage("7", ""), 2, "stages[0].from: found 7, allowed a whole number, 0 to 6 (learning.generations)"),
-        (stage("-1", ""), 2, "stages[0].from: found something else"),
+        (stage("-1", ""), 2, "stages[0].from: found -1, allowed a whole number, 0 to 6"),
         (stage("3", "") + &stage("3", ""), 5, "stages[1].from: found 3, allowed a whole number, 4 to 6"),
         // No generation is left for the second stage.
         (stage("6", "") + &stage("7", ""), 5, "stages[1].from: the stage before begins in the last generation, 6"),

@@ -297,10 +297,33 @@ fn varied_keys_change_one_at_a_time() {
 }
 
 #[test]
+fn keys_that_set_the_same_are_refused() {
+    const RIVER: &str = "[world]\n[[agents]]\nname = \"boat\"\nat = [[1, 1]]\nsenses = [{ of = \"pois\" }]\n\
+                         [[pois]]\nname = \"buoy\"\nat = [[9, 9]]\ncoupling = 1\n[grid]\n";
+    let range = "\"agents.boat.senses[0].range\" = [1.0, 2.0]\n";
+    for keys in [
+        "\"agents.boat.speed\" = [1.0]\n\"agents[0].speed\" = [2.0]\n",
+        &format!("{range}\"agents.boat.senses\" = [[{{ of = \"pois\" }}]]\n"),
+        &format!("{range}[vary]\n\"agents[0].senses[0].range\" = [3.0]\n"),
+    ] {
+        let error = parse_error(&format!("{RIVER}{keys}"));
+        assert!(error.contains("sets the same; leave one of them out"), "{error}");
+    }
+    let other = "\"agents.boat.senses[0].nearest\" = [1.0, 2.0]\n";
+    assert_eq!(Sweep::read(&format!("{RIVER}{range}{other}"), "x.toml", &[], false).unwrap().points.len(), 4);
+    let flags = [Override::of_text("agents[0].senses", "[]", "--set")];
+    let error = Sweep::read(&format!("{RIVER}{range}"), "x.toml", &flags, false).unwrap_err().to_string();
+    assert!(error.contains("the grid has agents.boat.senses[0].range already"), "{error}");
+}
+
+#[test]
 fn errors_in_varied_keys_name_the_line() {
     let error_of = |keys: &str| parse_error(&varied().replace("world.coupling = [1, 7]", keys));
     for (keys, expected) in [
-        ("\"learning.fitness\" = [\"D\"]", "x.toml:17: vary.\"learning.fitness\": it is also in [grid]"),
+        (
+            "\"learning.fitness\" = [\"D\"]",
+            "x.toml:17: vary.\"learning.fitness\": grid.\"learning.fitness\" sets the same",
+        ),
         (
             "\"world.coupling\" = [1, 3]",
             "x.toml:17: vary.\"world.coupling\"[1]: found 3, which is the file's own value",

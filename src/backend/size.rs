@@ -35,6 +35,12 @@ pub fn sum_bytes(world: &World) -> u64 {
     ((1 + world.leaders()) * size_of::<u32>()) as u64
 }
 
+/// Returns the maximum bytes of a team's [`Trace`](super::Trace).
+pub fn trace_bytes(world: &World) -> u64 {
+    let moments = (world.steps() + 1) * (traced_words(world) + 2 * world.agents());
+    ((record_words(world, RecordRequest(&[Fitness::Dt])) + moments) * size_of::<u32>()) as u64
+}
+
 /// Returns the words of one step of a team's trace: moments, then inputs.
 pub(super) fn traced_words(world: &World) -> usize {
     world.agents() * MOMENT_WORDS + world.leaders() * world.inputs()

@@ -176,7 +176,7 @@ impl UnresolvedStage<'_> {
             Some(from) if (min..=max).contains(&from) => return from,
             _ if min > max => format!("the stage before begins in the last generation, {max} ({GENERATIONS})"),
             found => {
-                let found = found.map_or("something else".into(), |found| found.to_string());
+                let found = found.map_or_else(|| from.found(), |found| found.to_string());
                 let after = if min > 0 { ", after the stage before" } else { "" };
                 format!("found {found}, allowed a whole number, {min} to {max} ({GENERATIONS}){after}")
             }

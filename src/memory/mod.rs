@@ -117,8 +117,8 @@ pub struct Peaks {
 /// A run needs more memory than is available.
 #[derive(Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "this needs {} of memory at its peak, and {} is available; choose a smaller population, fewer trials{} or another \
-     machine",
+    "this needs {} of memory at its peak, and {} is available; choose fewer policies, trials, agents or steps{}, or \
+     another machine",
     human(*needed), human(*available),
     if *checkpoint > 0 { format!(", no checkpoints (they take {} of it)", human(*checkpoint)) } else { String::new() }
 )]
@@ -199,6 +199,16 @@ pub fn check(needed: u64, checkpoint: u64) -> Result<(), TooLittle> {
     }
 }
 
+/// Fails if teams cannot be played and scored on so many threads of the CPU, with traces of some of them.
+///
+/// # Errors
+/// The available memory is smaller than what they need.
+pub fn check_rollout(world: &World, fitnesses: &[Fitness], threads: usize, traced: usize) -> Result<(), TooLittle> {
+    let block = fitnesses.iter().map(|&fitness| cpu::block_bytes(world, fitness)).max().unwrap_or(0);
+    let traces = backend::trace_bytes(world).saturating_mul(traced as u64);
+    check(traces.saturating_add(threads as u64 * block), 0)
+}
+
 /// Reports whether a checkpoint of these configs is copied and written while training continues. Larger checkpoints are
 /// written directly from the populations, and training waits.
 pub fn copies_checkpoint<'a>(configs: impl IntoIterator<Item = &'a Config>) -> bool {
@@ -252,7 +262,7 @@ mod tests {
     #[test]
     fn what_is_too_large_says_what_to_do() {
         let text = TooLittle { needed: 3 << 30, available: 5 << 20, checkpoint: 1 << 20 }.to_string();
-        for part in ["3.0 GiB", "5.0 MiB", "smaller population", "no checkpoints (they take 1.0 MiB"] {
+        for part in ["3.0 GiB", "5.0 MiB", "fewer policies", "no checkpoints (they take 1.0 MiB"] {
             assert!(text.contains(part), "{text}");
         }
     }

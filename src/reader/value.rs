@@ -131,7 +131,7 @@ impl<'a> Value<'a> {
     }
 
     /// Describes the value in errors.
-    pub(super) fn found(&self) -> String {
+    pub(crate) fn found(&self) -> String {
         match (&self.kind, self.written) {
             (Kind::List(items), _) => format!("a list of {}", items.len()),
             (Kind::Table(_), _) => "a table".into(),

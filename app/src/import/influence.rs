@@ -205,7 +205,7 @@ pub(super) fn translate(root: &At<'_>) -> Result<Vec<Section>, Problem> {
         }
     }
     let all = || kinds.iter().flat_map(|(kind, agents)| agents.iter().map(move |at| (*kind, at)));
-    let credits = all().map(|(_, at)| credit_of(at)).collect::<Result<Vec<_>, _>>()?;
+    let credits = all().map(|(_, at)| credit_of(at, rovers + uavs)).collect::<Result<Vec<_>, _>>()?;
     // One rule, and one choice to add G, are for all agents.
     let led_by = credits.iter().find_map(|credit| credit.led_by);
     let adds_g = credits.iter().any(|credit| credit.adds_g);
@@ -441,8 +441,8 @@ fn senses(
     Ok(())
 }
 
-/// Reads how an agent is scored.
-fn credit_of(at: &At<'_>) -> Result<Credit, Problem> {
+/// Reads how one of `agents` agents is scored.
+fn credit_of(at: &At<'_>, agents: usize) -> Result<Credit, Problem> {
     let of = |key: &str| format!("IndirectDifference.{key}");
     let adds_g = at.word(&of("add_G"), "false", &[("false", false), ("true", true)])?;
     let credit = |fitness| Credit { fitness, adds_g, led_by: None, removes: None };
@@ -452,8 +452,8 @@ fn credit_of(at: &At<'_>) -> Result<Credit, Problem> {
         return Ok(credit(fitness));
     }
     if at.word(&of("assignment"), "automatic", &[("automatic", false), ("manual", true)])? {
-        let agent = |agent: At<'_>| Ok(agent.number()?.clamp(0.0, 1e6) as usize);
-        let removes = at.list(&of("manual"))?.into_iter().map(agent).collect::<Result<_, Problem>>()?;
+        let manual = at.list(&of("manual"))?;
+        let removes = manual.iter().map(|agent| agent.agent(agents)).collect::<Result<_, Problem>>()?;
         return Ok(Credit { removes: Some(removes), ..credit("D") });
     }
     if !at.word(&of("automatic.timescale"), "trajectory", &[("trajectory", false), ("timestep", true)])? {

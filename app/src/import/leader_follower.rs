@@ -120,7 +120,17 @@ pub(super) fn translate(root: &At<'_>) -> Result<Vec<Section>, Problem> {
     learning.skip_unknown(root, &[RUN, POLICY, WORLD]);
     learning.skip_unknown(&env, &[ENVIRONMENT]);
 
-    let has_followers = !env.list("BoidSpawner.follower_positions")?.is_empty();
+    let count = |role: &str| {
+        let places = env.list(&format!("BoidSpawner.{role}_positions"))?.len();
+        match env.get(&format!("StateBounds.num_{role}s")) {
+            Some(count) if places > 0 && count.number()? != places as f64 => {
+                Err(count.problem(format!("found {}, but there are {places} {role}_positions", count.shown())))
+            }
+            _ => Ok(places),
+        }
+    };
+    count("leader")?;
+    let has_followers = count("follower")? > 0;
     let follower = if has_followers { Some(follower(&env)?) } else { None };
     let sections =
         [Some(world), Some(leader(&env, has_followers)?), follower, Some(pois), Some(policy), Some(learning)];

@@ -92,7 +92,11 @@ fn evaluate(text: &str) -> Option<Value> {
 
 /// Reads a text. Limits on its depth and its aliases keep time and memory in proportion to its length.
 pub(super) fn parse(text: &str) -> Result<Node, Problem> {
-    let options = serde_saphyr::options! { with_snippet: false };
+    // Many agents may be aliases of one.
+    let options = serde_saphyr::options! {
+        with_snippet: false,
+        budget: serde_saphyr::budget! { enforce_alias_anchor_ratio: false },
+    };
     serde_saphyr::from_str_with_options(text, options).map_err(|error| {
         let line = error.location().map(|location| location.line() as usize);
         let found = error.render_with_formatter(&UserMessageFormatter);
@@ -182,6 +186,13 @@ impl<'a> At<'a> {
             Tree::Scalar(Value::Float(number)) => Ok(*number),
             _ => Err(self.wrong("a number")),
         }
+    }
+
+    /// Returns the index of one of `count` agents.
+    pub fn agent(&self, count: usize) -> Result<usize, Problem> {
+        let number = self.number()?;
+        let index = (0..count).find(|&index| index as f64 == number);
+        index.ok_or_else(|| self.wrong(&format!("one of {count} agents, from 0")))
     }
 
     /// Returns the number at a path, or the default if it is missing.

@@ -3,7 +3,7 @@
 use serde::Serialize;
 use serde_json::{Value, json};
 
-use super::{BackendSource, ConfigText, Context, Error, ProcessorInfo};
+use super::{BackendSource, ConfigText, Context, Error, ProcessorInfo, check_memory};
 use crate::choice::Work;
 use flotilla::backend::Backend;
 use flotilla::baseline::{self, Baselines, SPEEDS};
@@ -101,9 +101,10 @@ pub fn run(
         return Err(Error::Usage("--seeds 0: allowed 1 or more".into()));
     }
     let config = request.config.read()?.validate()?;
-    let ((backend, machine), on) = backends.open(Work::of([&*config]))?;
+    let (open, on) = backends.open(Work::of([&*config]))?;
+    check_memory([&config], open)?;
     context.message(format_args!("playing on {on}"));
-    let outcomes = play(&config, request.seeds as usize, request.episodes, &mut **backend, context);
+    let outcomes = play(&config, request.seeds as usize, request.episodes, &mut *open.0, context);
     context.pause();
     let outcomes = outcomes?;
     let (learning, pois, actions) = (&config.learning, config.poi_count(), config.policy.actions);
@@ -146,7 +147,7 @@ pub fn run(
         shared: found(observed(&|outcome| outcome.shared), true),
         open_loop: found(observed(&|outcome| outcome.open_loop), true),
         hill_climbing: found(observed(&|outcome| outcome.hill_climbing), true),
-        processor: ProcessorInfo::of(machine, &backend.describe()),
+        processor: ProcessorInfo::of(&open.1, &open.0.describe()),
         actions,
         moves,
     })

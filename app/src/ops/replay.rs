@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 
 use super::output::{self, Destination};
-use super::{BackendSource, Context, Error, escaped, points, with_remedy};
+use super::{BackendSource, Context, Error, check_memory, escaped, points, with_remedy};
 use crate::choice::Work;
 use crate::record::RecordError;
 use crate::record::digests::Verification;
@@ -16,9 +16,12 @@ use crate::report::map;
 use crate::report::replay::{self, FPS, Film, ReplayError, Replayed, Which};
 use crate::report::runs;
 use crate::report::scene::{Format, PRINT};
+use crate::run::RunError;
 use flotilla::config::{Config, Learning, ValidConfig};
 use flotilla::escape::PathExt;
 use flotilla::file;
+use flotilla::memory;
+use flotilla::world::World;
 
 /// A request to replay episodes.
 #[derive(Clone, Debug)]
@@ -235,14 +238,17 @@ pub fn play(
 ) -> Result<Played, Error> {
     let config = stage(&points::config(folder, verification)?.validate()?, generations)?.clone();
     let learning = Learning { trials: 1, ..config.learning.clone() };
-    let ((backend, _), _) = backends.open(Work::of([&Config { learning, ..config.clone() }]))?;
+    let trained = Config { learning, ..config.clone() }.validate()?;
+    let (open, _) = backends.open(Work::of([&*trained]))?;
+    check_memory([&trained], open)?;
+    memory::check_rollout(&World::new(&trained), &[], 1, generations.len()).map_err(RunError::from)?;
     let last = generations.iter().max().copied().unwrap_or(0);
     let mut watch = |generation: usize| {
         let text = format!("training trial {trial} again: generation {generation} of {last}");
         context.fraction(generation as f64 / (last + 1) as f64, text);
         !context.is_stopped()
     };
-    let played = replay::replay(folder, trial, generations, team, verification, &mut **backend, &mut watch);
+    let played = replay::replay(folder, trial, generations, team, verification, &mut *open.0, &mut watch);
     context.pause();
     let episodes = played.map_err(|error| match error {
         ReplayError::Stopped => Error::Stopped("before the episode was played; nothing was written".into()),

@@ -13,14 +13,17 @@ use crate::record::{folder, policies, tensors};
 use crate::report::map;
 use crate::report::replay::numbered;
 use crate::report::runs::ReadError;
+use crate::run::RunError;
 use flotilla::backend::{Backend, Group};
 use flotilla::config::{self, Config, Learning, Override};
 use flotilla::escape::PathExt;
 use flotilla::evaluate::{self, Batch, Evaluation, Spread, Starts};
 use flotilla::file;
+use flotilla::memory;
 use flotilla::model::class::Class;
 use flotilla::model::classes::Frame;
 use flotilla::model::sense::{ChannelConstants, ChannelShape};
+use flotilla::parallel;
 use flotilla::world::{OUTPUTS, World};
 
 /// Columns of a trace. Only agents that learn fill the others: the inputs and outputs of their policies.
@@ -151,6 +154,9 @@ pub fn run(
         false => (path.clone(), None),
     };
     let Some(policies) = request.policies.clone().or(trained) else {
+        if !config::is_standard_input(path) {
+            config::read_file(path)?;
+        }
         return Err(Error::Usage(with_remedy(
             "--policies: a config file needs a file of policies",
             format!("or name a run's folder in place of {}", request.path.escaped()),
@@ -190,6 +196,8 @@ pub fn run(
         context.fraction(batch.share, &playing);
         if context.is_stopped() { Break(()) } else { Continue(()) }
     };
+    let threads = parallel::current_num_threads();
+    memory::check_rollout(&world, group.fitnesses, threads, 0).map_err(RunError::from)?;
     let evaluation = evaluate::evaluate(&mut **backend, &group, &starts, each);
     context.pause();
     let evaluation = evaluation?;
@@ -281,7 +289,8 @@ fn write_trace(
             let starts = starts.of(episode, group.world);
             let last = if episodes > 1 { format!(",{episode}") } else { String::new() };
             for (first, part) in evaluate::parts(&Group { starts: &starts, fitnesses: &[], ..*group }) {
-                let trace = match backend.trace(&part) {
+                let enough = memory::check_rollout(part.world, &[], 1, part.team_count()).map_err(RunError::from);
+                let trace = match enough.map_err(Error::from).and_then(|()| Ok(backend.trace(&part)?)) {
                     Ok(trace) => trace,
                     Err(error) => {
                         failed = Some(error);
@@ -316,5 +325,5 @@ fn write_trace(
         Ok(())
     });
     context.pause();
-    failed.map_or(written, |error| Err(error.into()))
+    failed.map_or(written, Err)
 }

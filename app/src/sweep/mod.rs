@@ -130,14 +130,24 @@ impl Sweep {
         // Every point reads the rest of the document, so its cost must not depend on the length of the lists.
         let document = document.without(&[GRID, VARY]);
         let skip = skip || grid.skip;
-        let mut problems: Vec<Problem> = flags
-            .iter()
-            .filter_map(|flag| Some((flag, grid.axes.iter().find(|(axis, _)| axis.key == flag.key)?)))
-            .map(|(flag, (axis, _))| {
+        let paths: Vec<_> = grid.axes.iter().map(|(axis, _)| path_of(&base, &axis.key)).collect();
+        let overlaps = |a: &[String], b: &[String]| a.iter().zip(b).all(|(a, b)| a == b);
+        let mut problems = Vec::new();
+        for flag in flags {
+            let path = path_of(&base, &flag.key);
+            let axes = grid.axes.iter().zip(&paths).filter(|(_, axis)| overlaps(axis, &path));
+            problems.extend(axes.map(|((axis, _), _)| {
                 let section = if axis.varied { "[vary]" } else { "the grid" };
-                problem(None, &flag.name, format!("{section} has {} already; leave one of them out", flag.key))
-            })
-            .collect();
+                problem(None, &flag.name, format!("{section} has {} already; leave one of them out", axis.key))
+            }));
+        }
+        for (index, (axis, line)) in grid.axes.iter().enumerate() {
+            let before = grid.axes.iter().zip(&paths[..index]).find(|(_, path)| overlaps(path, &paths[index]));
+            problems.extend(before.map(|((before, _), _)| {
+                let message = format!("{} sets the same; leave one of them out", before.name());
+                problem(Some(*line), &axis.name(), message)
+            }));
+        }
         problems.extend(layout::conflicts(&grid, &base));
         problems.extend(
             layout::AXES
@@ -280,9 +290,6 @@ impl Grid {
             other if key == SKIP && !varied => report(format!("found {other}, allowed true or false")),
             _ if varied && layout::AXES.contains(&key) => {
                 report("not allowed in [vary], because it replaces the whole layout; move it to [grid]".into());
-            }
-            _ if varied && self.axes.iter().any(|(other, _)| other.key == key) => {
-                report("it is also in [grid]; leave one of them out".into());
             }
             Value::Array(values) if values.is_empty() => {
                 report("found no values, allowed a list of at least one; or leave the key out".into());
@@ -453,6 +460,28 @@ fn value_of(config: &Config, key: &str) -> Option<Value> {
     (value != Value::Table(Table::new())).then_some(value)
 }
 
+/// Returns the parts of a key's path in a config, with an item of a list by its index.
+fn path_of(base: &Table, key: &str) -> Vec<String> {
+    let mut parts = config::key_path(key).peekable();
+    let mut value = parts.peek().and_then(|first| base.get(*first));
+    let mut path: Vec<String> = parts.next().map(String::from).into_iter().collect();
+    for part in parts {
+        let index = value.and_then(Value::as_array).and_then(|items| index_of(items, part));
+        value = match index {
+            Some(index) => value.and_then(|list| list.get(index)),
+            None => value.and_then(|table| table.get(part)),
+        };
+        path.push(index.map_or(part.into(), |index| index.to_string()));
+    }
+    path
+}
+
+/// Returns the index of the item of a list with this name or index.
+fn index_of(items: &[Value], part: &str) -> Option<usize> {
+    let is_named = |item: &Value| item.get("name").and_then(Value::as_str) == Some(part);
+    items.iter().position(is_named).or_else(|| part.parse().ok())
+}
+
 /// Returns the place of a key's value in a config. A missing value becomes an empty table. Returns `None` if a list of the
 /// config has no such item.
 fn place<'t>(table: &'t mut Table, key: &str) -> Option<&'t mut Value> {
@@ -461,8 +490,7 @@ fn place<'t>(table: &'t mut Table, key: &str) -> Option<&'t mut Value> {
     for part in path {
         value = match value {
             Value::Array(items) => {
-                let is_named = |item: &Value| item.get("name").and_then(Value::as_str) == Some(part);
-                let index = items.iter().position(is_named).or_else(|| part.parse().ok())?;
+                let index = index_of(items, part)?;
                 items.get_mut(index)?
             }
             Value::Table(table) => table.entry(part).or_insert_with(|| Value::Table(Table::new())),
@@ -475,8 +503,8 @@ fn place<'t>(table: &'t mut Table, key: &str) -> Option<&'t mut Value> {
 /// Returns a text that is the same for equal values only.
 fn canonical(value: &Value) -> String {
     match value {
-        // 0.0 and -0.0 are equal, and adding 0 to either gives 0.0.
-        Value::Float(number) => Value::Float(number + 0.0).to_string(),
+        // 1 and 1.0 are equal, and so are 0.0 and -0.0.
+        Value::Float(number) if number.fract() == 0.0 && number.abs() < 1e15 => (*number as i64).to_string(),
         Value::Array(values) => format!("[{}]", values.iter().map(canonical).collect::<Vec<_>>().join(",")),
         other => other.to_string(),
     }
@@ -540,5 +568,6 @@ mod tests {
         };
         assert!(twice("[0.5, 1.0, 0.50]").contains("found 0.5 twice, at [0] and at [2]"));
         assert!(twice("[0.0, -0.0]").contains("twice, at [0] and at [1]"));
+        assert!(twice("[1, 1.0]").contains("twice, at [0] and at [1]"));
     }
 }

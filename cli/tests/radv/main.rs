@@ -74,6 +74,8 @@ const PASSES: [Pass; 2] = [Pass::NoContraction, Pass::Guarded];
 /// Maximum vector registers of an episode's kernel in the paper's layouts. With more registers, fewer waves run at the
 /// same time and hide each other's latency.
 const MAX_REGISTERS: u64 = 64;
+/// Numbers that the shader of scores keeps in further registers, one per copy that D++ may need.
+const COPIES: u64 = 64;
 /// Maximum instructions of such a kernel, for each of [`PASSES`].
 const MAX_INSTRUCTIONS: [u64; 2] = [2650, 3500];
 
@@ -338,7 +340,8 @@ fn compiled_shaders_are_exact_small_and_fast() {
                 if name.starts_with("swarm, ") {
                     continue;
                 }
-                assert!(count("VGPRs") <= MAX_REGISTERS, "{context}: {} registers", count("VGPRs"));
+                let most = MAX_REGISTERS + if name.starts_with("count, ") { COPIES } else { 0 };
+                assert!(count("VGPRs") <= most, "{context}: {} registers", count("VGPRs"));
                 assert!(count("Instructions") <= max_instructions, "{context}: {} instructions", count("Instructions"));
             }
             let mut finding = format!("{chip}, {pass} pass: {} shaders, none fused", results.len());

@@ -297,11 +297,13 @@ pub(crate) fn block_bytes(world: &World, fitness: Fitness) -> u64 {
         (_, Fitness::Dt) => moments * agents * (copied + 1 + 2 * world.leader_words()),
         _ => moments * agents * (copied + 1),
     };
+    // Who leads whom, of one team at a time.
+    let led = if paths == 0 { sight_words(world, fitness == Fitness::Dt) } else { 0 };
     if is_large {
-        return (4 * (policies + record + scratch) + swarm::bytes(agents)) as u64;
+        return (4 * (policies + record + scratch + led) + swarm::bytes(agents)) as u64;
     }
     let words = 8 * agents + policies + 3 * followers + record + scratch;
-    words as u64 * lanes() * 4 + (8 * world.parameters() + agents * agents.div_ceil(64) * 8) as u64
+    words as u64 * lanes() * 4 + (8 * world.parameters() + 4 * led + agents * agents.div_ceil(64) * 8) as u64
 }
 
 #[cfg(test)]

@@ -6,6 +6,7 @@ use std::path::{Component, Path, PathBuf};
 
 use super::{ARMS, CHECKPOINTS, CONFIG, LOCK, METRICS, PAPER, POINTS, POLICIES, RESULTS, RUN, SWEEP};
 use crate::record::RecordError;
+use crate::record::ownership::LIST;
 use flotilla::file;
 
 /// Reports whether a folder contains any file of a run.
@@ -43,6 +44,7 @@ pub fn owner(path: &Path) -> Option<PathBuf> {
     }
     let is_needed = match name {
         CONFIG | RUN | METRICS | POLICIES | LOCK => is_run(folder),
+        LIST => is_run(folder) || has(folder, &[SWEEP, ARMS]),
         SWEEP | RESULTS | POINTS => has(folder, &[SWEEP]),
         PAPER => has(folder, &[ARMS]),
         _ => false,
