@@ -122,6 +122,7 @@ fn g_weighs_pois_by_value_in_metrics_replays_and_rollouts() {
     let (report, _) = place.good("train herd.toml --out run");
     // What is not a count of POIs says so.
     assert!(report.contains("POIs observed, of 3, weighted by value: mean over trials"), "{report}");
+    assert!(place.read("run/curves.svg").contains("G (weighted share of POIs)"));
     assert!(report.contains(" of 3 POIs, weighted by value.\n"), "{report}");
     let (text, _) = place.good("baseline herd.toml --seeds 1 --episodes 2");
     assert!(text.starts_with("2 × rover, 1 × drone, 1 seed. "), "{text}");

@@ -7,7 +7,7 @@ use serde::de::IntoDeserializer;
 use serde::{Deserialize, Serialize};
 
 use super::curves::{Band, Curve, Figure, Panel};
-use super::map::{counted, weighted};
+use super::map::counted;
 use crate::record::digests::{Digests, UNVERIFIED, Verification};
 use crate::record::folder::{OWN_FITNESS, Run};
 pub use crate::record::runs::{ReadError, config, metrics};
@@ -176,7 +176,8 @@ fn figure_of_runs(
         }
     };
     let y_label = match (all.len(), measure) {
-        (1, None) => format!("G (share of POIs observed{})", weighted(configs[0].weighted_by())),
+        (1, None) if configs[0].weighted_by().is_some() => "G (weighted share of POIs)".into(),
+        (1, None) => "G (share of POIs observed)".into(),
         (_, kind) => kind.unwrap_or_default().label(),
     };
     // Only stages that the run has reached are marked. If runs have different stages, none are marked.
