@@ -59,7 +59,7 @@ pub struct BaselineOutcome {
     /// Who learns, for people: the paradigm, or the classes that learn.
     #[serde(skip)]
     pub learners: String,
-    /// See [`Config::weighted_by`].
+    /// See [`Config::weighted_by`](flotilla::Config::weighted_by).
     #[serde(skip)]
     pub weighted_by: Option<&'static str>,
     /// Whether starts or POIs move. If they do, some episodes choose a team and others measure it.
