@@ -6,7 +6,7 @@ use flotilla::config::{Choice, Fitness};
 use flotilla::front;
 use flotilla::stepping;
 use flotilla::world::OUTPUTS;
-use flotilla_app::report::map::{self, Marker, Poi, Team, Viewport};
+use flotilla_app::report::map::{self, Form, Marker, Poi, Team, Viewport};
 use flotilla_app::report::scene::Scene;
 use glam::{DVec2, Vec2};
 use numpy::{
@@ -242,14 +242,15 @@ fn team_of(stepper: &mut stepping::Stepper, team: usize) -> Team {
     let (step, observed) = (stepper.steps()[team].max(1), &stepper.observed()[team * pois..][..pois]);
     let agent = |(agent, (place, heading))| {
         let group = (agent < leaders).then_some(agent);
-        let heading = map::heading_of(world, agent, heading);
-        Marker { place, heading, group, counts: world.rule.counts(agent), trail: vec![place] }
+        let (form, counts) = (Form::of_agent(world, agent), world.rule.counts(agent));
+        Marker { place, heading, form, group, counts, trail: vec![place] }
     };
     let poi = |(poi, place): (usize, &Vec2)| {
         let (near, needed) = (near(poi), world.coupling[poi]);
         Poi {
             place: place.as_dvec2(),
             radius: map::radius_of(world, poi),
+            size: map::size_of(world, poi),
             label: map::poi_label(world, poi, format!("{near}/{needed}")),
             share: Some(f64::from(near) / f64::from(needed)),
             observed: observed[poi],

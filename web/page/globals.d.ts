@@ -46,7 +46,7 @@ interface Episode extends Seen {
 }
 /** A channel of a class's senses, and a class of agents. Those that learn come first. */
 interface Channel { of: string | string[], sectors: number, each?: boolean, frame: "heading" | "map" }
-interface AgentClass { name: string, count: number, free: boolean, senses: Channel[], choose?: { name: string, agents: number[] } }
+interface AgentClass { name: string, count: number, free: boolean, outline: Place[], senses: Channel[], choose?: { name: string, agents: number[] } }
 /**
  * What only some scenes have: classes of agents, groups of POIs, the radius and value of each POI if they differ, and the population of each
  * agent if they share some and none follows.
@@ -54,10 +54,10 @@ interface AgentClass { name: string, count: number, free: boolean, senses: Chann
 interface Parts { populations?: number[], classes?: AgentClass[], groups?: { name: string, count: number }[], radii?: number[], values?: number[] }
 interface Scene extends Rule, Parts {
   map: Place, pois: Place[], observation_radius: number, attraction_radius: number, dt: number, steps: number, exact: boolean,
-  colors: Palettes, fitness?: string, episodes: Episode[],
+  colors: Palettes, outline: Place[], fitness?: string, episodes: Episode[],
 }
 /** A scene as it is sent: arrays are base64 until `stage.unpack`. */
-interface Packed { colors: Palettes, episodes: { generation: number, team_g: number }[] }
+interface Packed { colors: Palettes, outline: Place[], episodes: { generation: number, team_g: number }[] }
 
 /** What to show of an episode. */
 interface Look {

@@ -30,7 +30,7 @@ export function start_scene(config) {
   const owner = agents.map((_, agent) => owners[agent] < world.leaders.length ? owners[agent] : -1);
   return {
     map: world.map, pois: world.pois, observation_radius: world.observation_radius, attraction_radius: follow.attraction_radius,
-    dt: world.dt, steps: world.steps, exact: true, colors: opening.data.colors,
+    dt: world.dt, steps: world.steps, exact: true, colors: opening.data.colors, outline: opening.data.outline,
     observers: world.observers, windows: world.windows, after: world.after, ...parts,
     episodes: [{
       leaders: world.leaders.length, agents: agents.length, coupling, shown: [0], g: 0, generation: 0, trial: 0, owner,

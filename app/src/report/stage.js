@@ -3,10 +3,6 @@ const stage = (() => {
   "use strict";
   // Dashes distinguish groups once all colours are used; beyond that, only the leaders' numbers do.
   const DASHES = [[], [5, 3], [1.5, 2]];
-  // Outlines of agents as [ahead, aside]: of classes with a heading, and of those that move freely.
-  const around = (corners, first) => Array.from({ length: corners }, (_, corner) => [0, 1].map(axis => 0.9 * Math.cos((first + corner) / corners * 2 * Math.PI - axis * Math.PI / 2)));
-  const HEADED = [[[1.1, 0], [-0.8, 0.75], [-0.4, 0], [-0.8, -0.75]], [[1.1, 0], [-0.8, 0.6], [-0.8, -0.6]], [[1.1, 0], [0.2, 0.7], [-0.9, 0.45], [-0.9, -0.45], [0.2, -0.7]]];
-  const FREE = [around(24, 0), around(4, 0.5), around(4, 0)];
   const night = matchMedia("(prefers-color-scheme: dark)");
   const bytes = text => Uint8Array.from(atob(text), c => c.charCodeAt(0)).buffer;
   const turn = Array.from({ length: 256 }, (_, index) => index / 256 * 2 * Math.PI);
@@ -96,14 +92,13 @@ const stage = (() => {
     const window = data.windows[poi], others = data.after[poi] || [];
     return (data.values ? `, value ${data.values[poi]}` : "") + (window ? `, steps ${window[0]} to ${window[1]}` : "") + (others.length ? `, after ${others.join(" and ")}` : "");
   }
+  // size_of returns how large the mark of a POI is: 1 if all have the same value, otherwise more for more valuable ones.
+  const size_of = ({ values }, poi) => values ? 0.7 + 0.8 * Math.sqrt(values[poi] / Math.max(...values)) : 1;
   const radius = (data, poi) => (data.radii && data.radii[poi]) ?? data.observation_radius;
   // of_each returns the index of the class of each agent, or of the group of each POI.
   const of_each = (parts = []) => parts.flatMap(({ count }, index) => Array(count).fill(index));
-  // outline returns the outline of a class. Without classes, it is that of the first class with a heading.
-  function outline({ classes = [] }, index = 0) {
-    const free = Boolean(classes[index] && classes[index].free), alike = free ? FREE : HEADED;
-    return alike[classes.slice(0, index).filter(other => other.free === free).length % alike.length];
-  }
+  // outline returns the outline of the marks of a class, as [ahead, aside]. Without classes, all agents have the same.
+  const outline = ({ classes = [], outline }, index = 0) => (classes[index] || { outline }).outline;
   // Returns, for each class, an element with its mark, number and name.
   function legend(data) {
     let first = 0;
@@ -213,8 +208,8 @@ const stage = (() => {
 
     // POIs: a ring fills as agents arrive, and the disc changes colour once the POI is observed.
     const pois = data.pois.length, near = episode.near.slice(frame * pois, (frame + 1) * pois);
-    const ring = Math.max(7 * fit, Math.min(12, 1.3 * scale));
     const counts = data.pois.map(([x, y], poi) => {
+      const ring = Math.max(7 * fit, Math.min(12, 1.3 * scale)) * size_of(data, poi);
       const done = episode.observed[poi] !== null && episode.observed[poi] <= step, needed = episode.coupling[poi];
       const closed = !done && !is_open(data, episode, poi, Math.max(1, step));
       const lost = (look.lost || []).includes(poi), tone = color(lost ? "--wrong" : done ? "--seen" : "--poi");
@@ -241,7 +236,7 @@ const stage = (() => {
       // Marks below the ring show which classes count, if not all do.
       const observers = observers_of(data, poi) || [], small = Math.max(3 * fit, 0.45 * ring);
       observers.forEach((own, index) => {
-        const middle = X(x) + 3 * small * (index - (observers.length - 1) / 2), base = Y(y) + ring + 2.4 * small;
+        const middle = X(x) + 3 * small * (index - (observers.length - 1) / 2), base = Math.min(Y(y) + ring + 2.4 * small, tall - 1.2 * small);
         draw.beginPath();
         for (const [ahead, aside] of outline(data, own)) draw.lineTo(middle + small * aside, base - small * ahead);
         draw.closePath();
@@ -305,8 +300,9 @@ const stage = (() => {
       }
       draw.globalAlpha = 1;
     }
-    // Leaders are drawn last, on top of followers.
+    // Leaders are drawn last, on top of followers, and stand out from many.
     const size = Math.max(many ? 2.5 : 5 * fit, Math.min(9, 0.8 * scale));
+    const leader_size = Math.max(1.35 * size, episode.leaders > 60 ? 0 : 6 * fit);
     for (let agent = episode.agents - 1; agent >= 0; agent--) {
       const [x, y, ahead, aside] = now[agent], leads = agent < episode.leaders, own = classes[agent];
       const free = own !== undefined && data.classes[own].free, long = Math.hypot(ahead, aside) || 1;
@@ -315,7 +311,8 @@ const stage = (() => {
       const strays = X(x) < 0 || X(x) > wide || Y(y) < 0 || Y(y) > tall;
       const inside = (place, end) => strays ? Math.max(1.5 * size, Math.min(end - 1.5 * size, place)) : place;
       const left = inside(X(x), wide), high = inside(Y(y), tall);
-      const point = (a, b) => [left + (leads ? 1.35 : 1) * size * (a * cos - b * sin), high - (leads ? 1.35 : 1) * size * (a * sin + b * cos)];
+      const own_size = leads ? leader_size : size;
+      const point = (a, b) => [left + own_size * (a * cos - b * sin), high - own_size * (a * sin + b * cos)];
       draw.beginPath();
       for (const [a, b] of outline(data, own)) draw.lineTo(...point(a, b));
       draw.closePath();
@@ -352,15 +349,15 @@ const stage = (() => {
       label(words, Math.max(half, Math.min(wide - half, x)), Math.max(12, y));
     }
     // A leader's number is placed at the first corner of its arrow where it is on the map and hides no other label, and omitted if there is none.
-    const corners = [[1.5, 1.6], [1.5, -0.9], [-2.5, 1.6], [-2.5, -0.9]];
+    const corners = [[1.1, 1.2], [1.1, -0.7], [-1.85, 1.2], [-1.85, -0.7]];
     for (let agent = 0; agent < episode.leaders && labelled; agent++) {
       const [x, y] = now[agent], text = String(agent), long = draw.measureText(text).width;
       const hides = ([across, down]) => {
-        const left = X(x) + size * across, base = Y(y) + size * down;
+        const left = X(x) + leader_size * across, base = Y(y) + leader_size * down;
         return left < 1 || left + long + 1 > wide || taken.some(other => overlap([left - 1, base - 11, left + long + 1, base + 3], other));
       };
       const corner = corners.find(corner => !hides(corner));
-      if (corner) label(text, X(x) + size * corner[0], Y(y) + size * corner[1], "left");
+      if (corner) label(text, X(x) + leader_size * corner[0], Y(y) + leader_size * corner[1], "left");
     }
     return { step, near, led, positions: now.map(([x, y]) => [x, y]) };
   }

@@ -3,7 +3,8 @@
 use glam::DVec2;
 
 use super::{
-    FAINT, Legend, Marker, Poi, Team, Viewport, counted, heading_of, poi_label, radius_of, sample_note, values_differ,
+    FAINT, Form, Legend, Marker, Poi, Team, Viewport, counted, poi_label, radius_of, sample_note, size_of,
+    values_differ,
 };
 use crate::report::scene::{Anchor, BLACK, Pen, Scene};
 use flotilla::config::{AgentClass, Classes, Observers, PoiGroup, Region, StageConfig, drawn_agents};
@@ -14,7 +15,8 @@ fn team(config: &StageConfig, world: &World) -> Team {
     let leaders = world.leaders();
     let agent = |index: usize| Marker {
         place: world.starts[index].as_dvec2(),
-        heading: heading_of(world, index, world.headings[index].as_dvec2()),
+        heading: world.headings[index].as_dvec2(),
+        form: Form::of_agent(world, index),
         group: (index < leaders).then_some(index),
         counts: world.rule.counts(index),
         trail: vec![],
@@ -23,6 +25,7 @@ fn team(config: &StageConfig, world: &World) -> Team {
     let poi = |(poi, (&place, needed)): (usize, (&[f64; 2], &u32))| Poi {
         place: place.into(),
         radius: radius_of(world, poi),
+        size: size_of(world, poi),
         label: poi_label(world, poi, needed.to_string()),
         share: None,
         observed: false,
@@ -174,6 +177,24 @@ fn pois_in_words(world: &World) -> String {
 mod tests {
     use super::*;
     use crate::report::map::{around, label_area, overlap};
+    use crate::report::replay::parts;
+
+    #[test]
+    fn classes_have_marks_of_their_own_and_pages_the_same() {
+        for text in [
+            include_str!("../../../../configs/rovers.toml"),
+            include_str!("../../../../configs/herd.toml"),
+            include_str!("../../../../configs/influence/4_rovers_4_uavs.toml"),
+        ] {
+            let config = flotilla::Config::parse(text, "classes.toml").unwrap().validate().unwrap();
+            let world = World::new(&config);
+            let outline = |class: usize| Form::of_agent(&world, world.classes[class].agents().start).outline();
+            assert_ne!(outline(0), outline(1));
+            let (_, classes) = parts(&config).into_iter().find(|(key, _)| *key == "classes").unwrap();
+            let of_page: Vec<_> = classes.as_array().unwrap().iter().map(|class| class["outline"].clone()).collect();
+            assert_eq!(of_page, [serde_json::json!(outline(0)), serde_json::json!(outline(1))]);
+        }
+    }
 
     #[test]
     fn labels_of_windows_and_couplings_avoid_agents() {

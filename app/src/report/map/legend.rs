@@ -1,17 +1,19 @@
 //! The legend below a map.
 
+use std::ops::Range;
+
 use glam::DVec2;
 
-use super::{CLOSED, FAINT, LABEL, Team, Viewport, arrow, strike};
+use super::{CLOSED, FAINT, LABEL, Marker, Team, Viewport, mark};
 use crate::report::curves::round_step;
 use crate::report::scene::{Anchor, BLACK, COLORS, Fill, GREY, Pen, Scene, text_width};
-use flotilla::config::Config;
+use flotilla::config::{AgentClass, Config, drawn_agents};
 
 /// The symbol of an entry, drawn from a place on the baseline.
 enum Symbol {
     None,
-    /// An agent of a size, its heading, its group, whether it leads, and whether it observes.
-    Agent(f64, Option<DVec2>, Option<usize>, bool, bool),
+    /// An agent, the size of its mark, and whether it leads.
+    Agent(Marker, f64, bool),
     /// A POI's circle.
     Poi(Option<Fill>, Pen),
     /// A scale of a length in millimetres.
@@ -23,7 +25,7 @@ impl Symbol {
     fn width(&self) -> f64 {
         match self {
             Symbol::None => 0.0,
-            Symbol::Agent(_, _, _, _, false) => 3.4,
+            Symbol::Agent(Marker { counts: false, .. }, ..) => 3.4,
             Symbol::Agent(..) | Symbol::Poi(..) => 3.0,
             Symbol::Scale(length) => length + 1.0,
         }
@@ -32,12 +34,8 @@ impl Symbol {
     fn draw(&self, scene: &mut Scene, [x, y]: [f64; 2]) {
         match *self {
             Symbol::None => {}
-            Symbol::Agent(size, heading, group, leads, observes) => {
-                let place = [x + if observes { 1.2 } else { 1.4 }, y - 0.8];
-                arrow(scene, place, heading, size, group, leads);
-                if !observes {
-                    strike(scene, place, heading, size);
-                }
+            Symbol::Agent(ref agent, size, leads) => {
+                mark(scene, [x + if agent.counts { 1.2 } else { 1.4 }, y - 0.8], agent, size, leads);
             }
             Symbol::Poi(fill, ref pen) => scene.circle([x + 1.2, y - 0.8], 1.2, fill, Some(pen.clone())),
             Symbol::Scale(length) => {
@@ -53,24 +51,30 @@ impl Symbol {
     }
 }
 
-/// Returns the names of leaders, by the group of the first, of followers in the colour of their leader, and of other
-/// followers. With `[[agents]]` these are names of classes.
-fn roles(config: &Config, leaders: usize) -> (Vec<(usize, String)>, [String; 2]) {
+/// Returns the agents of each class, its name, and its name in the colour of a leader. Classes that learn come first.
+fn roles(config: &Config, leaders: usize, agents: usize) -> Vec<(Range<usize>, [String; 2])> {
     if config.agents.is_empty() {
         let leader = if leaders > 1 { "leader, by number" } else { "leader" };
-        return (vec![(0, leader.into())], ["its follower", "follower"].map(String::from));
+        let all = [(0..leaders, [leader; 2]), (leaders..agents, ["follower", "its follower"])];
+        return all.map(|(agents, names)| (agents, names.map(String::from))).to_vec();
     }
-    let (learning, others): (Vec<_>, Vec<_>) = config.agents.iter().partition(|class| class.learns());
     let mut first = 0;
-    let numbered = learning.iter().map(|class| {
-        let last = first + class.size() - 1;
-        let numbers = if first == last { first.to_string() } else { format!("{first} to {last}") };
-        let of_first = std::mem::replace(&mut first, last + 1);
-        (of_first, if leaders > 1 { format!("{} {numbers}", class.name) } else { class.name.clone() })
-    });
-    let leader = numbered.collect();
-    let follower = others.iter().map(|class| class.name.as_str()).collect::<Vec<_>>().join(" or ");
-    (leader, [format!("{follower}, in its leader's colour"), follower])
+    let role = |class: &AgentClass| {
+        let agents = first..first + class.size();
+        first = agents.end;
+        let numbers = match agents.len() {
+            1 => agents.start.to_string(),
+            _ => format!("{} to {}", agents.start, agents.end - 1),
+        };
+        let name = &class.name;
+        let names = match class.learns() {
+            true if leaders > 1 => [format!("{name} {numbers}"), format!("{name} {numbers}")],
+            true => [name.clone(), name.clone()],
+            false => [name.clone(), format!("{name}, in its leader's colour")],
+        };
+        (agents, names)
+    };
+    config.agents.iter().map(role).collect()
 }
 
 /// The legend below a map: symbols with their texts.
@@ -91,23 +95,30 @@ impl Legend {
         let mut add = |symbol: Symbol, text: &str| entries.push((symbol, text.to_string()));
         let Some(team) = teams.first() else { return Legend::default() };
         let mut pois = teams.iter().flat_map(|team| &team.pois);
-        let (leading, [its_follower, follower]) = roles(config, team.leaders);
-        let heading = |agent: usize| team.agents[agent].heading.map(|_| DVec2::Y);
-        for (first, leader) in leading {
-            add(Symbol::Agent(1.6, heading(first), Some(first), true, true), &leader);
-        }
-        let followers = &team.agents[team.leaders..];
-        if followers.iter().any(|agent| agent.group.is_some()) {
-            add(Symbol::Agent(1.4, heading(team.leaders), Some(0), false, true), &its_follower);
-        } else if !followers.is_empty() {
-            add(Symbol::Agent(1.4, heading(team.leaders), None, false, true), &follower);
+        let symbol = |agent: &Marker, group, counts, size, leads| {
+            let (heading, trail) = (DVec2::Y, vec![]);
+            Symbol::Agent(Marker { heading, group, counts, trail, ..*agent }, size, leads)
+        };
+        let all = config.agent_count();
+        let drawn = drawn_agents(team.leaders, all);
+        for (agents, [name, in_color]) in roles(config, team.leaders, all) {
+            let of_class = drawn.iter().zip(&team.agents).filter(|(agent, _)| agents.contains(agent));
+            let of_class: Vec<&Marker> = of_class.map(|(_, agent)| agent).collect();
+            let leads = agents.start < team.leaders;
+            // Followers in colours have that of the first leader here.
+            let group =
+                of_class.iter().any(|agent| agent.group.is_some()).then_some(if leads { agents.start } else { 0 });
+            let size = if leads { 1.6 } else { 1.4 };
+            if let Some(first) = of_class.first() {
+                add(symbol(first, group, true, size, leads), if group.is_some() { &in_color } else { &name });
+            }
         }
         if pois.clone().any(|poi| poi.observed) {
             let fill = Fill { color: COLORS[2], opacity: 0.22 };
             add(Symbol::Poi(Some(fill), Pen::new(COLORS[2], 0.25)), "observed POI, with its step");
         }
         if let Some(agent) = team.agents.iter().position(|agent| !agent.counts) {
-            add(Symbol::Agent(1.5, heading(agent), None, agent < team.leaders, false), "does not observe");
+            add(symbol(&team.agents[agent], None, false, 1.5, agent < team.leaders), "does not observe");
         }
         let unobserved = |dash| Symbol::Poi(None, Pen { dash, ..Pen::new(GREY, 0.25) });
         if pois.clone().any(|poi| !poi.observed && !poi.open) {

@@ -49,12 +49,57 @@ const PALE: Color = [250, 250, 250];
 /// Colour of secondary text.
 pub(crate) const FAINT: Color = [95, 95, 95];
 
+/// The form of an agent's mark, by which classes of agents differ.
+#[derive(Clone, Copy, Default)]
+pub struct Form {
+    /// Whether the agents move freely, so that their marks do not point ahead.
+    is_free: bool,
+    /// The class's number among those that move in the same way.
+    number: usize,
+}
+
+impl Form {
+    /// Returns the form of a class's marks. `is_free` tells whether the agents of a class move freely.
+    pub(crate) fn of(class: usize, is_free: impl Fn(usize) -> bool) -> Form {
+        let number = (0..class).filter(|&other| is_free(other) == is_free(class)).count();
+        Form { is_free: is_free(class), number }
+    }
+
+    /// Returns the form of an agent's mark.
+    pub fn of_agent(world: &World, agent: usize) -> Form {
+        let class = world.classes.iter().position(|class| class.agents().contains(&agent)).unwrap_or_default();
+        Form::of(class, |class| world.classes[class].constants.shape.free != 0)
+    }
+
+    /// Returns the corners of the mark's outline, each ahead and to the left of its middle, in sizes of the mark. Three
+    /// classes that steer and three that move freely have outlines of their own.
+    pub fn outline(self) -> Vec<[f64; 2]> {
+        let regular = |corners: usize, turn: f64| {
+            let corner = |corner: usize| {
+                let (sin, cos) = libm::sincos((corner as f64 + turn) / corners as f64 * std::f64::consts::TAU);
+                [0.9 * cos, 0.9 * sin]
+            };
+            (0..corners).map(corner).collect()
+        };
+        match (self.is_free, self.number % 3) {
+            (false, 0) => vec![[1.1, 0.0], [-0.8, 0.75], [-0.4, 0.0], [-0.8, -0.75]],
+            (false, 1) => vec![[1.1, 0.0], [-0.8, 0.6], [-0.8, -0.6]],
+            (false, _) => vec![[1.1, 0.0], [0.2, 0.7], [-0.9, 0.45], [-0.9, -0.45], [0.2, -0.7]],
+            (true, 0) => regular(24, 0.0),
+            (true, 1) => regular(4, 0.5),
+            (true, _) => regular(4, 0.0),
+        }
+    }
+}
+
 /// An agent to draw.
 pub struct Marker {
     /// Position in map units.
     pub place: DVec2,
-    /// Heading, a vector of any length except 0; none if the agent moves freely.
-    pub heading: Option<DVec2>,
+    /// Heading, a vector of any length except 0. Marks of agents that move freely ignore it.
+    pub heading: DVec2,
+    /// The form of the mark.
+    pub form: Form,
     /// The leader in whose group the agent is.
     pub group: Option<usize>,
     /// Whether the agent is an observer.
@@ -71,6 +116,8 @@ pub struct Poi {
     pub radius: f64,
     /// Text next to the POI.
     pub label: String,
+    /// Size of its mark: 1 if all POIs have the same value, otherwise more for more valuable ones.
+    pub size: f64,
     /// Observers present divided by the coupling. None before an episode.
     pub share: Option<f64>,
     /// Whether the POI has been observed.
@@ -93,6 +140,12 @@ pub fn weighted(by: Option<&str>) -> String {
 /// Returns the part of a POI's label that has its value, empty if all have the same value.
 fn value_label(world: &World, poi: usize) -> String {
     if values_differ(world) { format!(", value {}", world.values[poi]) } else { String::new() }
+}
+
+/// Returns the size of a POI's mark, see [`Poi::size`].
+pub fn size_of(world: &World, poi: usize) -> f64 {
+    let largest = world.values.iter().copied().fold(0.0, f32::max);
+    if values_differ(world) { 0.7 + 0.8 * f64::from(world.values[poi] / largest).sqrt() } else { 1.0 }
 }
 
 /// Returns the observation radius of a POI in map units.
@@ -194,14 +247,10 @@ impl Viewport {
             let trail = agent.trail.iter().map(|&place| self.at(place)).collect();
             scene.line(trail, Pen { opacity: 0.5, ..group_pen(agent.group, 0.3) });
         }
-        let size = self.agent_size(team);
         for (index, agent) in team.agents.iter().enumerate().rev() {
             let leads = index < team.leaders;
-            let size = if leads { size * 1.35 } else { size };
-            arrow(scene, self.at(agent.place), agent.heading, size, agent.group, leads);
-            if !agent.counts {
-                strike(scene, self.at(agent.place), agent.heading, size);
-            }
+            let size = if leads { self.leader_size(team) } else { self.agent_size(team) };
+            mark(scene, self.at(agent.place), agent, size, leads);
         }
         let mut taken = Vec::new();
         for (poi, ([x, y], size)) in team.pois.iter().zip(labels.into_iter().flatten()) {
@@ -213,6 +262,12 @@ impl Viewport {
 
     fn agent_size(&self, team: &Team) -> f64 {
         (self.scale * 1.1).clamp(0.6, 2.2) * if team.agents.len() > 60 { 0.6 } else { 1.0 }
+    }
+
+    /// Returns the size of leaders' marks, which stand out from many followers.
+    fn leader_size(&self, team: &Team) -> f64 {
+        let smallest: f64 = if team.leaders > 60 { 0.0 } else { 1.0 };
+        smallest.max(self.agent_size(team) * 1.35)
     }
 
     fn poi(&self, scene: &mut Scene, poi: &Poi, ring: Option<f64>) {
@@ -229,7 +284,7 @@ impl Viewport {
         let fill = Fill { color, opacity };
         scene.circle([x, y], radius, Some(fill), Some(Pen { dash, ..Pen::new(color, 0.25) }));
         let (Some(ring), Some(share)) = (ring, poi.share) else {
-            let arm = ring.unwrap_or(0.8).min(0.8);
+            let arm = ring.unwrap_or(0.8).min(0.8) * poi.size;
             for sign in [1.0, -1.0] {
                 scene.line(vec![[x - arm, y - sign * arm], [x + arm, y + sign * arm]], Pen::new(color, 0.35));
             }
@@ -256,7 +311,7 @@ impl Viewport {
 
     /// Returns each POI label's position and font size, or none if labels would overlap. Labels avoid agents if they can.
     fn poi_labels(&self, team: &Team) -> Option<Vec<([f64; 2], f64)>> {
-        let arm = self.agent_size(team) * 1.35;
+        let arm = self.leader_size(team);
         let agents: Vec<_> = team.agents.iter().map(|agent| around(self.at(agent.place), arm)).collect();
         [LABEL, MIN_LABEL].into_iter().find_map(|size| {
             let crosses: Vec<_> = team.pois.iter().map(|poi| around(self.at(poi.place), 0.8)).collect();
@@ -299,28 +354,30 @@ impl Viewport {
     fn numbers(&self, scene: &mut Scene, team: &Team, mut taken: Vec<[f64; 4]>) {
         // More numbers than this never fit, and trying takes time.
         const MAX_NUMBERS: usize = 256;
-        let arrow = self.agent_size(team) * 1.35;
+        let mark = self.leader_size(team);
         let leaders = &team.agents[..team.leaders.min(MAX_NUMBERS)];
-        let arrows: Vec<_> = team.agents.iter().map(|agent| around(self.at(agent.place), arrow * 0.6)).collect();
+        let marks: Vec<_> = team.agents.iter().map(|agent| around(self.at(agent.place), mark * 0.6)).collect();
         let size = if team.leaders > 20 { MIN_LABEL } else { LABEL };
         for (number, leader) in leaders.iter().enumerate() {
             let [x, y] = self.at(leader.place);
             let text = number.to_string();
-            let aside = arrow + text_width(&text, size) / 2.0;
+            let aside = mark + text_width(&text, size) / 2.0;
             let low = y + 0.36 * size;
-            let places =
-                [[x + aside, low + 1.2], [x - aside, low + 1.2], [x + aside, low - 1.2], [x - aside, low - 1.2]];
+            let diagonal = [[aside, 1.2], [-aside, 1.2], [aside, -1.2], [-aside, -1.2]];
+            let straight = [[0.0, mark + 0.6 * size], [0.0, -mark - 0.6 * size], [aside, 0.0], [-aside, 0.0]];
+            let places = [diagonal, straight].concat().into_iter().map(|[right, down]| [x + right, low + down]);
+            let places: Vec<_> = places.collect();
             let whole = self.whole();
             let inside = |place: &&[f64; 2]| within(label_area(**place, &text, size), whole);
             // Followers may be covered if there is no other place.
             let free = |place: &[f64; 2], agents: usize| {
                 let area = label_area(*place, &text, size);
-                let mut arrows = arrows[..agents].iter().enumerate();
+                let mut marks = marks[..agents].iter().enumerate();
                 within(area, whole)
                     && !taken.iter().any(|other| overlap(area, *other))
-                    && !arrows.any(|(at, other)| at != number && overlap(area, *other))
+                    && !marks.any(|(at, other)| at != number && overlap(area, *other))
             };
-            let found = [arrows.len(), leaders.len()]
+            let found = [marks.len(), leaders.len()]
                 .into_iter()
                 .find_map(|agents| places.iter().find(|place| free(place, agents)));
             let place = match found {
@@ -364,33 +421,21 @@ pub fn counted(number: usize, what: &str) -> String {
     format!("{number} {what}{}", if number == 1 { "" } else { "s" })
 }
 
-/// Returns the heading to draw of an agent, none if it moves freely.
-pub fn heading_of(world: &World, agent: usize, heading: DVec2) -> Option<DVec2> {
-    (world.class_of(agent).constants.shape.free == 0).then_some(heading)
-}
-
-/// Draws an agent's arrow, or a disc without a heading: filled for a leader, hollow for a follower.
-fn arrow(scene: &mut Scene, [px, py]: [f64; 2], heading: Option<DVec2>, size: f64, group: Option<usize>, leads: bool) {
+/// Draws an agent's mark: filled for a leader, hollow for a follower, with a stroke across it if it does not observe.
+fn mark(scene: &mut Scene, [px, py]: [f64; 2], agent: &Marker, size: f64, leads: bool) {
     let (fill, pen) = match leads {
-        // A thin outline leaves enough colour in small arrows.
-        true => (group_color(group), Pen::new(BLACK, (size * 0.1).min(0.2))),
-        false => (WHITE, group_pen(group, 0.35)),
+        // A thin outline leaves enough colour in small marks.
+        true => (group_color(agent.group), Pen::new(BLACK, (size * 0.1).min(0.2))),
+        false => (WHITE, group_pen(agent.group, 0.35)),
     };
-    let Some(heading) = heading else {
-        return scene.circle([px, py], size * 0.7, Some(fill.into()), Some(pen));
-    };
+    let heading = if agent.form.is_free { DVec2::Y } else { agent.heading };
     let [x, y] = heading.normalize_or(DVec2::Y).to_array();
-    let corner = |ahead: f64, aside: f64| [px + size * (x * ahead - y * aside), py - size * (y * ahead + x * aside)];
-    let corners = vec![corner(1.0, 0.0), corner(-0.75, 0.7), corner(-0.4, 0.0), corner(-0.75, -0.7)];
-    scene.polygon(corners, Some(fill.into()), Some(pen));
-}
-
-/// Draws a stroke across the arrow of an agent that does not observe.
-fn strike(scene: &mut Scene, [px, py]: [f64; 2], heading: Option<DVec2>, size: f64) {
-    let [x, y] = heading.unwrap_or(DVec2::Y).normalize_or(DVec2::Y).to_array();
-    let end = |side: f64| [px - side * size * y, py - side * size * x];
-    for (color, width) in [(WHITE, 0.32), (BLACK, 0.16)] {
-        scene.line(vec![end(1.1), end(-1.1)], Pen::new(color, size * width));
+    let at = |[ahead, left]: [f64; 2]| [px + size * (x * ahead - y * left), py - size * (y * ahead + x * left)];
+    scene.polygon(agent.form.outline().into_iter().map(at).collect(), Some(fill.into()), Some(pen));
+    if !agent.counts {
+        for (color, width) in [(WHITE, 0.32), (BLACK, 0.16)] {
+            scene.line(vec![at([0.0, 1.1]), at([0.0, -1.1])], Pen::new(color, size * width));
+        }
     }
 }
 

@@ -4,7 +4,7 @@ use glam::{DVec2, Vec2};
 
 use super::Replayed;
 use crate::record::digests::UNVERIFIED;
-use crate::report::map::{self, FAINT, Legend, Marker, Poi, Team, Viewport, sample_note};
+use crate::report::map::{self, FAINT, Form, Legend, Marker, Poi, Team, Viewport, sample_note};
 use crate::report::scene::{Anchor, BLACK, Scene};
 use flotilla::config::{Config, drawn_agents};
 
@@ -28,8 +28,8 @@ impl Replayed {
             trail.push(place);
             let group = self.group(step, agent);
             let counts = world.rule.counts(agent);
-            let heading = map::heading_of(world, agent, toward(step, agent).lerp(toward(next, agent), part));
-            Marker { place, heading, group, counts, trail }
+            let heading = toward(step, agent).lerp(toward(next, agent), part);
+            Marker { place, heading, form: Form::of_agent(world, agent), group, counts, trail }
         };
         // The POIs that were observed before this step decide which POIs are open.
         let before: Vec<bool> = self.observed.iter().map(|at| at.is_some_and(|at| at < step.max(1))).collect();
@@ -39,6 +39,7 @@ impl Replayed {
             Poi {
                 place: place.as_dvec2(),
                 radius: map::radius_of(world, poi),
+                size: map::size_of(world, poi),
                 // An observed POI needs no agents any more.
                 label: match observed {
                     Some(observed) => map::observed_label(world, poi, observed),

@@ -6,7 +6,7 @@ use serde_json::json;
 
 use super::{Counterfactual, Replayed, near};
 use crate::record::folder::OWN_FITNESS;
-use crate::report::map::{GROUPS, GROUPS_DARK, sample_note};
+use crate::report::map::{Form, GROUPS, GROUPS_DARK, sample_note};
 use crate::report::scene::hex;
 use flotilla::config::{AgentClass, Channel, Config, Control, Fitness, Mobility, PoiGroup, Sectors, drawn_agents};
 use flotilla::credit::{self, Strided};
@@ -115,6 +115,7 @@ pub fn data(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Val
         "steps": world.steps,
         "exact": exact,
         "colors": { "light": GROUPS.map(hex), "dark": GROUPS_DARK.map(hex) },
+        "outline": Form::default().outline(),
         "episodes": episodes,
     });
     for (key, value) in parts(config) {
@@ -138,7 +139,7 @@ fn sensed(channel: &Channel) -> serde_json::Value {
 ///
 /// If agents share populations and none follows, there are `populations`, with that of each agent.
 /// With `[[agents]]`, they have `classes`, those that learn first: their `name`, the `count` of their agents, whether they
-/// move `free`, the class and the `agents` that they `choose` among, if any, the distance up to which they `influence` others, and the
+/// move `free`, the `outline` of their marks, the class and the `agents` that they `choose` among, if any, the distance up to which they `influence` others, and the
 /// channels of their `senses`, with the number of `sectors` and whether `each` agent or POI has one. The `groups` of POIs
 /// have their `name`, the `count` of their POIs, and the indices of the classes that are `observers`. Only if POIs differ
 /// in their radius or value, there are `radii` or `values`.
@@ -153,15 +154,18 @@ pub fn parts(config: &Config) -> Vec<(&'static str, serde_json::Value)> {
         parts.push(("weighted", true.into()));
     }
     if !config.agents.is_empty() {
+        let is_free = |class: usize| matches!(config.agents[class].motion, Mobility::Free { .. });
         let class = |(index, class): (usize, &AgentClass)| {
-            let free = matches!(class.motion, Mobility::Free { .. });
+            let free = is_free(index);
             let influence = (0..count).filter_map(|led| all.influence_radius(index, led)).fold(0.0, f64::max);
             let AgentClass { name, control, .. } = class;
             let senses: Vec<_> = class.senses.iter().map(sensed).collect();
             let places = all.agents_of(index);
             let size = drawn.iter().filter(|agent| places.contains(agent)).count();
-            let mut class =
-                json!({ "name": name, "count": size, "free": free, "influence": influence, "senses": senses });
+            let outline = Form::of(index, is_free).outline();
+            let mut class = json!({
+                "name": name, "count": size, "free": free, "outline": outline, "influence": influence, "senses": senses,
+            });
             if let Control::Choose(target) = control {
                 let targets = all.agents.iter().position(|class| class.name == *target);
                 let chosen: Vec<usize> = targets.map(|class| all.agents_of(class)).into_iter().flatten().collect();
