@@ -1,7 +1,8 @@
 """Times a step of an agent in large teams: python3 benches/swarms.py FLOTILLA [INSTRUCTIONS]
 
 Followers fill a box so that each has about so many others within its radius, and hardly move. One thread, random policies, median
-of what `flotilla bench` repeats.
+of what `flotilla bench` repeats. The last columns are shares of what the core reaches: chains of f32 operations in registers, and a
+copy of an array. A step reads and writes six numbers of each agent, does so again to sort them by cell, and finds the cells.
 """
 
 import json
@@ -10,6 +11,9 @@ import pathlib
 import subprocess
 import sys
 import tempfile
+import time
+
+BYTES = 4 * (6 + 6 + 6 + 6 + 2 + 1 + 1)  # per agent and step, at least
 
 CONFIG = """
 [world]
@@ -44,8 +48,20 @@ radius = 2.0
 fitness = "G"
 """
 
+
+def copied_per_ns():
+    """Returns the bytes that a copy of a large array reads and writes."""
+    numbers, copy, times = bytearray(1 << 28), bytearray(1 << 28), []
+    for _ in range(9):
+        start = time.perf_counter_ns()
+        memoryview(copy)[:] = numbers
+        times.append(time.perf_counter_ns() - start)
+    return 2 * len(numbers) / sorted(times)[4]
+
+
 flotilla, *instructions = sys.argv[1:]
-print("| agents | neighbours | ns per agent-step |\n|---|---|---|")
+bandwidth = copied_per_ns()
+print("| agents | neighbours | ns per agent-step | of arithmetic | of bandwidth |\n|---|---|---|---|---|")
 for agents in [10**3, 10**4, 10**5, 10**6]:
     for neighbours in [10, 50, 200]:
         side = round(max(5, math.sqrt(agents * math.pi / neighbours)), 3)
@@ -55,4 +71,6 @@ for agents in [10**3, 10**4, 10**5, 10**6]:
         command = [flotilla, "bench", config, "--teams", teams, "--rollout-only", "--threads", 1, "--json", "--backend", "cpu"]
         command += ["--instructions", *instructions] if instructions else []
         found = json.loads(subprocess.run([str(word) for word in command], capture_output=True, check=True).stdout)
-        print(f"| {agents} | {neighbours} | {found['ns_per_agent_step']:.0f} |", flush=True)
+        time_of_step = found["ns_per_agent_step"]
+        shares = f"{found['ceiling_share']:.0%} | {BYTES / time_of_step / bandwidth:.0%}"
+        print(f"| {agents} | {neighbours} | {time_of_step:.0f} | {shares} |", flush=True)

@@ -310,6 +310,13 @@ fn bad_input_is_refused_with_its_line() {
         "num_steps: many",
         &at("num_steps", "world.steps, from ccea.num_steps: found \"many\""),
     );
+    for (part, wrong, message) in [
+        ("fixed: [31, 20]", "fixed: [99, 20]", "at[0][0], from env.agents.uavs[0].position: "),
+        ("capture_radius: 8.0", "capture_radius: 99999.0", "radius, from env.pois.hidden_pois[0].capture_radius: "),
+    ] {
+        fails(INFLUENCE, part, wrong, message);
+        fails(INFLUENCE, part, wrong, &format!("config.yaml:{}: ", line(part)));
+    }
     fails(INFLUENCE, "  num_steps: 40\n", "", "ccea.num_steps: missing, and the translation needs it");
     fails(
         INFLUENCE,

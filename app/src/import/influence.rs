@@ -104,12 +104,14 @@ const MEASURES: &[(&str, (&str, &str))] = &[
 ];
 
 /// Agents that differ in their positions only, or POIs.
-struct Group {
+struct Group<'a> {
     /// For a name.
     stem: String,
     section: Section,
     /// Fixed positions, or regions, of each member.
     places: Vec<Place>,
+    /// The position of the first member.
+    position: At<'a>,
     /// Indices of agents in the program: rovers, then UAVs.
     members: Vec<usize>,
     learns: bool,
@@ -131,10 +133,10 @@ struct Credit {
     adds_g: bool,
 }
 
-impl Group {
+impl Group<'_> {
     /// Reports whether another member can be in this group.
-    fn fits(&self, other: &Group) -> bool {
-        let texts = |group: &Group| {
+    fn fits(&self, other: &Group<'_>) -> bool {
+        let texts = |group: &Group<'_>| {
             let lines = group.section.lines.iter().map(|line| line.text.clone());
             lines.filter(|text| !text.is_empty()).collect::<Vec<_>>()
         };
@@ -146,8 +148,8 @@ impl Group {
 }
 
 /// Puts members that differ in their positions only together, and names the groups.
-fn grouped(members: Vec<Group>) -> Vec<(String, Group)> {
-    let mut groups: Vec<Group> = Vec::new();
+fn grouped(members: Vec<Group<'_>>) -> Vec<(String, Group<'_>)> {
+    let mut groups: Vec<Group<'_>> = Vec::new();
     for member in members {
         match groups.iter_mut().find(|group| group.fits(&member)) {
             Some(group) => {
@@ -160,11 +162,11 @@ fn grouped(members: Vec<Group>) -> Vec<(String, Group)> {
     }
     // Classes that learn come first.
     groups.sort_by_key(|group| !group.learns);
-    let named = |(i, group): (usize, &Group)| match groups[..i].iter().filter(|other| other.stem == group.stem).count()
-    {
-        0 => group.stem.clone(),
-        before => format!("{}_{}", group.stem, before + 1),
-    };
+    let named =
+        |(i, group): (usize, &Group<'_>)| match groups[..i].iter().filter(|other| other.stem == group.stem).count() {
+            0 => group.stem.clone(),
+            before => format!("{}_{}", group.stem, before + 1),
+        };
     let names: Vec<String> = groups.iter().enumerate().map(named).collect();
     names.into_iter().zip(groups).collect()
 }
@@ -195,7 +197,7 @@ pub(super) fn translate(root: &At<'_>) -> Result<Vec<Section>, Problem> {
             pois.push(of_poi(&poi, kind, reach)?);
         }
     }
-    let is_random = |group: &Group| matches!(group.places[0], Place::In(_));
+    let is_random = |group: &Group<'_>| matches!(group.places[0], Place::In(_));
     let mut random = pois.iter().any(is_random);
     let pois = grouped(pois);
     let [rovers, uavs] = [0, 1].map(|kind| kinds[kind].1.len());
@@ -261,18 +263,18 @@ pub(super) fn translate(root: &At<'_>) -> Result<Vec<Section>, Problem> {
         return Err(Problem { line: Some(line.line), key: line.path.clone(), message });
     }
     let [rovers, uavs] = ["rover", "uav"].map(names);
-    let finish = |(name, group): (String, Group)| {
+    let finish = |(name, group): (String, Group<'_>)| {
         let mut section = Section::new(group.section.head);
         section.set("name", quoted(&name), &format!("{} of them", group.places.len()));
         match &group.places[0] {
             Place::In(region) => {
                 section.set("count", group.places.len(), "drawn anew for every episode");
-                section.set("in", region, "position");
+                section.derive("in", region, &group.position, "position");
             }
             Place::At(_) => {
                 let at =
                     group.places.iter().filter_map(|place| if let Place::At(at) = place { Some(at) } else { None });
-                section.set("at", format!("{:?}", at.collect::<Vec<_>>()), "position.fixed");
+                section.derive("at", format!("{:?}", at.collect::<Vec<_>>()), &group.position, "position.fixed");
             }
         }
         section.lines.extend(group.section.lines);
@@ -312,13 +314,14 @@ fn place(at: &At<'_>) -> Result<Place, Problem> {
 }
 
 /// Translates a POI. `reach` is the largest radius of rovers.
-fn of_poi(at: &At<'_>, kind: &str, reach: f64) -> Result<Group, Problem> {
+fn of_poi<'a>(at: &At<'a>, kind: &str, reach: f64) -> Result<Group<'a>, Problem> {
     let mut section = Section::new("[[pois]]");
     let (observed, captured) = (at.need("observation_radius")?, at.number_or("capture_radius", -1.0)?);
     let radius = captured.max(reach.min(observed.number()?));
-    section.set(
+    section.derive(
         "radius",
         format!("{radius:?}"),
+        &at.get("capture_radius").unwrap_or(observed),
         "capture_radius, or the less of a rover's and the POI's observation_radius",
     );
     section.fill(at, POI)?;
@@ -331,8 +334,8 @@ fn of_poi(at: &At<'_>, kind: &str, reach: f64) -> Result<Group, Problem> {
     }
     section.skip_unknown(at, &[POI]);
     let subtype = at.get("subtype").map_or(String::new(), |subtype| format!("_{}", word(&subtype)));
-    let (places, stem) = (vec![place(at)?], format!("{kind}{subtype}"));
-    Ok(Group { stem, section, places, members: vec![], learns: true, credit: Credit::default() })
+    let (position, places, stem) = (at.need("position")?, vec![place(at)?], format!("{kind}{subtype}"));
+    Ok(Group { stem, section, places, position, members: vec![], learns: true, credit: Credit::default() })
 }
 
 /// Returns a value as part of a name.
@@ -341,13 +344,13 @@ fn word(at: &At<'_>) -> String {
 }
 
 /// Translates an agent but for its fitness.
-fn of_agent(
-    at: &At<'_>,
+fn of_agent<'a>(
+    at: &At<'a>,
     kind: &str,
     max_speed: &At<'_>,
-    pois: &[(String, Group)],
+    pois: &[(String, Group<'_>)],
     has_uavs: bool,
-) -> Result<Group, Problem> {
+) -> Result<Group<'a>, Problem> {
     let mut section = Section::new("[[agents]]");
     section.fill(at, AGENT)?;
     let follows = at.word("policy.type", "network", &[("network", false), ("follow", true)])?;
@@ -383,6 +386,7 @@ fn of_agent(
         stem: kind.into(),
         section,
         places: vec![place(at)?],
+        position: at.need("position")?,
         members: vec![],
         learns: !follows,
         credit: Credit::default(),
@@ -393,7 +397,7 @@ fn of_agent(
 fn senses(
     at: &At<'_>,
     kind: &str,
-    pois: &[(String, Group)],
+    pois: &[(String, Group<'_>)],
     has_uavs: bool,
     section: &mut Section,
 ) -> Result<(), Problem> {
@@ -404,7 +408,8 @@ fn senses(
             resolution.problem(format!("found {}, allowed degrees that make 1 to 16 sectors", resolution.shown()))
         );
     }
-    let range = at.need("observation_radius")?.number()?;
+    let radius = at.need("observation_radius")?;
+    let range = radius.number()?;
     let (measure, nearest) = at.word("sensor.measurement_type", "inverse_distance_squared", MEASURES)?;
     let combine = at.word("sensor.accum_type", "average", &[("average", "mean"), ("sum", "sum")])?;
     let empty = at.number_or("sensor.default_value", -1.0)?;
@@ -424,7 +429,7 @@ fn senses(
     } else {
         let of_uavs = if has_uavs { channel(UAVS, range, measure, combine, empty) } else { nothing() };
         let of_agents = channel(ROVERS, range, measure, combine, empty) + &of_uavs;
-        let seen = |(_, group): &&(String, Group)| {
+        let seen = |(_, group): &&(String, Group<'_>)| {
             let subtypes = at.list("observable_subtypes").unwrap_or_default();
             let knows = |subtype: &str| subtypes.iter().any(|other| word(other) == subtype);
             group.stem == "rover" || kind == "uav" && group.stem.strip_prefix("hidden_").is_none_or(knows)
@@ -437,7 +442,7 @@ fn senses(
         };
         if sensor == 0 { of_agents + &of_pois } else { of_agents }
     };
-    section.set("senses", format!("[\n{channels}]"), "sensor, resolution and observation_radius");
+    section.derive("senses", format!("[\n{channels}]"), &radius, "sensor, resolution and observation_radius");
     Ok(())
 }
 
@@ -464,7 +469,7 @@ fn credit_of(at: &At<'_>, agents: usize) -> Result<Credit, Problem> {
 }
 
 /// Returns the section with what all credits have in common.
-fn credit(agents: &[(String, Group)], led_by: Option<&str>, adds_g: bool) -> Section {
+fn credit(agents: &[(String, Group<'_>)], led_by: Option<&str>, adds_g: bool) -> Section {
     let mut section = Section::new("[credit]");
     if let Some(led_by) = led_by {
         let more = if led_by == "first" {

@@ -59,6 +59,11 @@ impl Section {
         self.add(format!("{key} = {value}"), None, comment.into());
     }
 
+    /// Adds a key with a value that follows from another key.
+    pub fn derive(&mut self, key: &str, value: impl Display, from: &At<'_>, comment: &str) {
+        self.add(format!("{key} = {value}"), Some(from), comment.into());
+    }
+
     /// Adds a key with the value of another. If two keys of the YAML file have one name here, the first counts.
     pub fn put(&mut self, key: &str, value: impl Display, at: &At<'_>) {
         let start = format!("{key} = ");
