@@ -426,6 +426,22 @@ fn different_layouts_print_a_note_and_are_not_paired() {
     }
 }
 
+#[test]
+fn keys_of_classes_are_compared_one_by_one() {
+    let place = Place::new(&[("rovers.toml", include_str!("../../configs/rovers.toml"))]);
+    let train = "train rovers.toml --backend cpu --generations 1 --population 4 --trials 2";
+    for fitness in ["G", "D"] {
+        place.good(&format!("{train} --out {fitness} --set agents.drone.fitness={fitness}"));
+    }
+    let (text, stderr) = place.good("compare G D");
+    assert!(text.contains("drone.fitness G") && text.contains("drone.fitness D"), "{text}");
+    assert!(!stderr.contains("layouts"), "{stderr}");
+    let error = place.refused(1, &format!("{train} --out G --resume --set agents.rover.motion.max_speed=9"));
+    assert!(error.contains("agents.rover.motion.max_speed: ") && error.contains(" there, 9.0 here"), "{error}");
+    place.good(&format!("{train} --out fast --set agents.rover.motion.max_speed=9"));
+    assert!(place.good("compare G fast").1.contains("the arms play in different layouts: agents differ"));
+}
+
 #[cfg(target_os = "linux")]
 #[test]
 fn a_folder_name_that_is_not_utf_8_is_escaped() {

@@ -352,6 +352,10 @@ fn bad_input_is_refused_with_its_line() {
     let many = format!("    - *rover\n{}", "    - {a: 1}\n".repeat(2000));
     fails(INFLUENCE, "    - *rover\n", &many, "env.agents.rovers: found 2003 items, allowed up to 1024");
 
+    // Rovers see all POIs but hidden ones, whatever their subtype.
+    let (_, text, _) = import(&INFLUENCE.replace("- {value: 2.0,", "- {subtype: B, value: 2.0,"));
+    assert!(text.contains("pois = [\"rover_B\"]"), "{text}");
+
     let (config, ..) = import(&INFLUENCE.replace("    - *rover\n", &"    - *rover\n".repeat(200)));
     assert_eq!(config.agent_count(), 204);
 

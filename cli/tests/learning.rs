@@ -73,6 +73,7 @@ fn the_tested_team_is_in_files_pictures_and_tables() {
     assert!(!fs::read_to_string(place.path("plain/curves.svg")).unwrap().contains("tested"));
     let error = place.refused(1, "plot run plain --measure test --out none.svg");
     assert!(error.contains("plain: it has no tested best team, because learning.test_episodes is 0"), "{error}");
+    assert!(error.contains("--set learning.test_episodes=") && !error.contains("--resume"), "{error}");
     let measures = |words: &str| {
         let compared = json(&place, words);
         let measures = compared["comparisons"][0]["measures"].as_array().unwrap();

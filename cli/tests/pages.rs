@@ -484,6 +484,23 @@ fn the_page_on_swarms_agrees_with_its_files() {
     };
     assert!(p("fitness G,", "fitness Df,").iter().all(|&p| p >= 0.07));
     assert!(p("fitness G,", "fitness D,")[2..].iter().all(|&p| p < 0.05));
+
+    let teams = read_csv(folder.join("swarms/one_leader.csv"));
+    for followers in teams.iter().filter(|row| row["team"] == "champion" && row["seed"] == "0") {
+        let followers = &followers["followers"];
+        let of = |team: &str| {
+            let of_cell = teams.iter().filter(|row| row["followers"] == *followers && row["team"] == team);
+            of_cell.map(|row| number(row, "g")).collect::<Vec<_>>()
+        };
+        let cells = ["champion", "constant", "network", "hill_climbing"].map(|team| match &of(team)[..] {
+            [] => String::new(),
+            g => format!(" {:.2}", g.iter().sum::<f64>() / g.len() as f64),
+        });
+        let trials = of("champion").len();
+        let trials = if trials == 10 { String::new() } else { format!(", {trials} trials") };
+        let line = format!("| {followers}{trials} |{} |", cells.join(" |"));
+        assert!(page.contains(&line), "{line}");
+    }
 }
 
 #[test]

@@ -1314,6 +1314,35 @@ mod unix {
     }
 
     #[test]
+    fn a_signal_stops_the_drawing_of_a_film() {
+        let folder = tempfile::tempdir().unwrap();
+        let text = "[world]\nleaders = [[10, 5]]\npois = [[10, 9]]\nsteps = 200\n\
+                    [learning]\npopulation = 4\ngenerations = 1\ntrials = 1\n";
+        let (file, out) = (config_file(folder.path(), text), folder.path().join("run"));
+        assert!(flotilla_train(&file, &out, &["--quiet"]).status().unwrap().success());
+        let draw = |name: &str| {
+            let mut command = flotilla();
+            command.arg("replay").arg(&out).args(["--fps", "50", "--width", "2000", "--out"]);
+            command.arg(folder.path().join(name)).stderr(Stdio::piped()).spawn().unwrap()
+        };
+        let child = draw("%04d.png");
+        wait_until("a picture is there", || folder.path().join("0001.png").exists());
+        signal(&child, "TERM");
+        let (status, message) = wait_for_end(child);
+        assert!(status.code() == Some(75) && message.contains("stopped: after "), "{message}");
+        let pictures = fs::read_dir(folder.path()).unwrap().count();
+        let (_, all) = message.split_once(" of ").expect(&message);
+        let all: usize = all.split(' ').next().unwrap().parse().unwrap();
+        assert!(pictures < all, "{pictures} of {all}");
+        // A GIF is written whole or not at all.
+        let child = draw("film.gif");
+        std::thread::sleep(Duration::from_millis(500));
+        signal(&child, "TERM");
+        let (status, message) = wait_for_end(child);
+        assert!(status.code() == Some(75) && !folder.path().join("film.gif").exists(), "{message}");
+    }
+
+    #[test]
     fn a_signal_stops_a_run_after_its_generation_and_prints_how_to_resume() {
         let config = Config::parse(HEAVY, "heavy.toml").unwrap();
         let expected = reference(&config);

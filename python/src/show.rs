@@ -113,8 +113,8 @@ impl Replay {
 
     fn gif<'py>(&self, py: Python<'py>, width: Option<u32>, fps: u32) -> PyResult<Bound<'py, PyBytes>> {
         let motion = Film { width, fps };
-        let bytes = workers::aside(py, || again::gif(&self.config, &self.played, motion)).raise()?;
-        Ok(PyBytes::new(py, &bytes))
+        let draw = || again::gif(&again::Frames::new(&self.config, &self.played, motion), motion, |_| true);
+        Ok(PyBytes::new(py, &workers::aside(py, draw).raise()?.unwrap_or_default()))
     }
 
     fn still(&self, step: Option<usize>) -> PyResult<Figure> {

@@ -254,7 +254,7 @@ fn team_of(stepper: &mut stepping::Stepper, team: usize) -> Team {
             label: map::poi_label(world, poi, format!("{near}/{needed}")),
             share: Some(f64::from(near) / f64::from(needed)),
             observed: observed[poi],
-            open: world.rule.is_open(poi, step, observed),
+            open: map::is_open(world, poi, step as usize, observed),
         }
     };
     Team {

@@ -432,7 +432,7 @@ fn senses(
         let seen = |(_, group): &&(String, Group<'_>)| {
             let subtypes = at.list("observable_subtypes").unwrap_or_default();
             let knows = |subtype: &str| subtypes.iter().any(|other| word(other) == subtype);
-            group.stem == "rover" || kind == "uav" && group.stem.strip_prefix("hidden_").is_none_or(knows)
+            group.stem.starts_with("rover") || kind == "uav" && group.stem.strip_prefix("hidden_").is_none_or(knows)
         };
         let groups: Vec<_> = pois.iter().filter(seen).map(|(name, _)| quoted(name)).collect();
         let of_pois = match groups.len() {

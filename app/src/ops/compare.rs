@@ -13,7 +13,7 @@ use crate::report::comparison::{self, At, Cohort, Comparison, ComparisonError, Q
 use crate::report::runs::{self, MAX_RUNS, ReadError};
 use crate::shell;
 use crate::sweep::{Sweep, results};
-use flotilla::config::Config;
+use flotilla::config::{AgentClass, Config};
 use flotilla::escape::PathExt;
 use flotilla::file;
 use flotilla::statistics;
@@ -114,8 +114,8 @@ pub fn run(args: &CompareRequest, context: Context<'_>) -> Result<CompareOutcome
     };
     if groups.iter().all(|(_, arms)| arms.iter().all(nothing)) {
         notes.push(
-            "no team of these runs observed any POI in any generation: there is nothing to compare; `flotilla check CONFIG` \
-             names POIs that cannot be reached"
+            "no team of these runs scored in any generation: there is nothing to compare; `flotilla check CONFIG` names POIs \
+             that cannot be reached"
                 .into(),
         );
     }
@@ -172,7 +172,7 @@ fn of_runs(folders: &[PathBuf], args: &CompareRequest, notes: &mut Vec<String>) 
         ("world.leaders", differs(|a, b| a.world.leaders != b.world.leaders)),
         ("world.followers", differs(|a, b| a.world.followers != b.world.followers)),
         ("world.pois", differs(|a, b| a.world.pois != b.world.pois)),
-        ("agents", differs(|a, b| a.agents != b.agents)),
+        ("agents", differs(|a, b| without_fitness(a) != without_fitness(b))),
         ("pois", differs(|a, b| a.pois != b.pois)),
     ];
     let layouts: Vec<&str> = layouts.into_iter().filter(|(_, differ)| *differ).map(|(key, _)| key).collect();
@@ -183,6 +183,11 @@ fn of_runs(folders: &[PathBuf], args: &CompareRequest, notes: &mut Vec<String>) 
     let arms = runs::labels(folders, &configs).into_iter().zip(folders);
     let read = |(name, folder): (String, &PathBuf)| Cohort::read(name, vec![folder.clone()], verification);
     Ok(arms.map(read).collect::<Result<_, _>>()?)
+}
+
+/// Returns the classes of agents without what selects their policies.
+fn without_fitness(config: &Config) -> Vec<AgentClass> {
+    config.agents.iter().map(|class| AgentClass { fitness: None, ..class.clone() }).collect()
 }
 
 /// Returns a note for each run with the results of another, because there is nothing to compare between them.

@@ -284,7 +284,7 @@ fn of_record(error: &RecordError) -> &'static str {
 fn of_read(error: &ReadError) -> &'static str {
     match error {
         ReadError::Missing(_) | ReadError::NoFolder(_) => "no_run",
-        ReadError::Unfinished { .. } => "unfinished",
+        ReadError::Unfinished { .. } | ReadError::Untested { .. } => "unfinished",
         ReadError::Config { .. } => "damaged",
         ReadError::Record(error) => of_record(error),
         ReadError::Foreign { .. } | ReadError::Collection { .. } => "refused",

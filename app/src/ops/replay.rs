@@ -197,16 +197,28 @@ pub fn run(
     let name = folder.canonicalize().ok().and_then(|path| Some(path.file_name()?.to_string_lossy().into_owned()));
     let name = name.unwrap_or_else(|| folder.escaped().to_string());
     let motion = Film { width, fps: fps.unwrap_or(FPS) };
+    let frames = || replay::Frames::new(&config, &played, motion);
+    let watch = |number: usize, count: usize| {
+        context.fraction(number as f64 / count as f64, format!("drawing picture {number} of {count}"));
+        !context.is_stopped()
+    };
     let content = match kind {
         Form::Page => Ok(replay::page(&name, &config, &played).into_bytes()),
-        Form::Gif => replay::gif(&config, &played, motion),
+        Form::Gif => {
+            let frames = frames();
+            let film = replay::gif(&frames, motion, |number| watch(number, frames.places.len()));
+            context.pause();
+            let stopped = || Error::Stopped("before all pictures were drawn; nothing was written".into());
+            film.transpose().ok_or_else(stopped)?
+        }
         Form::Still(kind) => {
             let scene = replay::still(&config, &played, step.unwrap_or(steps));
             scene.file(kind, width.map_or(PRINT, |width| f64::from(width) / scene.width))
         }
         Form::Film(numbered) => {
-            let written = write_film(&numbered, out, &replay::Frames::new(&config, &played, motion))?;
-            return Ok(outcome(written, &config, &played));
+            let written = write_film(&numbered, out, &frames(), watch);
+            context.pause();
+            return Ok(outcome(written?, &config, &played));
         }
     };
     let content = content.map_err(RecordError::write(out))?;
@@ -287,8 +299,14 @@ fn outcome(written: Written, config: &Config, played: &[Replayed]) -> ReplayOutc
     ReplayOutcome { written, episodes: played.iter().map(|played| Episode::of(config, played)).collect(), unverified }
 }
 
-/// Writes one numbered picture per moment. The folder must exist.
-fn write_film(numbered: &Numbered, out: &Path, frames: &replay::Frames<'_>) -> Result<Written, Error> {
+/// Writes one numbered picture per moment. The folder must exist. Before each picture, `watch` gets its number and that of
+/// all; if it returns false, no more are written.
+fn write_film(
+    numbered: &Numbered,
+    out: &Path,
+    frames: &replay::Frames<'_>,
+    watch: impl Fn(usize, usize) -> bool,
+) -> Result<Written, Error> {
     let place = |number: usize| out.with_file_name(numbered.name(number));
     let count = frames.places.len();
     if let Some(path) =
@@ -298,6 +316,9 @@ fn write_film(numbered: &Numbered, out: &Path, frames: &replay::Frames<'_>) -> R
     }
     let disk = ownership::open_output_folder(&Disk::default(), file::folder(out), true)?;
     for (number, &moment) in frames.places.iter().enumerate() {
+        if !watch(number, count) {
+            return Err(Error::Stopped(format!("after {number} of {count} pictures").into()));
+        }
         let (scene, per_mm) = frames.scene(moment);
         let (path, content) = (place(number), scene.png(per_mm));
         let written = content.and_then(|content| disk.replace(&path, |output| output.write_all(&content)));

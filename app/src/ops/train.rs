@@ -22,7 +22,7 @@ use crate::report::scene::Scene;
 use crate::run::{Progress, RunError, Session, SessionEnd};
 use crate::shell;
 use flotilla::backend::OpenBackend;
-use flotilla::config::{Config, When};
+use flotilla::config::{Config, Score, When};
 use flotilla::escape::PathExt;
 use flotilla::file;
 use flotilla::front::{self, Generation, Trained};
@@ -300,16 +300,21 @@ fn train(
     Ok(last)
 }
 
-/// Warns that no team observed a POI in any generation.
+/// Warns that G was 0 in every generation.
 fn warn_that_nothing_was_observed(folder: &Path, config: &Config, context: Context<'_>) {
     let at_the_end = match config.pois.iter().any(|group| group.when == When::End) {
         true => " (if `when` is \"end\", only the last step counts)",
         false => "",
     };
+    // The closeness of agents that are all far away rounds to 0.
+    let cause = match config.pois.iter().any(|group| group.score == Score::Closeness) {
+        true => "no team scored",
+        false => "no team observed any POI",
+    };
     context.warn(format_args!(
-        "warning: no team observed any POI in any generation{at_the_end}, so there was nothing to learn from; try more \
-         world.steps, a smaller world.coupling, POIs nearer to the starts, or a larger learning.population; \
-         `flotilla replay {}` shows what teams do",
+        "warning: {cause} in any generation{at_the_end}, so there was nothing to learn from; try more world.steps, a \
+         smaller coupling, POIs nearer to the starts, or a larger learning.population; `flotilla replay {}` shows what \
+         teams do",
         shell::quoted(shell::argument(folder))
     ));
 }

@@ -27,7 +27,7 @@ use sha2::{Digest, Sha256};
 
 use crate::shell;
 use disk::Place;
-use flotilla::config::{self, Config, ConfigError};
+use flotilla::config::{self, Config, ConfigError, STAGES};
 use flotilla::escape::{self, PathExt};
 use flotilla::file::{self, TextError};
 use ownership::CONFIG;
@@ -373,12 +373,34 @@ pub(crate) fn values_by_key(config: &Config) -> BTreeMap<String, toml::Value> {
             toml::Value::Table(keys) => {
                 values.extend(keys.into_iter().map(|(key, value)| (format!("{section}.{key}"), value)));
             }
-            toml::Value::Array(stages) => {
+            toml::Value::Array(stages) if section == STAGES => {
                 let stages = stages.into_iter().enumerate();
                 values.extend(stages.map(|(index, stage)| (format!("{section}[{index}]"), stage)));
+            }
+            toml::Value::Array(tables) => {
+                let name = |table: &toml::Value| table.get("name").cloned();
+                values.insert(section.clone(), toml::Value::Array(tables.iter().filter_map(name).collect()));
+                tables.into_iter().for_each(|table| {
+                    let key = table.get("name").and_then(toml::Value::as_str).map(|name| format!("{section}.{name}"));
+                    add_keys(&mut values, key.unwrap_or(section.clone()), table);
+                });
             }
             value => drop(values.insert(section, value)),
         }
     }
     values
+}
+
+/// Adds the keys below a key of a class or group, as `--set` names them.
+fn add_keys(values: &mut BTreeMap<String, toml::Value>, key: String, value: toml::Value) {
+    match value {
+        toml::Value::Table(keys) => {
+            keys.into_iter().for_each(|(below, value)| add_keys(values, format!("{key}.{below}"), value));
+        }
+        toml::Value::Array(items) if items.iter().any(toml::Value::is_table) => {
+            let items = items.into_iter().enumerate();
+            items.for_each(|(index, item)| add_keys(values, format!("{key}[{index}]"), item));
+        }
+        value => drop(values.insert(key, value)),
+    }
 }

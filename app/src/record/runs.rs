@@ -60,6 +60,14 @@ pub enum ReadError {
         /// The missing data.
         reason: String,
     },
+    /// The run tested no teams.
+    #[error("{}: {reason}", folder.escaped())]
+    Untested {
+        /// The run.
+        folder: PathBuf,
+        /// Why.
+        reason: String,
+    },
     /// The run's files cannot be read.
     #[error(transparent)]
     Record(#[from] RecordError),
@@ -83,6 +91,7 @@ impl ReadError {
             ReadError::Config { .. } => {
                 "find a config that is whole, and repeat the run with `flotilla train CONFIG --out DIR`".into()
             }
+            ReadError::Untested { .. } => "train another run with --set learning.test_episodes=10".into(),
             ReadError::Unfinished { folder, .. } => format!("finish the run with `{}`", command_to_resume(folder, &[])),
             ReadError::Record(error) => return error.help("try again"),
             ReadError::Collection { .. } => return None,

@@ -134,7 +134,7 @@ pub fn figure(
     let configs = folders.iter().map(|folder| config(folder, verification)).collect::<Result<Vec<_>, _>>()?;
     for (folder, config) in folders.iter().zip(&configs) {
         if let Some(reason) = measure.and_then(|kind| kind.missing(config)) {
-            return Err(ReadError::Unfinished { folder: folder.clone(), reason });
+            return Err(ReadError::Untested { folder: folder.clone(), reason });
         }
     }
     let all = folders.iter().zip(&configs).map(|(folder, config)| RunMetrics::read(folder, config, verification));

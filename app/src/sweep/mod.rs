@@ -70,6 +70,8 @@ pub struct Axis {
     pub values: Vec<Value>,
     /// Whether the key is varied. At most one varied key of a point differs from its first value.
     pub varied: bool,
+    /// Where the part of the key begins that names the axis, see [`Axis::leaf`].
+    leaf: usize,
 }
 
 impl Axis {
@@ -91,9 +93,19 @@ impl Axis {
         }
     }
 
-    /// Returns the key without its section.
+    /// Returns the end of the key, as much of it as no other axis has: `max_speed`, or `rover.motion.max_speed`.
     pub fn leaf(&self) -> &str {
-        self.key.rsplit('.').next().unwrap_or_default()
+        &self.key[self.leaf..]
+    }
+
+    /// Finds [`Axis::leaf`] among the keys of all axes.
+    fn shorten(&mut self, keys: &[String]) {
+        let is_own = |&start: &usize| {
+            let leaf = &self.key[start..];
+            let others = keys.iter().filter(|key| **key != self.key);
+            !others.filter_map(|key| key.strip_suffix(leaf)).any(|before| before.is_empty() || before.ends_with('.'))
+        };
+        self.leaf = self.key.match_indices('.').rev().map(|(dot, _)| dot + 1).find(is_own).unwrap_or(0);
     }
 }
 
@@ -278,11 +290,13 @@ impl Grid {
             let message = "it has no axis; give a list of values for at least one key: \"world.coupling\" = [1, 2, 3]";
             problems.push(problem(Some(grid.line), GRID, message));
         }
+        let keys: Vec<String> = grid.axes.iter().map(|(axis, _)| axis.key.clone()).collect();
+        grid.axes.iter_mut().for_each(|(axis, _)| axis.shorten(&keys));
         if problems.is_empty() { Ok(grid) } else { Err(problems) }
     }
 
     fn read_key(&mut self, varied: bool, line: usize, key: String, value: Value, problems: &mut Vec<Problem>) {
-        let mut axis = Axis { key, values: vec![], varied };
+        let mut axis = Axis { key, values: vec![], varied, leaf: 0 };
         let (key, name) = (&*axis.key, axis.name());
         let mut report = |message: String| problems.push(problem(Some(line), &name, message));
         match value {
@@ -557,6 +571,22 @@ mod tests {
             let (bytes, length) = parsed(points);
             assert!(bytes <= 2 * length, "{points} points of {length} bytes: {bytes} bytes parsed");
         }
+    }
+
+    #[test]
+    fn axes_are_named_by_as_much_of_their_keys_as_tells_them_apart() {
+        let leaves = |keys: [&str; 3]| {
+            let keys = keys.map(String::from);
+            keys.clone().map(|key| {
+                let mut axis = Axis { key, values: vec![], varied: false, leaf: 0 };
+                axis.shorten(&keys);
+                axis.leaf().to_string()
+            })
+        };
+        let speeds = ["agents.rover.motion.max_speed", "agents.uav.motion.max_speed", "motion.max_speed"];
+        assert_eq!(leaves(["world.steps", "world.dt", "learning.seed"]), ["steps", "dt", "seed"]);
+        assert_eq!(leaves(speeds), ["rover.motion.max_speed", "uav.motion.max_speed", "motion.max_speed"]);
+        assert_eq!(leaves(["pois.a.value", "pois.b.value", "seed"]), ["a.value", "b.value", "seed"]);
     }
 
     #[test]

@@ -3,11 +3,11 @@
 use glam::DVec2;
 
 use super::{
-    FAINT, Form, Legend, Marker, Poi, Team, Viewport, counted, poi_label, radius_of, sample_note, size_of,
-    values_differ,
+    FAINT, Form, Legend, Marker, Poi, Team, Viewport, counted, is_open, is_timed, poi_label, radius_of, sample_note,
+    size_of, time_label, values_differ,
 };
-use crate::report::scene::{Anchor, BLACK, Pen, Scene};
-use flotilla::config::{AgentClass, Classes, Observers, PoiGroup, Region, StageConfig, drawn_agents};
+use crate::report::scene::{Anchor, BLACK, Pen, Scene, text_width};
+use flotilla::config::{AgentClass, Classes, Observers, PoiGroup, Region, StageConfig, When, drawn_agents};
 use flotilla::world::World;
 
 /// Returns the team of a config before training.
@@ -29,7 +29,7 @@ fn team(config: &StageConfig, world: &World) -> Team {
         label: poi_label(world, poi, needed.to_string()),
         share: None,
         observed: false,
-        open: world.rule.is_open(poi, 1, &none),
+        open: is_open(world, poi, 1, &none),
     };
     Team {
         leaders,
@@ -71,7 +71,7 @@ pub fn layout(name: &str, config: &StageConfig) -> Scene {
     let mut legend = Legend::new(config, &view, std::slice::from_ref(&team), "");
     let alike = world.coupling.windows(2).all(|pair| pair[0] == pair[1]);
     let needs = match (world.coupling.first(), view.poi_labels(&team)) {
-        (_, Some(_)) if world.rule.is_timed() => {
+        (_, Some(_)) if is_timed(&world) => {
             format!("at a POI: its number, agents it needs {within}, and when")
         }
         (_, Some(_)) if values_differ(&world) => format!("at a POI: agents it needs {within}, and its value"),
@@ -82,6 +82,9 @@ pub fn layout(name: &str, config: &StageConfig) -> Scene {
         _ => format!("what each POI needs has no room here; it counts {within}"),
     };
     legend.note(needs);
+    if !is_timed(&world) && classes.pois.iter().any(|group| group.when == When::End) {
+        legend.note("only the last step counts");
+    }
     let observers = if config.agents.is_empty() { vec![] } else { observers(&classes) };
     if (2..=4).contains(&observers.len()) {
         legend.note(observers.join("; "));
@@ -106,11 +109,17 @@ pub fn layout(name: &str, config: &StageConfig) -> Scene {
     let agents = match &config.agents[..] {
         [] => [counted(leaders, "leader"), counted(world.followers(), "follower")].join(", "),
         classes => {
-            classes.iter().map(|class| format!("{} × {}", class.size(), class.name)).collect::<Vec<_>>().join(", ")
+            let size = |class: &AgentClass| format!("{} × {}", class.size(), class.name);
+            classes.iter().map(size).collect::<Vec<_>>().join(", ")
         }
     };
     let described = format!("{agents}, {}", counted(team.pois.len(), "POI"));
-    scene.bold([EDGE, 4.2], described.clone(), 3.0, Anchor::Start, BLACK);
+    // The legend names the classes, too.
+    let title = match text_width(&described, 3.0) * 1.1 < room {
+        true => described.clone(),
+        false => format!("{}, {}", counted(world.agents(), "agent"), counted(team.pois.len(), "POI")),
+    };
+    scene.bold([EDGE, 4.2], title, 3.0, Anchor::Start, BLACK);
     view.draw(&mut scene, &team);
     regions.iter().for_each(|(_, region)| outline(&view, &mut scene, *region));
     view.rule(&mut scene);
@@ -133,7 +142,7 @@ pub fn layout(name: &str, config: &StageConfig) -> Scene {
         Observers::All => String::new(),
         observers => format!(" Only {observers} observe."),
     };
-    let timed = if world.rule.is_timed() { pois_in_words(&world) } else { String::new() };
+    let timed = if is_timed(&world) { pois_in_words(&world) } else { String::new() };
     let starts: Vec<DVec2> = team.agents[..leaders].iter().map(|agent| agent.place).collect();
     let pois: Vec<DVec2> = team.pois.iter().map(|poi| poi.place).collect();
     let drawn = if regions.is_empty() { String::new() } else { format!(" Drawn in every episode: {drawn}.") };
@@ -169,7 +178,9 @@ fn observers(classes: &Classes) -> Vec<String> {
 /// Describes when POIs can be observed, for at most 12 of them.
 fn pois_in_words(world: &World) -> String {
     let pois = world.pois.len();
-    let list: Vec<_> = (0..pois.min(12)).map(|poi| poi_label(world, poi, "any time".into())).collect();
+    let time =
+        |poi: usize| Some(time_label(world, poi)).filter(|time| !time.is_empty()).unwrap_or("at any time".into());
+    let list: Vec<_> = (0..pois.min(12)).map(|poi| format!("{poi}: {}", time(poi))).collect();
     format!(" POIs can be observed: {}{}.", list.join("; "), if pois > 12 { "; …" } else { "" })
 }
 
@@ -178,6 +189,19 @@ mod tests {
     use super::*;
     use crate::report::map::{around, label_area, overlap};
     use crate::report::replay::parts;
+
+    #[test]
+    fn pois_that_count_at_the_end_say_so() {
+        let text = "[world]\nsteps = 7\n[[agents]]\nname = \"rover\"\nat = [[5, 5]]\nsenses = [{ of = \"pois\" }]\n\
+            [[pois]]\nname = \"last\"\nat = [[9, 9]]\nwhen = \"end\"\n[[pois]]\nname = \"any\"\nat = [[30, 9]]\n";
+        let config = flotilla::Config::parse(text, "end.toml").unwrap().validate().unwrap();
+        let world = World::new(&config);
+        let labels = [0, 1].map(|poi| poi_label(&world, poi, "1".into()));
+        assert_eq!(labels, ["0: 1, step 7", "1: 1"]);
+        assert!(pois_in_words(&world).contains("0: step 7; 1: at any time"), "{}", pois_in_words(&world));
+        let open = [0, 1].map(|poi| [6, 7].map(|step| is_open(&world, poi, step, &[false; 2])));
+        assert_eq!(open, [[false, true], [true, true]]);
+    }
 
     #[test]
     fn classes_have_marks_of_their_own_and_pages_the_same() {

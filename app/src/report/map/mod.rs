@@ -6,7 +6,7 @@ use glam::DVec2;
 
 use super::curves::round_step;
 use super::scene::{Anchor, BLACK, COLORS, Color, Fill, GREY, LIGHT, Pen, Scene, WHITE, colors, text_width};
-use flotilla::config::{Config, drawn_every};
+use flotilla::config::{Config, When, drawn_every};
 use flotilla::world::World;
 
 mod layout;
@@ -153,25 +153,51 @@ pub fn radius_of(world: &World, poi: usize) -> f64 {
     f64::from(world.radii2[poi]).sqrt()
 }
 
-/// Returns a POI's label: `needs`, its value if values differ, and for a timed rule also the POI's number and when it can be
+/// Returns the steps at which a POI can be observed, if these are not all.
+fn window_of(world: &World, poi: usize) -> Option<[u32; 2]> {
+    match world.paths.as_ref().map(|rule| rule.scores[poi].1) {
+        Some(When::End) => Some([world.steps() as u32; 2]),
+        _ => world.rule.window(poi),
+    }
+}
+
+/// Reports whether POIs differ in when they can be observed, or come after others.
+pub(crate) fn is_timed(world: &World) -> bool {
+    world.rule.is_timed() || (0..world.pois.len()).any(|poi| window_of(world, poi) != window_of(world, 0))
+}
+
+/// Reports whether a POI can be observed at a step, if these POIs were observed before.
+pub fn is_open(world: &World, poi: usize, step: usize, before: &[bool]) -> bool {
+    let step = step as u32;
+    world.rule.is_open(poi, step, before)
+        && window_of(world, poi).is_none_or(|[first, last]| (first..=last).contains(&step))
+}
+
+/// Returns when a POI can be observed, empty if at any step.
+fn time_label(world: &World, poi: usize) -> String {
+    let window = window_of(world, poi).map(|[first, last]| match first == last {
+        true => format!("step {first}"),
+        false => format!("steps {first} to {last}"),
+    });
+    let after: Vec<_> = world.rule.after(poi).iter().map(usize::to_string).collect();
+    let after = (!after.is_empty()).then(|| format!("after {}", after.join(" ")));
+    window.into_iter().chain(after).collect::<Vec<_>>().join(", ")
+}
+
+/// Returns a POI's label: `needs`, its value if values differ, and if POIs are timed also the POI's number and when it can be
 /// observed.
 pub fn poi_label(world: &World, poi: usize, needs: String) -> String {
-    let (rule, needs) = (&world.rule, needs + &value_label(world, poi));
-    if !rule.is_timed() {
-        return needs;
+    let needs = needs + &value_label(world, poi);
+    match (is_timed(world), time_label(world, poi)) {
+        (false, _) => needs,
+        (true, time) if time.is_empty() => format!("{poi}: {needs}"),
+        (true, time) => format!("{poi}: {needs}, {time}"),
     }
-    let window = rule.window(poi).map(|[first, last]| match first == last {
-        true => format!(", step {first}"),
-        false => format!(", steps {first} to {last}"),
-    });
-    let after: Vec<_> = rule.after(poi).iter().map(usize::to_string).collect();
-    let after = if after.is_empty() { String::new() } else { format!(", after {}", after.join(" ")) };
-    format!("{poi}: {needs}{}{after}", window.unwrap_or_default())
 }
 
 /// Returns an observed POI's label: the step at which it was observed, and its value if values differ.
 pub(crate) fn observed_label(world: &World, poi: usize, step: usize) -> String {
-    let number = if world.rule.is_timed() { format!("{poi}: ") } else { String::new() };
+    let number = if is_timed(world) { format!("{poi}: ") } else { String::new() };
     format!("{number}at step {step}{}", value_label(world, poi))
 }
 

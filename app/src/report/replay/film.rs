@@ -47,7 +47,7 @@ impl Replayed {
                 },
                 share: Some(if observed.is_some() { 1.0 } else { f64::from(near) / f64::from(needed) }),
                 observed: observed.is_some(),
-                open: world.rule.is_open(poi, step.max(1) as u32, &before),
+                open: map::is_open(world, poi, step.max(1), &before),
             }
         };
         Team {
@@ -237,11 +237,15 @@ impl<'a> Frames<'a> {
     }
 }
 
-/// Returns the episodes side by side as a GIF that repeats.
-pub fn gif(config: &Config, played: &[Replayed], motion: Film) -> std::io::Result<Vec<u8>> {
-    let frames = Frames::new(config, played, motion);
+/// Returns frames as a GIF that repeats, or `None` if `watch` returned false. It gets the number of each picture before
+/// that is drawn.
+pub fn gif(
+    frames: &Frames<'_>,
+    motion: Film,
+    mut watch: impl FnMut(usize) -> bool,
+) -> std::io::Result<Option<Vec<u8>>> {
     let places = &frames.places;
-    let Some(&end) = places.last() else { return Ok(vec![]) };
+    let Some(&end) = places.last() else { return Ok(Some(vec![])) };
     let picture = |place: f64| {
         let (scene, per_mm) = frames.scene(place);
         scene.pixels(per_mm)
@@ -251,9 +255,13 @@ pub fn gif(config: &Config, played: &[Replayed], motion: Film) -> std::io::Resul
     let due = |index: usize| (index as u32 * 100).div_ceil(motion.fps);
     let delay = |index| if index + 1 == places.len() { 200 } else { due(index + 1) - due(index) };
     let size = [last.width() as u16, last.height() as u16];
-    let pictures =
-        places.iter().enumerate().map(|(index, &place)| (picture(place).data().to_vec(), delay(index) as u16));
-    animate(size, last.data(), pictures)
+    let mut drawn = 0;
+    let pictures = places.iter().enumerate().take_while(|(index, _)| watch(*index)).map(|(index, &place)| {
+        drawn += 1;
+        (picture(place).data().to_vec(), delay(index) as u16)
+    });
+    let film = animate(size, last.data(), pictures)?;
+    Ok((drawn == places.len()).then_some(film))
 }
 
 /// Returns pictures of one size, in pixels, as a GIF that repeats. Each is RGBA `[height][width][4]`, with its delay in
