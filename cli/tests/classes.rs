@@ -207,7 +207,9 @@ fn pictures_and_pages_show_classes_radii_and_values() {
         assert!(layout.contains(&format!("aria-label=\"{text}\"")), "{text}");
     }
     assert!(layout.contains(" rover or drone observes near and far."), "sheep do not observe");
-    assert!(layout.contains("r=\"11.2\""), "what moves freely is a disc in the legend");
+    // One drone is on the map, and one in the legend.
+    let discs = layout.lines().filter(|line| line.starts_with("<polygon") && line.matches(',').count() == 24);
+    assert_eq!(discs.count(), 2, "what moves freely is a disc of 24 corners");
     // 80 mm show 40 units, and an SVG has 10 units per millimetre.
     for radius in [5, 3] {
         assert!(layout.contains(&format!("r=\"{}\" fill=\"#", radius * 20)), "a circle of {radius} units");
@@ -216,7 +218,7 @@ fn pictures_and_pages_show_classes_radii_and_values() {
     place.good("replay run --out page.html");
     let page = place.read("page.html");
     assert!(page.contains("\"classes\":[{\"count\":2,\"free\":false,\"influence\":"));
-    assert!(page.contains("\"name\":\"rover\",\"senses\":[{"));
+    assert!(page.contains("\"name\":\"rover\",\"outline\":[[1.0,0.0],"));
     assert!(page.contains("\"radii\":[5.0,5.0,3.0]") && page.contains("\"values\":[2.0,2.0,0.5]"));
 }
 

@@ -99,12 +99,12 @@ const stage = (() => {
   const of_each = (parts = []) => parts.flatMap(({ count }, index) => Array(count).fill(index));
   // outline returns the outline of the marks of a class, as [ahead, aside]. Without classes, all agents have the same.
   const outline = ({ classes = [], outline }, index = 0) => (classes[index] || { outline }).outline;
+  // learns reports whether a class learns. Those that do come first.
+  const learns = ({ classes, episodes }, index) => classes.slice(0, index).reduce((sum, { count }) => sum + count, 0) < episodes[0].leaders;
   // Returns, for each class, an element with its mark, number and name.
   function legend(data) {
-    let first = 0;
     return (data.classes || []).map(({ count, name }, index) => {
-      const item = document.createElement("span"), filled = first < data.episodes[0].leaders;
-      first += count;
+      const item = document.createElement("span"), filled = learns(data, index);
       const points = outline(data, index).map(([ahead, aside]) => `${7 * aside},${-7 * ahead}`).join(" ");
       item.innerHTML = `<svg viewBox="-9 -9 18 18" width="16" height="16"><polygon points="${points}" fill="${filled ? "currentColor" : "none"}" stroke="currentColor" stroke-width="1.5"/></svg> `;
       item.append(`${count} × ${name}`);
@@ -240,8 +240,9 @@ const stage = (() => {
         draw.beginPath();
         for (const [ahead, aside] of outline(data, own)) draw.lineTo(middle + small * aside, base - small * ahead);
         draw.closePath();
-        draw.fillStyle = color("--poi");
-        draw.fill();
+        draw.fillStyle = draw.strokeStyle = color("--poi");
+        draw.lineWidth = 1.2 * fit;
+        if (learns(data, own)) draw.fill(); else draw.stroke();
       });
       // The counts of POIs at the same place are above each other.
       const same = data.pois.flatMap(([left, low], other) => left === x && low === y ? [other] : []);

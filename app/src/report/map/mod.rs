@@ -41,6 +41,9 @@ const DASHES: [&[f64]; 3] = [&[], &[0.9, 0.5], &[0.3, 0.35]];
 /// Dashes of the circle around a POI that cannot be observed now.
 const CLOSED: &[f64] = &[0.3, 1.2];
 
+/// More agents have smaller marks.
+const MANY: usize = 60;
+
 /// Usual font size of labels, in millimetres.
 const LABEL: f64 = 2.4;
 /// Minimum font size of labels, in millimetres.
@@ -54,25 +57,28 @@ pub(crate) const FAINT: Color = [95, 95, 95];
 pub struct Form {
     /// Whether the agents move freely, so that their marks do not point ahead.
     is_free: bool,
-    /// The class's number among those that move in the same way.
+    /// The class's number among those of its kind. Those that learn have filled marks, and others hollow ones.
     number: usize,
 }
 
 impl Form {
-    /// Returns the form of a class's marks. `is_free` tells whether the agents of a class move freely.
-    pub(crate) fn of(class: usize, is_free: impl Fn(usize) -> bool) -> Form {
-        let number = (0..class).filter(|&other| is_free(other) == is_free(class)).count();
-        Form { is_free: is_free(class), number }
+    /// Returns the form of a class's marks. `kind` tells of a class whether its agents move freely and whether they learn.
+    pub(crate) fn of(class: usize, kind: impl Fn(usize) -> [bool; 2]) -> Form {
+        let number = (0..class).filter(|&other| kind(other) == kind(class)).count();
+        Form { is_free: kind(class)[0], number }
     }
 
     /// Returns the form of an agent's mark.
     pub fn of_agent(world: &World, agent: usize) -> Form {
         let class = world.classes.iter().position(|class| class.agents().contains(&agent)).unwrap_or_default();
-        Form::of(class, |class| world.classes[class].constants.shape.free != 0)
+        Form::of(class, |class| {
+            let class = &world.classes[class];
+            [class.constants.shape.free != 0, class.agents().start < world.leaders()]
+        })
     }
 
     /// Returns the corners of the mark's outline, each ahead and to the left of its middle, in sizes of the mark. Three
-    /// classes that steer and three that move freely have outlines of their own.
+    /// classes of each kind have outlines of their own.
     pub fn outline(self) -> Vec<[f64; 2]> {
         let regular = |corners: usize, turn: f64| {
             let corner = |corner: usize| {
@@ -82,9 +88,9 @@ impl Form {
             (0..corners).map(corner).collect()
         };
         match (self.is_free, self.number % 3) {
-            (false, 0) => vec![[1.1, 0.0], [-0.8, 0.75], [-0.4, 0.0], [-0.8, -0.75]],
-            (false, 1) => vec![[1.1, 0.0], [-0.8, 0.6], [-0.8, -0.6]],
-            (false, _) => vec![[1.1, 0.0], [0.2, 0.7], [-0.9, 0.45], [-0.9, -0.45], [0.2, -0.7]],
+            (false, 0) => vec![[1.0, 0.0], [-0.75, 0.7], [-0.4, 0.0], [-0.75, -0.7]],
+            (false, 1) => vec![[1.0, 0.0], [-0.75, 0.6], [-0.75, -0.6]],
+            (false, _) => vec![[1.0, 0.0], [0.2, 0.65], [-0.85, 0.4], [-0.85, -0.4], [0.2, -0.65]],
             (true, 0) => regular(24, 0.0),
             (true, 1) => regular(4, 0.5),
             (true, _) => regular(4, 0.0),
@@ -287,12 +293,12 @@ impl Viewport {
     }
 
     fn agent_size(&self, team: &Team) -> f64 {
-        (self.scale * 1.1).clamp(0.6, 2.2) * if team.agents.len() > 60 { 0.6 } else { 1.0 }
+        (self.scale * 1.1).clamp(0.6, 2.2) * if team.agents.len() > MANY { 0.6 } else { 1.0 }
     }
 
     /// Returns the size of leaders' marks, which stand out from many followers.
     fn leader_size(&self, team: &Team) -> f64 {
-        let smallest: f64 = if team.leaders > 60 { 0.0 } else { 1.0 };
+        let smallest: f64 = if team.agents.len() > MANY && team.leaders <= MANY { 1.0 } else { 0.0 };
         smallest.max(self.agent_size(team) * 1.35)
     }
 

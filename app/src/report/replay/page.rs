@@ -162,7 +162,7 @@ pub fn parts(config: &Config) -> Vec<(&'static str, serde_json::Value)> {
             let senses: Vec<_> = class.senses.iter().map(sensed).collect();
             let places = all.agents_of(index);
             let size = drawn.iter().filter(|agent| places.contains(agent)).count();
-            let outline = Form::of(index, is_free).outline();
+            let outline = Form::of(index, |class| [is_free(class), config.agents[class].learns()]).outline();
             let mut class = json!({
                 "name": name, "count": size, "free": free, "outline": outline, "influence": influence, "senses": senses,
             });
