@@ -186,6 +186,20 @@ fn a_poi_that_counts_at_the_end_is_observed_only_then() {
 }
 
 #[test]
+fn a_closeness_that_rounds_to_0_is_not_called_unobserved() {
+    let places: Vec<[f64; 2]> = (40..48).map(|x| [f64::from(x), 50.0]).collect();
+    let text = format!(
+        "[world]\nmap = [100, 100]\nsteps = 3\n[[agents]]\nname = \"a\"\nat = {places:?}\n\
+         motion = {{ kind = \"free\", max_speed = 0 }}\nsenses = [{{ of = \"pois\" }}]\n[[pois]]\nname = \"p\"\nat = [[90, 50]]\n\
+         coupling = 8\nradius = 60\nscore = \"closeness\"\n[learning]\npopulation = 4\ngenerations = 1\ntrials = 1\n"
+    );
+    let place = Place::new(&[("far.toml", &text)]);
+    let (_, stderr) = place.good("train far.toml --out far");
+    assert!(stderr.contains("warning: no team scored in any generation"), "{stderr}");
+    assert!(!stderr.contains("no team observed any POI"), "{stderr}");
+}
+
+#[test]
 fn pictures_and_pages_show_classes_radii_and_values() {
     let place = Place::new(&[("herd.toml", HERD)]);
     let drawn = "the layout is drawn in layout.svg";
