@@ -5,7 +5,7 @@ use crate::support;
 use flotilla::backend::Group;
 use flotilla::backend::cpu::{Cpu, Noise, StepArrays, level_name};
 #[cfg(feature = "gpu")]
-use flotilla::backend::gpu::device::{AdapterInfo, DeviceError, Request};
+use flotilla::backend::gpu::device::{AdapterInfo, Request};
 #[cfg(feature = "gpu")]
 use flotilla::backend::gpu::{self, episode::GpuBackend, episode::Records};
 use flotilla::config::Config;
@@ -170,7 +170,10 @@ fn loops_that_drivers_may_end_are_reported() {
         let worlds = vec![("swarm".into(), Config::parse(SWARM, "swarm.toml").unwrap())];
         let plan = Plan { worlds, ..Plan::random(0..0, 1) };
         let error = compare(&plan, &mut Cpu::default(), &mut backend, |_| ()).unwrap_err();
-        assert!(matches!(error, flotilla::backend::BackendError::Gpu(DeviceError::Lost { .. })), "{info}: {error}");
+        assert!(
+            matches!(error, flotilla::backend::BackendError::Gpu(gpu::device::DeviceError::Lost { .. })),
+            "{info}: {error}"
+        );
     }
 }
 

@@ -6,6 +6,12 @@ use std::fs;
 use std::io::Cursor;
 use std::path::Path;
 
+use flotilla::backend::cpu::Cpu;
+use flotilla::config::{Config, Fitness};
+use flotilla::trainer::Trainer;
+use flotilla_app::report::replay;
+use serde_json::Value;
+
 use crate::support::{Place, tiny};
 
 /// Pictures of a small run: the name of the reference, and the command that draws it.
@@ -94,4 +100,35 @@ fn pictures_equal_their_references() {
         let differing = drawn.differing(&reference, 8);
         assert!(differing == 0.0, "{name}: {differing} of the pixels differ from {}", path.display());
     }
+}
+
+/// The page opens with a recorded episode. If pages change, `node web/opening.mjs web/dist/index.html` records it again.
+#[test]
+fn the_episode_that_the_page_opens_with_is_current() {
+    fn rounded(value: &mut Value) {
+        match value {
+            // JavaScript writes 1.0 as 1, and readers differ in the last bit of f64.
+            Value::Number(number) => *value = (number.as_f64().unwrap() as f32).into(),
+            Value::Array(values) => values.iter_mut().for_each(rounded),
+            Value::Object(values) => values.values_mut().for_each(rounded),
+            _ => (),
+        }
+    }
+    let read = |path: &str| fs::read_to_string(Path::new(crate::ROOT).join("web").join(path)).unwrap();
+    let mut opening: Value = serde_json::from_str(&read("page/opening.json")).unwrap();
+    let [trial, generation] = ["trial", "generation"].map(|key| opening[key].as_u64().unwrap() as usize);
+    let config = Config::parse(&read("gallery/two_groups.toml"), "two_groups.toml").unwrap().validate().unwrap();
+    let mut trainer = Trainer::of_trial(&config, trial);
+    while trainer.generation(0) <= generation {
+        trainer.advance(&mut Cpu::default()).unwrap();
+    }
+    let mut timed = Config::clone(&config);
+    timed.learning.fitness = Fitness::Dt;
+    let config = config.at(generation);
+    let mut played = replay::champion(config, &timed, &mut trainer, trial, &mut Cpu::default()).unwrap();
+    played.led.clear();
+    let mut data = replay::detailed("", config, &[played]);
+    rounded(&mut data);
+    rounded(&mut opening["data"]);
+    assert!(data == opening["data"], "web/page/opening.json is out of date");
 }
