@@ -920,3 +920,20 @@ fn a_channel_names_at_most_four_runs_of_groups() {
         "runs.toml:5: agents[0].senses[0].pois: found 5 runs of neighbouring groups, allowed up to 4: reorder [[pois]]";
     assert_eq!(error, expected);
 }
+
+/// What a channel cannot sense does not change its inputs, whatever it is worth.
+#[test]
+fn values_of_other_groups_do_not_change_inputs() {
+    let inputs = |others: f64| {
+        let text = format!(
+            "[[agents]]\nname = \"rover\"\nat = [[5, 5]]\nsenses = [{{ of = \"pois\", pois = \"near\", \
+             measure = \"inverse-squared\", nearest = 0.025 }}]\n\
+             [[pois]]\nname = \"near\"\nat = [[6, 8]]\ncoupling = 1\n\
+             [[pois]]\nname = \"other\"\nat = [[9, 9]]\ncoupling = 1\nvalue = {others}\n"
+        );
+        let config = parse(&text);
+        flotilla::stepper(&config, 1, false).unwrap().inputs().to_vec()
+    };
+    assert_eq!(inputs(1000.0), inputs(1.0));
+    assert!((inputs(1.0).iter().sum::<f32>() - 0.1).abs() < 1e-3, "{:?}", inputs(1.0));
+}

@@ -401,8 +401,8 @@ fn configs() -> impl Strategy<Value = Config> {
                 stages: vec![],
             };
             if config.populations() == 1 {
-                let Learning { hall_of_fame, teams, team_elites, team_g_elites, .. } = &mut config.learning;
-                (*hall_of_fame, *teams, *team_elites, *team_g_elites) = (0, Teams::Random, 0, 0);
+                let Learning { partners, hall_of_fame, teams, team_elites, team_g_elites, .. } = &mut config.learning;
+                (*partners, *hall_of_fame, *teams, *team_elites, *team_g_elites) = (1, 0, Teams::Random, 0, 0);
             }
             config
         },

@@ -149,6 +149,15 @@ impl Args {
         if self.skip_impossible {
             words.push("--skip-impossible".into());
         }
+        let results = [
+            ("--every", self.every.to_string(), "1"),
+            ("--reach", self.reach.to_string(), "0.75"),
+            ("--axes", self.axes.join(","), ""),
+            ("--measure", self.measure.to_string(), "champion"),
+            ("--band", self.band.to_string(), "interval"),
+        ];
+        let changed = results.into_iter().filter(|(_, value, default)| value != default);
+        words.extend(changed.flat_map(|(flag, value, _)| [OsString::from(flag), value.into()]));
         words
     }
 
@@ -178,17 +187,6 @@ impl Args {
     fn command_to_resume(&self, out: &Path, shard: Option<Shard>) -> String {
         let shard = shard.map(|shard| shard.to_string());
         let mut more: Vec<&str> = shard.iter().flat_map(|shard| ["--shard", shard]).collect();
-        let shown = [
-            ("--every", self.every.to_string(), "1"),
-            ("--reach", self.reach.to_string(), "0.75"),
-            ("--axes", self.axes.join(","), ""),
-            ("--measure", self.measure.to_string(), "champion"),
-            ("--band", self.band.to_string(), "interval"),
-        ];
-        if shard.is_none() {
-            let changed = shown.iter().filter(|(_, value, default)| value != default);
-            more.extend(changed.flat_map(|(flag, value, _)| [*flag, value]));
-        }
         more.push("--resume");
         self.command(out, &more)
     }

@@ -276,6 +276,13 @@ fn fitness_by_led_agents_that_nobody_leads_is_noted() {
         let (_, notes) = place.good(&format!("check alone.toml --fitness {fitness}"));
         assert!(notes.contains(&format!("note: {fitness} of every dog is {always_0}")), "{notes}");
     }
+    let rock =
+        "[[agents]]\nname = \"rock\"\nat = [[1, 1], [2, 1], [3, 1], [4, 1], [5, 1], [6, 1]]\ncontrol = \"still\"\n";
+    place.write(
+        "rocks.toml",
+        herd.replace("[[pois]]", "[[pois]]\nobservers = \"rock\"").replacen("[[pois]]", &format!("{rock}[[pois]]"), 1),
+    );
+    assert!(place.good("check rocks.toml --fitness Df").1.contains(&format!("note: Df of every dog is {always_0}")));
     let (_, notes) = place.good("check counting.toml --fitness Df");
     assert!(notes.contains("note: Df equals D here, because no class has `leads`"), "{notes}");
     // Runs that differ in nothing but the name of their fitness.

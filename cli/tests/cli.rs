@@ -379,6 +379,7 @@ fn wrong_values_are_reported_with_line_and_range() {
     assert_eq!(failure_message(check(crowd, &[])), format!("x.toml:4: world.followers: {agents}"));
     for (key, problem) in [
         ("hall_of_fame = 3", "hall_of_fame: found 3 with a single leader, allowed 0: it has no partners"),
+        ("partners = 2", "partners: found 2 with a single leader, allowed 1: it has no partners"),
         ("teams = 'sorted'", "teams: found \"sorted\" with a single leader, allowed \"random\": it has no partners"),
     ] {
         let single = GOOD.replace("[[10, 5], [20, 5]]", "[[10, 5]]") + key + "\n";

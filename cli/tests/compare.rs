@@ -115,7 +115,8 @@ fn generations_to_reach_count_only_in_the_last_stage() {
     let course: [&[f64]; 2] = [&[1.0, 1.0, 1.0, 0.0, 1.0, 0.0], &[1.0, 1.0, 1.0, 0.0, 0.0, 0.0]];
     let five = ("learning.generations", "5");
     run(&place, "plain", &[five], &course);
-    run(&place, "staged", &[five, ("stages", "[{ from = 3, set = { 'world.coupling' = 1 } }]")], &course);
+    let stages = ("stages", "[{ from = 3, set = { 'world.coupling' = 1 } }]");
+    run(&place, "staged", &[five, stages], &course);
     let report = json(&place, "compare plain staged");
     let reach = &report["comparisons"][0]["measures"][2];
     assert_eq!([0, 1].map(|arm| reach["arms"][arm]["value"].as_f64()), [Some(0.0), None]);
@@ -124,6 +125,10 @@ fn generations_to_reach_count_only_in_the_last_stage() {
         [0, 1].map(|arm| report["comparisons"][0]["arms"][arm]["name"].as_str().unwrap()),
         ["no stages", "1 stage"]
     );
+    // The last stage has not begun.
+    run(&place, "early", &[five, stages], &course.map(|trial| &trial[..3]));
+    let (table, _) = place.good("compare plain early --csv");
+    assert!(table.contains("champion_g") && !table.contains("generations_to_reach"), "{table}");
 }
 
 #[test]
@@ -337,7 +342,8 @@ fn a_sweep_is_compared_along_an_axis_and_seeds_add_trials() {
     assert_eq!(json(&place, "compare s --by seed")["comparisons"].as_array().unwrap().len(), 4);
 
     fs::remove_dir_all(place.path("s/points/0006")).unwrap();
-    fs::remove_dir_all(place.path("s/points/0002")).unwrap();
+    // A process that is killed early leaves no config.
+    fs::remove_file(place.path("s/points/0002/config.toml")).unwrap();
     fs::remove_dir_all(place.path("s/points/0003")).unwrap();
     let (_, stderr) = place.good("compare s --by fitness");
     assert!(stderr.contains("note: s/points/0006 was not run, and is left out: world.coupling = 2"), "{stderr}");

@@ -151,6 +151,10 @@ fn a_finished_run_without_digests_is_damaged() {
     place.write("run/run.json", record.to_string());
     let stderr = place.refused(1, "plot run");
     assert!(stderr.contains("run.json: not the record of a run"), "{stderr}");
+    assert!(
+        stderr.contains("restore it, or make it again with `flotilla train run/config.toml --out run --resume`"),
+        "{stderr}"
+    );
     place.good("plot run --unverified");
     place.good("train small.toml --out run --resume");
     assert_eq!(place.read("run/run.json").matches("\"digest\"").count(), 1);

@@ -3,9 +3,16 @@
 use std::collections::BTreeMap;
 use std::fs;
 use std::process::Stdio;
+use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 use std::time::Duration;
 
 use crate::support::{Place, flotilla};
+use flotilla::config::Override;
+use flotilla::front;
+use flotilla_app::ops::{Context, Event};
+use flotilla_app::record::folder::Start;
+use flotilla_studies::influence;
+use flotilla_studies::paper::run::Request;
 
 /// Returns the contents of the files with results.
 fn tables(place: &Place, out: &str) -> BTreeMap<String, Vec<u8>> {
@@ -53,7 +60,56 @@ fn a_killed_study_resumes_to_the_same_tables() {
     assert!(lines.lines().all(|line| compared.lines().any(|other| other == line)), "{lines}\n{compared}");
 
     assert!(place.refused(1, &format!("{line} --out whole")).contains("--resume"));
+    let other = line.replace("rover_uav,3_rovers_1_uav", "3_rovers_3_uavs");
+    assert!(place.refused(1, &format!("{other} --out whole")).contains("whole holds rover_uav.csv already"));
+    assert!(tables(&place, "whole") == whole);
     assert!(place.refused(1, &format!("{line} --out whole --resume --seed 4")).contains("holds another sweep"));
     assert!(place.refused(2, "paper --influence=nowhere").contains("3_rovers_3_uavs"));
     assert!(place.refused(2, "paper --influence --trials 1 --out none").contains("two trials or more"));
+}
+
+#[test]
+fn a_stop_while_baselines_play_leaves_a_study_to_resume() {
+    let (place, stop) = (Place::new(&[]), AtomicBool::new(false));
+    let few = [("learning.trials", 2), ("learning.generations", 1), ("learning.population", 10)];
+    let request = Request {
+        out: place.path("out"),
+        start: Start::Fresh,
+        set: few.map(|(key, value)| Override::new(key, value, key)).to_vec(),
+        questions: vec![],
+        populations: vec![],
+        influence: vec!["rover_uav".into()],
+    };
+    let report = |event: Event<'_>| {
+        if matches!(&event, Event::Fraction(_, text) if text.starts_with("playing random teams")) {
+            stop.store(true, Relaxed);
+        }
+    };
+    let context = Context { stop: &stop, ..Context::new(&report) };
+    let error = influence::run(&request, &mut &mut front::cpu(), context).unwrap_err();
+    assert_eq!((error.code(), &*error.to_string()), ("stopped", "with everything saved"));
+}
+
+/// The populations' own tests are in `searchers.rs`.
+#[test]
+fn studies_do_not_replace_other_results_and_refuse_keys_that_they_fix() {
+    for (file, what) in [("paper.toml", "a paper"), ("sweep.toml", "a sweep"), ("run.json", "a run")] {
+        let place = Place::new(&[(file, "")]).on_cpu();
+        for study in ["populations=chaotic", "influence=rover_uav", "questions=d"] {
+            let error = place.refused(1, &format!("paper --{study} --trials 2 --generations 1 --out . --resume"));
+            assert!(error.contains(&format!(". holds {what}; choose another --out")), "{error}");
+        }
+        assert_eq!(place.names(), [file]);
+    }
+    let place = Place::new(&[]).on_cpu();
+    let study = "--trials 2 --generations 1 --set learning.population=12 --out study --quiet";
+    place.good(&format!("paper --populations=chaotic {study}"));
+    let before = tables(&place, "study");
+    let error = place.refused(1, &format!("paper --populations=coupling-6 {study}"));
+    assert!(error.contains("study holds cells.csv already; pass --resume"), "{error}");
+    assert!(tables(&place, "study") == before);
+    for (layout, set) in [("chaotic", "sense.density=mean"), ("coupling-6", "world.steps=9")] {
+        let error = place.refused(2, &format!("paper --populations={layout} --set {set} --out none"));
+        assert!(error.contains("fix this key: leave it out") && !place.path("none").exists(), "{error}");
+    }
 }

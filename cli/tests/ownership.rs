@@ -227,8 +227,17 @@ fn an_animation_does_not_replace_pictures_of_others() {
     assert_eq!(place.read("p0003.png"), "precious");
     assert!(!place.path("p0000.png").exists(), "no frame is written");
     place.good("replay run --quiet --width 100 --out q%04d.png");
-    // An animation may replace its own frames.
-    place.good("replay run --quiet --width 100 --out q%04d.png --trial 1");
+    // An animation may replace its own frames. None of a longer one remain.
+    let frames = || {
+        fs::read_dir(place.path("."))
+            .unwrap()
+            .filter(|file| file.as_ref().unwrap().file_name().to_string_lossy().starts_with('q'))
+            .count()
+    };
+    place.good("replay run --quiet --width 100 --out q%04d.png --trial 1 --fps 20");
+    let before = frames();
+    place.good("replay run --quiet --width 100 --out q%04d.png --fps 5");
+    assert!(frames() < before, "{} of {before}", frames());
     // A comparison, which has a default name, may replace itself, but not a picture of others.
     place.good("train small.toml --out other --quiet --seed 3");
     place.good("plot run other");
@@ -582,7 +591,11 @@ fn an_interrupted_replacement_is_completed_by_force_and_by_resume() {
             let (folder, failed, _) = attempt(Some(at));
             assert!(failed.is_err(), "operation {at}");
             let state = Run::read(&folder.path().join(RUN)).map(|run| run.state);
-            replacing += usize::from(state.as_ref().is_ok_and(|state| *state == Status::Replacing));
+            if state.as_ref().is_ok_and(|state| *state == Status::Replacing) {
+                replacing += 1;
+                // A resume with another config is refused, and changes nothing.
+                train(&old, folder.path(), Start::Resume, Disk::default()).unwrap_err();
+            }
             let complete = state.is_ok_and(|state| state == Status::Done);
             // Before the first operation the old run is complete. It cannot be resumed with another config.
             let start = if complete && Config::load(&folder.path().join("config.toml")).unwrap() == old {

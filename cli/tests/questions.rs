@@ -72,8 +72,13 @@ fn a_short_form_of_the_study_writes_its_page_and_files() {
     let (code, _, stderr) = run_paper(folder, &format!("{short} --quiet --resume --seed 4"));
     assert!(code == Some(1) && stderr.contains("holds another sweep"), "{stderr}");
 
-    // An error in one part is reported before any part is trained.
+    // The results of another question are not replaced. A study without results yet may take more questions.
     succeed(folder, "--questions=d --trials 2 --generations 2 --out mixed --quiet");
+    let (code, _, stderr) = run_paper(folder, "--questions=b --trials 2 --generations 2 --out mixed --quiet");
+    assert!(code == Some(1) && stderr.contains("mixed holds observers.svg already; pass --resume"), "{stderr}");
+    let files = fs::read_dir(folder.join("mixed")).unwrap().map(|entry| entry.unwrap().path());
+    files.filter(|path| path.is_file()).for_each(|path| fs::remove_file(path).unwrap());
+    // An error in one part is reported before any part is trained.
     let (code, _, stderr) = run_paper(folder, "--questions=b,d --trials 2 --generations 2 --out mixed --quiet");
     assert!(
         code == Some(1) && stderr.contains("--resume") && !folder.join("mixed/behaviours/points").exists(),
@@ -88,6 +93,16 @@ fn a_short_form_of_the_study_writes_its_page_and_files() {
     assert!(code == Some(2) && stderr.contains("allowed a, b, c, d, e, f, g"), "{stderr}");
     let (code, _, stderr) = run_paper(folder, "--questions=e --out e/curricula");
     assert!(code == Some(1) && stderr.contains("holds a sweep"), "{stderr}");
+}
+
+#[test]
+fn a_refused_resume_leaves_a_paper_that_can_be_resumed() {
+    let place = TempDir::new().unwrap();
+    let paper = "--trials 1 --quiet --resume --out paper --set learning.population";
+    succeed(place.path(), &format!("{paper}=12 --generations 1"));
+    let (code, _, stderr) = run_paper(place.path(), &format!("{paper}=14 --generations 2"));
+    assert!(code == Some(1) && stderr.contains("a run of another config"), "{stderr}");
+    succeed(place.path(), &format!("{paper}=12 --generations 1"));
 }
 
 fn results_file(name: &str) -> PathBuf {

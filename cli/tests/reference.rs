@@ -89,8 +89,8 @@ The region of the `count` POIs of a group, with one of these keys.
 const CLOSING: &str = "
 ## `[[stages]]`
 
-Any number of stages, in order of `from`. Each starts from the file's own keys and changes some of them
-([curricula](../explain/model.md#learning-section-43-algorithm-1)).
+Up to 256 stages, in order of `from`. Each starts from the file's own values and changes some of them. Defaults that depend on other
+keys stay those of the file ([curricula](../explain/model.md#learning-section-43-algorithm-1)).
 
 | key | unit | type | range | default | meaning | paper |
 |---|---|---|---|---|---|---|

@@ -211,6 +211,11 @@ fn errors_in_sweeps_name_the_line() {
         ("groups = [0, 2.5]", "x.toml:13: grid.groups: found 2.5, allowed whole numbers 1 to 256"),
         ("followers_per_leader = [65]", "grid.followers_per_leader: found 65, allowed whole numbers 0 to 64"),
         ("followers_per_leader = [2]", "it lays out world.leaders, which is given too"),
+        (
+            "\"world.coupling\" = [1, 3]\nworld.coupling = [2]",
+            "x.toml:14: grid.\"world.coupling\": given twice; leave one of them out",
+        ),
+        ("world.coupling = [2]\n\"world.coupling\" = [1, 3]", "x.toml:14: grid.\"world.coupling\": given twice"),
         ("skip_impossible = 1", "grid.skip_impossible: found 1, allowed true or false"),
         ("\"world.dt\" = [nan]", "grid.\"world.dt\"[0]: found nan"),
         ("\"world.dt\" = [0.2", "array"),
@@ -390,7 +395,8 @@ fn a_varied_sweep_has_columns_and_a_picture_of_its_keys() {
     for shard in ["1/2", "2/2"] {
         succeed(flotilla(&sweep, &sharded, &["--quiet", skip, "--shard", shard]));
     }
-    succeed(flotilla(&sweep, &sharded, &["--collect", skip]));
+    // Nothing is impossible, so the flag makes no other sweep.
+    succeed(flotilla(&sweep, &sharded, &["--collect"]));
     assert_eq!(results(&unsharded), results(&sharded));
     assert!(fail(flotilla(&sweep, &unsharded, &["--collect", "--axes", "coupling"]), 2).contains("one picture"));
 }
@@ -693,7 +699,8 @@ fn killed_shards_resume_to_the_same_bytes() {
         // Stops each shard three times, after different pauses: the first with SIGKILL, the second with SIGTERM. Windows
         // has no SIGTERM, so both are killed there.
         for pause in [0, 15, 40] {
-            let mut child = start_until_checkpoint(&sweep, &out, &["--quiet", "--resume", "--shard", shard]);
+            let flags = ["--quiet", "--resume", "--shard", shard, "--band", "none"];
+            let mut child = start_until_checkpoint(&sweep, &out, &flags);
             std::thread::sleep(Duration::from_millis(pause));
             if at == 0 || cfg!(windows) {
                 let _ = child.kill();
@@ -708,7 +715,7 @@ fn killed_shards_resume_to_the_same_bytes() {
                     interrupted[at] += 1;
                     let command = message.lines().last().unwrap();
                     assert!(message.starts_with("stopped: everything is saved; continue with"), "{message}");
-                    assert!(command.contains("--backend cpu --shard 2/2 --resume"), "{message}");
+                    assert!(command.contains("--backend cpu --band none --shard 2/2 --resume"), "{message}");
                 }
             }
         }
@@ -799,7 +806,7 @@ fn a_folder_with_another_sweep_or_a_run_is_refused() {
     // Another seed makes another sweep. Another comment does not.
     assert!(fail(flotilla(&sweep, &out, &["--seed", "6", "--resume"]), 1).contains("there: seed = 5"));
     let (_other, same) = write_sweep(&format!("# The same.\n{SMALL}"));
-    succeed(flotilla(&same, &out, &["--quiet", "--resume"]));
+    succeed(flotilla(&same, &out, &["--quiet", "--resume", "--skip-impossible"]));
     assert!(results(&out) == before);
     // A sweep does not write into a run's folder.
     let error = fail(flotilla(&sweep, &out.join("points/0000"), &[]), 1);
@@ -928,10 +935,11 @@ fn at_most_twenty_missing_points_are_listed() {
 fn json_summaries_agree_with_the_files() {
     let (folder, sweep) = write_sweep(SMALL);
     let out = folder.path().join("out");
-    let stdout = succeed(flotilla(&sweep, &out, &["--quiet", "--json", "--shard", "1/2"]));
+    let stdout =
+        succeed(flotilla(&sweep, &out, &["--quiet", "--json", "--shard", "1/2", "--every", "2", "--reach", "0.5"]));
     let summary: serde_json::Value = serde_json::from_str(&stdout).unwrap();
     assert_eq!((&summary["shard"], &summary["folder"]), (&"1/2".into(), &out.to_str().unwrap().into()));
-    assert!(summary["collect"].as_str().unwrap().ends_with("--collect"));
+    assert!(summary["collect"].as_str().unwrap().ends_with("--every 2 --reach 0.5 --collect"));
     let output = flotilla(&sweep, &out, &["--collect", "--json"]);
     assert_eq!(output.status.code(), Some(1));
     let summary: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
@@ -996,9 +1004,12 @@ fn the_batch_script_runs_in_bash() {
         assert!(script.lines().any(|other| other == line), "{line}: {script}");
     }
     assert!(!script.contains("--gpus"), "a GPU is requested for a sweep on the CPU: {script}");
-    let host = ["--slurm", "--seed", "7", "--breed", "host"];
+    let host = ["--slurm", "--seed", "7", "--breed", "host", "--axes", "steps", "--measure", "best"];
     let host_script = succeed(flotilla(&sweep, &out, &host));
-    assert!(host_script.contains("--backend cpu --breed host --shard"), "{host_script}");
+    for then in ["--shard", "--collect"] {
+        let words = format!("--backend cpu --breed host --axes steps --measure best {then}");
+        assert!(host_script.contains(&words), "{host_script}");
+    }
     assert!(
         script.contains("--seed 7 --backend cpu --threads 4 --shard \"$SLURM_ARRAY_TASK_ID/3\" --resume"),
         "{script}"

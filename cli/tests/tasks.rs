@@ -7,12 +7,16 @@ use crate::support;
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
 
 use crate::support::{Place, TINY};
 use assert_cmd::cargo::cargo_bin_cmd;
-use flotilla::Config;
+use flotilla::{Config, front};
+use flotilla_app::ops::{ConfigText, Context};
+use flotilla_app::record::folder::Start;
 use flotilla_app::script::Script;
 use flotilla_studies::questions::parts;
+use flotilla_studies::tasks::{self, Request, Task};
 use serde_json::Value;
 use tempfile::TempDir;
 
@@ -146,9 +150,10 @@ fn tasks_resume_and_those_that_a_constant_speed_solves_fail() {
     let folder = TempDir::new().unwrap();
     let run = |line: &str| run(folder.path(), &format!("{line} --trials 2"));
     fs::write(folder.path().join("tiny.toml"), TINY).unwrap();
-    let (code, table, error) = run("tiny.toml --out a");
+    // Only large populations fix the number of elites.
+    let (code, table, error) = run("tiny.toml --out a --set learning.elites=1");
     assert!(code == Some(1) && error.contains("the baseline constant action reaches G 1.00"), "{error}");
-    assert_eq!(run("tiny.toml --out a --resume"), (code, table, error));
+    assert_eq!(run("tiny.toml --out a --set learning.elites=1 --resume"), (code, table, error));
     // Without `--resume`, the same command does not overwrite the runs.
     let (code, _, error) = run("tiny.toml --out a");
     assert!(code == Some(1) && error.contains("--resume"), "{error}");
@@ -163,19 +168,41 @@ fn the_large_population_differs_from_the_small_ones() {
     place.write("tiny.toml", TINY);
     let error = place.refused(2, "tasks tiny.toml --trials 2 --population 50 --out refused");
     assert!(error.contains("--population 50") && !place.path("refused").exists(), "{error}");
+    for key in ["fitness=G", "trials=3", "elites=1"] {
+        let error = place.refused(2, &format!("tasks tiny.toml --set learning.{key} --out refused"));
+        assert!(error.contains("all tasks fix this key") && !place.path("refused").exists(), "{error}");
+    }
+}
+
+#[test]
+fn a_stop_while_baselines_play_leaves_a_suite_to_resume() {
+    let place = Place::new(&[]);
+    let config = ConfigText { text: TINY.into(), name: "tiny.toml".into(), set: vec![] };
+    let tasks = vec![Task { name: "tiny".into(), config, script: None }];
+    let (out, start, stop) = (place.path("out"), Start::Fresh, AtomicBool::new(true));
+    let request = Request { tasks, out, named: true, start, trials: 2, population: 0, seed: 1 };
+    let context = Context { stop: &stop, ..Context::new(&|_| ()) };
+    let error = tasks::run(&request, &mut &mut front::cpu(), context).unwrap_err();
+    assert_eq!((error.code(), &*error.to_string()), ("stopped", "with everything saved"));
 }
 
 #[test]
 fn champions_play_held_out_episodes_if_starts_or_pois_move() {
     let place = Place::new(&[]).on_cpu();
-    for key in ["start_jitter", "poi_jitter"] {
-        place.write(format!("{key}.toml"), format!("{TINY}{key} = 2.0\n"));
-        let output = place.run(&format!("tasks {key}.toml --trials 2 --population 0 --quiet --json"));
+    let (head, tail) = TINY.split_once("pois = [[10, 9], [20, 9]]\ncoupling = 2\n").unwrap();
+    let region = "[[pois]]\nname = 'poi'\ncount = 2\nin = { box = [8, 7, 22, 11] }\ncoupling = 2\n";
+    for (name, text) in [
+        ("start_jitter", format!("{TINY}start_jitter = 2.0\n")),
+        ("poi_jitter", format!("{TINY}poi_jitter = 2.0\n")),
+        ("region", format!("{head}{tail}{region}")),
+    ] {
+        place.write(format!("{name}.toml"), text);
+        let output = place.run(&format!("tasks {name}.toml --trials 2 --population 0 --quiet --json"));
         let found: Value = serde_json::Deserializer::from_slice(&output.stdout).into_iter().next().unwrap().unwrap();
         let task = &found["tasks"][0];
         assert!(task["scripted_g"].is_null() && task["scripted"] == false, "{task}");
         for trained in task["trained"].as_array().unwrap() {
-            let run = format!("tasks/{key}/50-{}", trained["fitness"].as_str().unwrap());
+            let run = format!("tasks/{name}/50-{}", trained["fitness"].as_str().unwrap());
             for trial in 0..2 {
                 let line = format!("rollout {run} --trial {trial} --episodes 200 --seed 0 --json");
                 let played: Value = serde_json::from_str(&place.good(&line).0).unwrap();

@@ -155,6 +155,16 @@ fn a_run_is_overwritten_only_with_force() {
     // --resume also starts a new run.
     place.good(&format!("train small.toml --out fresh --resume {short}"));
     assert!(place.path("fresh/run.json").exists());
+    // The name of a config may be that of another config's second run.
+    for name in ["small-2.toml", "small-4.toml"] {
+        place.write(name, place.read("small.toml"));
+    }
+    let error = place.refused(1, &format!("train small-2.toml --force {short}"));
+    assert!(error.contains("runs/small-2 is a run of small; choose another --out"), "{error}");
+    place.good(&format!("train small-4.toml {short}"));
+    place.good("train small.toml --resume --generations 2 --quiet");
+    let last = |run: &str| place.read(format!("runs/{run}/metrics.csv")).lines().count();
+    assert!(last("small-3") > last("small-4"), "another config's run is extended");
 }
 
 #[test]

@@ -423,7 +423,9 @@ impl Config {
         let Learning { population, hall_of_fame, .. } = config.learning;
         if r.error_count() == 0 && config.populations() == 1 {
             let what = if config.learners() == 1 { "leader" } else { "population" };
-            for (key, found, default) in config.learning.team_keys() {
+            let partners = config.learning.partners;
+            let partners = (partners > 1).then(|| ("learning.partners", partners.to_string(), "1".into()));
+            for (key, found, default) in config.learning.team_keys().chain(partners) {
                 r.report_key(key, format!("found {found} with a single {what}, allowed {default}: it has no partners"));
             }
         }

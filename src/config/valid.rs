@@ -138,19 +138,21 @@ fn notes(config: &Config) -> Vec<String> {
 /// Returns a note for each class that learns by a fitness that is always 0, because its agents count at no POI and are taken
 /// out alone, and one for Df or Dt if no class leads another.
 fn without_credit(config: &Config, classes: &Classes) -> Vec<String> {
+    let counts_somewhere = |index| (0..classes.pois.len()).any(|group| classes.observes(index, group));
     let of_class = |(index, class): (usize, &AgentClass)| {
         let fitness = class.fitness.unwrap_or(config.learning.fitness);
+        let mut others = classes.agents.iter().enumerate();
+        let led_count = others.any(|(other, led)| class.leads.contains(&led.name) && counts_somewhere(other));
         let is_alone = match fitness {
             Fitness::D => config.credit.removes.is_empty(),
             Fitness::Dpp => true,
-            Fitness::Df | Fitness::Dt => class.leads.is_empty(),
+            Fitness::Df | Fitness::Dt => !led_count,
             Fitness::G => false,
         };
-        let counts = (0..classes.pois.len()).any(|group| classes.observes(index, group));
-        let others = if class.leads.is_empty() { "G, or Df with `leads`" } else { "G, Df or Dt" };
-        (class.learns() && is_alone && !counts && !config.credit.add_g).then(|| {
+        let better = if led_count { "G, Df or Dt" } else { "G, or Df with `leads`" };
+        (class.learns() && is_alone && !counts_somewhere(index) && !config.credit.add_g).then(|| {
             format!(
-                "{fitness} of every {} is always 0, because none counts at a POI: selection is random; use {others}",
+                "{fitness} of every {} is always 0, because none counts at a POI: selection is random; use {better}",
                 class.name
             )
         })

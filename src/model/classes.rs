@@ -61,7 +61,7 @@ table! {
         /// speed at the start
         speed: f64 = "units/s",
         /// what decides how its agents move: a policy, which learns; its `rule`; the nearest agent of a class, to which
-        /// they move straight, or else they stay; a policy, which learns, with one output per agent of a class and one
+        /// they move straight, if turns and speeds allow it, or else they stay; a policy, which learns, with one output per agent of a class and one
         /// for nobody, so that they move straight to the one with the largest (ties go to the first); or nothing, so
         /// that they stay where they are; classes that learn come first
         control: Control = "",
@@ -88,7 +88,7 @@ table! {
         wall_radius: f64 = "units",
         /// push of a wall for each unit nearer than the wall radius
         wall_gain: f64 = "1/s",
-        /// classes whose agents it influences, for Df and Dt
+        /// classes whose agents it influences, for Df and Dt; only classes that learn can lead
         #[serde(skip_serializing_if = "Vec::is_empty", serialize_with = "one_or_list")]
         leads: Vec<String> = "",
         /// distance up to which it influences them
@@ -335,7 +335,7 @@ table! {
         /// pull towards them at the distance `to`, less in proportion when nearer; a push if negative
         #[serde(skip_serializing_if = "Option::is_none")]
         gain: Option<f64> = "units/s",
-        /// pull towards their mean heading
+        /// pull towards their mean heading; agents with free motion keep the heading of their start
         #[serde(skip_serializing_if = "Option::is_none")]
         align: Option<f64> = "units/s",
     }
@@ -364,7 +364,8 @@ table! {
         /// classes whose agents count here, by default those that observe
         #[serde(skip_serializing_if = "Vec::is_empty", serialize_with = "one_or_list")]
         observers: Vec<String> = "",
-        /// the first and the last step, from 1, at which each POI can be observed; one pair for all, or one per POI
+        /// the first and the last step, from 1, at which each POI can be observed; one pair for all, or one per POI; if
+        /// that is all steps, the start is among them, if it counts
         #[serde(skip_serializing_if = "Vec::is_empty")]
         windows: Vec<[usize; 2]> = "steps",
         /// once an observer has come this near, nobody senses the POI any more, though it can still be observed; with 0 it

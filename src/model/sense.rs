@@ -147,7 +147,11 @@ impl ChannelConstants {
             false if of == &[AGENTS] => one_range(0..agents),
             false => ranges(of.iter().map(|name| class(name))),
         };
-        let value = if of_pois { values.iter().copied().fold(0.0, f32::max) } else { 1.0 };
+        // POIs of other groups may be worth so much more that the lattice would be too coarse for these.
+        let value = match of_pois {
+            true => super::each(&ranges).flat_map(|pois| &values[pois]).copied().fold(0.0, f32::max),
+            false => 1.0,
+        };
         // No measure exceeds the largest by more than rounding.
         let size = 1.01 * measure.largest(*nearest) * f64::from(value);
         let [base, distance] = lattice(agents.max(values.len()), size, FINEST);

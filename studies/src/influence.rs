@@ -4,15 +4,15 @@ use std::path::PathBuf;
 
 use serde::Serialize;
 
-use crate::paper::run::{Request, check_trials};
-use crate::tasks::{EPISODES, SEEDS, mean};
+use crate::paper::run::{Request, check_folder, check_trials};
+use crate::tasks::{mean, play_baselines};
 use flotilla::baseline::NAMES;
 use flotilla::escape::PathExt;
 use flotilla_app::choice::Work;
 use flotilla_app::ops::sweep::{PointOutcome, SweepRequest, same_sweep};
-use flotilla_app::ops::{BackendSource, Context, Error, baseline, check_memory, compare, sweep};
+use flotilla_app::ops::{BackendSource, Context, Error, check_memory, compare, sweep};
 use flotilla_app::record::disk::Disk;
-use flotilla_app::record::folder::{self, POINTS};
+use flotilla_app::record::folder::POINTS;
 use flotilla_app::record::{RecordError, ownership};
 use flotilla_app::report::comparison::{self, Comparison, Measure};
 use flotilla_app::sweep::Sweep;
@@ -71,15 +71,14 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let sweeps: Vec<(&str, Sweep)> = sweeps.collect::<Result<_, Error>>()?;
     let configs = || sweeps.iter().flat_map(|(_, sweep)| &sweep.points).map(|point| &point.config);
     check_trials(configs().map(|config| &**config))?;
+    check_folder(out)?;
     for (name, sweep) in &sweeps {
         same_sweep(sweep, &out.join(name))?;
     }
     let (mut backend, on) = backends.open(Work::of(configs().map(|config| &**config)))?;
     check_memory(configs(), backend)?;
-    let disk = ownership::create_output_folder(&Disk::default(), out, request.is_out_named())?;
-    let _lock = folder::lock(&disk, out)?;
     let products = LAYOUT_NAMES.iter().flat_map(|name| [csv_name(name, ""), csv_name(name, "_pairs")]);
-    ownership::check(&disk, products.chain([BASELINES.into()]).map(|name| out.join(name)))?;
+    let (disk, _lock) = request.open_folder(products.chain([BASELINES.into()]))?;
     context.message(format_args!("training {} experiments on {on}, into {}", configs().count(), out.escaped()));
     let mut layouts = Vec::new();
     for (name, sweep) in &sweeps {
@@ -92,8 +91,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         let mut table = Vec::new();
         comparison::csv(std::slice::from_ref(&pairs), &mut table).map_err(Error::Output)?;
         write(&disk, out.join(csv_name(name, "_pairs")), &table)?;
-        let played = baseline::play(&sweep.points[0].config, SEEDS, EPISODES, &mut *backend.0, context)?;
-        let baselines = std::array::from_fn(|index| played.iter().map(|outcome| outcome.all()[index]).collect());
+        let baselines = play_baselines(&sweep.points[0].config, &mut *backend.0, context)?;
         layouts.push(LayoutOutcome { name, points, pairs, baselines });
     }
     context.pause();

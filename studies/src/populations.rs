@@ -8,7 +8,8 @@ use std::path::Path;
 
 use serde::Serialize;
 
-use crate::paper::run::{Request, check_trials};
+use crate::paper::check_fixed;
+use crate::paper::run::{Request, check_folder, check_trials};
 use crate::tasks;
 use flotilla::backend::Backend;
 use flotilla::config::{Choice, Config, Density, Fitness, LAYOUTS, Paradigm, Sharing, ValidConfig};
@@ -31,6 +32,9 @@ pub const LAYOUT_NAMES: [&str; 4] = ["generally-forward", "strictly-forward", "c
 const SPEEDS: [f64; 2] = [3.0, 10.0];
 /// The densities: the default and the paper's words.
 const DENSITIES: [Density; 2] = [Density::Linear, Density::Mean];
+/// The keys that all experiments fix. Stages could change some of them.
+const FIXED: [&str; 6] =
+    ["learning.paradigm", "learning.sharing", "learning.fitness", "motion.max_speed", "sense.density", "stages"];
 /// Number of held-out episodes per champion, and the largest offset of each start, in units.
 const HELD_OUT: (u32, f64) = (100, 2.0);
 /// The files with the results.
@@ -128,10 +132,14 @@ pub struct Row {
 
 /// Returns the experiments on some layouts.
 fn cells(request: &Request) -> Result<Vec<Cell>, Error> {
+    check_fixed(&request.set, &FIXED, "the study's experiments")?;
     let mut cells = Vec::new();
     for (index, layout) in LAYOUT_NAMES.into_iter().enumerate() {
         if !request.populations.iter().any(|name| name == layout) {
             continue;
+        }
+        if index == LAYOUTS.len() {
+            check_fixed(&request.set, &["world.coupling", "world.steps"], "the experiments of coupling-6")?;
         }
         for (arm, (paradigm, sharing, _)) in ARMS_OF.into_iter().enumerate() {
             for fitness in [Fitness::G, Fitness::D, Fitness::Df] {
@@ -166,15 +174,14 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let configs: Vec<Config> = cells.iter().map(|cell| cell.config.clone()).collect();
     let learning = configs[0].learning.clone();
     check_trials(&configs)?;
+    check_folder(out)?;
     let mut work = Work::default();
     configs.iter().for_each(|config| work += Work::of([config]));
     let (backend, on) = backends.open(work)?;
     for config in ValidConfig::all(&configs)? {
         check_memory([&config], backend)?;
     }
-    let disk = ownership::create_output_folder(&Disk::default(), out, request.is_out_named())?;
-    let _lock = folder::lock(&disk, out)?;
-    ownership::check(&disk, products().map(|name| out.join(name)))?;
+    let (disk, _lock) = request.open_folder(products())?;
     let parent = out.join(ARMS);
     disk.create_folder(&parent).map_err(RecordError::write(&parent))?;
     let folders: Vec<_> = cells.iter().map(|cell| parent.join(cell.name())).collect();

@@ -8,10 +8,12 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
+use crate::paper::check_fixed;
+use crate::questions::run::stopped;
 use crate::questions::{champions, play};
 use flotilla::backend::{Backend, OpenBackend};
 use flotilla::baseline::NAMES;
-use flotilla::config::{Config, Fitness, Learning, Override};
+use flotilla::config::{Config, Fitness, Learning, Override, ValidConfig};
 use flotilla::evaluate::Starts;
 use flotilla::world::World;
 use flotilla_app::choice::Work;
@@ -32,11 +34,20 @@ pub const BUDGET: usize = 10;
 /// Number of policies in the small populations, and their number of generations.
 pub const SMALL: (i64, i64) = (50, 100);
 /// Number of repetitions of the baselines.
-pub(crate) const SEEDS: usize = 10;
+const SEEDS: usize = 10;
 /// Number of held-out episodes per champion, if starts or POIs move.
-pub(crate) const EPISODES: u32 = 200;
+const EPISODES: u32 = 200;
 /// G above which a team solves a task. If starts or POIs move, no team observes all POIs in all episodes.
 pub const SOLVED: f64 = 0.9;
+/// The keys that all trainings fix. The last one is fixed for large populations only.
+const FIXED: [&str; 6] = [
+    "learning.fitness",
+    "learning.trials",
+    "learning.seed",
+    "learning.generations",
+    "learning.population",
+    "learning.elites",
+];
 /// The fitnesses of both kinds of populations.
 pub const FITNESSES: [Fitness; 4] = [Fitness::G, Fitness::D, Fitness::Df, Fitness::Dpp];
 
@@ -145,6 +156,8 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         if tasks.iter().any(|(other, ..)| other.name == *name) {
             return Err(Error::Usage(format!("two configs have the name {name}; rename one").into()));
         }
+        let fixed = &FIXED[..FIXED.len() - usize::from(request.population == 0)];
+        check_fixed(&task.config.set, fixed, "the trainings of all tasks")?;
         let set =
             |key: &str, value: toml::Value| Override::new(format!("learning.{key}"), value, format!("learning.{key}"));
         let common = [("trials", request.trials.into()), ("seed", request.seed.into()), ("generations", SMALL.1)];
@@ -174,8 +187,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         let small = &configs[0];
         let mut searched = small.clone();
         searched.learning.population *= BUDGET;
-        let played = baseline::play(&searched.validate()?, SEEDS, EPISODES, &mut *backend.0, context.quiet())?;
-        let baselines = std::array::from_fn(|index| played.iter().map(|outcome| outcome.all()[index]).collect());
+        let baselines = play_baselines(&searched.validate()?, &mut *backend.0, context.quiet())?;
         let mut trained = Vec::new();
         // One training at a time, because large populations take much memory.
         for config in &configs {
@@ -197,6 +209,19 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     Ok(Outcome { population: request.population, tasks: found })
 }
 
+/// Returns G of each baseline of [`NAMES`], per seed. If it is stopped, earlier trainings are saved.
+pub(crate) fn play_baselines(
+    config: &ValidConfig,
+    backend: &mut dyn Backend,
+    context: Context<'_>,
+) -> Result<[Vec<f64>; NAMES.len()], Error> {
+    let played = baseline::play(config, SEEDS, EPISODES, backend, context).map_err(|error| match error {
+        Error::Stopped(_) => stopped(),
+        error => error,
+    })?;
+    Ok(std::array::from_fn(|index| played.iter().map(|outcome| outcome.all()[index]).collect()))
+}
+
 /// Returns G of a task's scripted team.
 fn play_script(script: &Script, name: &str, config: &Config) -> Result<f64, Error> {
     let invalid = |error: String| Error::Usage(format!("{name}: scripted team: {error}").into());
@@ -214,7 +239,7 @@ fn play_script(script: &Script, name: &str, config: &Config) -> Result<f64, Erro
 
 /// Reports whether starts or POIs move.
 fn moves(config: &Config) -> bool {
-    config.learning.start_jitter > 0.0 || config.learning.poi_jitter > 0.0
+    config.starts_move() || config.pois_move()
 }
 
 /// Returns the starts of held-out episodes.
@@ -247,7 +272,7 @@ pub(crate) fn train(
     context.pause();
     match ended? {
         SessionEnd::Finished => Ok(()),
-        SessionEnd::Stopped => Err(Error::Stopped("with everything saved".into())),
+        SessionEnd::Stopped => Err(stopped()),
     }
 }
 

@@ -101,9 +101,11 @@ impl Section {
                     None => {}
                 },
                 To::Only(value, why) => {
+                    // 0 and 0.0 are equal.
+                    let plain = |text: &str| text.parse::<f64>().map_or(text.to_string(), |number| number.to_string());
                     found
                         .iter()
-                        .filter(|at| at.shown().trim_matches(['"', ',']) != *value)
+                        .filter(|at| plain(at.shown().trim_matches(['"', ','])) != plain(value))
                         .for_each(|at| self.skip(at, why));
                 }
                 To::Nothing(why) => found.iter().for_each(|at| self.skip(at, why)),

@@ -232,7 +232,7 @@ fn of_sweep(out: &Path, args: &CompareRequest, notes: &mut Vec<String>) -> Resul
                     Ok(_) => {
                         return Err(Error::Refused(format!("{} is a run of another config", folder.escaped()).into()));
                     }
-                    Err(ReadError::Missing(_) | ReadError::Unfinished { .. }) => {
+                    Err(ReadError::Missing(_) | ReadError::Foreign { .. } | ReadError::Unfinished { .. }) => {
                         let point = sweep.describe(point);
                         notes.push(format!("{} was not run, and is left out: {point}", folder.escaped()));
                     }

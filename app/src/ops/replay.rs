@@ -324,6 +324,10 @@ fn write_film(
         let written = content.and_then(|content| disk.replace(&path, |output| output.write_all(&content)));
         written.map_err(RecordError::write(&path))?;
     }
+    // Otherwise the pictures of a longer film that was there would follow.
+    for path in (count..).map(place).take_while(|path| ownership::is_drawing(path)) {
+        disk.remove(&path).map_err(RecordError::write(&path))?;
+    }
     Ok(Written::Film { first: place(0), last: place(count - 1), frames: count })
 }
 

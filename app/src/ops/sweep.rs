@@ -232,9 +232,10 @@ pub fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
         }
     }
     let existing = config::read_file(&path)?;
-    // A person may have written the file, so the same sweep may be formatted differently.
-    let normal = |text: &str| Some(Sweep::read(text, SWEEP, &[], sweep.skipped > 0).ok()?.text);
-    if existing == sweep.text || normal(&existing).as_ref() == Some(&sweep.text) {
+    // A person may have written the file, so the same sweep may be formatted differently. `skip_impossible` only
+    // decides whether impossible points are an error, so it makes no other sweep.
+    let normal = |text: &str| Some(Sweep::read(text, SWEEP, &[], true).ok()?.text);
+    if existing == sweep.text || normal(&existing).is_some_and(|there| normal(&sweep.text) == Some(there)) {
         return Ok(());
     }
     let missing = |from: &str, other: &str, where_: &str| {
@@ -434,8 +435,8 @@ pub(crate) fn unreachable(config: &ValidConfig) -> Vec<String> {
         }
         if let Some(steps) = reach::fewest_steps(config, &found) {
             lines.push(format!(
-                "{place}to reach these POIs, set world.steps to at least {steps}, raise motion.max_speed, or let agents \
-                 start nearer"
+                "{place}to reach these POIs, set world.steps to at least {steps}, raise the `max_speed` of agents, or let \
+                 them start nearer"
             ));
         }
     }

@@ -159,7 +159,14 @@ impl TrainRequest {
         Ok(match (&self.out, self.start) {
             (Some(out), _) => out.clone(),
             (None, Start::Resume) => folder::latest(runs, &self.name),
-            (None, Start::Force) => runs.join(&self.name),
+            (None, Start::Force) => {
+                let path = runs.join(&self.name);
+                if let Some(other) = folder::other_name(&path, &self.name) {
+                    let text = format!("{} is a run of {}", path.escaped(), Path::new(&other).escaped());
+                    return Err(Error::Refused(with_remedy(text, "choose another --out")));
+                }
+                path
+            }
             (None, Start::Fresh) => folder::next_free(runs, &self.name)?,
         })
     }
@@ -259,12 +266,13 @@ fn open_session(
         }
     }
     let opened = Session::open_from(vec![(config.clone(), folder.to_path_buf(), policies)], start, &disk);
-    let (session, found) = opened.map_err(|error| match error {
+    let (mut session, found) = opened.map_err(|error| match error {
         // This avoids the advice to use `--resume`. Until the run's origin is recorded, a resumed run would start from
         // random policies.
         RunError::Record(error) if init.is_some() => Error::Record(error),
         error => Error::Run(error),
     })?;
+    session.name(0, &request.name);
     for (_, note) in found {
         if note.is_damage() { context.warn(note) } else { context.note(note) }
     }

@@ -30,7 +30,7 @@ use disk::Place;
 use flotilla::config::{self, Config, ConfigError, STAGES};
 use flotilla::escape::{self, PathExt};
 use flotilla::file::{self, TextError};
-use ownership::CONFIG;
+use ownership::{CONFIG, METRICS, POLICIES, RUN};
 
 pub use flotilla::trainer::digest::hex;
 
@@ -208,6 +208,7 @@ impl RecordError {
 
     /// Returns what the user can do about it. `next` follows the remedy of a full disk, such as "run it again".
     pub fn help(&self, next: &str) -> Option<String> {
+        let again = |path: &Path| format!("make it again with `{}`", command_to_resume(file::folder(path), &[]));
         Some(match self {
             RecordError::Write { error, .. } | RecordError::Read { error, .. }
                 if cfg!(unix) && error.raw_os_error() == Some(TOO_MANY_FILES) =>
@@ -259,12 +260,17 @@ impl RecordError {
                 "restore what it was, or move {} away and name the run's own config, or choose another --out",
                 path.display()
             ),
+            RecordError::Differs(path) if path.ends_with(CONFIG) => {
+                "restore it, or read it all the same with --unverified".into()
+            }
             RecordError::Differs(path) => {
-                let again = match path.ends_with(CONFIG) {
-                    true => String::new(),
-                    false => format!(", make it again with `{}`", command_to_resume(file::folder(path), &[])),
-                };
-                format!("restore it{again}, or read it all the same with --unverified")
+                format!("restore it, {}, or read it all the same with --unverified", again(path))
+            }
+            RecordError::Damaged { path, .. }
+                if [RUN, METRICS, POLICIES].iter().any(|name| path.ends_with(name))
+                    && file::folder(path).join(CONFIG).exists() =>
+            {
+                format!("restore it, or {}", again(path))
             }
             RecordError::Newer { .. } => "use that version, or choose another --out".into(),
             RecordError::Damaged { .. } | RecordError::NoTrial { .. } => return None,

@@ -322,8 +322,10 @@ pub fn compare(place: &str, arms: &[Cohort], options: &Question) -> Result<Compa
     // All arms need test episodes.
     let tested = arms.iter().flat_map(|arm| &arm.trials).all(|trial| trial.rows[last].test_g.is_some());
     let test = generations.iter().filter(|_| tested).map(|&generation| Measure::TestG { generation });
-    let reach = Measure::GenerationsToReach { reach: options.reach, generation: last };
-    let measures = champion.chain(test).chain(best).chain([reach]).map(|measure| {
+    // No trial can reach a G in a stage that has not begun.
+    let begun = arms.iter().flat_map(|arm| &arm.trials).all(|trial| trial.from <= last);
+    let reach = begun.then_some(Measure::GenerationsToReach { reach: options.reach, generation: last });
+    let measures = champion.chain(test).chain(best).chain(reach).map(|measure| {
         let values = |arm: &Cohort| arm.trials.iter().filter_map(|trial| measure.of(trial)).collect();
         measured(measure, &arms.iter().map(values).collect::<Vec<_>>(), options.paired)
     });

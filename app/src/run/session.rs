@@ -161,6 +161,11 @@ impl Session {
         &self.members[run].run
     }
 
+    /// Gives a run a name, which is recorded when it trains. A resumed run keeps the name that it has.
+    pub fn name(&mut self, run: usize, name: &str) {
+        self.members[run].run.name.get_or_insert_with(|| name.into());
+    }
+
     /// Trains all runs until they are finished or the caller stops them.
     ///
     /// # Errors

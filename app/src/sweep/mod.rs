@@ -156,8 +156,9 @@ impl Sweep {
         for (index, (axis, line)) in grid.axes.iter().enumerate() {
             let before = grid.axes.iter().zip(&paths[..index]).find(|(_, path)| overlaps(path, &paths[index]));
             problems.extend(before.map(|((before, _), _)| {
-                let message = format!("{} sets the same; leave one of them out", before.name());
-                problem(Some(*line), &axis.name(), message)
+                let (before, name) = (before.name(), axis.name());
+                let what = if before == name { "given twice".into() } else { format!("{before} sets the same") };
+                problem(Some(*line), &name, format!("{what}; leave one of them out"))
             }));
         }
         problems.extend(layout::conflicts(&grid, &base));
@@ -267,7 +268,7 @@ impl Grid {
             // Spans give the order in the file. Plain values are simpler to use.
             let mut starts = BTreeMap::new();
             flatten_spans(section, "", &mut starts);
-            let mut flat = BTreeMap::new();
+            let mut flat = Vec::new();
             flatten(values, "", &mut flat);
             let mut keys: Vec<_> =
                 flat.into_iter().map(|(key, value)| (starts.get(&key).copied(), key, value)).collect();
@@ -528,24 +529,26 @@ fn quoted(key: &str) -> String {
     if key.contains('.') { format!("{key:?}") } else { key.into() }
 }
 
-/// Joins nested keys with dots: `world.coupling = […]` without quotes is a table in a table.
-fn flatten(table: Table, prefix: &str, flat: &mut BTreeMap<String, Value>) {
+/// Joins nested keys with dots: `world.coupling = […]` without quotes is a table in a table. A key that the file has in
+/// both notations is there twice.
+fn flatten(table: Table, prefix: &str, flat: &mut Vec<(String, Value)>) {
     for (key, value) in table {
         let key = format!("{prefix}{key}");
         match value {
             Value::Table(table) => flatten(table, &format!("{key}."), flat),
-            value => drop(flat.insert(key, value)),
+            value => flat.push((key, value)),
         }
     }
 }
 
+/// Finds where each key of [`flatten`] starts, the later place if it is there twice.
 fn flatten_spans(table: &DeTable<'_>, prefix: &str, starts: &mut BTreeMap<String, usize>) {
     for (key, value) in table {
         let start = key.span().start;
         let key = format!("{prefix}{}", key.get_ref());
         match value.get_ref() {
             DeValue::Table(table) => flatten_spans(table, &format!("{key}."), starts),
-            _ => drop(starts.insert(key, start)),
+            _ => drop(starts.entry(key).and_modify(|later| *later = start.max(*later)).or_insert(start)),
         }
     }
 }

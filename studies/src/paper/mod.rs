@@ -75,17 +75,7 @@ const FIXED: [&str; 4] = ["learning.paradigm", "learning.fitness", "policy.actio
 /// # Errors
 /// An override is invalid, or sets a key that the experiments fix.
 pub fn arms(overrides: &[Override]) -> Result<Vec<Experiment>, ConfigError> {
-    let problems: Vec<_> = overrides
-        .iter()
-        .filter(|set| FIXED.contains(&set.key.as_str()))
-        .map(|set| {
-            let message = "the paper's experiments fix this key: leave it out".to_string();
-            Problem { line: None, key: set.name.clone(), message }
-        })
-        .collect();
-    if !problems.is_empty() {
-        return Err(ConfigError::Invalid { name: "the paper's experiments".into(), problems, unlisted: 0 });
-    }
+    check_fixed(overrides, &FIXED, "the paper's experiments")?;
     let shown = |layout: &Layout| layout.figure.is_some();
     let places = LAYOUTS.into_iter().flat_map(|layout| PARADIGMS.map(|paradigm| (layout, paradigm, false)));
     let rivals = LAYOUTS.into_iter().filter(shown).map(|layout| (layout, Paradigm::AllLeaders, true));
@@ -104,6 +94,18 @@ pub fn arms(overrides: &[Override]) -> Result<Vec<Experiment>, ConfigError> {
         }
     }
     Ok(arms)
+}
+
+/// Fails if an override sets a key that some experiments fix. `experiments` names them in the error.
+pub(crate) fn check_fixed(overrides: &[Override], fixed: &[&str], experiments: &str) -> Result<(), ConfigError> {
+    let message = format!("{experiments} fix this key: leave it out");
+    let set = overrides.iter().filter(|set| fixed.contains(&set.key.as_str()));
+    let problems: Vec<_> =
+        set.map(|set| Problem { line: None, key: set.name.clone(), message: message.clone() }).collect();
+    match problems.is_empty() {
+        true => Ok(()),
+        false => Err(ConfigError::Invalid { name: experiments.into(), problems, unlisted: 0 }),
+    }
 }
 
 /// Returns the configs to train, and for each arm the index of its config. All-leaders with Df share the training with

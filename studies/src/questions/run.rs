@@ -4,14 +4,14 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
-use crate::paper::run::{Request, check_trials};
+use crate::paper::run::{self, Request, check_trials, holds};
 use crate::questions::{self, Answer, OpenQuestion, QUESTIONS, Study, Warm};
 use flotilla::backend::OpenBackend;
 use flotilla::config::Config;
 use flotilla::escape::PathExt;
 use flotilla_app::choice::Work;
 use flotilla_app::ops::sweep::{claim, free_memory, same_sweep, train_points};
-use flotilla_app::ops::{BackendSource, Context, Error, Event, check_memory, with_remedy};
+use flotilla_app::ops::{BackendSource, Context, Error, Event, check_memory};
 use flotilla_app::record::disk::Disk;
 use flotilla_app::record::folder::{self, SWEEP};
 use flotilla_app::record::{RecordError, ownership, policies};
@@ -79,9 +79,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let configs = || parts.iter().flat_map(|(_, sweep)| &sweep.points).map(|point| &point.config);
     let (backend, on) = backends.open(Work::of(configs().map(|config| &**config)))?;
     check_memory(configs(), backend)?;
-    let disk = ownership::create_output_folder(&Disk::default(), out, request.is_out_named())?;
-    let _lock = folder::lock(&disk, out)?;
-    ownership::check(&disk, files().chain([PAGE.into()]).map(|name| out.join(name)))?;
+    let (disk, _lock) = request.open_folder(files().chain([PAGE.into()]))?;
     let points: usize = parts.iter().map(|(_, sweep)| sweep.points.len()).sum();
     context.message(format_args!("training {points} experiments on {on}, into {}", out.escaped()));
 
@@ -124,26 +122,17 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
 
 /// Refuses a folder with other content, or with other sweeps.
 fn check_folder(parts: &[(&Study, Sweep)], out: &Path) -> Result<(), Error> {
-    let refused = |what: &str| {
-        let reason = format!("{} holds {what}", out.escaped());
-        Err(Error::Refused(with_remedy(reason, "choose another --out")))
-    };
-    if let Some(what) = folder::collection(out) {
-        return refused(what);
-    }
-    if folder::holds_run(out)? {
-        return refused("a run");
-    }
+    run::check_folder(out)?;
     parts.iter().try_for_each(|(part, sweep)| same_sweep(sweep, &out.join(part.name)))?;
     let has_sweeps = all_parts().any(|part| out.join(part.name).join(SWEEP).exists());
     match files().chain([PAGE.into()]).find(|name| out.join(name).exists()) {
-        Some(theirs) if !has_sweeps => refused(&format!("{theirs}, but none of the questions' sweeps")),
+        Some(theirs) if !has_sweeps => Err(holds(out, &format!("{theirs}, but none of the questions' sweeps"))),
         _ => Ok(()),
     }
 }
 
 /// Returns the error for a command that the user stopped.
-fn stopped() -> Error {
+pub(crate) fn stopped() -> Error {
     Error::Stopped("with everything saved".into())
 }
 

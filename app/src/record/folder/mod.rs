@@ -25,7 +25,7 @@ mod resume;
 mod run;
 
 pub use paths::{around, collection, owner};
-pub use paths::{holds_run, latest, next_free};
+pub use paths::{holds_run, latest, next_free, other_name};
 pub use resume::{FirstAndLastRows, differences};
 pub(crate) use run::RunSums;
 pub use run::{FileSums, OWN_FITNESS, Origin, Run, Status, now};
@@ -201,6 +201,9 @@ impl Folder {
                 folder.clear(&Run { init: from.digest(), ..Run::new(config) }, config, &mut found)?;
             }
             (Start::Resume, Some(run)) => {
+                if let Some(error) = folder.origin_error(config, Some(&run), false) {
+                    return Err(error);
+                }
                 found.notes.push(Note::Replacing);
                 folder.clear(&run, config, &mut found)?;
             }

@@ -4,7 +4,7 @@ use std::fs;
 use std::io::ErrorKind;
 use std::path::{Component, Path, PathBuf};
 
-use super::{ARMS, CHECKPOINTS, CONFIG, LOCK, METRICS, PAPER, POINTS, POLICIES, RESULTS, RUN, SWEEP};
+use super::{ARMS, CHECKPOINTS, CONFIG, LOCK, METRICS, PAPER, POINTS, POLICIES, RESULTS, RUN, Run, SWEEP};
 use crate::record::RecordError;
 use crate::record::ownership::LIST;
 use flotilla::file;
@@ -71,7 +71,7 @@ pub fn around(path: &Path) -> Option<&Path> {
 /// Creates the next folder after the last existing one of `stem`, `stem-2`, `stem-3`, … and returns its path.
 pub fn next_free(parent: &Path, stem: &str) -> Result<PathBuf, RecordError> {
     fs::create_dir_all(parent).map_err(RecordError::write(parent))?;
-    let mut number = newest(parent, stem) + 1;
+    let mut number = numbers(parent, stem).max().unwrap_or(0) + 1;
     loop {
         let path = numbered(parent, stem, number);
         match fs::create_dir(&path) {
@@ -82,19 +82,25 @@ pub fn next_free(parent: &Path, stem: &str) -> Result<PathBuf, RecordError> {
     }
 }
 
-/// Returns the last existing path of `stem`, `stem-2`, …, or `stem` if none exists.
+/// Returns the last existing path of `stem`, `stem-2`, …, or `stem` if none exists. Runs with another name are left out.
 pub fn latest(parent: &Path, stem: &str) -> PathBuf {
-    numbered(parent, stem, newest(parent, stem).max(1))
+    let own = numbers(parent, stem).filter(|&number| other_name(&numbered(parent, stem, number), stem).is_none());
+    numbered(parent, stem, own.max().unwrap_or(1))
 }
 
-/// Returns the largest number of the existing folders, or 0 if there is none.
-fn newest(parent: &Path, stem: &str) -> usize {
-    let number = |name: &str| match name.strip_prefix(stem)? {
+/// Returns the name of the run in a folder if it has another name: `x-2` may be the second run of `x`.
+pub fn other_name(folder: &Path, name: &str) -> Option<String> {
+    Run::read(&folder.join(RUN)).ok()?.name.filter(|other| other != name)
+}
+
+/// Returns the numbers of the existing folders.
+fn numbers(parent: &Path, stem: &str) -> impl Iterator<Item = usize> {
+    let number = move |name: &str| match name.strip_prefix(stem)? {
         "" => Some(1),
         rest => rest.strip_prefix('-')?.parse().ok().filter(|&number| name == format!("{stem}-{number}") && number > 1),
     };
     let entries = fs::read_dir(parent).into_iter().flatten().flatten();
-    entries.filter_map(|entry| number(entry.file_name().to_str()?)).max().unwrap_or(0)
+    entries.filter_map(move |entry| number(entry.file_name().to_str()?))
 }
 
 fn numbered(parent: &Path, stem: &str, number: usize) -> PathBuf {

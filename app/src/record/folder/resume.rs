@@ -93,7 +93,7 @@ impl Folder {
 
     /// Returns an error if the run's origin does not allow the given config. `has_config` says that `config.toml` could
     /// be read. It then agrees with the given config, so that a mismatch means that it was edited.
-    fn origin_error(&self, config: &Config, run: Option<&Run>, has_config: bool) -> Option<RecordError> {
+    pub(super) fn origin_error(&self, config: &Config, run: Option<&Run>, has_config: bool) -> Option<RecordError> {
         let origin = Some(&run?.origin).filter(|origin| !origin.allows(config))?;
         let (path, existing, requested) = (self.path.clone(), origin.generations, config.learning.generations);
         Some(match existing > requested {

@@ -19,6 +19,9 @@ pub struct Run {
     pub version: String,
     /// Progress of the run.
     pub state: Status,
+    /// Name of a run that `flotilla train` started, by default that of its config.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub name: Option<String>,
     /// Random seed in the config.
     pub seed: u64,
     /// Backend, "cpu" or "gpu".

@@ -1,5 +1,6 @@
 //! Trains the paper's experiments, draws its figures and checks its claims.
 
+use std::fs::File;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
@@ -13,7 +14,7 @@ use flotilla::escape::PathExt;
 use flotilla::memory;
 use flotilla::parallel::current_num_threads;
 use flotilla_app::choice::Work;
-use flotilla_app::ops::{BackendSource, Context, Error, Event, ProcessorInfo};
+use flotilla_app::ops::{BackendSource, Context, Error, Event, ProcessorInfo, with_remedy};
 use flotilla_app::record::disk::Disk;
 use flotilla_app::record::folder::{self, Start};
 use flotilla_app::record::{RecordError, ownership};
@@ -60,6 +61,33 @@ impl Request {
     pub fn is_out_named(&self) -> bool {
         self.out != Path::new(OUT)
     }
+
+    /// Opens and locks the folder of a study that is not the paper. A new study does not replace `files`, its results.
+    pub(crate) fn open_folder(&self, files: impl Iterator<Item = String>) -> Result<(Disk, Option<File>), Error> {
+        let out = &self.out;
+        let disk = ownership::create_output_folder(&Disk::default(), out, self.is_out_named())?;
+        let lock = folder::lock(&disk, out)?;
+        let files: Vec<String> = files.collect();
+        ownership::check(&disk, files.iter().map(|name| out.join(name)))?;
+        match files.iter().find(|name| self.start == Start::Fresh && out.join(name).exists()) {
+            Some(name) => Err(Error::Refused(with_remedy(
+                format!("{} holds {name} already", out.escaped()),
+                "pass --resume to continue the study or --force to overwrite it, or choose another --out",
+            ))),
+            None => Ok((disk, lock)),
+        }
+    }
+}
+
+/// Returns the error for a folder that holds something other than a study's results.
+pub(crate) fn holds(out: &Path, what: &str) -> Error {
+    Error::Refused(with_remedy(format!("{} holds {what}", out.escaped()), "choose another --out"))
+}
+
+/// Refuses the folder of a paper, a sweep or a run.
+pub(crate) fn check_folder(out: &Path) -> Result<(), Error> {
+    let is_run = folder::holds_run(out)?;
+    folder::collection(out).or(is_run.then_some("a run")).map_or(Ok(()), |what| Err(holds(out, what)))
 }
 
 /// Fails if a config has fewer trials than intervals and tests need.
@@ -173,8 +201,15 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     identity.check(out, start)?;
     experiments.check_folders(&disk, start)?;
     ownership::check(&disk, products().map(|name| out.join(name)))?;
-    identity.write(out, start, &disk)?;
+    // A new paper is marked first, so that it is recognised if it is stopped. A refused resume keeps the old mark.
+    let resumes = start == Start::Resume && out.join(folder::PAPER).exists();
+    if !resumes {
+        identity.write(out, start, &disk)?;
+    }
     let mut session = experiments.open(start, &disk, context)?;
+    if resumes {
+        identity.write(out, start, &disk)?;
+    }
     if !session.is_done() {
         experiments.train(&mut session, backend, &on, out, context)?;
     }
