@@ -781,7 +781,7 @@ fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
                     let text = String::from_utf8(bytes).unwrap();
                     text.lines().map(|line| line.rsplit_once(',').unwrap().0).collect::<Vec<_>>().join("\n").into()
                 }
-                "run.json" => without(&bytes, &["started", "updated", "seconds", "command"]),
+                "run.json" => without(&bytes, &["started", "updated", "seconds", "command", "name"]),
                 name if name.ends_with(".safetensors") && name != "policies.safetensors" => {
                     let length = u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
                     let times = ["seconds", "metrics_bytes", "metrics_sha256", "checksum", "sha256"];
