@@ -921,7 +921,7 @@ fn a_channel_names_at_most_four_runs_of_groups() {
     assert_eq!(error, expected);
 }
 
-/// What a channel cannot sense does not change its inputs, whatever it is worth.
+/// POIs that a channel cannot sense do not change its inputs, whatever they are worth.
 #[test]
 fn values_of_other_groups_do_not_change_inputs() {
     let inputs = |others: f64| {

@@ -90,7 +90,7 @@ const CLOSING: &str = "
 ## `[[stages]]`
 
 Up to 256 stages, in order of `from`. Each starts from the file's own values and changes some of them. Defaults that depend on other
-keys stay those of the file ([curricula](../explain/model.md#learning-section-43-algorithm-1)).
+keys stay as in the file ([curricula](../explain/model.md#learning-section-43-algorithm-1)).
 
 | key | unit | type | range | default | meaning | paper |
 |---|---|---|---|---|---|---|

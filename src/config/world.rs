@@ -39,8 +39,8 @@ section! {
         observation_radius: f64 = "units", "3.2, Eq. 3",
         /// agents that count at a POI; the coupling is at most their number
         observers: Observers = "", "5",
-        /// the first and the last step of each POI at which it can be observed; if that is all steps, the start is among
-        /// them, if it counts
+        /// the first and the last step of each POI at which it can be observed; a window of all
+        /// steps has the start, too, if world.start_counts is true
         windows: Vec<[usize; 2]> = "steps", "5",
         /// for each POI, the POIs (indices into world.pois, from 0) that must have been observed at an earlier step
         /// before it can be

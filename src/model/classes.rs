@@ -61,9 +61,9 @@ table! {
         /// speed at the start
         speed: f64 = "units/s",
         /// what decides how its agents move: a policy, which learns; its `rule`; the nearest agent of a class, to which
-        /// they move straight, if turns and speeds allow it, or else they stay; a policy, which learns, with one output per agent of a class and one
-        /// for nobody, so that they move straight to the one with the largest (ties go to the first); or nothing, so
-        /// that they stay where they are; classes that learn come first
+        /// they move (if motion is free, straight, and they stay if there is none); a policy, which learns, with one
+        /// output per agent of a class and one for nobody, so that they move in the same way to the one with the
+        /// largest (ties go to the first); or nothing, so that they stay where they are; classes that learn come first
         control: Control = "",
         /// with control = "nearest:CLASS": the distance up to which they move to an agent
         #[serde(skip_serializing_if = "Option::is_none")]
@@ -364,8 +364,8 @@ table! {
         /// classes whose agents count here, by default those that observe
         #[serde(skip_serializing_if = "Vec::is_empty", serialize_with = "one_or_list")]
         observers: Vec<String> = "",
-        /// the first and the last step, from 1, at which each POI can be observed; one pair for all, or one per POI; if
-        /// that is all steps, the start is among them, if it counts
+        /// the first and the last step, from 1, at which each POI can be observed; one pair for all, or one per POI;
+        /// a window of all steps has the start, too, if world.start_counts is true
         #[serde(skip_serializing_if = "Vec::is_empty")]
         windows: Vec<[usize; 2]> = "steps",
         /// once an observer has come this near, nobody senses the POI any more, though it can still be observed; with 0 it

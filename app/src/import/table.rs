@@ -101,7 +101,7 @@ impl Section {
                     None => {}
                 },
                 To::Only(value, why) => {
-                    // 0 and 0.0 are equal.
+                    // Two spellings of a number are the same value.
                     let plain = |text: &str| text.parse::<f64>().map_or(text.to_string(), |number| number.to_string());
                     found
                         .iter()

@@ -272,7 +272,7 @@ fn open_session(
         RunError::Record(error) if init.is_some() => Error::Record(error),
         error => Error::Run(error),
     })?;
-    session.name(0, &request.name);
+    session.set_name(0, &request.name);
     for (_, note) in found {
         if note.is_damage() { context.warn(note) } else { context.note(note) }
     }

@@ -162,7 +162,7 @@ impl Session {
     }
 
     /// Gives a run a name, which is recorded when it trains. A resumed run keeps the name that it has.
-    pub fn name(&mut self, run: usize, name: &str) {
+    pub fn set_name(&mut self, run: usize, name: &str) {
         self.members[run].run.name.get_or_insert_with(|| name.into());
     }
 
