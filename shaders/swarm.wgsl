@@ -427,8 +427,9 @@ fn learn(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_
                 sensed.sums[sector] = sum;
                 sensed.counts[sector] = count;
                 if has_quadrants(channel) {
-                    sensed.quadrants.sums[sector] = sum;
-                    sensed.quadrants.counts[sector] = count;
+                    let own_sector = vec4(sector) == vec4(0u, 1u, 2u, 3u);
+                    sensed.quadrants.sums = select(sensed.quadrants.sums, vec4(sum), own_sector);
+                    sensed.quadrants.counts = select(sensed.quadrants.counts, vec4(count), own_sector);
                 }
             }
             write_inputs(channel, gauge_of(own_class, index), sensed, &inputs);

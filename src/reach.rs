@@ -232,8 +232,11 @@ pub fn unreachable(config: &StageConfig) -> Vec<Unreachable> {
 /// Returns the smallest number of steps in which every POI could be reached. None if longer episodes would not help.
 pub fn fewest_steps(config: &StageConfig, unreachable: &[Unreachable]) -> Option<usize> {
     let far = unreachable.iter().filter(|unreachable| matches!(unreachable.why, Why::Far { .. }));
-    let distances = Distances::new(config, &config.classes(), MAX_STEPS);
-    let steps: Option<Vec<usize>> = far.map(|unreachable| distances.first(unreachable.poi, 1.0)).collect();
+    let classes = config.classes();
+    let (distances, windows) = (Distances::new(config, &classes, MAX_STEPS), classes.windows(MAX_STEPS));
+    let is_open = |poi: usize, step: usize| windows.get(poi).is_none_or(|[_, last]| step <= *last);
+    let first = |Unreachable { poi, .. }: &Unreachable| distances.first(*poi, 1.0).filter(|&step| is_open(*poi, step));
+    let steps: Option<Vec<usize>> = far.map(first).collect();
     steps?.into_iter().max().filter(|&steps| steps > config.world.steps)
 }
 
@@ -394,5 +397,8 @@ mod tests {
         assert_eq!(fewest_steps(near.as_ref(), &unreachable(near.as_ref())), Some(26));
         let still = config("coupling = 1\n[motion]\nmax_speed = 0\n");
         assert_eq!(fewest_steps(still.as_ref(), &unreachable(still.as_ref())), None);
+        // More steps do not open a window for longer.
+        let closed = config("coupling = 1\nsteps = 25\nwindows = [[1, 25], [1, 25]]\n");
+        assert_eq!(fewest_steps(closed.as_ref(), &unreachable(closed.as_ref())), None);
     }
 }

@@ -569,7 +569,7 @@ fn score_otherwise(rng: &mut ChaCha8Rng, config: &mut Config, lengths: &Lengths)
         let list = |_| (0..agents).filter(|_| rng.random_bool(0.3)).collect();
         config.credit.removes = (0..lists).map(list).collect();
     }
-    if config.needs_paths().is_some() {
+    if !config.needs_paths().is_empty() {
         config.pois.iter_mut().for_each(|group| group.after.clear());
     }
 }

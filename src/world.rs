@@ -123,7 +123,7 @@ impl Deref for World {
 impl World {
     /// Builds the world of a valid config.
     pub fn new(config: &impl AsRef<StageConfig>) -> World {
-        World::build(config.as_ref(), config.as_ref().needs_paths().is_some())
+        World::build(config.as_ref(), !config.as_ref().needs_paths().is_empty())
     }
 
     /// Builds the world of a valid config, whose scores are computed from paths even if they do not need that. POIs have no
@@ -140,7 +140,7 @@ impl World {
         let of_each: Vec<&PoiGroup> =
             described.group_of_each().into_iter().map(|group| &described.pois[group]).collect();
         let (mut worth, mut total_worth) = worth(of_each.iter().map(|group| group.value));
-        if config.needs_paths().is_some() {
+        if !config.needs_paths().is_empty() {
             // Scores are shares of these units.
             let finer = MOST_UNITS / total_worth;
             worth.iter_mut().for_each(|worth| *worth *= finer);

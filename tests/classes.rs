@@ -221,7 +221,7 @@ fn every_problem_names_key_line_found_and_allowed() {
         (
             steps,
             "steps = 20\nstart_counts = true",
-            "18: pois: found POIs that come after others, allowed without world.start_counts",
+            "18: pois: found \"b\", which comes after others, allowed without world.start_counts",
         ),
         (
             "after = \"a\"",

@@ -189,15 +189,24 @@ struct Slow {
     turns_a_second: u64,
     longest: AtomicU64,
     ended: AtomicUsize,
+    /// Submissions of episodes, and waits.
+    submitted: AtomicUsize,
+    waited: AtomicUsize,
 }
 
 impl Faults for Slow {
     fn drops(&self, what: &str, turns: u64) -> bool {
         let turns = if what == "episodes" { turns } else { 0 };
+        self.submitted.fetch_add(usize::from(what == "episodes"), SeqCst);
         self.longest.fetch_max(turns, SeqCst);
         let ended = turns > 2 * self.turns_a_second;
         self.ended.fetch_add(usize::from(ended), SeqCst);
         ended
+    }
+
+    fn stalls(&self) -> bool {
+        self.waited.fetch_add(1, SeqCst);
+        false
     }
 
     fn takes(&self, turns: u64) -> Option<Duration> {
@@ -213,8 +222,8 @@ fn no_submission_is_long_enough_for_a_watchdog() {
     let rows = Trainer::new(configs()).finish(&mut Cpu::default()).unwrap();
     for (request, info) in support::adapters("no_submission_is_long_enough_for_a_watchdog") {
         for mode in [MODES[0], MODES[3]] {
-            let (longest, ended) = (AtomicU64::new(0), AtomicUsize::new(0));
-            let faults = Arc::new(Slow { turns_a_second: 150_000_000, longest, ended });
+            let (longest, [ended, submitted, waited]) = (AtomicU64::new(0), [0; 3].map(AtomicUsize::new));
+            let faults = Arc::new(Slow { turns_a_second: 150_000_000, longest, ended, submitted, waited });
             let mut device = backend(with_faults(&open_gpu(&request), &faults), mode);
             let result = Trainer::new(configs()).finish(&mut device);
             let longest = faults.longest.load(SeqCst) as f64 / faults.turns_a_second as f64;
@@ -227,6 +236,8 @@ fn no_submission_is_long_enough_for_a_watchdog() {
             assert_eq!(result.unwrap(), rows, "{info}");
             // The speed is unknown at the first trial, so it may take longer than the intended 0.1 s.
             assert!(longest <= 0.25, "{info}: a submission takes {longest} s");
+            // A batch of many submissions makes progress with each.
+            assert!(faults.waited.load(SeqCst) >= faults.submitted.load(SeqCst), "{info}: submissions share a wait");
             let stages = device.take_times();
             assert!(stages.longest.as_secs_f64() <= 0.25 && !stages.longest.is_zero(), "{:?}", stages.longest);
         }

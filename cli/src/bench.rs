@@ -122,6 +122,7 @@ fn combinations(config: &Config, args: &Args) -> Result<Vec<Config>, Error> {
                 config.learning.population = teams as usize;
                 config.learning.trials = 1;
                 config.learning.episodes_per_team = 1;
+                config.learning.test_episodes = 0;
                 config.learning.generations = config::MAX_GENERATIONS;
                 configs.push(config);
             }

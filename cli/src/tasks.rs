@@ -50,7 +50,10 @@ pub fn run(args: Args) -> Result<(), Error> {
     let (named, start) = (out != Path::new(OUT), existing.start());
     let request = Request { tasks, out, named, start, trials, population, seed };
     let found = console::run(&run, printed.quiet, |backends, context| tasks::run(&request, backends, context))
-        .map_err(|error| error.or_advise(|| "run the same command with --resume to continue".into()))?;
+        .map_err(|error| match error {
+            Error::Stopped(_) => error.or_advise(|| "run the same command with --resume to continue".into()),
+            error => error,
+        })?;
     printed.outcome(&found, in_words)?;
     found.refused().map_or(Ok(()), Err)
 }

@@ -18,7 +18,7 @@ pub struct Args {
     #[arg(long, value_name = "N", default_value_t = TEAMS, value_parser = between(1..=65_536u32))]
     teams: u32,
     /// Random worlds per adapter, pass and kernel [default: as many of 200 as take about a minute]
-    #[arg(long, value_name = "N", value_parser = between(1..=100_000u32))]
+    #[arg(long, value_name = "N", conflicts_with = "config", value_parser = between(1..=100_000u32))]
     worlds: Option<u32>,
     /// Random seed
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = between(0..=u32::MAX))]

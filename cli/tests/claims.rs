@@ -204,6 +204,30 @@ fn intervals_of_few_discrete_scores_cover_the_mean() {
     assert_eq!((statistics::share(0, 0), statistics::share(2, 1)), (None, None));
 }
 
+/// Most pairs are equal in the worst case, and the others all differ in one direction.
+#[test]
+fn intervals_of_pairs_cover_as_much_as_documented() {
+    for (pairs, least) in [(5, 0.90), (10, 0.88), (20, 0.86), (50, 0.86)] {
+        let sample = |ones: usize| (0..pairs).map(move |pair| f64::from(u8::from(pair < ones)));
+        let all: Vec<Estimate> = (0..=pairs)
+            .map(|ones| statistics::paired(&sample(ones).collect::<Vec<_>>().iter().collect(), 1.0).unwrap())
+            .collect();
+        let coverage = |chance: f64| {
+            let mut probability = (1.0 - chance).powi(pairs as i32);
+            let mut covered = 0.0;
+            for (ones, at) in all.iter().enumerate() {
+                if at.low <= chance && chance <= at.high {
+                    covered += probability;
+                }
+                probability *= (pairs - ones) as f64 / (ones + 1) as f64 * chance / (1.0 - chance);
+            }
+            covered
+        };
+        let worst = (1..1000).map(|chance| coverage(f64::from(chance) / 1000.0)).fold(1.0, f64::min);
+        assert!((least..least + 0.02).contains(&worst), "{worst} of {pairs} pairs");
+    }
+}
+
 /// Plays baselines to the end.
 fn played(mut baselines: Baselines) -> Baselines {
     while !baselines.is_done() {

@@ -262,6 +262,13 @@ fn a_credit_that_is_always_0_is_noted() {
         assert!(!notes(line).contains("is always 0"), "{line}");
     }
     assert!(!notes("check herd.toml --fitness Df").contains("equals D"));
+    let own = herd.replace("leads = \"sheep\"", "leads = \"sheep\"\nfitness = \"G\"");
+    place.write("own.toml", own);
+    let unused = "learning.fitness = \"D\" has no effect: every class that learns has its own";
+    assert!(notes("check own.toml --fitness D").contains(unused));
+    for line in ["check own.toml --fitness G", "check own.toml", "check herd.toml --fitness G"] {
+        assert!(!notes(line).contains("has no effect"), "{line}");
+    }
 }
 
 #[test]
@@ -275,6 +282,21 @@ fn fitness_by_led_agents_that_nobody_leads_is_noted() {
     for fitness in ["D", "Df", "Dt"] {
         let (_, notes) = place.good(&format!("check alone.toml --fitness {fitness}"));
         assert!(notes.contains(&format!("note: {fitness} of every dog is {always_0}")), "{notes}");
+    }
+    let close = herd.replacen("coupling = [2, 4, 6]", "coupling = [2, 300, 6]\nscore = \"closeness\"", 1);
+    let sheep = close.find("at = [[23.0").unwrap();
+    let end = sheep + close[sheep..].find('\n').unwrap();
+    let close = [&close[..sheep], "count = 400\nin = { disc = [25, 20, 5] }", &close[end..]].concat();
+    place.write("close.toml", close.replace("after = \"gate\"", ""));
+    let cubic = "D++ by closeness takes a time that grows with the cube of the coupling, which is 300 here";
+    assert!(place.good("check close.toml --fitness D++").1.contains(cubic));
+    assert!(!place.good("check close.toml --fitness D").1.contains(cubic));
+    // Dt takes out the sheep that another class leads, if anyone may lead them.
+    let bird = "[[agents]]\nname = \"bird\"\nat = [[1, 1]]\nsenses = [{ of = \"sheep\" }]\nleads = \"sheep\"\nobserves = false\n[[agents]]";
+    place.write("bird.toml", alone.replacen("[[agents]]", bird, 1));
+    for (led_by, is_0) in [("anyone", false), ("most-seen", true)] {
+        let (_, notes) = place.good(&format!("check bird.toml --fitness Dt --set credit.led_by=\"{led_by}\""));
+        assert_eq!(notes.contains("Dt of every dog is always 0"), is_0, "{led_by}: {notes}");
     }
     let rock =
         "[[agents]]\nname = \"rock\"\nat = [[1, 1], [2, 1], [3, 1], [4, 1], [5, 1], [6, 1]]\ncontrol = \"still\"\n";

@@ -508,6 +508,7 @@ fn wrong_usage_exits_with_code_2() {
         &["check", "configs/chaotic.toml", "--fitness", "E"],
         &["check", "configs/chaotic.toml", "--paradigm", "leaders"],
         &["check", "configs/chaotic.toml", "another.toml"],
+        &["verify", "configs/chaotic.toml", "--worlds", "3"],
         &[],
     ] {
         let output = flotilla(args);

@@ -134,6 +134,24 @@ fn the_lint_names_inexact_operations() {
     }
 }
 
+/// DX12 without `dxcompiler.dll` compiles by FXC, which refuses such stores.
+#[test]
+fn a_store_to_a_variable_component_of_a_vector_is_found() {
+    let found = |store: &str| {
+        let text = format!(
+            "@group(0) @binding(1) var<storage, read_write> places: array<i32>;
+            @compute @workgroup_size(1) fn main() {{
+                var v = vec4(0); var all: array<i32, 4>; let i = places[0]; {store} places[1] = v.x + all[i];
+            }}"
+        );
+        exact::inexact_operations(&exact::parse(&text).unwrap().0)
+    };
+    for store in ["v[2] = i;", "v.y = i;", "all[i] = v[i];"] {
+        assert_eq!(found(store), Vec::<String>::new(), "{store}");
+    }
+    assert!(matches!(&found("v[i] = 1;")[..], [line] if line.starts_with("main: Store")), "{:?}", found("v[i] = 1;"));
+}
+
 #[test]
 fn an_inexact_operation_inside_a_function_and_a_loop_is_found() {
     let text = "fn deep(x: f32) -> f32 { var y = x; loop { if y > 9.0 { break; } y = y + 1.0 / x; } return y; }

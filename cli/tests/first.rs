@@ -154,7 +154,8 @@ fn quiet_prints_the_summary_only_if_asked() {
     for line in ["train small.toml --out again --quiet", "replay run --quiet"] {
         assert_eq!(place.good(line), (String::new(), String::new()), "{line}");
     }
-    assert_eq!(json(&place, "train small.toml --out third --quiet --json")["pois"], 2);
+    let trained = json(&place, "train small.toml --out third --quiet --json");
+    assert_eq!((&trained["pois"], trained["poi_value"].as_f64()), (&2.into(), Some(2.0)));
 }
 
 #[test]

@@ -175,15 +175,31 @@ fn sums_and_populations_on_a_gpu_are_counted() {
         peaks(&[&config], 1).adapter
     };
     // Per team, weights and record: 4 leaders of 112 weights; 25 steps of 4 POIs, 8 followers with 4 leaders each, and
-    // five sums.
-    let (weights, record) = (4 * 112 * 4, (25 * 4 + 8 * 4 + 5) * 4);
-    assert_eq!(adapter(50), 2 * 51 * (weights + record));
+    // five sums. A task has 16 teams or more.
+    let (weights, record, task) = (4 * 112 * 4, (25 * 4 + 8 * 4 + 5) * 4, 64 / 16);
+    assert_eq!(adapter(50), 2 * 51 * (weights + record + task));
     // Populations of this size stay on the device, which takes five more sets of weights per team, and the parents.
     let population = 5 * 112 * 4 + 4 * 4;
-    assert_eq!(adapter(2000), 2 * 2001 * (weights + record + population));
+    assert_eq!(adapter(2000), 2 * 2001 * (weights + record + task + population));
 }
 
-/// Episodes of large teams take several dispatches on a GPU. The agents' states between them must count, too.
+/// A batch has at least one team, however large.
+#[test]
+fn a_team_larger_than_a_batch_is_counted() {
+    let text = "[world]\nmap = [400, 400]\nsteps = 5\n\
+                [[agents]]\nname = 'leader'\ncount = 200\nin = { disc = [200, 200, 10] }\nsenses = [{ of = 'pois' }]\n\
+                leads = 'follower'\ninfluence_radius = 5\n\
+                [[agents]]\nname = 'follower'\ncount = 1000000\nin = { disc = [200, 200, 160] }\ncontrol = 'follow'\n\
+                rule = [{ of = 'leader', to = 5, gain = 5 }]\n\
+                [[pois]]\nname = 'place'\nat = [[150, 100]]\n[learning]\npopulation = 4\ntrials = 1\n";
+    let peaks = peaks(&[&Config::parse(text, "huge").unwrap()], 1);
+    // Two teams, of which each pair of leader and follower has a count of 4 bytes.
+    let records = 2 * 200 * 1_000_000 * 4;
+    assert!(peaks.adapter > records && peaks.gpu_host > records, "{peaks:?}");
+}
+
+/// Episodes of large teams take several dispatches on a GPU. The agents' states between them and the tasks of each must
+/// count, too.
 #[test]
 fn states_between_dispatches_are_counted() {
     let text = |agents: usize| {
@@ -191,10 +207,10 @@ fn states_between_dispatches_are_counted() {
         format!("[world]\nleaders = [[1, 1]]\nfollowers = [{followers}]\npois = [[9, 9]]\n[learning]\ntrials = 1\n")
     };
     let config = Config::parse(&text(1024), "config").unwrap();
-    // Per team, weights, record and states: 112 weights; 25 steps of 32 words, 1023 followers with one leader, and two
-    // sums.
-    let (weights, record, states) = (112 * 4, (25 * 32 + 1023 + 2) * 4, 1024 * 20);
-    assert_eq!(peaks(&[&config], 1).adapter, 2 * 51 * (weights + record + states) / 2);
+    // Per team, weights, record, states and tasks: 112 weights; 25 steps of 32 words, 1023 followers with one leader, and
+    // two sums; 5 dispatches.
+    let (weights, record, states, tasks) = (112 * 4, (25 * 32 + 1023 + 2) * 4, 1024 * 20, 5 * 64);
+    assert_eq!(peaks(&[&config], 1).adapter, 51 * (weights + record + states + tasks));
 }
 
 /// A checkpoint written from the populations must equal one written from a copy of them.

@@ -188,6 +188,13 @@ fn several_runs_are_labelled_by_the_keys_that_differ() {
     let svg = fs::read_to_string(out).unwrap();
     assert!(svg.contains("\"fitness G\"") && svg.contains("\"fitness D++\""), "{svg}");
     assert!(!svg.contains("population"));
+    let fewer = Run::new(CONFIG, &["--trials", "2"]);
+    for (run, trials_are_pairs) in [(&second, true), (&fewer, false)] {
+        let plotted =
+            flotilla(&["plot", &first.text(), &run.text(), "--out", first.file("both.svg").to_str().unwrap()]);
+        let notes = String::from_utf8(plotted.stderr).unwrap();
+        assert_eq!(notes.contains("their trials are pairs"), trials_are_pairs, "{notes}");
+    }
 }
 
 #[test]
@@ -242,8 +249,14 @@ fn an_unfinished_run_plots_and_replays_up_to_its_last_whole_generation() {
     run.mark_unfinished();
     let metrics = fs::read_to_string(run.file("metrics.csv")).unwrap();
     let lines: Vec<&str> = metrics.lines().take(1 + 3 * 4).collect();
-    fs::write(run.file("metrics.csv"), lines.join("\n") + "\n0,4,0.").unwrap();
+    // Only one of three trials has a row of generation 4.
+    fs::write(run.file("metrics.csv"), lines.join("\n") + "\n0,4,1,1,1,0.000\n1,4,0.").unwrap();
     succeed(&["plot", &run.text()]);
+    let svg = fs::read_to_string(run.file("curves.svg")).unwrap();
+    assert!(svg.contains("at generation 3") && !svg.contains("at generation 4"), "{svg}");
+    fs::write(run.file("metrics.csv"), lines[..3].join("\n") + "\n").unwrap();
+    fail(&["plot", &run.text()], &["no generation of all trials", "--resume"]);
+    fs::write(run.file("metrics.csv"), lines.join("\n") + "\n0,4,0.").unwrap();
     let stdout = succeed(&["replay", &run.text(), "--backend", "cpu"]);
     assert!(stdout.contains("generation 3"), "{stdout}");
     fail_with(2, &["replay", &run.text(), "--generation", "5", "--backend", "cpu"], &["generation 5", "newest is 3"]);
@@ -861,7 +874,7 @@ fn plots_of_long_runs_stay_small() {
     succeed(&["plot", &run.text()]);
     let svg = fs::read_to_string(run.file("curves.svg")).unwrap();
     assert!(svg.len() < 100_000, "{} bytes", svg.len());
-    assert!(svg.contains("each point the mean of"));
+    assert!(svg.contains("Generation (means of "));
 }
 
 #[test]
@@ -916,6 +929,7 @@ fn paper_writes_figures_runs_and_claims() {
     let summary: Value = serde_json::from_str(&fs::read_to_string(out.join("summary.json")).unwrap()).unwrap();
     let arms = summary["arms"].as_array().unwrap();
     assert_eq!(arms.len(), 33 + 48);
+    assert_eq!(summary["set"], serde_json::json!(["learning.population = 40"]));
     for arm in arms {
         for curve in ["generation", "mean", "error", "deviation"] {
             assert_eq!(arm[curve].as_array().unwrap().len(), 4, "{curve}");
@@ -970,6 +984,7 @@ fn paper_writes_figures_runs_and_claims() {
     // Three generations are too few for claims about 100 generations, and the table reports that.
     assert!(stdout.contains(" open (too few generations or trials)"), "{stdout}");
     let claims = fs::read_to_string(out.join("claims.md")).unwrap();
+    assert!(claims.contains("2 trials, 3 generations, seed 0. Changed keys: `learning.population = 40`."), "{claims}");
     assert_eq!(claims.lines().filter(|line| line.starts_with("| ")).count(), (2 + 8) + (2 + 8) + (2 + 36));
     // Baselines without learning come first, on the page and in the output.
     assert!(claims.find("best constant speed").unwrap() < claims.find("The paper says").unwrap());

@@ -73,6 +73,29 @@ fn each_stage_changes_the_config_of_the_file() {
     assert_eq!([0, 6].map(|generation| column(&immediate, generation)), [0, 0]);
 }
 
+/// A world whose POIs are all there eight times gives every team the same G, and other teams by softmax, since these depend
+/// on the sum of values.
+#[test]
+fn the_first_teams_of_a_stage_depend_on_what_was_observed_before_it() {
+    const POIS: &str = "[[20, 30], [12, 26], [27, 28], [20, 15]]";
+    let eight = format!("[{}]", [&POIS[1..POIS.len() - 1]; 8].join(", "));
+    let text = |pois: &str| {
+        format!(
+            "[world]\nmap = [40, 40]\nleaders = [[15, 18], [24, 20]]\npois = {pois}\ncoupling = 2\nsteps = 40\n\
+             [learning]\npopulation = 6\nelites = 6\ntrials = 60\ngenerations = 1\nfitness = 'G'\n\
+             teams = 'softmax'\ntemperature = 0.3\n"
+        )
+    };
+    let stage = format!("[[stages]]\nfrom = 1\nset = {{ 'world.pois' = {eight} }}\n");
+    let last = |text: &str| {
+        let rows = Trainer::new([config(text).validate().unwrap()]).finish(&mut Cpu::default()).unwrap();
+        rows.into_iter().filter(|row| row.generation == 1).map(|row| row.mean_g).collect::<Vec<f64>>()
+    };
+    let [once, all_eight, staged] = [text(POIS), text(&eight), text(POIS) + &stage].map(|text| last(&text));
+    assert_eq!(staged, once);
+    assert_ne!(staged, all_eight);
+}
+
 #[test]
 fn errors_in_stages_name_their_line() {
     let lines = SMALL.lines().count();

@@ -904,7 +904,7 @@ fn damaged_points_are_reported_as_missing() {
     for expected in [
         "4 of 8 points are missing",
         "point 0001 (world.coupling = 1, world.steps = 8, learning.generations = 12): \
-         it has reached generation 2 of 12",
+         it has 2 of 13 generations",
         "point 0002",
         "metrics.csv: line 2 is not",
         "it was not run",

@@ -31,7 +31,7 @@ mod trace;
 pub use batch::{Group, Weights};
 pub use error::BackendError;
 pub use scores::GroupScores;
-pub(crate) use size::{BATCH_BYTES, held_bytes, state_bytes, sum_bytes, trace_bytes, weight_bytes};
+pub(crate) use size::{BATCH_BYTES, dispatch_bytes, held_bytes, sum_bytes, trace_bytes, weight_bytes};
 pub use size::{HELD_FROM, record_bytes};
 #[cfg(feature = "gpu")]
 use size::{VECTOR, WeightVector, check_sizes, record_words, traced_words, weight_vectors};

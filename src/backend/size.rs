@@ -56,14 +56,15 @@ pub fn weight_bytes(world: &World) -> u64 {
     (weight_vectors(world) * size_of::<WeightVector>()) as u64
 }
 
-/// Returns the bytes of a team's states that a GPU keeps between dispatches, 0 if one dispatch plays the whole episode.
-pub fn state_bytes(world: &World, fitness: Fitness) -> u64 {
+/// Returns the bytes of a team's states that a GPU keeps between dispatches, 0 if one dispatch plays the whole episode, and
+/// of its share of the tasks of all dispatches.
+pub fn dispatch_bytes(world: &World, fitness: Fitness) -> [u64; 2] {
     #[cfg(feature = "gpu")]
-    let bytes = super::gpu::episode::state_bytes(world, RecordRequest(&[fitness]));
+    let bytes = super::gpu::episode::dispatch_bytes(world, RecordRequest(&[fitness]));
     #[cfg(not(feature = "gpu"))]
     let bytes = {
         let _ = (world, fitness);
-        0
+        [0; 2]
     };
     bytes
 }

@@ -64,6 +64,14 @@ impl Config {
         }
     }
 
+    /// Returns the sum of the values of all POIs. G times it is the sum that a team observed.
+    pub fn poi_value(&self) -> f64 {
+        match &self.pois[..] {
+            [] => self.world.pois.len() as f64,
+            groups => groups.iter().map(|group| group.size() as f64 * group.value).sum(),
+        }
+    }
+
     /// Returns by what G weights the observed POIs: their values if these differ, and their scores by distance or by time.
     /// `None` means that G times the number of POIs is how many are observed.
     pub fn weighted_by(&self) -> Option<&'static str> {
@@ -189,18 +197,17 @@ impl Config {
         (self.agents.is_empty() || !has(REPLACED_BY_AGENTS)) && (self.pois.is_empty() || !has(REPLACED_BY_POIS))
     }
 
-    /// Returns what, if anything, makes scores depend on more than the agents at each POI and step, so that they are
-    /// computed from paths.
-    pub(crate) fn needs_paths(&self) -> Option<&'static str> {
+    /// Returns what makes scores depend on more than the agents at each POI and step, so that they are computed from paths.
+    pub(crate) fn needs_paths(&self) -> Vec<&'static str> {
         let learn = |name: &String| self.agents.iter().any(|class| class.name == *name && class.learns());
-        match self {
-            _ if self.world.start_counts => Some("world.start_counts"),
-            _ if !self.credit.removes.is_empty() => Some("credit.removes"),
-            _ if self.pois.iter().any(|group| group.score != Score::Observed) => Some("score = \"closeness\""),
-            _ if self.pois.iter().any(|group| group.when != When::Ever) => Some("another `when` than \"ever\""),
-            _ if self.agents.iter().flat_map(|class| &class.leads).any(learn) => Some("classes that learn and are led"),
-            _ => None,
-        }
+        let reasons = [
+            ("world.start_counts", self.world.start_counts),
+            ("credit.removes", !self.credit.removes.is_empty()),
+            ("score = \"closeness\"", self.pois.iter().any(|group| group.score != Score::Observed)),
+            ("another `when` than \"ever\"", self.pois.iter().any(|group| group.when != When::Ever)),
+            ("classes that learn and are led", self.agents.iter().flat_map(|class| &class.leads).any(learn)),
+        ];
+        reasons.into_iter().filter(|(_, holds)| *holds).map(|(reason, _)| reason).collect()
     }
 
     /// Returns the fitness of each learner, `[learners]`.

@@ -267,7 +267,7 @@ impl Config {
         let [agents, learners, pois, steps] = numbers.map(|number| number as u64);
         let followers = agents.saturating_sub(learners);
         let sights = followers * learners.div_ceil(32);
-        let paths = if self.needs_paths().is_some() { 2 * agents } else { 0 };
+        let paths = if self.needs_paths().is_empty() { 0 } else { 2 * agents };
         4 * (steps * (pois * agents.div_ceil(32) + sights) + followers * learners + (steps + 1) * paths)
     }
 
@@ -398,7 +398,7 @@ impl Config {
             let [found, most] = [record, MAX_RECORD_BYTES].map(|bytes| bytes.div_ceil(1 << 20));
             let text = format!(
                 "found {}, with which the record of an episode takes {found} MiB, allowed {most} MiB: it grows with \
-                 steps × agents × learners and with steps × agents × POIs",
+                 agents × learners, steps × agents × learners and steps × agents × POIs",
                 config.world.steps
             );
             r.report_key("world.steps", text);
@@ -413,12 +413,16 @@ impl Config {
             );
             r.report_key("policy.actions", message);
         }
+        let why = config.needs_paths();
         if r.error_count() == 0
-            && let Some(why) = config.needs_paths()
-            && config.classes().pois.iter().any(|group| !group.after.is_empty())
+            && !why.is_empty()
+            && let Some(group) = config.classes().pois.iter().find(|group| !group.after.is_empty())
         {
-            let key = if has_pois { POIS } else { "world.after" };
-            r.report_key(key, format!("found POIs that come after others, allowed without {why}"));
+            let (key, pois) = match has_pois {
+                true => (POIS, format!("{:?}, which comes", group.name)),
+                false => ("world.after", "POIs that come".into()),
+            };
+            r.report_key(key, format!("found {pois} after others, allowed without {}", why.join(", ")));
         }
         let Learning { population, hall_of_fame, .. } = config.learning;
         if r.error_count() == 0 && config.populations() == 1 {

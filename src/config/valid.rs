@@ -3,7 +3,7 @@
 use std::collections::HashSet;
 use std::ops::Deref;
 
-use super::{AgentClass, Classes, Config, ConfigError, Fitness, Mobility, WorldConfig};
+use super::{AgentClass, Classes, Config, ConfigError, Fitness, LedBy, Mobility, Score, WorldConfig};
 
 /// A config whose every key is in its range: one that a [`World`](crate::world::World) is made from.
 #[derive(Clone, Debug, PartialEq)]
@@ -93,6 +93,12 @@ impl ValidConfig {
         self.stages.iter().all(|(_, config)| config.poi_count() == count).then_some(count)
     }
 
+    /// Returns the sum of the values of all POIs, or `None` if it differs between stages.
+    pub fn poi_value(&self) -> Option<f64> {
+        let value = self.stages[0].1.poi_value();
+        self.stages.iter().all(|(_, config)| config.poi_value() == value).then_some(value)
+    }
+
     /// Returns a note for each setting that is valid but likely a mistake.
     pub fn notes(&self) -> Vec<String> {
         let mut shown = HashSet::new();
@@ -116,7 +122,8 @@ impl ValidConfig {
 fn notes(config: &Config) -> Vec<String> {
     let WorldConfig { map, dt, .. } = config.world;
     let classes = config.classes();
-    let without_credit = without_credit(config, &classes);
+    let of_learning = [unused_fitness(config, &classes), slow_credit(config)].into_iter().flatten();
+    let without_credit = without_credit(config, &classes).into_iter().chain(of_learning);
     if config.agents.is_empty() {
         let notes = [config.motion.too_short("motion", dt, map), config.world.heading.likely_degrees("world.heading")];
         return notes.into_iter().flatten().chain(without_credit).collect();
@@ -141,8 +148,12 @@ fn without_credit(config: &Config, classes: &Classes) -> Vec<String> {
     let counts_somewhere = |index| (0..classes.pois.len()).any(|group| classes.observes(index, group));
     let of_class = |(index, class): (usize, &AgentClass)| {
         let fitness = class.fitness.unwrap_or(config.learning.fitness);
+        // Dt can take out all agents that anyone leads.
+        let by_anyone = fitness == Fitness::Dt && config.credit.led_by == LedBy::Anyone;
+        let leading = |leader: &&AgentClass| by_anyone || leader.name == class.name;
+        let led: Vec<_> = classes.agents.iter().filter(leading).flat_map(|leader| &leader.leads).collect();
         let mut others = classes.agents.iter().enumerate();
-        let led_count = others.any(|(other, led)| class.leads.contains(&led.name) && counts_somewhere(other));
+        let led_count = others.any(|(other, agents)| led.contains(&&agents.name) && counts_somewhere(other));
         let is_alone = match fitness {
             Fitness::D => config.credit.removes.is_empty(),
             Fitness::Dpp => true,
@@ -167,6 +178,28 @@ fn without_credit(config: &Config, classes: &Classes) -> Vec<String> {
     let equal = equal.filter(|_| always_0.is_empty());
     let note = equal.map(|fitness| format!("{fitness} equals D here, because no class has `leads`"));
     always_0.into_iter().chain(note).collect()
+}
+
+/// Returns a note for a fitness that no class learns by, because each has its own.
+fn unused_fitness(config: &Config, classes: &Classes) -> Option<String> {
+    let fitness = config.learning.fitness;
+    let uses = |class: &AgentClass| class.learns() && class.fitness.unwrap_or(fitness) == fitness;
+    let is_used = fitness == Fitness::Df || classes.agents.iter().any(uses);
+    (!is_used).then(|| format!("learning.fitness = \"{fitness}\" has no effect: every class that learns has its own"))
+}
+
+/// Returns a note if D++ takes very long: for each number of copies, the nearest observers are found again.
+fn slow_credit(config: &Config) -> Option<String> {
+    const LARGE: usize = 256;
+    let close = config.pois.iter().filter(|group| group.score == Score::Closeness);
+    let coupling =
+        close.flat_map(|group| group.coupling.of_each(group.size())).max().filter(|&coupling| coupling >= LARGE)?;
+    config.fitnesses().contains(&Fitness::Dpp).then(|| {
+        format!(
+            "D++ by closeness takes a time that grows with the cube of the coupling, which is {coupling} here: D or Df take \
+             far less"
+        )
+    })
 }
 
 #[cfg(test)]

@@ -38,8 +38,10 @@ struct StageBytes {
     queue: u64,
     /// On the CPU: a thread's vector of teams.
     block: u64,
-    /// On a GPU: the weights, the records and the states of all teams.
-    on_gpu: [u64; 3],
+    /// On a GPU: the weights, the records, the states and the tasks of all teams.
+    on_gpu: [u64; 4],
+    /// The largest of these of one team.
+    largest_of_team: u64,
 }
 
 impl StageBytes {
@@ -71,7 +73,11 @@ impl StageBytes {
             + (episodes + tests) * EPISODE_WORDS;
         let played = trials * (episodes * teams).max(tests);
         let record = largest(backend::record_bytes) + backend::sum_bytes(&world);
-        let of_team = [backend::weight_bytes(&world), record, largest(backend::state_bytes)];
+        let [states, tasks] = [0, 1].map(|part| {
+            let bytes = fitnesses.iter().map(|&fitness| backend::dispatch_bytes(&world, fitness)[part]);
+            bytes.max().unwrap_or(0)
+        });
+        let of_team = [backend::weight_bytes(&world), record, states, tasks];
         StageBytes {
             training: 4 * trials * words_of_trial + schedules,
             schedules,
@@ -79,6 +85,7 @@ impl StageBytes {
             queue: played.div_ceil(cpu::lanes()) * 16,
             block: largest(cpu::block_bytes),
             on_gpu: of_team.map(|bytes| played.saturating_mul(bytes)),
+            largest_of_team: of_team.into_iter().fold(0, u64::max),
         }
     }
 
@@ -94,6 +101,7 @@ impl StageBytes {
                 queue: most.queue.max(stage.queue),
                 block: most.block.max(stage.block),
                 on_gpu: std::array::from_fn(|array| most.on_gpu[array].max(stage.on_gpu[array])),
+                largest_of_team: most.largest_of_team.max(stage.largest_of_team),
             }
         });
         let before = if config.stages.is_empty() { 0 } else { most.starts };
@@ -136,7 +144,7 @@ impl Peaks {
     pub fn of<'a>(configs: impl IntoIterator<Item = &'a ValidConfig>, threads: usize) -> Peaks {
         let [mut training, mut next, mut checkpoint, mut queue, mut drawing] = [0_u64; 5];
         let [mut block, mut order, mut populations, mut held] = [0_u64; 4];
-        let mut on_gpu = [0_u64; 3];
+        let (mut on_gpu, mut batch) = ([0_u64; 4], BATCH_BYTES);
         for config in configs {
             let most = StageBytes::most(config);
             let trials = config.learning.trials as u64;
@@ -155,26 +163,28 @@ impl Peaks {
                 held +=
                     trials * backend::held_bytes([config.populations(), config.learning.slots(), config.parameters()]);
             }
+            batch = batch.max(most.largest_of_team);
             on_gpu.iter_mut().zip(most.on_gpu).for_each(|(sum, bytes)| *sum = sum.saturating_add(bytes));
         }
-        let [weights, record, states] = on_gpu;
+        let [weights, record, states, tasks] = on_gpu;
         // Episodes, the final sorting of each population and the picture do not happen at the same time.
         let playing = threads as u64 * block + queue;
         let ending = (populations.min(threads as u64) * order).max(drawing);
         let always = PROGRAM + training + checkpoint;
-        // A batch ends when the largest of its three large buffers is full. Two batches are in progress at a time.
+        // A batch ends when the largest of its large buffers is full, and has at least one team. Two batches are in progress
+        // at a time.
+        let fullest = on_gpu.into_iter().fold(1, u64::max);
         let share = |bytes: u64, batches: u64| {
-            let batch =
-                u128::from(bytes) * u128::from(BATCH_BYTES) / u128::from(weights.max(record).max(states).max(1));
-            bytes.min(batch as u64 * batches)
+            let of_batch = u128::from(bytes) * u128::from(batch) / u128::from(fullest);
+            bytes.min(of_batch as u64 * batches)
         };
         let records = share(record, 2);
         Peaks {
             host: always + playing.max(ending),
             checkpoint,
             // One batch is assembled on the host, and two are being transferred to or from the adapter.
-            gpu_host: always + next + (share(weights, 1) + share(weights, 2) + records).max(ending),
-            adapter: share(weights, 2) + records + share(states, 2) + held,
+            gpu_host: always + next + (share(weights + tasks, 1) + share(weights + tasks, 2) + records).max(ending),
+            adapter: share(weights, 2) + records + share(states, 2) + share(tasks, 2) + held,
         }
     }
 

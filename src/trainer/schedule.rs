@@ -58,7 +58,10 @@ impl TeamSchedule {
         }
         self.drawn_for = Some((generation, stages.index_of(generation)));
         let stage = stages.of(generation);
-        self.form_teams(level, stage, [trial, generation], fitness);
+        // Fitness is a share of what was to be observed in the generation before.
+        let before = stages.of(generation.saturating_sub(1));
+        let value: f64 = before.world.values.iter().map(|&value| f64::from(value)).sum();
+        self.form_teams(level, stage, [trial, generation], |of, slot| value * f64::from(fitness(of, slot)));
         let draw_starts = |stage: &Stage, episodes: Episodes, all: &mut Vec<Vec<Vec2>>| {
             let (learning, world) = (&stage.config.learning, &stage.world);
             let count = match episodes {
@@ -78,18 +81,17 @@ impl TeamSchedule {
         }
     }
 
-    /// Writes `teams`.
+    /// Writes `teams`. `fitness` returns a policy's score in the generation before, in values of POIs.
     fn form_teams(
         &mut self,
         level: Level,
         Stage { config, world, .. }: &Stage,
         [trial, generation]: [usize; 2],
-        fitness: impl Fn(usize, usize) -> f32 + Sync,
+        fitness: impl Fn(usize, usize) -> f64 + Sync,
     ) {
         let (learning, populations) = (&config.learning, &world.populations);
         let (leaders, count) = (populations.len(), population_count(populations));
         let population = learning.population;
-        let total_value: f64 = world.values.iter().map(|&value| f64::from(value)).sum();
         let (of_round, orders_of_round) = (population * leaders, population * count);
         self.orders.resize(learning.partners * orders_of_round, 0);
         self.teams.resize(learning.partners * of_round, 0);
@@ -99,7 +101,7 @@ impl TeamSchedule {
             1 => order.iter_mut().zip(0..).for_each(|(policy, team)| *policy = team),
             _ => {
                 let [round, of] = [index / count, index % count];
-                let fitness = |slot| total_value * f64::from(fitness(of, slot));
+                let fitness = |slot| fitness(of, slot);
                 evolve::order_policies(level, learning, trial, generation, [round, of], fitness, order);
             }
         });

@@ -68,6 +68,8 @@ pub struct TrainOutcome {
     pub generations: usize,
     /// Number of POIs, if it is the same in all stages.
     pub pois: Option<usize>,
+    /// Sum of the values of all POIs, if it is the same in all stages.
+    pub poi_value: Option<f64>,
     /// Generations that were trained now.
     pub trained_generations: usize,
     /// Seconds that this took.
@@ -216,7 +218,7 @@ pub fn run(
     if most == 0.0 {
         warn_that_nothing_was_observed(&folder, config, context);
     }
-    let learning = &config.learning;
+    let (learning, valid) = (&config.learning, config.validate()?);
     Ok(TrainOutcome {
         config: request.name.clone(),
         digest: results.digest.clone(),
@@ -224,7 +226,8 @@ pub fn run(
         trials: learning.trials,
         population: learning.population,
         generations: learning.generations,
-        pois: config.validate()?.pois(),
+        pois: valid.pois(),
+        poi_value: valid.poi_value(),
         trained_generations: if was_done { 0 } else { (last + 1).saturating_sub(from) },
         seconds: if was_done { 0.0 } else { since.elapsed().as_secs_f64() },
         notes,

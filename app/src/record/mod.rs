@@ -242,7 +242,7 @@ impl RecordError {
             }
             RecordError::Locked { .. } => "wait for it, stop it, or choose another --out".into(),
             RecordError::ConfigDiffers { path, .. } => format!(
-                "resume with the config it was started with ({}/{CONFIG}), or choose another --out",
+                "resume with the config and the flags it was started with ({}/{CONFIG} has both), or choose another --out",
                 path.escaped()
             ),
             RecordError::InitDiffers { existing, .. } => {

@@ -146,6 +146,14 @@ impl Curve {
     }
 }
 
+/// Returns the label of an axis of generations, for curves whose points are the means of so many.
+pub(super) fn generation_label(each: usize) -> String {
+    match each {
+        1 => "Generation".into(),
+        each => format!("Generation (means of {each})"),
+    }
+}
+
 /// One set of axes.
 #[derive(Clone, Debug, Default)]
 pub struct Panel {
@@ -232,12 +240,8 @@ impl Figure {
             axes.draw(&mut scene, column == 0, self.shares, COLUMN);
             axes.stages(&mut scene, &panel.stages);
             if column == 0 {
-                let label = match each {
-                    1 => "Generation".to_string(),
-                    each => format!("Generation (each point the mean of {each})"),
-                };
                 let middle = edge + (COLUMN - edge - RIGHT) / 2.0;
-                scene.text([middle, above + height + 7.4], label, NORMAL, Anchor::Middle, BLACK);
+                scene.text([middle, above + height + 7.4], generation_label(each), NORMAL, Anchor::Middle, BLACK);
             }
             if let Some(caption) = banded.as_ref().filter(|_| column == 0) {
                 draw_caption(&mut scene, [edge, above + height + 11.4], caption, bars);

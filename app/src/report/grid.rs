@@ -1,7 +1,9 @@
 //! Figures of a sweep: heat maps over two axes, curves by the values of an axis, and dots for keys that are varied one
 //! at a time.
 
-use super::curves::{Axes, Band, Curve, Look, NORMAL, SMALL, band_caption, distinct, draw_caption, needs_bars};
+use super::curves::{
+    Axes, Band, Curve, Look, NORMAL, SMALL, band_caption, distinct, draw_caption, generation_label, needs_bars,
+};
 use super::scene::{Anchor, BLACK, Color, Fill, GREY, LIGHT, Pen, Scene, WHITE, colors, text_width};
 
 /// Maximum width of a figure in millimetres. Further panels go to the next row.
@@ -260,14 +262,16 @@ impl Curves {
             let [left, above] = panels.place(index);
             let axes = Axes { left, above, width, height: HEIGHT, x_max: last, most: 1.0 };
             axes.draw(&mut scene, panels.is_first(index), true, whole);
-            scene.text([left + width / 2.0, above + HEIGHT + 7.4], "Generation", SMALL, Anchor::Middle, BLACK);
+            let thinned: Vec<_> = curves.iter().map(|(value, curve)| (*value, curve.thinned())).collect();
+            let each = thinned.iter().map(|(_, (_, each))| *each).max().unwrap_or(1);
+            let below = [left + width / 2.0, above + HEIGHT + 7.4];
+            scene.text(below, generation_label(each), SMALL, Anchor::Middle, BLACK);
             scene.text([left + width / 2.0, above - 1.6], &**title, SMALL, Anchor::Middle, BLACK);
             if panels.is_first(index) {
                 scene.upright([4.0, above + HEIGHT / 2.0], &*self.y_label, SMALL, BLACK);
             }
             scene.clipped([left - 0.4, above - 0.4, width + 0.8, HEIGHT + 0.8], |scene| {
-                let curves: Vec<_> = curves.iter().map(|(value, curve)| (*value, curve.thinned().0)).collect();
-                let curves: Vec<_> = curves.iter().map(|(value, curve)| (*value, curve)).collect();
+                let curves: Vec<_> = thinned.iter().map(|(value, (curve, _))| (*value, curve)).collect();
                 axes.bands(scene, &curves, self.band, bars);
                 axes.curves(scene, &curves, self.band, bars, labels.len());
             });

@@ -96,11 +96,16 @@ impl RunMetrics {
         &self.0[kind as usize]
     }
 
-    /// Reads a run's metrics. Memory grows only with the number of generations.
+    /// Reads a run's metrics, up to the last generation that all trials have reached. Memory grows only with the number of
+    /// generations.
     pub fn read(folder: &Path, config: &Config, verification: Verification) -> Result<RunMetrics, ReadError> {
         let mut run = RunMetrics::default();
         metrics(folder, config, verification, |row| run.add(row))?;
-        Ok(run)
+        let is_whole = |average: &Average| average.count() as usize == config.learning.trials;
+        run.0.iter_mut().for_each(|averages| averages.truncate(averages.partition_point(is_whole)));
+        let reason = || "no generation of all trials is recorded yet".into();
+        let begun = !run.of(TeamKind::Best).is_empty();
+        begun.then_some(run).ok_or_else(|| ReadError::Unfinished { folder: folder.into(), reason: reason() })
     }
 
     pub fn add(&mut self, row: &Row) {
@@ -202,13 +207,14 @@ fn figure_of_runs(
     }
 }
 
-/// Reports whether trials of several runs form pairs, because all runs have the same seed.
+/// Reports whether trials of several runs form pairs, because all runs have the same seed and number of trials.
 ///
 /// Paired trials share their starts and all random numbers. If sizes agree, they also share their first populations.
 pub fn paired(folders: &[PathBuf], verification: Verification) -> Result<bool, ReadError> {
-    let seed = |folder: &PathBuf| Ok(config(folder, verification)?.learning.seed);
-    let seeds = folders.iter().map(seed).collect::<Result<Vec<_>, ReadError>>()?;
-    Ok(seeds.len() > 1 && seeds.iter().all(|seed| *seed == seeds[0]))
+    let trials =
+        |folder: &PathBuf| config(folder, verification).map(|Config { learning, .. }| (learning.seed, learning.trials));
+    let trials = folders.iter().map(trials).collect::<Result<Vec<_>, ReadError>>()?;
+    Ok(trials.len() > 1 && trials.iter().all(|other| *other == trials[0]))
 }
 
 /// Most config keys in the label of a run. More are not read.

@@ -99,8 +99,8 @@ pub enum Missing {
     /// The point's folder has no run.
     #[error("it was not run")]
     NotRun,
-    /// The point's run has reached the first of these generations. The second is its last.
-    #[error("it has reached generation {0} of {1}")]
+    /// The point's run has the first of these numbers of generations. The second is that of a finished one.
+    #[error("it has {0} of {1} generations")]
     Unfinished(usize, usize),
     /// The point's files cannot be used.
     #[error("{0}")]
@@ -233,7 +233,7 @@ fn read(point: &Point, place: Place<'_>, options: &ResultOptions) -> Result<(Vec
     let found = found.map_err(|error| damaged(&error))?;
     digests.compare_metrics(&path, found.digest).map_err(|error| damaged(&error))?;
     if found.rows < trials * (last + 1) {
-        return Err(Missing::Unfinished(found.rows / trials, last));
+        return Err(Missing::Unfinished(found.rows / trials, last + 1));
     }
     let ends = || rows.iter().filter_map(|rows| rows.last());
     let curve = (0..rows[0].len()).map(|at| {

@@ -170,7 +170,7 @@ impl DevicePopulation for Population {
                 let back = recording.read_back(Slice { buffer, bytes: bytes(piece.start)..bytes(piece.end) });
                 recording.read_status(Buffer::GroupStatus(0), &status);
                 let submitted = self.executor.run(&recording, &mut workspace, &[Some(&self.workspace)])?;
-                self.executor.read(submitted, &workspace, &recording.readback, |read| {
+                self.executor.read(&submitted, &workspace, &recording.readback, |read| {
                     // All threads copy, because the host's memory may be new, and the system then clears it page by page.
                     let target = bytemuck::cast_slice_mut::<f32, u8>(&mut policies[piece]);
                     let parts = read[back].par_chunks(COPIED_TOGETHER);

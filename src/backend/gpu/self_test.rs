@@ -105,7 +105,7 @@ fn arithmetic(executor: &Executor) -> Result<Option<String>, BackendError> {
     recording.read_back(output);
     let mut workspace = Workspace::default();
     let submitted = executor.run(&recording, &mut workspace, &[])?;
-    let words: Vec<u32> = executor.read(submitted, &workspace, &recording.readback, bytemuck::pod_collect_to_vec)?;
+    let words: Vec<u32> = executor.read(&submitted, &workspace, &recording.readback, bytemuck::pod_collect_to_vec)?;
     Ok((0..ITEMS).zip(words.chunks_exact(WORDS)).find_map(|(item, words)| {
         let mut probes = expected(&values, item).into_iter().zip(words);
         let ((name, expected), found) = probes.find(|((_, expected), found)| expected != *found)?;

@@ -338,6 +338,8 @@ pub(crate) struct Summary<'a> {
     pub trials: usize,
     /// Number of generations of every experiment.
     pub generations: usize,
+    /// The other keys that were changed, `key = value`.
+    pub set: Vec<String>,
     /// The curves of every arm and of the baselines without learning.
     #[serde(rename = "arms")]
     pub curves: Vec<Trajectory>,

@@ -85,7 +85,7 @@ impl Executor {
         lock(&self.pipelines).clone()
     }
 
-    /// Submits a recording, after its buffers were created and its pipelines compiled. Returns the last submission.
+    /// Submits a recording, after its buffers were created and its pipelines compiled. Returns its submissions.
     /// Waits for nothing. `groups` has the workspaces of the populations that each group plays.
     ///
     /// # Errors
@@ -95,15 +95,15 @@ impl Executor {
         recording: &Recording<'_>,
         workspace: &mut Workspace,
         groups: &[Option<&Workspace>],
-    ) -> Result<wgpu::SubmissionIndex, DeviceError> {
+    ) -> Result<Vec<wgpu::SubmissionIndex>, DeviceError> {
         let gpu = &self.gpu;
         self.create_buffers(recording, workspace)?;
         let pipelines = self.compile(recording)?;
         let is_dispatch = |command: &Command<'_>| matches!(command, Command::Dispatch { .. });
         let mut passes_left = recording.submissions().filter(|commands| commands.iter().any(is_dispatch)).count();
         let mut is_first = true;
-        let submitted = gpu.scoped(recording.what, || {
-            let mut submitted = None;
+        gpu.scoped(recording.what, || {
+            let mut submitted = Vec::new();
             for commands in recording.submissions() {
                 let dropped = gpu.faults().is_some_and(|faults| faults.drops(recording.what, iterations(commands)));
                 let mut encoder = gpu.device.create_command_encoder(&Default::default());
@@ -139,26 +139,25 @@ impl Executor {
                     }
                 }
                 let commands = encoder.finish();
-                submitted = Some(gpu.queue.submit(Some(commands).filter(|_| !dropped)));
+                submitted.push(gpu.queue.submit(Some(commands).filter(|_| !dropped)));
             }
             submitted
-        })?;
-        Ok(submitted.expect("there is at least one submission"))
+        })
     }
 
-    /// Waits for a submission, and calls `show` with what it read back.
+    /// Waits for the submissions of a recording, and calls `show` with what they read back.
     ///
     /// # Errors
     /// The device was lost, or the bytes cannot be read. A device also counts as lost if a status word is missing: it did
     /// not do the work that its driver reports as done.
     pub(in crate::backend::gpu) fn read<T>(
         &self,
-        submitted: wgpu::SubmissionIndex,
+        submitted: &[wgpu::SubmissionIndex],
         workspace: &Workspace,
         readback: &Readback,
         show: impl FnOnce(&[u8]) -> T,
     ) -> Result<T, DeviceError> {
-        self.gpu.wait_for(Some(submitted))?;
+        self.gpu.wait_for(submitted)?;
         self.gpu.mapped(workspace.buffer(Buffer::Readback, &[]), readback.bytes, |bytes| {
             let is_done = |&(at, word): &(usize, u32)| bytes[at..at + size_of::<u32>()] == word.to_ne_bytes();
             match readback.status.par_iter().all(is_done) {
@@ -176,8 +175,7 @@ impl Executor {
         self.start_clock(workspace)?;
         self.gpu.wait()?;
         let start = Instant::now();
-        self.run(recording, workspace, &[])?;
-        self.gpu.wait()?;
+        self.gpu.wait_for(&self.run(recording, workspace, &[])?)?;
         let elapsed = start.elapsed();
         // Some software drivers have a clock that stands still.
         Ok(self.clock(workspace)?.filter(|time| !time.is_zero()).unwrap_or(elapsed))

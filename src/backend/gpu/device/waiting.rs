@@ -45,17 +45,19 @@ impl Gpu {
     /// # Errors
     /// The device was lost, or a command failed.
     pub fn wait(&self) -> Result<(), DeviceError> {
-        self.wait_for(None)
+        self.wait_until(None)
     }
 
-    /// Waits until a submission is done, or everything.
+    /// Waits for submissions, one after the other, because each that is done shows progress.
     ///
     /// # Errors
     /// The device was lost, or a command failed.
-    pub(in crate::backend::gpu) fn wait_for(
-        &self,
-        submission_index: Option<wgpu::SubmissionIndex>,
-    ) -> Result<(), DeviceError> {
+    pub(in crate::backend::gpu) fn wait_for(&self, submissions: &[wgpu::SubmissionIndex]) -> Result<(), DeviceError> {
+        submissions.iter().try_for_each(|submission| self.wait_until(Some(submission.clone())))
+    }
+
+    /// Waits until a submission is done, or everything.
+    fn wait_until(&self, submission_index: Option<wgpu::SubmissionIndex>) -> Result<(), DeviceError> {
         // A browser cannot poll. There, this waits for everything submitted so far.
         if cfg!(target_family = "wasm") {
             let (send, done) = oneshot::channel();

@@ -40,7 +40,7 @@ mod plan;
 
 pub use super::shape::Kernel;
 pub use inspect::{WorkgroupBuffers, shader_of, workgroup_of};
-pub(crate) use plan::state_bytes;
+pub(crate) use plan::dispatch_bytes;
 
 use count::Counting;
 use plan::{BatchPlan, BatchReadback, PlannedTask, RecordingOptions, plan};
@@ -117,11 +117,10 @@ struct Submitted<'a> {
     plan: &'a BatchPlan,
     /// The index of its workspace.
     workspace: usize,
-    last: wgpu::SubmissionIndex,
+    submissions: Vec<wgpu::SubmissionIndex>,
     start: Instant,
-    /// The estimated work, and the number of submissions.
+    /// The estimated work.
     iterations: u64,
-    submissions: usize,
     /// The words that the batch reads back, and the places of its results among them.
     readback: Readback,
     ranges: BatchReadback,
@@ -324,28 +323,28 @@ impl GpuBackend {
             most_workgroups: self.gpu().limits.max_compute_workgroups_per_dimension,
         };
         let (recording, ranges) = plan.record(&options);
-        let (iterations, submissions) = (iterations(&recording.commands), recording.submissions().count());
+        let iterations = iterations(&recording.commands);
         if self.clock {
             self.executor.start_clock(&mut self.workspaces[workspace])?;
         }
         let submission = Instant::now();
-        let last = self.executor.run(&recording, &mut self.workspaces[workspace], &workspaces)?;
+        let submissions = self.executor.run(&recording, &mut self.workspaces[workspace], &workspaces)?;
         self.times.gather += gathered - start;
         self.times.upload += gathered.elapsed();
         let (start, readback) = (submission, recording.readback);
-        Ok(Submitted { plan, workspace, last, start, iterations, submissions, readback, ranges })
+        Ok(Submitted { plan, workspace, submissions, start, iterations, readback, ranges })
     }
 
     /// Waits for one batch, and passes its record on.
     fn collect(&mut self, submitted: Submitted<'_>, done: &Done<'_>) -> Result<(), DeviceError> {
         let start = Instant::now();
-        self.gpu().wait_for(Some(submitted.last.clone()))?;
+        self.gpu().wait_for(&submitted.submissions)?;
         let waited = start.elapsed();
         let elapsed = self.measure(&submitted, waited);
         let clock = self.executor.clock(&self.workspaces[submitted.workspace])?;
         let score = self.score(&submitted, done)?;
         self.times.gpu += clock.unwrap_or_default();
-        self.times.longest = self.times.longest.max(clock.unwrap_or(elapsed) / submitted.submissions as u32);
+        self.times.longest = self.times.longest.max(clock.unwrap_or(elapsed) / submitted.submissions.len() as u32);
         self.times.wait += waited;
         self.times.score += score;
         self.times.read_back += start.elapsed().saturating_sub(waited + score);
@@ -370,8 +369,9 @@ impl GpuBackend {
 
     /// Passes the results of a batch on. Returns how long that took.
     fn score(&self, submitted: &Submitted<'_>, done: &Done<'_>) -> Result<Duration, DeviceError> {
-        let Submitted { plan, workspace, last, readback, ranges: BatchReadback { traced, words }, .. } = submitted;
-        self.executor.read(last.clone(), &self.workspaces[*workspace], readback, |bytes| {
+        let Submitted { plan, workspace, submissions, readback, ranges: BatchReadback { traced, words }, .. } =
+            submitted;
+        self.executor.read(submissions, &self.workspaces[*workspace], readback, |bytes| {
             let start = Instant::now();
             let words = bytemuck::cast_slice(&bytes[words.clone()]);
             let traced = bytemuck::cast_slice(&bytes[traced.clone()]);
@@ -469,10 +469,11 @@ impl Backend for GpuBackend {
             ResidencyPolicy::From(_) => true,
             ResidencyPolicy::Always => false,
         };
-        if bytes > allowed {
+        let parents = (populations * slots * size_of::<u32>()) as u64;
+        if bytes.max(parents) > allowed {
             let text = || {
                 format!(
-                    "one population takes {bytes} bytes, this adapter holds {allowed} in one buffer; \
+                    "one population takes {bytes} bytes and all parents {parents}, this adapter holds {allowed} in one buffer; \
                      breed on the host, or use a smaller population"
                 )
             };

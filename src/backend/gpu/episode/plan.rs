@@ -11,7 +11,7 @@ use crate::backend::gpu::population::Held;
 use crate::backend::gpu::recording::{BINDING_ALIGNMENT, Buffer, Command, Recording, Slice, grid};
 use crate::backend::gpu::shape::{Capacity, MAX_THREADS, Recorded, Shape, WORKGROUPS, Workgroup};
 use crate::backend::gpu::source::{
-    GatherJob, LEADERS_PER_GATHER, MAX_ITERATIONS, NOWHERE, Pipeline, State, SwarmPart, Task,
+    COUNT_WORKGROUP, GatherJob, LEADERS_PER_GATHER, MAX_ITERATIONS, NOWHERE, Pipeline, State, SwarmPart, Task,
 };
 use crate::backend::grid::{Grid, LARGE_FROM, is_large};
 use crate::backend::{BackendError, Group, VECTOR, WeightVector, Weights, record_words, traced_words, weight_vectors};
@@ -102,16 +102,26 @@ fn steps_per_dispatch(world: &World, workgroup: Workgroup, records: Recorded) ->
     (MAX_ITERATIONS / iterations_per_step(world, workgroup, records)).max(1)
 }
 
-/// Returns the bytes of a team's states between two dispatches, 0 if one dispatch plays the whole episode. This is an
-/// upper bound: adapters with larger workgroups may need none.
-pub fn state_bytes(world: &World, request: RecordRequest<'_>) -> u64 {
+/// Returns the bytes of a team's states between two dispatches, 0 if one dispatch plays the whole episode, and of its share
+/// of the tasks of all dispatches. Adapters with larger workgroups may need no states.
+pub fn dispatch_bytes(world: &World, request: RecordRequest<'_>) -> [u64; 2] {
     let recorded = Recorded { trace: false, sightings: request.sights() && world.followers() > 0 };
+    let is_large = is_large(world, LARGE_FROM);
     let generic = Workgroup::generic(world, WORKGROUPS[2]);
     let specialised = Workgroup::specialised(world, Capacity::of_workgroups(MAX_THREADS));
-    let is_parted = |workgroup| world.steps() > steps_per_dispatch(world, workgroup, recorded);
-    let is_large = is_large(world, LARGE_FROM);
-    let states = states(world, is_large, is_parted(generic) || specialised.is_some_and(is_parted));
-    (states * size_of::<State>()) as u64 + if is_large { words(cell_words(world).1) } else { 0 }
+    let rounds = |workgroup| world.steps().div_ceil(steps_per_dispatch(world, workgroup, recorded));
+    let all = || specialised.into_iter().chain([generic]);
+    let tasks = match is_large {
+        true => world.steps() * size_of::<Task>(),
+        false => all().map(|each| (rounds(each) * size_of::<Task>()).div_ceil(each.teams)).max().unwrap_or(0),
+    };
+    let states = states(world, is_large, all().any(|each| rounds(each) > 1)) * size_of::<State>();
+    [states as u64 + if is_large { words(cell_words(world).1) } else { 0 }, tasks as u64]
+}
+
+/// Returns the number of jobs that gather the policies of a group.
+fn gather_jobs(world: &World) -> usize {
+    world.leaders().div_ceil(LEADERS_PER_GATHER)
 }
 
 /// Returns the number of states that a team keeps between two dispatches.
@@ -263,6 +273,10 @@ pub(super) struct BatchPlan {
     pub(super) places: Vec<Vec2>,
     /// The elements that its tasks use.
     used: Elements,
+    /// Maximum tasks in the buffer: one for each of its tasks and rounds, and those that align the first of each part.
+    laid_out: usize,
+    /// Maximum jobs that gather its policies.
+    jobs: usize,
     /// The words of all sums and their status words, 0 if the whole record is copied; and the `scoring` of the shader.
     counted: usize,
     scoring: Vec<u32>,
@@ -273,6 +287,7 @@ impl BatchPlan {
     fn is_full(&self, plan: &GroupPlan<'_>, teams: usize, capacity: Capacity) -> bool {
         let more = teams as u64 * plan.bytes_per_team;
         let world = plan.group.world;
+        let (tasks, jobs) = (self.laid_out + TASK_ALIGNMENT * plan.part.rounds(), self.jobs + gather_jobs(world));
         let places = self.places.len()
             + plan.group.starts.len()
             + 3 * world.pois.len()
@@ -282,7 +297,8 @@ impl BatchPlan {
             places * size_of::<Vec2>(),
             (self.worlds.len() + 1) * size_of::<Constants>(),
             (self.classes.len() + world.classes.len()) * size_of::<Class>(),
-            (self.tasks.len() + 1) * size_of::<Task>(),
+            tasks * size_of::<Task>(),
+            jobs * BINDING_ALIGNMENT,
         ];
         self.used.largest() + more > capacity.target()
             || of_groups.into_iter().any(|bytes| bytes as u64 > capacity.target())
@@ -312,6 +328,8 @@ impl BatchPlan {
                 self.places.extend([Vec2::new(numbers[0], numbers[1]), Vec2::new(numbers[2], numbers[3])]);
             }
         }
+        self.laid_out += (TASK_ALIGNMENT - 1) * plan.part.rounds();
+        self.jobs += gather_jobs(world);
         self.worlds.push(Constants { first_class: self.classes.len() as u32, ..world.constants });
         self.classes.extend(&world.classes);
         self.parts.push(Part { tasks: self.tasks.len()..self.tasks.len(), ..plan.part.clone() });
@@ -336,6 +354,7 @@ impl BatchPlan {
         used.weights += per_team.weights * teams;
         used.traced += per_team.traced * teams;
         used.states += per_team.states * teams;
+        self.laid_out += plan.part.rounds();
         self.tasks.push(PlannedTask { group: plan.part.group, first_team, task });
         self.parts.last_mut().expect("a part has begun").tasks.end = self.tasks.len();
     }
@@ -426,13 +445,13 @@ impl BatchPlan {
         });
         // The dispatches, in submissions of at most `cap` iterations, and then those that count.
         let most = options.most_workgroups as usize / TASK_ALIGNMENT * TASK_ALIGNMENT;
-        let (mut count, mut load, mut is_split) = (Vec::new(), 0, false);
-        for Run { dispatches, is_first_round, mut tasks, iterations: per_task } in runs {
+        let (mut count, mut load) = (Vec::new(), 0);
+        for Run { dispatches, is_first_round, mut tasks, iterations: per_task, counting: per_count } in runs {
             while !tasks.is_empty() {
                 let allowed = (options.cap.saturating_sub(load) / per_task) as usize / TASK_ALIGNMENT * TASK_ALIGNMENT;
                 if allowed == 0 && load > 0 {
                     recording.commands.push(Command::Submit);
-                    (load, is_split) = (0, true);
+                    load = 0;
                     continue;
                 }
                 let part = tasks.start..tasks.end.min(tasks.start + allowed.clamp(TASK_ALIGNMENT, most));
@@ -444,8 +463,11 @@ impl BatchPlan {
                 let tasks = Slice { buffer: Buffer::Tasks, bytes };
                 if let (Some((counted, scoring)), true) = (&counting, is_first_round) {
                     let bindings = [&worlds, &tasks, scoring, counted, &record].map(Slice::clone).into();
-                    let grid = [workgroups, 1, 1];
-                    count.push(Command::Dispatch { pipeline: Pipeline::Count, bindings, grid, iterations: 0 });
+                    let (grid, iterations) = ([workgroups, 1, 1], part.len() as u64 * per_count);
+                    count.push((
+                        iterations,
+                        Command::Dispatch { pipeline: Pipeline::Count, bindings, grid, iterations },
+                    ));
                 }
                 for (index, &(pipeline, several)) in dispatches.iter().enumerate() {
                     let bindings = [&worlds, &tasks, &places, &weights, &record, &traced, &states, &classes];
@@ -456,10 +478,14 @@ impl BatchPlan {
                 }
             }
         }
-        if is_split && !count.is_empty() {
-            recording.commands.push(Command::Submit);
+        for (work, command) in count {
+            if load > 0 && load + work > options.cap {
+                recording.commands.push(Command::Submit);
+                load = 0;
+            }
+            load += work;
+            recording.commands.push(command);
         }
-        recording.commands.extend(count);
         // Its status words stand for everything before it, so this is read back last.
         let [.., traced_bytes, _] = self.used.bytes();
         let traced = if trace { recording.read_back(first(Buffer::Traced, traced_bytes)) } else { 0..0 };
@@ -495,10 +521,13 @@ impl BatchPlan {
         let (mut tasks, mut runs): (Vec<Task>, Vec<Run>) = Default::default();
         for (round, &shape) in (0..self.rounds()).flat_map(|round| shapes.iter().map(move |shape| (round, shape))) {
             tasks.resize(tasks.len().next_multiple_of(TASK_ALIGNMENT), Task::default());
-            let (first, mut iterations) = (tasks.len(), 1);
+            let (first, mut iterations, mut counting) = (tasks.len(), 1, 0);
             for part in self.parts.iter().filter(|part| part.shape == shape && round < part.rounds()) {
                 let steps = part.round(round);
                 iterations = iterations.max((steps.len() * part.iterations_per_step) as u64);
+                let teams = self.tasks[part.tasks.start].task.teams as usize;
+                let counted = Counting::of(&groups[part.group]).map_or(0, |counting| counting.iterations(teams));
+                counting = counting.max((counted * COUNT_WORKGROUP) as u64);
                 let (first, end) = (steps.start as u32, steps.end as u32);
                 let of_round = |planned: &PlannedTask| Task { first, end, nonce, ..planned.task };
                 tasks.extend(self.tasks[part.tasks.clone()].iter().map(of_round));
@@ -506,7 +535,7 @@ impl BatchPlan {
             if tasks.len() > first {
                 let (tasks, is_first_round) = (first..tasks.len(), round == 0);
                 let dispatches = self.dispatches(groups, shape, is_first_round);
-                runs.push(Run { dispatches, is_first_round, tasks, iterations });
+                runs.push(Run { dispatches, is_first_round, tasks, iterations, counting });
             }
         }
         (tasks, runs)
@@ -581,6 +610,8 @@ struct Run {
     tasks: Range<usize>,
     /// The estimated work of a task.
     iterations: u64,
+    /// The estimated work of counting it.
+    counting: u64,
 }
 
 /// The inputs of a batch's recording besides its plan.
@@ -738,7 +769,7 @@ mod tests {
     fn check_recording(recording: &Recording<'_>, batch: &BatchPlan, [cap, buffer]: [u64; 2], most: u32) -> usize {
         let bytes_of = |buffer| recording.buffers.iter().find(|(other, _)| *other == buffer).map(|(_, bytes)| *bytes);
         let fits = |slice: &Slice| bytes_of(slice.buffer).is_none_or(|bytes| slice.bytes.end <= bytes);
-        let too_large = recording.buffers.iter().find(|(id, bytes)| *id != Buffer::Tasks && *bytes > buffer);
+        let too_large = recording.buffers.iter().find(|(_, bytes)| *bytes > buffer);
         assert_eq!(too_large, None);
         let (mut tasks, mut played): (Vec<Task>, Vec<Task>) = Default::default();
         let (mut counted, mut copied, mut dispatches) = (0, 0, 0);
@@ -816,7 +847,7 @@ mod tests {
             check(&both, 1 << 24, FREE, Records::CountedFrom(0), false),
             // 300 tasks in dispatches of 8, then 150.
             check(&both, 1 << 24, [u64::MAX, 8], Records::Whole, true),
-            // The smallest dispatches have 4 tasks. Counting is a submission of its own.
+            // The smallest dispatches have 4 tasks. So do those that count.
             check(&both, 1 << 24, [1, 65_535], Records::CountedFrom(0), true),
             // 4 tasks of the first round stay below the cap, or 12 of the second.
             check(&both, 1 << 24, [1 << 26, 65_535], Records::Whole, false),
@@ -825,10 +856,26 @@ mod tests {
             // With one team per group, classes of agents take more than records and weights.
             check(&[(1, &short); 1000], 1 << 20, FREE, Records::Whole, false),
         ];
-        let one_batch = [[1, 1, 1], [1, 1, 1], [1, 1, 2], [1, 1, 38 + 19], [1, 75 + 38 + 1, 75 + 38], [1, 94, 94]];
+        let one_batch = [[1, 1, 1], [1, 1, 1], [1, 1, 2], [1, 1, 38 + 19], [1, 75 + 38 + 75, 75 + 38], [1, 94, 94]];
         assert_eq!(found[..6], one_batch);
         assert_eq!(found[6..], [[133, 133, 266], [5, 5, 5]]);
-        assert_eq!(state_bytes(&long, RecordRequest(&[Fitness::Df])), 256 * 20);
+        assert_eq!(dispatch_bytes(&long, RecordRequest(&[Fitness::Df])), [256 * 20, 2 * 64]);
+    }
+
+    /// If each step is a dispatch of its own, the tasks of all steps take more than records.
+    #[test]
+    fn tasks_of_many_dispatches_fill_a_batch() {
+        let senses = ["{ of = 'agents', sectors = 16 }"; 4].join(", ");
+        let text = format!(
+            "[world]\nsteps = 100\n[[agents]]\nname = 'leader'\nat = [[1, 1]]\nleads = 'follower'\nsenses = [{senses}]\n\
+             [[agents]]\nname = 'follower'\ncontrol = 'follow'\nat = [{}]\nrule = [{{ of = 'leader', to = 9, gain = 1 }}]\n\
+             [[pois]]\nname = 'place'\nat = [[9, 9]]\n",
+            ["[2, 2]"; 255].join(", ")
+        );
+        let world = World::new(&Config::parse(&text, "many steps").unwrap().validate().unwrap());
+        let found = check(&[(300, &world)], 1 << 20, [u64::MAX, 65_535], Records::Whole, false);
+        assert_eq!(found, [2, 2, 200]);
+        assert_eq!(dispatch_bytes(&world, RecordRequest(&[Fitness::Df]))[1], 100 * 64);
     }
 
     /// Each step of large teams takes four dispatches, after two at the start. Each team is a task.

@@ -73,11 +73,12 @@ pub(super) fn operands_and_blocks(statement: &mut Statement) -> Option<OperandsA
     })
 }
 
-/// Returns the operations of a module whose results may differ between devices, as `function: operation`.
+/// Returns the operations of a module whose results may differ between devices, or that some compiler refuses, as
+/// `function: operation`.
 ///
 /// Allowed are f32 `+ - *`, negation, comparison, `select`, `abs`, `floor`, bit casts; all integer arithmetic;
 /// conversions between u32, i32 and f32; vectors of these; loads, stores, integer atomics, calls, control flow,
-/// workgroup barriers.
+/// workgroup barriers. DX12's older compiler refuses stores to a component of a vector by a variable index.
 pub fn inexact_operations(module: &Module) -> Vec<String> {
     match validate(module) {
         Ok(info) => inexact_in(module, &info),
@@ -98,7 +99,14 @@ pub(super) fn inexact_in(module: &Module, info: &ModuleInfo) -> Vec<String> {
                 report(what);
             }
         }
-        inexact_statements(&function.body, &mut report);
+        let is_component = |pointer: Handle<Expression>| {
+            let inner = info[pointer].ty.inner_with(&module.types);
+            matches!(
+                (&function.expressions[pointer], inner),
+                (Expression::Access { .. }, TypeInner::ValuePointer { .. })
+            )
+        };
+        inexact_statements(&function.body, &is_component, &mut report);
     }
     found
 }
@@ -152,19 +160,25 @@ fn inexact_expression<'a>(
     }
 }
 
-fn inexact_statements(block: &Block, report: &mut impl FnMut(String)) {
+/// `is_component` reports whether a pointer is to a component of a vector, by a variable index.
+fn inexact_statements(
+    block: &Block,
+    is_component: &impl Fn(Handle<Expression>) -> bool,
+    report: &mut impl FnMut(String),
+) {
     for statement in block.iter() {
         let mut statement = statement.clone();
         let outside = match &statement {
             Statement::ControlBarrier(barrier) | Statement::MemoryBarrier(barrier) => {
                 barrier.intersects(Barrier::SUB_GROUP | Barrier::TEXTURE)
             }
+            Statement::Store { pointer, .. } => is_component(*pointer),
             _ => false,
         };
         match operands_and_blocks(&mut statement) {
             Some((_, blocks)) if !outside => {
                 for block in blocks {
-                    inexact_statements(block, report);
+                    inexact_statements(block, is_component, report);
                 }
             }
             _ => report(format!("{statement:?}")),

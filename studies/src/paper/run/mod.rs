@@ -231,7 +231,11 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     }
     let claims = claims::claims(found);
     let baseline = tables::without_learning(found);
-    let heading = tables::heading(&learning, &claims);
+    const SHOWN: [&str; 3] = ["learning.seed", "learning.trials", "learning.generations"];
+    let set = request.set.iter().filter(|set| !SHOWN.contains(&&*set.key));
+    let set: Vec<String> = set.map(|set| format!("{} = {}", set.key, set.text)).collect();
+    let changed = if set.is_empty() { String::new() } else { format!(" Changed keys: `{}`.", set.join("`, `")) };
+    let heading = tables::heading(&learning, &claims) + &changed;
     let full = tables::full(&claims);
     publish(CLAIMS, tables::page(&baseline, &heading, &full).as_bytes())?;
     let seconds = (0..experiments.configs.len()).map(|run| session.run(run).seconds).fold(0.0, f64::max);
@@ -243,6 +247,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         seed: learning.seed,
         trials: learning.trials,
         generations: learning.generations,
+        set,
         curves: Trajectory::all(found),
         claims: &claims,
     };
