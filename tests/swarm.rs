@@ -163,7 +163,7 @@ fn a_swarm_is_equal_on_gpus_whatever_the_order_in_cells() {
 fn loops_that_drivers_may_end_are_reported() {
     for (request, info) in support::adapters("loops_that_drivers_may_end_are_reported") {
         let backend = GpuBackend::new(gpu::open(request).unwrap()).unwrap();
-        let edit = |text: String| text.replace("visits > MAX_VISITS", "visits > 100u");
+        let edit = |text: String| text.replace("> MAX_VISITS", "> 100u");
         // SAFETY: the edit changes a limit.
         #[expect(unsafe_code, reason = "an edited shader is compiled without bounds checks")]
         let mut backend = unsafe { backend.edited(edit) };

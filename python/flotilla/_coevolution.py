@@ -41,6 +41,7 @@ class Played(NamedTuple):
 
 
 STATE = ("generation", "policies", "fitness", "pending", "rows", "own_fitness")
+"""What the native state has. `Coevolution.state` has the config's digest and that of the initial policies, too."""
 
 
 class Coevolution:
@@ -169,11 +170,17 @@ class Coevolution:
         Raises:
             ValueError: a state that is set is of another config.
         """
-        return dict(zip(STATE, self._native.state()))
+        return {**dict(zip(STATE, self._native.state())), "config": self._config_digest(), "init": self._init}
 
     @state.setter
     def state(self, state: dict[str, Any]) -> None:
+        if state["config"] != self._config_digest():
+            raise ValueError("the state is of another config")
         self._native.restore(tuple(state[name] for name in STATE))
+        self._init = state["init"]
+
+    def _config_digest(self) -> str:
+        return hashlib.sha256(self.config.to_toml().encode()).hexdigest()
 
     @property
     def run(self) -> Run:
@@ -189,12 +196,11 @@ class Coevolution:
         return Run(self._native.finish(), played, None, None)
 
     def __getstate__(self) -> dict[str, Any]:
-        kept = {"started": self._started, "init": self._init}
-        return {"config": self.config, "backend": self._backend, "state": self.state, **kept}
+        return {"config": self.config, "backend": self._backend, "state": self.state, "started": self._started}
 
     def __setstate__(self, saved: dict[str, Any]) -> None:
         Coevolution.__init__(self, saved["config"], backend=saved["backend"])
-        self.state, self._started, self._init = saved["state"], saved["started"], saved["init"]
+        self.state, self._started = saved["state"], saved["started"]
 
     def __repr__(self) -> str:
         last = self.config["learning.generations"]

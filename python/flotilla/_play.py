@@ -416,7 +416,7 @@ def collect(
     array = _checked(config, policies)
     if reward not in _native.FITNESSES:
         raise ValueError(f"reward {reward!r}, allowed are {', '.join(_native.FITNESSES)}")
-    scored = config.replace(learning={"fitness": reward})
+    scored = Config._of(config._native.with_fitness(reward))
     deviations = np.asarray(noise, np.float32)
     if deviations.shape not in ((), (2,), (config.num_learners, 2)) or not (np.isfinite(deviations) & (deviations >= 0)).all():
         raise ValueError("noise must be a number from 0 on, or an array of them, [2] or [leaders, 2]")

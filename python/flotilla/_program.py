@@ -103,7 +103,7 @@ def compare(
         >>> table.groupby("measure")["generation"].max().to_dict()
         {'best_g': 3, 'champion_g': 3, 'generations_to_reach': 3}
     """
-    folders, unverified = run_folders(runs)
+    folders, unverified, _kept = run_folders(runs)
     if not folders:
         raise ValueError("no runs, allowed are two at least or the folder of a sweep")
     wanted = at if isinstance(at, Sequence) and not isinstance(at, str) else [at]

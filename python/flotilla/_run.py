@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shlex
 import shutil
@@ -17,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from flotilla import _native
 from flotilla._arrays import Floats, count, floats, text, whole, word
 from flotilla._config import Config, check_config
-from flotilla._errors import no_key
+from flotilla._errors import Error, no_key
 from flotilla._show import Figure, Replay
 
 if TYPE_CHECKING:
@@ -104,25 +105,43 @@ class Run:
         """
         path = os.fspath(folder)
         outcome, played, times = _native.open(path, unverified)
-        run = cls(outcome, played, times, path)
+        run = cls(outcome, played, times, os.path.abspath(path))
         run.unverified = unverified
         return run
 
     @property
     def folder(self) -> str:
-        """Where the run's files are; of a run that was trained in memory a temporary folder, which goes with it."""
+        """Where the run's files are; of a run that was trained in memory a temporary folder, which goes with it.
+
+        Raises:
+            Error: the folder holds another run by now.
+        """
         if self._folder is None:
             folder = os.path.join(self._temporary_folder(), "run")
             self._write(folder, force=False)
             self._folder = folder
+        elif not self._holds(self._folder, missing=True) and not self.unverified:
+            raise Error(f"{self._folder} holds another run by now: open that, or train this one again")
         return self._folder
+
+    def _holds(self, folder: str, missing: bool) -> bool:
+        """Returns whether a folder holds this run, or `missing` if its record cannot be read."""
+        try:
+            with open(os.path.join(folder, "run.json"), encoding="utf-8") as file:
+                return bool(json.load(file)["digest"] == self.digest)
+        except (OSError, ValueError, KeyError, TypeError):
+            return missing
 
     def _temporary_folder(self) -> str:
         """Makes a folder that is removed together with this run."""
         folder = tempfile.mkdtemp(prefix="flotilla-")
-        weakref.finalize(self, shutil.rmtree, folder, True)
-        self._temporary = True
+        self._own(folder)
         return folder
+
+    def _own(self, folder: str) -> None:
+        """Has a folder removed together with this run, but not by a forked process."""
+        weakref.finalize(self, _remove, folder, os.getpid())
+        self._temporary = True
 
     def save(self, folder: str | os.PathLike[str], force: bool = False) -> None:
         """Writes the run as `flotilla train` does, so that the program reads it, too.
@@ -141,6 +160,10 @@ class Run:
             >>> sorted(os.listdir("runs/saved"))[-3:]
             ['metrics.csv', 'policies.safetensors', 'run.json']
         """
+        own = self._folder is not None and os.path.realpath(folder) == os.path.realpath(self._folder)
+        if own and force and self._holds(os.fspath(folder), missing=False):
+            # Its files are there, with checkpoints that this object does not have.
+            return
         self._write(os.fspath(folder), force)
         if self._temporary and self._folder is not None and self._played[6] is not None:
             # Only its checkpoints have the policies that it started from.
@@ -246,15 +269,23 @@ class Run:
 Runs = Union[Run, str, os.PathLike[str], Iterable[Union[Run, str, os.PathLike[str]]]]
 
 
-def run_folders(runs: Runs) -> tuple[list[str], bool]:
-    """Returns the directories of one run or of several, and whether any was opened unverified."""
+def _remove(folder: str, owner: int) -> None:
+    if os.getpid() == owner:
+        shutil.rmtree(folder, True)
+
+
+def run_folders(runs: Runs) -> tuple[list[str], bool, list[Any]]:
+    """Returns the directories of one run or of several, whether any was opened unverified, and the runs.
+
+    Temporary folders are there for as long as the caller keeps the runs.
+    """
     if isinstance(runs, (Run, str, os.PathLike)):
         runs = [runs]
     if not isinstance(runs, Iterable):
         raise TypeError(f"runs is {type(runs).__name__}, allowed are runs and their directories, one or a list")
     every = list(runs)
     folders = [text("a run", run.folder if isinstance(run, Run) else os.fspath(run)) for run in every]
-    return folders, any(isinstance(run, Run) and run.unverified for run in every)
+    return folders, any(isinstance(run, Run) and run.unverified for run in every), every
 
 
 def plot(runs: Runs, measure: str | None = None) -> Figure:
@@ -275,7 +306,7 @@ def plot(runs: Runs, measure: str | None = None) -> Figure:
         >>> flotilla.plot(runs).svg()[:4]
         '<svg'
     """
-    folders, unverified = run_folders(runs)
+    folders, unverified, _kept = run_folders(runs)
     if not 1 <= len(folders) <= 24:
         raise ValueError(f"{len(folders)} runs, allowed are 1 to 24")
     return Figure(_native.figure(folders, None if measure is None else text("measure", measure), unverified))
@@ -284,7 +315,8 @@ def plot(runs: Runs, measure: str | None = None) -> Figure:
 def _command() -> str:
     """Returns the command that started this process as a shell reads it, for a run's record."""
     program, *words = sys.orig_argv or ["python"]
-    return shlex.join([os.path.basename(program), *words])[:8000]
+    # Arguments need not be text.
+    return shlex.join([os.path.basename(program), *words]).encode(errors="replace").decode()[:8000]
 
 
 def _shown_by_default() -> bool:
@@ -300,7 +332,8 @@ def _with_bar(called: list[Callback], config: Config, progress: bool | None) -> 
     def told(generation: Generation) -> Any:
         answers = [callback(generation) for callback in called]
         # A wrong answer is reported as it is.
-        return next((answer for answer in answers if answer is not None and answer is not False), None)
+        continues = (answer is None or isinstance(answer, (bool, np.bool_)) and not answer for answer in answers)
+        return next((answer for answer, goes_on in zip(answers, continues) if not goes_on), None)
 
     inner = called[0] if len(called) == 1 else told if called else None
     if progress is False or (progress is None and not _shown_by_default()):
@@ -400,8 +433,7 @@ def train(
         # A callback may change the working directory.
         run = Run.open(where if os.path.abspath(where) == absolute else absolute)
         if temporary:
-            run._temporary = True
-            weakref.finalize(run, shutil.rmtree, folder, True)
+            run._own(folder)
             temporary = False
         return run
     finally:
@@ -450,7 +482,7 @@ def init_file(init: Any, config: Config, aside: str) -> str:
         if trial.shape != shape or population < 2:
             allowed = f"[leaders, policies, parameters] = [{leaders}, 2 or more, {config.parameters}]"
             raise ValueError(f"init has the shape {list(trial.shape)}, allowed is {allowed}, the same for all trials")
-    sizes = {"population": population, "trials": trials, "elites": 1}
+    sizes = {"population": population, "trials": trials, "elites": 1, "team_elites": 0, "team_g_elites": 0}
     sized = config.replace(learning=sizes)
     path = os.path.join(aside, "policies.safetensors")
     _native.write_policies(sized._native, policies * (trials // len(policies)), path)

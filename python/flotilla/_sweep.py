@@ -144,27 +144,9 @@ def _with_grid(config: Config, grid: Mapping[str, Sequence[Any]]) -> str:
     for key, values in grid.items():
         if isinstance(values, (str, bytes)) or not isinstance(values, (Sequence, np.ndarray)):
             raise TypeError(f"grid[{key!r}] is {type(values).__name__}, allowed is a list of values")
-        # The whole config with each value: it is checked, and written as TOML.
-        section, _, name = key.rpartition(".")
-        texts = [_value(config.replace(**{section: {name: value}}), section, name) for value in values]
+        texts = [_native.value_as_toml(f"grid[{key!r}]", value) for value in values]
         lines.append(f'"{key}" = [{", ".join(texts)}]')
     return _without(config.to_toml(), grid) + "\n" + "\n".join(lines) + "\n"
-
-
-def _value(config: Config, section: str, name: str) -> str:
-    """Returns one value as its line in the config's text has it."""
-    return next(text for table, key, text in _lines(config.to_toml()) if (table, key) == (section, name))
-
-
-def _lines(text: str) -> Iterator[tuple[str, str, str]]:
-    """Yields section, key and value of each line of a config's text. A value is on one line."""
-    section = ""
-    for line in text.splitlines():
-        if line.startswith("["):
-            section = line.strip("[]")
-        elif " = " in line:
-            key, _, value = line.partition(" = ")
-            yield section, key, value
 
 
 def _without(text: str, keys: Mapping[str, Any]) -> str:

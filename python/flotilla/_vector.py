@@ -70,8 +70,8 @@ class TeamBatch:
 
     def _make_stepper(self) -> _native.Stepper:
         # The fitness decides what the stepper records.
-        scored = self.config.replace(learning={"fitness": self.reward})
-        return _native.Stepper(scored._native, self.count, not self.by_step)
+        scored = self.config._native.with_fitness(self.reward)
+        return _native.Stepper(scored, self.count, not self.by_step)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "stepper": self.stepper.save()}

@@ -58,6 +58,13 @@ impl Config {
         self.0.with(&overrides(keys)?).raise().map(Config)
     }
 
+    /// Returns the config with one fitness for all learners.
+    fn with_fitness(&self, fitness: &str) -> PyResult<Config> {
+        let mut config = self.0.with(&[Override::new("learning.fitness", fitness, "the fitness")]).raise()?;
+        config.agents.iter_mut().for_each(|class| class.fitness = None);
+        Ok(Config(config))
+    }
+
     fn to_toml(&self) -> String {
         self.0.to_toml()
     }
@@ -164,15 +171,22 @@ pub fn sweep<'py>(
     Ok((sweep.axes.iter().map(|axis| axis.key.clone()).collect(), points, sweep.text))
 }
 
+/// Returns a value as a config file has it. `key` is its name in errors.
+#[pyfunction]
+pub fn value_as_toml(key: &str, value: &Bound<'_, PyAny>) -> PyResult<String> {
+    Ok(value_of(key, value)?.to_string())
+}
+
 fn overrides(keys: Vec<(String, Bound<'_, PyAny>)>) -> PyResult<Vec<Override>> {
-    let set = |(key, value): (String, Bound<'_, PyAny>)| {
-        let value = to_toml(&value, 0).map_err(|error| match error {
-            Odd::Value(what) => PyTypeError::new_err(format!("{key}: {what}, allowed is what a config file may hold")),
-            Odd::Python(error) => error,
-        })?;
-        Ok(Override::new(key.clone(), value, key))
-    };
+    let set = |(key, value): (String, Bound<'_, PyAny>)| Ok(Override::new(&*key, value_of(&key, &value)?, &*key));
     keys.into_iter().map(set).collect()
+}
+
+fn value_of(key: &str, value: &Bound<'_, PyAny>) -> PyResult<Value> {
+    to_toml(value, 0).map_err(|error| match error {
+        Odd::Value(what) => PyTypeError::new_err(format!("{key}: {what}, allowed is what a config file may hold")),
+        Odd::Python(error) => error,
+    })
 }
 
 /// The reason why a value cannot be part of a config.

@@ -23,7 +23,7 @@ mod _native {
     #[pymodule_export]
     use crate::coevolution::Coevolution;
     #[pymodule_export]
-    use crate::config::{Config, keys, sweep};
+    use crate::config::{Config, keys, sweep, value_as_toml};
     #[pymodule_export]
     use crate::play::{forward, record, rollout, score, starts};
     #[pymodule_export]
@@ -40,6 +40,9 @@ mod _native {
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
         use flotilla::config::{Choice, Fitness};
+        use numpy::PyArray1;
+        // The first array loads NumPy's interface. A signal that is pending then would make that fail.
+        drop(PyArray1::<f32>::zeros(module.py(), 0, false));
         module.add("__version__", env!("CARGO_PKG_VERSION"))?;
         module.add("COMMIT", flotilla::COMMIT)?;
         module.add("FITNESSES", Fitness::names().collect::<Vec<_>>())?;

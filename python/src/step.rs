@@ -38,11 +38,13 @@ impl Stepper {
         match self.inner.try_lock() {
             Ok(stepper) => Ok(stepper),
             Err(TryLockError::Poisoned(poisoned)) => Ok(poisoned.into_inner()),
-            Err(TryLockError::WouldBlock) => Err(PyValueError::new_err(
-                "another thread is stepping this environment: make one environment per thread",
-            )),
+            Err(TryLockError::WouldBlock) => Err(shared()),
         }
     }
+}
+
+fn shared() -> PyErr {
+    PyValueError::new_err("another thread is stepping this environment: make one environment per thread")
 }
 
 /// Copies one of the stepper's arrays to a new NumPy array.
@@ -109,14 +111,15 @@ impl Stepper {
         &self,
         py: Python<'_>,
         actions: PyReadonlyArray3<'_, f32>,
-        rewards: Option<PyReadwriteArray2<'_, f32>>,
+        rewards: Option<Bound<'_, PyArray2<f32>>>,
     ) -> PyResult<()> {
         let shape = [self.teams()?, self.config.learners(), OUTPUTS];
         if actions.shape() != shape {
             let text = format!("actions are {:?}, allowed is [teams, leaders, 2] = {shape:?}", actions.shape());
             return Err(PyValueError::new_err(text));
         }
-        let (mut rewards, leaders) = (rewards, self.config.learners());
+        let leaders = self.config.learners();
+        let mut rewards = rewards.map(|rewards| rewards.try_readwrite().map_err(|_| shared())).transpose()?;
         let rewards = rewards.as_mut().map(|rewards| contiguous("rewards", rewards.as_slice_mut())).transpose()?;
         let actions = contiguous("actions", actions.as_slice())?;
         workers::aside(py, || {

@@ -291,3 +291,17 @@ def test_starts_and_pois_in_regions_are_drawn_for_every_episode():
     run.save("run")
     assert np.array_equal(flotilla.Run.open("run").metrics["test_g"], run.metrics["test_g"])
     assert "test_g" not in flotilla.train(CONFIG).metrics
+
+
+@pytest.mark.parametrize("reward", ["Dt", "G"])
+def test_rewards_do_not_depend_on_the_fitness_of_classes(reward):
+    own = TEXT.replace('name = "rover"', 'name = "rover"\nfitness = "D"').replace('name = "drone"', 'name = "drone"\nfitness = "Df"')
+    plain, own = Config.parse(TEXT), Config.parse(own)
+    policies = random_policies(plain, 3)
+    expected, found = (flotilla.collect(config, policies, noise=0.1, episodes=2, reward=reward) for config in (plain, own))
+    assert np.array_equal(expected.rewards, found.rewards) and np.isfinite(found.rewards).all()
+    env = VectorEnv(own, 2, reward=reward)
+    env.reset(seed=0)
+    for _ in range(30):
+        rewards = env.step(np.ones(env.action_space.shape, np.float32))[1]
+    assert np.isfinite(rewards).all()

@@ -4,6 +4,9 @@ import gc
 import json
 import os
 import pickle
+import signal
+import subprocess
+import sys
 import warnings
 from pathlib import Path
 
@@ -235,3 +238,30 @@ def test_a_deleted_run_causes_no_resource_warning(config):
         del run
         gc.collect()
     assert not os.path.exists(folder)
+
+
+def test_a_state_of_another_config_is_refused(config):
+    coevolution = flotilla.Coevolution(config)
+    coevolution.tell(coevolution.play().fitness)
+    for other in ({"seed": 9}, {"fitness": "G"}):
+        with pytest.raises(ValueError, match="another config"):
+            flotilla.Coevolution(config.replace(learning=other)).state = coevolution.state
+
+
+@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="this system has no timers")
+def test_an_interrupt_of_the_first_episodes_is_no_panic():
+    script = """if True:
+        import signal, flotilla
+        config = flotilla.Config.paper().replace(learning={"population": 60_000, "trials": 1}, world={"steps": 400})
+        coevolution = flotilla.Coevolution(config, backend="cpu")
+        signal.signal(signal.SIGALRM, signal.default_int_handler)
+        signal.setitimer(signal.ITIMER_REAL, 0.2)
+        try:
+            coevolution.play()
+            while True:
+                pass
+        except KeyboardInterrupt:
+            print("interrupted")
+    """
+    found = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300)
+    assert (found.stdout, found.returncode) == ("interrupted\n", 0), found.stderr

@@ -7,6 +7,7 @@ import signal
 
 import numpy as np
 import pytest
+from conftest import ROOT
 
 import flotilla
 from flotilla import Config, ConfigError, sweep, train
@@ -123,3 +124,17 @@ def test_points_convert_to_a_pandas_table(grid):
     axes, measures = ["world.coupling", "learning.fitness"], ["best_g", "mean_g", "champion_g"]
     assert list(table.columns) == ["point", *axes, "trial", *measures]
     assert len(table) == 4 and np.isfinite(table["best_g"]).all()
+
+
+def test_a_grid_may_name_keys_of_groups_and_values_that_fit_only_together(config):
+    text = config.to_toml()
+    herd = flotilla.Config.parse((ROOT / "configs/herd.toml").read_text()).replace(
+        learning={"population": 4, "generations": 0, "trials": 1}, world={"steps": 5}
+    )
+    found = sweep(herd, grid={"pois.pen.radius": [1.5, 2.5]}, backend="cpu")
+    assert [point.values for point in found] == [{"pois.pen.radius": 1.5}, {"pois.pen.radius": 2.5}]
+    small = flotilla.Config.parse(text).replace(learning={"elites": 5, "generations": 0, "trials": 1})
+    found = sweep(small, grid={"learning.population": [2, 20], "learning.elites": [1, 2]}, backend="cpu")
+    assert [point.run.policies[0].shape[1] for point in found] == [2, 2, 20, 20]
+    with pytest.raises(TypeError, match="world.steps"):
+        sweep(config, grid={"world.steps": [object()]})

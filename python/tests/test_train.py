@@ -83,14 +83,14 @@ def test_the_program_resumes_runs_of_the_package(config, program):
 
 
 def files_of(folder):
-    """Returns the content of a run's files by name, without times, paths, and the program that wrote them."""
+    """Returns the content of a run's files by name, without names, times, paths, and the program that wrote them."""
 
     def content(path):
         data = path.read_bytes()
         if path.name == "metrics.csv":
             return [line.rsplit(b",", 1)[0] for line in data.splitlines()]
         if path.name == "run.json":
-            excluded = ("started", "updated", "seconds", "command", "commit")
+            excluded = ("name", "started", "updated", "seconds", "command", "commit")
             return {key: value for key, value in json.loads(data).items() if key not in excluded}
         if path.parent.name == "checkpoints":
             length = int.from_bytes(data[:8], "little")
@@ -399,3 +399,64 @@ def test_the_recorded_command_is_quoted_for_a_shell(tmp_path):
     subprocess.run([sys.executable, *arguments], check=True, cwd=tmp_path)
     command = json.loads((tmp_path / "kept/run.json").read_text())["command"]
     assert shlex.split(command)[1:] == arguments
+
+
+def test_no_answer_of_one_callback_hides_that_of_another(config):
+    def no(generation):
+        return generation.champion_g.min() > 2
+
+    def stops(generation):
+        return generation.generation == 2
+
+    alone, together = train(config, callback=stops), train(config, callback=[no, stops])
+    assert together.digest == alone.digest != train(config, callback=no).digest
+
+
+def test_a_run_whose_folder_was_overwritten_says_so(config, tmp_path, monkeypatch):
+    run = train(config, seed=1, out="run")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert len(run.replay(backend="cpu").episodes) == 1
+    monkeypatch.chdir(tmp_path)
+    train(config, seed=2, out="run", force=True)
+    for use in (run.plot, run.replay, lambda: train(config, init=run)):
+        with pytest.raises(flotilla.Error, match="holds another run by now"):
+            use()
+
+
+def test_runs_of_a_generator_are_read_before_they_are_freed(config):
+    configs = [config.replace(learning={"fitness": fitness}) for fitness in ("G", "D")]
+    assert flotilla.plot(train(each) for each in configs).svg().startswith("<svg")
+    assert flotilla.compare(map(train, configs))
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
+def test_a_forked_process_keeps_the_folder_of_its_parent(config):
+    run = train(config)
+    folder = run.folder
+    child = os.fork()
+    if child == 0:
+        del run
+        os._exit(0)
+    os.waitpid(child, 0)
+    assert os.path.isdir(folder) and len(run.replay(backend="cpu").episodes) == 1
+
+
+def test_saving_a_run_over_itself_keeps_its_checkpoints(config):
+    run = train(config, init=train(config), out="own")
+    before = sorted(os.listdir("own"))
+    run.save("own", force=True)
+    assert sorted(os.listdir("own")) == before and len(run.replay(generation=0, backend="cpu").episodes) == 1
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux passes any bytes")
+def test_arguments_of_the_process_need_not_be_text():
+    script = "import flotilla; flotilla.train(flotilla.Config.paper().replace(learning={'generations': 1}), out='run')"
+    subprocess.run([sys.executable, "-c", script, b"\xff"], check=True, timeout=300)
+    assert "?" in json.loads(pathlib.Path("run/run.json").read_text())["command"]
+
+
+def test_fewer_initial_policies_than_team_elites(config):
+    elites = config.replace(learning={"population": 40, "team_elites": 10})
+    policies = np.zeros((config.num_learners, 8, config.parameters), np.float32)
+    assert train(elites, init=policies).policies[0].shape[1] == 40
