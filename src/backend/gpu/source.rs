@@ -294,7 +294,6 @@ fn episode(shape: Shape) -> String {
         MAX_CLASSES,
         MOMENT_WORDS,
         LANES,
-        MAX_VISITS = MAX_ITERATIONS,
     );
     let own = format!(
         "fn class_constants(class_number: u32) -> ClassConstants {{ return {}; }}\n",
