@@ -287,10 +287,10 @@ fn agent_of(agent: u32) -> Agent {
     return me;
 }
 
-// Spoils the status word if the driver has ended a loop of this thread too soon. The host then takes nothing of the task.
+// Spoils the status word if the driver ends loops too soon. The host then takes nothing of the task.
 //
-// Mesa's llvmpipe 22.3 ends all loops of a thread once they have had 65 535 turns together, and then this one after a turn.
-// Its two turns are from a buffer, so that it remains a loop.
+// A thread of Mesa's llvmpipe 22.3 has 65 535 turns for all its loops together. After that each loop ends with its first
+// turn, and so does this one, which should have two. Compilers cannot know that number, because it is from a buffer.
 fn check_loops(task: Task) {
     var turns = 0u;
     for (var turn = task.first; turn <= task.end; turn++) {

@@ -40,8 +40,8 @@ class Played(NamedTuple):
     """The config's fitness of each leader, `[trials, teams, leaders]`."""
 
 
+# The parts of the native state. `Coevolution.state` also has the digests of the config and of the initial policies.
 STATE = ("generation", "policies", "fitness", "pending", "rows", "own_fitness")
-"""What the native state has. `Coevolution.state` has the config's digest and that of the initial policies, too."""
 
 
 class Coevolution:

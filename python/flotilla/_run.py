@@ -315,7 +315,7 @@ def plot(runs: Runs, measure: str | None = None) -> Figure:
 def _command() -> str:
     """Returns the command that started this process as a shell reads it, for a run's record."""
     program, *words = sys.orig_argv or ["python"]
-    # Arguments need not be text.
+    # Arguments may be any bytes.
     return shlex.join([os.path.basename(program), *words]).encode(errors="replace").decode()[:8000]
 
 
@@ -332,8 +332,8 @@ def _with_bar(called: list[Callback], config: Config, progress: bool | None) -> 
     def told(generation: Generation) -> Any:
         answers = [callback(generation) for callback in called]
         # A wrong answer is reported as it is.
-        continues = (answer is None or isinstance(answer, (bool, np.bool_)) and not answer for answer in answers)
-        return next((answer for answer, goes_on in zip(answers, continues) if not goes_on), None)
+        no = [answer is None or isinstance(answer, (bool, np.bool_)) and not answer for answer in answers]
+        return next((answer for answer, is_no in zip(answers, no) if not is_no), None)
 
     inner = called[0] if len(called) == 1 else told if called else None
     if progress is False or (progress is None and not _shown_by_default()):

@@ -148,7 +148,7 @@ fn without_credit(config: &Config, classes: &Classes) -> Vec<String> {
     let counts_somewhere = |index| (0..classes.pois.len()).any(|group| classes.observes(index, group));
     let of_class = |(index, class): (usize, &AgentClass)| {
         let fitness = class.fitness.unwrap_or(config.learning.fitness);
-        // Dt can take out all agents that anyone leads.
+        // With this key, Dt takes out all agents that any class leads.
         let by_anyone = fitness == Fitness::Dt && config.credit.led_by == LedBy::Anyone;
         let leading = |leader: &&AgentClass| by_anyone || leader.name == class.name;
         let led: Vec<_> = classes.agents.iter().filter(leading).flat_map(|leader| &leader.leads).collect();
@@ -188,7 +188,8 @@ fn unused_fitness(config: &Config, classes: &Classes) -> Option<String> {
     (!is_used).then(|| format!("learning.fitness = \"{fitness}\" has no effect: every class that learns has its own"))
 }
 
-/// Returns a note if D++ takes very long: for each number of copies, the nearest observers are found again.
+/// Returns a note if D++ by closeness takes very long, because it finds the nearest observers again for each number of
+/// copies.
 fn slow_credit(config: &Config) -> Option<String> {
     const LARGE: usize = 256;
     let close = config.pois.iter().filter(|group| group.score == Score::Closeness);

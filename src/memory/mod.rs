@@ -73,10 +73,8 @@ impl StageBytes {
             + (episodes + tests) * EPISODE_WORDS;
         let played = trials * (episodes * teams).max(tests);
         let record = largest(backend::record_bytes) + backend::sum_bytes(&world);
-        let [states, tasks] = [0, 1].map(|part| {
-            let bytes = fitnesses.iter().map(|&fitness| backend::dispatch_bytes(&world, fitness)[part]);
-            bytes.max().unwrap_or(0)
-        });
+        let states = largest(|world, fitness| backend::dispatch_bytes(world, fitness)[0]);
+        let tasks = largest(|world, fitness| backend::dispatch_bytes(world, fitness)[1]);
         let of_team = [backend::weight_bytes(&world), record, states, tasks];
         StageBytes {
             training: 4 * trials * words_of_trial + schedules,

@@ -58,7 +58,7 @@ impl TeamSchedule {
         }
         self.drawn_for = Some((generation, stages.index_of(generation)));
         let stage = stages.of(generation);
-        // Fitness is a share of what was to be observed in the generation before.
+        // The fitness is a share of the values of the generation before, whose stage may have had other POIs.
         let before = stages.of(generation.saturating_sub(1));
         let value: f64 = before.world.values.iter().map(|&value| f64::from(value)).sum();
         self.form_teams(level, stage, [trial, generation], |of, slot| value * f64::from(fitness(of, slot)));
@@ -101,8 +101,15 @@ impl TeamSchedule {
             1 => order.iter_mut().zip(0..).for_each(|(policy, team)| *policy = team),
             _ => {
                 let [round, of] = [index / count, index % count];
-                let fitness = |slot| fitness(of, slot);
-                evolve::order_policies(level, learning, trial, generation, [round, of], fitness, order);
+                evolve::order_policies(
+                    level,
+                    learning,
+                    trial,
+                    generation,
+                    [round, of],
+                    |slot| fitness(of, slot),
+                    order,
+                );
             }
         });
         for (teams, orders) in self.teams.chunks_exact_mut(of_round).zip(self.orders.chunks_exact(orders_of_round)) {

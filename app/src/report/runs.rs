@@ -103,9 +103,11 @@ impl RunMetrics {
         metrics(folder, config, verification, |row| run.add(row))?;
         let is_whole = |average: &Average| average.count() as usize == config.learning.trials;
         run.0.iter_mut().for_each(|averages| averages.truncate(averages.partition_point(is_whole)));
-        let reason = || "no generation of all trials is recorded yet".into();
-        let begun = !run.of(TeamKind::Best).is_empty();
-        begun.then_some(run).ok_or_else(|| ReadError::Unfinished { folder: folder.into(), reason: reason() })
+        if run.of(TeamKind::Best).is_empty() {
+            let reason = "no generation of all trials is recorded yet".into();
+            return Err(ReadError::Unfinished { folder: folder.into(), reason });
+        }
+        Ok(run)
     }
 
     pub fn add(&mut self, row: &Row) {

@@ -273,7 +273,8 @@ pub(super) struct BatchPlan {
     pub(super) places: Vec<Vec2>,
     /// The elements that its tasks use.
     used: Elements,
-    /// Maximum tasks in the buffer: one for each of its tasks and rounds, and those that align the first of each part.
+    /// An upper bound of the tasks in [`Buffer::Tasks`]: each of its tasks once per round, and those that align the first of
+    /// each part.
     laid_out: usize,
     /// Maximum jobs that gather its policies.
     jobs: usize,
