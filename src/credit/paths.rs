@@ -374,11 +374,17 @@ impl PathCredit {
                 self.near.truncate(start);
             }
         }
-        let row = |index: usize, first: usize| &self.near[index * width + first..][..S::f32s::LEN];
-        let is_near = |index: usize, first: usize| S::f32s::from_slice(simd, row(index, first)).simd_lt(infinity);
-        let is_anyone_near = |&first: &usize| (0..self.observers.len()).any(|index| is_near(index, first).any_true());
         self.vectors.clear();
-        self.vectors.extend((0..width).step_by(S::f32s::LEN).filter(is_anyone_near));
+        for first in (0..width).step_by(S::f32s::LEN) {
+            let mut is_anyone_near = false;
+            for near in self.near.chunks_exact(width) {
+                let near = S::f32s::from_slice(simd, &near[first..][..S::f32s::LEN]);
+                is_anyone_near |= near.simd_lt(infinity).any_true();
+            }
+            if is_anyone_near {
+                self.vectors.push(first);
+            }
+        }
     }
 
     /// Finds the worth of a POI to each team after a change.

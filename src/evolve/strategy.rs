@@ -216,14 +216,14 @@ fn sample_lanes<S: Simd>(simd: S, mirrored: bool, samples: Samples<'_>, children
             draw_noise(simd, key.at(generation, population, number), scratch);
         }
         let sign = splat(simd, if is_mirror { -1.0 } else { 1.0 });
-        let sampled = |mean, sigma, noise| within_limits(simd, mean + noise * sigma * sign);
         for at in (0..whole).step_by(S::f32s::LEN) {
             let load = |from: &[f32]| S::f32s::from_slice(simd, &from[at..at + S::f32s::LEN]);
-            sampled(load(mean), load(sigmas), load(scratch)).store_slice(&mut child[at..at + S::f32s::LEN]);
+            let weights = within_limits(simd, load(mean) + load(scratch) * load(sigmas) * sign);
+            weights.store_slice(&mut child[at..at + S::f32s::LEN]);
         }
         if whole < parameters {
             let load = |from: &[f32]| S::f32s::from_fn(simd, |lane| from.get(whole + lane).copied().unwrap_or(0.0));
-            let last = sampled(load(mean), load(sigmas), load(scratch));
+            let last = within_limits(simd, load(mean) + load(scratch) * load(sigmas) * sign);
             child[whole..].copy_from_slice(&last.as_slice()[..parameters - whole]);
         }
     }

@@ -157,23 +157,26 @@ pub fn choose<S: Simd>(inputs: &[S::f32s], wanted: &[S::f32s; BEHAVIOURS]) -> [S
         most = select::<S>(most, wanted, more);
         behaviour = select::<S>(behaviour, number(index.into()), more);
     }
-    let [pois, agents] = [[0, 1, 2, 3], [4, 5, 6, 7]].map(
-        #[inline(always)]
-        |quadrants: [usize; 4]| {
-            let (mut most, mut turn) = (inputs[quadrants[0]], number(-0.75));
-            for (middle, quadrant) in [(-0.25, quadrants[1]), (0.25, quadrants[2]), (0.75, quadrants[3])] {
-                let more = inputs[quadrant].simd_gt(most);
-                most = select::<S>(most, inputs[quadrant], more);
-                turn = select::<S>(turn, number(middle), more);
-            }
-            let back = turn + select::<S>(number(-1.0), number(1.0), turn.simd_lt(0.0));
-            let away = behaviour.simd_eq(2.0) | behaviour.simd_eq(4.0);
-            select::<S>(number(0.0), select::<S>(turn, back, away), most.simd_gt(0.0))
-        },
-    );
+    let away = behaviour.simd_eq(2.0) | behaviour.simd_eq(4.0);
+    let (pois, agents) = (turn_to_most::<S>(&inputs[..4], away), turn_to_most::<S>(&inputs[4..8], away));
     let turn = select::<S>(agents, pois, behaviour.simd_lt(3.0));
     let moves = behaviour.simd_gt(0.0);
     [select::<S>(number(0.0), turn, moves), select::<S>(number(-1.0), number(1.0), moves)]
+}
+
+/// Returns the output that turns a leader to the middle of the quadrant with the most, or away from it, or 0 if there is
+/// nothing in any.
+#[inline(always)]
+fn turn_to_most<S: Simd>(quadrants: &[S::f32s], away: S::mask32s) -> S::f32s {
+    let number = |number: f32| splat(away.token(), number);
+    let (mut most, mut turn) = (quadrants[0], number(-0.75));
+    for (middle, &quadrant) in [-0.25, 0.25, 0.75].into_iter().zip(&quadrants[1..]) {
+        let more = quadrant.simd_gt(most);
+        most = select::<S>(most, quadrant, more);
+        turn = select::<S>(turn, number(middle), more);
+    }
+    let back = turn + select::<S>(number(-1.0), number(1.0), turn.simd_lt(0.0));
+    select::<S>(number(0.0), select::<S>(turn, back, away), most.simd_gt(0.0))
 }
 
 /// Converts the first output, in -1..1, to a wanted turn in radians to the left.

@@ -303,18 +303,18 @@ impl<S: Simd> Quadrants<S> {
     }
 
     /// Adds an entity with this measure at an offset from an agent with this [heading](ChannelLanes::heading). `PLAIN`
-    /// channels count no entities.
+    /// channels count no entities, and the quadrants of `MAP` channels do not turn with a heading.
     ///
     /// The signs of the offset along the heading and to its left determine the quadrant. A tie goes to the
     /// counterclockwise quadrant, so that each boundary belongs to exactly one.
     #[inline(always)]
-    pub(crate) fn add<const PLAIN: bool>(
+    pub(crate) fn add<const PLAIN: bool, const MAP: bool>(
         &mut self,
         (measured, within): (S::i32s, S::mask32s),
         offset: [S::f32s; 2],
         heading: [S::f32s; 2],
     ) {
-        let (fx, fy) = turned::<S>(offset, heading);
+        let (fx, fy) = if MAP { (offset[0], offset[1]) } else { turned::<S>(offset, heading) };
         let zero = splat(fx.token(), 0.0);
         let left = (fy.simd_gt(zero) | (fy.simd_ge(zero) & fx.simd_ge(zero))).to_vector();
         let front = (fx.simd_gt(zero) | (fx.simd_ge(zero) & !fy.simd_gt(zero))).to_vector();

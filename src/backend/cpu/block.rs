@@ -8,7 +8,7 @@ use glam::Vec2;
 use super::agent::Agent;
 use super::neighbours::{self, Bounds, Masks, masks};
 use crate::backend::Moment;
-use crate::config::{Combine, ControlKind, Measure};
+use crate::config::{Combine, ControlKind, Frame, Measure};
 use crate::config_enum::ConstDispatch;
 use crate::kernels::math::{on_lattice, within};
 use crate::kernels::{clamp_to, select, splat};
@@ -180,16 +180,19 @@ impl<S: Simd> Block<S> {
     /// This, [`Block::step`] and [`Network::decide`](super::network::Network::decide) are most of the compiled code. They
     /// are functions of their own, so that whole episodes, traces, records and single steps share them.
     pub fn sense(&mut self) {
-        if !self.gone_within.is_empty() {
-            self.find_gone();
-        }
         self.simd.vectorize(
             #[inline(always)]
-            || self.sense_channels(),
+            || {
+                if !self.gone_within.is_empty() {
+                    self.find_gone();
+                }
+                self.sense_channels();
+            },
         );
     }
 
     /// Finds the POIs that are gone, and puts them where no range reaches.
+    #[inline(always)]
     fn find_gone(&mut self) {
         let Block { simd, world, agents, gone_within, gone, pois, sensed, .. } = self;
         for (GoneWithin { poi, distance2, classes }, gone) in gone_within.iter().zip(gone) {
@@ -514,21 +517,22 @@ impl<S: Simd> Scene<'_, S> {
         sense::measured::<S>(self.channel, const { Measure::of(MEASURE) }, value, dx, dy)
     }
 
-    /// Senses by quadrants. `PLAIN` channels count no entities, and sense POIs of value 1 only. It is a function of its own,
-    /// so that registers hold its constants.
-    fn sense_quadrants<const MEASURE: u32, const PLAIN: bool>(
+    /// Senses by quadrants. `PLAIN` channels count no entities, and sense POIs of value 1 only. `MAP` says that quadrants do
+    /// not turn with the heading; without it they may or may not. It is a function of its own, so that registers hold its
+    /// constants.
+    fn sense_quadrants<const MEASURE: u32, const PLAIN: bool, const MAP: bool>(
         &self,
         observers: Range<usize>,
         mut inputs: Inputs<'_, S>,
     ) {
         self.simd.vectorize(
             #[inline(always)]
-            || self.sense_each_quadrant::<MEASURE, PLAIN>(observers, &mut inputs),
+            || self.sense_each_quadrant::<MEASURE, PLAIN, MAP>(observers, &mut inputs),
         );
     }
 
     #[inline(always)]
-    fn sense_each_quadrant<const MEASURE: u32, const PLAIN: bool>(
+    fn sense_each_quadrant<const MEASURE: u32, const PLAIN: bool, const MAP: bool>(
         &self,
         observers: Range<usize>,
         inputs: &mut Inputs<'_, S>,
@@ -547,7 +551,7 @@ impl<S: Simd> Scene<'_, S> {
                 |_, other| {
                     let offset = [other.x - x, other.y - y];
                     let measured = self.measured::<MEASURE, true>(1.0, offset);
-                    quadrants.add::<PLAIN>(measured, offset, heading);
+                    quadrants.add::<PLAIN, MAP>(measured, offset, heading);
                 },
             );
             for range in &plan.pois {
@@ -565,12 +569,12 @@ impl<S: Simd> Scene<'_, S> {
                     }
                     for index in 0..4 {
                         let measured = (measures[index], within[index]);
-                        quadrants.add::<PLAIN>(measured, offset(pois[index], x, y), heading);
+                        quadrants.add::<PLAIN, MAP>(measured, offset(pois[index], x, y), heading);
                     }
                 }
                 for (poi, &value) in rest.iter().zip(last) {
                     let offset = offset(*poi, x, y);
-                    quadrants.add::<PLAIN>(self.measured::<MEASURE, PLAIN>(value, offset), offset, heading);
+                    quadrants.add::<PLAIN, MAP>(self.measured::<MEASURE, PLAIN>(value, offset), offset, heading);
                 }
             }
             let inputs = inputs.of(observer, channel).as_chunks_mut().0;
@@ -606,8 +610,8 @@ impl<S: Simd> Scene<'_, S> {
         let &Scene { simd, channel, pois, values, agents, near, plan } = self;
         let measure = Measure::of(channel.shape.measure);
         for observer in observers {
-            let &Agent { x, y, .. } = &agents[observer];
-            let heading = channel.heading(agents[observer].hx, agents[observer].hy);
+            let &Agent { x, y, hx, hy, .. } = &agents[observer];
+            let heading = channel.heading(hx, hy);
             let mut sectors = sense::Sectors::new(simd, Combine::of(channel.shape.combine));
             neighbours::each_near(
                 near,
@@ -643,9 +647,11 @@ impl<S: Simd> ConstDispatch for Quartering<'_, '_, S> {
 
     #[inline(always)]
     fn with<const MEASURE: u32>(self) {
-        match self.scene.plan.is_plain {
-            true => self.scene.sense_quadrants::<MEASURE, true>(self.observers, self.inputs),
-            false => self.scene.sense_quadrants::<MEASURE, false>(self.observers, self.inputs),
+        let Quartering { scene, observers, inputs } = self;
+        match (scene.plan.is_plain, scene.channel.shape.frame == Frame::Map as u32) {
+            (true, true) => scene.sense_quadrants::<MEASURE, true, true>(observers, inputs),
+            (true, false) => scene.sense_quadrants::<MEASURE, true, false>(observers, inputs),
+            (false, _) => scene.sense_quadrants::<MEASURE, false, false>(observers, inputs),
         }
     }
 }

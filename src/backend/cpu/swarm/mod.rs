@@ -213,35 +213,39 @@ impl<S: Simd> Swarm<S> {
 
     /// Computes the inputs of the leaders' policies, channel by channel.
     pub fn sense(&mut self) {
+        self.simd.vectorize(
+            #[inline(always)]
+            || {
+                self.find_gone();
+                self.sense_channels();
+            },
+        );
+    }
+
+    #[inline(always)]
+    fn find_gone(&mut self) {
         let Swarm { simd, cells, pois, gone, gone_within, .. } = self;
         for GoneWithin { poi, distance2, classes } in gone_within {
             for &class in &*classes {
-                each_within(*simd, &cells[class], pois[*poi], *distance2, |_| gone[*poi] = true);
+                each_within(
+                    *simd,
+                    &cells[class],
+                    pois[*poi],
+                    *distance2,
+                    #[inline(always)]
+                    |_| gone[*poi] = true,
+                );
             }
         }
-        self.simd.vectorize(
-            #[inline(always)]
-            || self.sense_channels(),
-        );
     }
 
     #[inline(always)]
     fn sense_channels(&mut self) {
         let mut inputs = std::mem::take(&mut self.inputs);
-        let width = self.world.constants.policy.inputs();
         for (index, class) in self.world.classes.iter().enumerate() {
             let cells = &self.cells[index];
             for (channel, of) in class.channels.iter().zip(&self.plans[index].channels) {
-                let mut sense = |slots: Range<usize>| {
-                    let sensed = self.sensed(index, channel, of, slots.clone());
-                    for (lane, slot) in slots.enumerate() {
-                        let leader = cells.slots.agents[slot] as usize;
-                        let to = &mut inputs[leader / S::f32s::LEN * width + channel.shape.input as usize..];
-                        for (to, sensed) in to.iter_mut().zip(&sensed[..channel.shape.sectors as usize]) {
-                            to[leader % S::f32s::LEN] = sensed[lane];
-                        }
-                    }
-                };
+                let mut sense = |slots| self.sense_together(index, channel, of, slots, &mut inputs);
                 // Agents that sense everything need not be near each other.
                 if channel.shape.of_pois != 0 || channel.range2[0] >= self.diagonal2() {
                     for slot in (0..cells.len()).step_by(S::f32s::LEN) {
@@ -253,6 +257,29 @@ impl<S: Simd> Swarm<S> {
             }
         }
         self.inputs = inputs;
+    }
+
+    /// Writes the inputs of a channel of some agents of a class.
+    fn sense_together(
+        &self,
+        class: usize,
+        channel: &ChannelLanes<S>,
+        of: &[usize],
+        slots: Range<usize>,
+        inputs: &mut [S::f32s],
+    ) {
+        let sensed = self.simd.vectorize(
+            #[inline(always)]
+            || self.sensed(class, channel, of, slots.clone()),
+        );
+        let width = self.world.constants.policy.inputs();
+        for (lane, slot) in slots.enumerate() {
+            let leader = self.cells[class].slots.agents[slot] as usize;
+            let to = &mut inputs[leader / S::f32s::LEN * width + channel.shape.input as usize..];
+            for (to, sensed) in to.iter_mut().zip(&sensed[..channel.shape.sectors as usize]) {
+                to[leader % S::f32s::LEN] = sensed[lane];
+            }
+        }
     }
 
     fn diagonal2(&self) -> f32 {
@@ -551,6 +578,7 @@ impl<S: Simd> Together<S> for Swarm<S> {
             && self.paths.is_empty() == world.paths.is_none()
     }
 
+    #[inline(always)]
     fn play<O: Observer<S, Self>>(&mut self, batch: &WorldBatch<'_>, teams: Range<usize>, observer: &mut O) {
         let place = batch.locate(teams.start);
         let group = &batch.groups[place.0];
@@ -681,7 +709,7 @@ impl<S: Simd> Sensing<'_, S> {
         let (measured, within) = sense::measured::<S>(self.channel, measure, splat(simd, value), offset[0], offset[1]);
         let measured = (measured & counts.to_vector(), within & counts);
         match self.in_quadrants {
-            true => self.quadrants.add::<false>(measured, offset, self.heading),
+            true => self.quadrants.add::<false, false>(measured, offset, self.heading),
             false => self.sectors.add(self.channel, measured, offset, self.heading),
         }
     }
