@@ -500,7 +500,12 @@ fn every_problem_names_key_line_found_and_allowed() {
         (
             steps,
             "[[stages]]\nfrom = 1\nset = { \"pois.radius\" = 3 }",
-            "4: stages[0].set.pois.radius: this key cannot change between stages",
+            "4: stages[0].set.pois.radius: found no radius in a list of 2, allowed a, b",
+        ),
+        (
+            steps,
+            "[[stages]]\nfrom = 1\nset = { pois.b.coupling = 0 }",
+            "4: stages[0].set.pois.b.coupling: found 0, allowed 1 to 3 (the number of its observers)",
         ),
         (
             steps,
@@ -670,6 +675,14 @@ fn stages_keep_tables() {
     let staged = parse(&format!("{TEXT}[[stages]]\nfrom = 3\nset = {{ \"world.steps\" = 30 }}\n"));
     assert_eq!((staged.stages.len(), &staged.agents), (1, &config.agents));
     assert_eq!(parse(&staged.to_toml()), staged);
+    // A stage can change groups of POIs, with quotes or without.
+    let staged =
+        parse(&format!("{TEXT}[[stages]]\nfrom = 3\nset = {{ \"pois.b.coupling\" = 1, pois.a.radius = 2 }}\n"));
+    let valid = staged.validate().unwrap();
+    let [before, after] = [2, 3].map(|generation| World::new(valid.at(generation)));
+    assert_eq!((&before.coupling[..], before.radii2[0]), (&[1, 1, 2][..], 25.0));
+    assert_eq!((&after.coupling[..], after.radii2[0]), (&[1, 1, 1][..], 4.0));
+    assert_eq!(parse(&staged.to_toml()), staged);
 }
 
 #[test]
@@ -761,7 +774,7 @@ fn classes_and_groups_in_regions_have_their_sizes() {
     assert_eq!((parse(&written), config.validate().unwrap().into_config()), (config.clone(), config));
 }
 
-/// Stages cannot set keys of tables, so what they set stays in short.
+/// What stages set in short stays in short.
 #[test]
 fn keys_that_stages_set_stay_in_short() {
     let text =

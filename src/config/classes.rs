@@ -160,7 +160,7 @@ impl Config {
     }
 
     /// Returns the same config in full: with `[[agents]]` and `[[pois]]`, and groups of learners written out. Keys that
-    /// a stage sets stay as they are, because stages cannot set keys of tables.
+    /// a stage sets stay as they are.
     pub fn expanded(&self) -> Config {
         let Classes { agents, pois } = self.classes();
         let mut config = self.clone();

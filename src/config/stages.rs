@@ -6,6 +6,7 @@
 use std::collections::BTreeMap;
 
 use serde::Serialize;
+use toml::Spanned;
 use toml::de::DeValue;
 
 use super::{AGENTS, Config, MAX_GENERATIONS, Override, POIS, Problem};
@@ -18,11 +19,10 @@ pub const MAX_STAGES: usize = 256;
 /// The key with the length of a run.
 pub const GENERATIONS: &str = "learning.generations";
 /// Keys that stages cannot change. A name that ends with a dot is a whole section.
-const FIXED: [&str; 23] = [
+const FIXED: [&str; 22] = [
     AGENTS,
     "agents.",
     POIS,
-    "pois.",
     "policy.",
     "checkpoint.",
     "learning.paradigm",
@@ -82,6 +82,18 @@ impl UnresolvedStage<'_> {
     }
 }
 
+impl<'a> UnresolvedStage<'a> {
+    /// Adds a key that the document sets. `set = { world.coupling = 1 }` is the same key without quotes.
+    fn add(&mut self, key: &str, line: Option<usize>, value: &'a Spanned<DeValue<'a>>, document: &'a Document<'_>) {
+        match value.get_ref() {
+            DeValue::Table(leaves) => leaves
+                .iter()
+                .for_each(|(leaf, value)| self.add(&format!("{key}.{}", leaf.get_ref()), line, value, document)),
+            _ => drop(self.set.insert(key.into(), (line, document.value(value)))),
+        }
+    }
+}
+
 /// Returns the name of a stage in problems.
 fn name_of(index: usize) -> String {
     format!("{STAGES}[{index}]")
@@ -117,13 +129,7 @@ pub(super) fn unresolved<'a>(document: &'a Document<'_>, outside: bool) -> (Vec<
                 ("set", DeValue::Table(set)) => {
                     for (key, value) in set {
                         let (line, key) = (line(key.span().start), key.get_ref());
-                        match value.get_ref() {
-                            // `set = { world.coupling = 1 }` is the same key without quotes.
-                            DeValue::Table(leaves) => stage.set.extend(leaves.iter().map(|(leaf, value)| {
-                                (format!("{key}.{}", leaf.get_ref()), (line, document.value(value)))
-                            })),
-                            _ => drop(stage.set.insert(key.to_string(), (line, document.value(value)))),
-                        }
+                        stage.add(key, line, value, document);
                     }
                 }
                 ("set", _) => report(offset, place, "allowed a table of dotted keys in quotes".into()),
@@ -190,17 +196,17 @@ impl UnresolvedStage<'_> {
     fn config(&self, own: &Config, problems: &mut Vec<Problem>) -> Config {
         let name = &self.name;
         // A stage changes the values of `own`, so defaults that depend on other keys stay as they are there.
+        let names: Vec<String> = self.set.keys().map(|key| format!("{name}.set.{key}")).collect();
         let mut reader = Reader::of_values(own.values());
-        for (key, (line, value)) in &self.set {
-            let name = format!("{name}.set.{key}");
+        for ((key, (line, value)), name) in self.set.iter().zip(&names) {
             if FIXED.iter().any(|fixed| includes(fixed, key)) {
                 problems.push(Problem {
                     line: *line,
-                    key: name,
+                    key: name.clone(),
                     message: "this key cannot change between stages".into(),
                 });
             } else {
-                reader.set(key, value.clone(), name);
+                reader.set_within(key, value.clone(), name, &[POIS]);
             }
         }
         let line = |key: &str| {
@@ -226,6 +232,9 @@ impl UnresolvedStage<'_> {
             let [found, expected] = [&config, own].map(Config::learners);
             let message = format!("{found} leaders learn in this stage, {expected} in all others");
             problems.push(Problem { line: line(&key), key, message });
+        } else if config.widths() != own.widths() {
+            let message = "policies have other inputs or outputs in this stage than in all others".into();
+            problems.push(Problem { line: self.line, key: name.clone(), message });
         }
         config
     }

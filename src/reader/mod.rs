@@ -393,24 +393,26 @@ impl<'a> Reader<'a> {
             if let Some(error) = errors.first() {
                 self.report(Place::Outside, name, format!("found {}: {}", shorten(text), error.message().trim()));
             }
-            let value = Value::of_text(value, text);
-            let path: Vec<&str> = key_path(key).collect();
-            match &path[..] {
-                [list, path @ ..] if !path.is_empty() && lists.contains(list) => {
-                    let set = match self.entries.get_mut(*list) {
-                        // Otherwise a long key would nest tables until the stack overflows.
-                        _ if path.len() > MAX_PARTS => {
-                            Err(format!("found {} parts after `{list}`, allowed up to {MAX_PARTS}", path.len()))
-                        }
-                        Some(entry) => entry.value.set(path, Value { set_by: Some(name), ..value }),
-                        None => {
-                            Err(format!("found a config without [[{list}]]; `flotilla check --expand` writes them"))
-                        }
-                    };
-                    set.unwrap_or_else(|message| self.report(Place::Outside, name, message));
-                }
-                _ => self.set(key, value, name.clone()),
+            self.set_within(key, Value::of_text(value, text), name, lists);
+        }
+    }
+
+    /// Sets a key, as [`Reader::set_all`] does.
+    pub fn set_within(&mut self, key: &str, value: Value<'a>, name: &'a str, lists: &[&str]) {
+        let path: Vec<&str> = key_path(key).collect();
+        match &path[..] {
+            [list, path @ ..] if !path.is_empty() && lists.contains(list) => {
+                let set = match self.entries.get_mut(*list) {
+                    // Otherwise a long key would nest tables until the stack overflows.
+                    _ if path.len() > MAX_PARTS => {
+                        Err(format!("found {} parts after `{list}`, allowed up to {MAX_PARTS}", path.len()))
+                    }
+                    Some(entry) => entry.value.set(path, Value { set_by: Some(name), ..value }),
+                    None => Err(format!("found a config without [[{list}]]; `flotilla check --expand` writes them")),
+                };
+                set.unwrap_or_else(|message| self.report(Place::Outside, name, message));
             }
+            _ => self.set(key, value, name.into()),
         }
     }
 
