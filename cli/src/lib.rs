@@ -241,7 +241,7 @@ fn hinted(mut error: clap::Error) -> clap::Error {
         } else if let Some(flag @ ("--champion" | "--best")) = unknown.as_deref() {
             let meant = format!("--team {}", flag.trim_start_matches('-'));
             error.insert(ContextKind::SuggestedArg, ContextValue::String(meant));
-        } else if let Some(key) = unknown.and_then(|flag| key_of(&flag)).filter(|_| takes_set()) {
+        } else if let Some(key) = unknown.and_then(|flag| key_of(&flag)).filter(|key| takes_key(key)) {
             let meant = format!("--set {key}=VALUE");
             error.insert(ContextKind::SuggestedArg, ContextValue::String(meant));
         }
@@ -255,10 +255,13 @@ fn key_of(flag: &str) -> Option<&'static str> {
     config::keys().iter().map(|key| key.name).find(|key| key.rsplit('.').next() == Some(&*leaf))
 }
 
-/// Reports whether the command that was typed has `--set`.
-fn takes_set() -> bool {
+/// Reports whether the command that was typed has `--set`, and uses this key.
+fn takes_key(key: &str) -> bool {
     let words = words();
     let typed = words.get(1).and_then(|word| word.to_str()).unwrap_or_default();
+    if ["rollout", "baseline"].contains(&typed) && key.starts_with("learning.") {
+        return false;
+    }
     let command = Cli::command();
     command
         .find_subcommand(typed)

@@ -664,7 +664,8 @@ fn an_unknown_flag_named_like_a_config_key_suggests_set() {
     let stderr = |arguments: &[&str]| String::from_utf8(flotilla(arguments).stderr).unwrap();
     assert!(stderr(&["train", "x.toml", "--steps", "50"]).contains("'--set world.steps=VALUE'"));
     assert!(stderr(&["check", "x.toml", "--start-jitter=2"]).contains("'--set learning.start_jitter=VALUE'"));
-    // No suggestion if the command has no --set, or if the config has no such key.
+    // No suggestion if the command has no --set or does not use the key, or if the config has no such key.
+    assert!(!stderr(&["rollout", "run", "--generations", "3"]).contains("VALUE"));
     assert!(!stderr(&["plot", "run", "--steps", "50"]).contains("--set"));
     assert!(!stderr(&["train", "x.toml", "--colour", "red"]).contains("VALUE"));
     let (_folder, path) = write_config(include_str!("../../configs/chaotic.toml"));

@@ -430,6 +430,11 @@ fn different_layouts_print_a_note_and_are_not_paired() {
         assert!(stderr.contains(&format!("note: the arms play in different layouts: {key} differ")), "{stderr}");
         assert!(!stderr.contains("--paired"), "{stderr}");
     }
+    // The long form is the same layout.
+    let (long, _) = place.good("check here/config.toml --expand");
+    std::fs::write(place.path("long.toml"), long).unwrap();
+    place.good("train long.toml --backend cpu --out long");
+    assert!(!place.good("compare here long").1.contains("layouts"));
 }
 
 #[test]

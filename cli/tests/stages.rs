@@ -601,6 +601,7 @@ fn a_shared_policy_fits_any_number_of_leaders() {
     let (code, _, stderr) = run(&folder, "train small.toml --out cold --init run/policies.safetensors");
     let reason = "weights.0 is F32 [1, 8, 57], but the config needs F32 [2, 1 to 1048576, 57]";
     assert!(code == Some(1) && stderr.contains(reason) && stderr.lines().count() == 1, "{stderr}");
+    assert!(stderr.contains("of another config") && !stderr.contains("restore"), "{stderr}");
     // Every trial needs policies of its own.
     let (code, _, stderr) = run(&folder, "train shared.toml --trials 4 --out cold --init run/policies.safetensors");
     assert!(code == Some(1) && stderr.contains("it has no tensor weights.3; it has weights.0"), "{stderr}");

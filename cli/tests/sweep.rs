@@ -792,6 +792,10 @@ fn a_folder_with_another_sweep_or_a_run_is_refused() {
     for flags in [&["--resume"][..], &["--force"], &["--collect"], &["--shard", "1/3"], &[]] {
         let error = fail(flotilla(&another, &out, flags), 1);
         assert!(error.contains("holds another sweep"), "{error}");
+        assert!(
+            error.contains(&format!("`flotilla sweep {0}/sweep.toml --out {0} --resume`", out.display())),
+            "{error}"
+        );
         assert!(error.contains("there: \"world.coupling\" = [1, 3]"), "{error}");
         assert!(error.contains("here: \"world.coupling\" = [1, 2, 3]"), "{error}");
         assert!(!error.contains('…'), "{error}");

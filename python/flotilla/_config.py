@@ -51,8 +51,8 @@ class Config(Mapping[str, Any]):
 
     Args:
         sections: a mapping for every section of a config file: `world={"leaders": [[5, 5]], "pois": [[5, 15]]}`, and a
-            list for `stages`. Positions may be lists or NumPy arrays `[n, 2]`, in map units. Classes of agents and groups of
-            POIs are read from text only, see `parse`.
+            list of mappings for `agents`, `pois` and `stages`. Positions may be lists or NumPy arrays `[n, 2]`, in map
+            units.
 
     Raises:
         ConfigError: everything that is wrong, at once.
@@ -104,7 +104,7 @@ class Config(Mapping[str, Any]):
 
     @classmethod
     def paper(cls, layout: str = "generally_forward", fitness: str = "Df", paradigm: str = "leader-follower") -> Config:
-        """One of the paper's experiments: `"generally_forward"`, `"strictly_forward"` or `"chaotic"`.
+        """One of the paper's experiments: `"generally_forward"`, `"strictly_forward"`, `"chaotic"` or `"eight_followers"`.
 
         Raises:
             ValueError: there is no such layout, fitness or paradigm.

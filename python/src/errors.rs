@@ -107,7 +107,12 @@ impl Raised for RecordError {
 
 impl Raised for runs::ReadError {
     fn raised(self) -> PyErr {
-        failed(self)
+        match self {
+            runs::ReadError::Unfinished { .. } => {
+                failed(format!("{self}; finish the run with flotilla.train(config, out=..., resume=True)"))
+            }
+            _ => failed(self),
+        }
     }
 }
 

@@ -141,7 +141,10 @@ impl Lent {
 
     /// Keeps the backend for the next call. Call this only if the backend did not fail.
     pub fn give_back(self) {
-        if let Ok(mut idle) = IDLE.try_lock()
+        // Training that lost its GPU has continued on the CPU.
+        let is_other = self.name != "cpu" && self.backend.1.backend == "cpu";
+        if !is_other
+            && let Ok(mut idle) = IDLE.try_lock()
             && idle.len() < MAX_IDLE_BACKENDS
         {
             idle.push((self.name, self.backend));

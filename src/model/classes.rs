@@ -78,10 +78,10 @@ table! {
         /// heading and speed
         #[serde(skip_serializing_if = "Option::is_none")]
         moves_near: Option<String> = "",
-        /// of classes that learn: what their policies sense, channel by channel, see below
+        /// of classes that learn, which need one or more: what their policies sense, channel by channel, see below
         #[serde(skip_serializing_if = "Vec::is_empty")]
         senses: Vec<Channel> = "",
-        /// with control = "follow": the terms of the force on its agents, see below
+        /// with control = "follow", which needs one or more: the terms of the force on its agents, see below
         #[serde(skip_serializing_if = "Vec::is_empty")]
         rule: Vec<Term> = "",
         /// distance within which walls push agents that obey a rule
@@ -91,7 +91,7 @@ table! {
         /// classes whose agents it influences, for Df and Dt; only classes that learn can lead
         #[serde(skip_serializing_if = "Vec::is_empty", serialize_with = "one_or_list")]
         leads: Vec<String> = "",
-        /// distance up to which it influences them
+        /// distance up to which it influences them; has to be given if a class that it leads has no rule
         #[serde(skip_serializing_if = "Option::is_none")]
         influence_radius: Option<f64> = "units",
         /// whether it counts at POIs that do not name their observers

@@ -27,8 +27,8 @@ impl Region {
         let [width, height] = sides;
         let corners = r.key("in.box", "units", "rectangle with the corners (x0, y0) and (x1, y1)", "");
         let corners = corners.optional_tuple("x0, y0, x1, y1", [width, height, width, height]);
-        let round = [width, height, between(LEAST, width.high.max(height.high))];
-        let disc = r.key("in.disc", "units", "area of the circle around (x, y) with radius r", "");
+        let round = [width, height, between(LEAST, width.high.max(height.high)).because("the map")];
+        let disc = r.key("in.disc", "units", "area of the circle around (x, y) with radius r, within the map", "");
         let disc = disc.optional_tuple("x, y, r", round);
         let circle = r.key("in.circle", "units", "line of that circle", "").optional_tuple("x, y, r", round);
         let found = [corners.map(Region::Box), disc.map(Region::Disc), circle.map(Region::Circle)];

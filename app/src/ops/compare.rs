@@ -167,16 +167,18 @@ fn of_runs(folders: &[PathBuf], args: &CompareRequest, notes: &mut Vec<String>) 
     }
     let configs = folders.iter().map(|folder| runs::config(folder, verification)).collect::<Result<Vec<_>, _>>()?;
     let differs = |differs: fn(&Config, &Config) -> bool| configs.iter().any(|config| differs(config, &configs[0]));
+    // The short form and the long form of one layout are the same.
+    let parts = |config: &Config| (config.world.map, without_fitness(config.classes().agents), config.classes().pois);
     let layouts = [
         ("world.map", differs(|a, b| a.world.map != b.world.map)),
         ("world.leaders", differs(|a, b| a.world.leaders != b.world.leaders)),
         ("world.followers", differs(|a, b| a.world.followers != b.world.followers)),
         ("world.pois", differs(|a, b| a.world.pois != b.world.pois)),
-        ("agents", differs(|a, b| without_fitness(a) != without_fitness(b))),
+        ("agents", differs(|a, b| without_fitness(a.agents.clone()) != without_fitness(b.agents.clone()))),
         ("pois", differs(|a, b| a.pois != b.pois)),
     ];
     let layouts: Vec<&str> = layouts.into_iter().filter(|(_, differ)| *differ).map(|(key, _)| key).collect();
-    if !layouts.is_empty() {
+    if !layouts.is_empty() && configs.iter().any(|config| parts(config) != parts(&configs[0])) {
         notes.push(format!("the arms play in different layouts: {} differ", layouts.join(", ")));
     }
     notes.extend(copies(folders, &configs));
@@ -185,9 +187,9 @@ fn of_runs(folders: &[PathBuf], args: &CompareRequest, notes: &mut Vec<String>) 
     Ok(arms.map(read).collect::<Result<_, _>>()?)
 }
 
-/// Returns the classes of agents without what selects their policies.
-fn without_fitness(config: &Config) -> Vec<AgentClass> {
-    config.agents.iter().map(|class| AgentClass { fitness: None, ..class.clone() }).collect()
+/// Returns classes of agents without what selects their policies.
+fn without_fitness(classes: Vec<AgentClass>) -> Vec<AgentClass> {
+    classes.into_iter().map(|class| AgentClass { fitness: None, ..class }).collect()
 }
 
 /// Returns a note for each run with the results of another, because there is nothing to compare between them.

@@ -19,6 +19,7 @@ use crate::record::runs;
 use crate::report::comparison;
 use crate::report::runs::TeamKind;
 use crate::run::{Progress, RunError, Session, SessionEnd};
+use crate::shell;
 use crate::sweep::pictures;
 use crate::sweep::results::{self, Missing, PointResults, ResultOptions};
 use crate::sweep::run::{self, SweepProgress};
@@ -246,10 +247,18 @@ pub fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
         lines.concat() + more
     };
     refuse(format!(
-        "{} holds another sweep; what differs:{}{}\nchoose another --out",
+        "{} holds another sweep; what differs:{}{}\ncontinue that one with `{}`, or choose another --out",
         out.escaped(),
         missing(&existing, &sweep.text, "there"),
         missing(&sweep.text, &existing, "here"),
+        shell::command([
+            "flotilla".into(),
+            "sweep".into(),
+            shell::argument(&path),
+            "--out".into(),
+            shell::argument(out),
+            "--resume".into(),
+        ]),
     ))
 }
 

@@ -87,11 +87,19 @@ pub enum RecordError {
         /// Description of the problem.
         reason: String,
     },
+    /// The policies in the file are of another config.
+    #[error("{path}: {reason}", path = path.escaped())]
+    OtherPolicies {
+        /// Path of the file.
+        path: PathBuf,
+        /// Description of the problem.
+        reason: String,
+    },
     /// The folder already holds a run, which would be overwritten.
     #[error("{} holds a run already", .0.escaped())]
     Exists(PathBuf),
     /// A file that flotilla did not create would be overwritten.
-    #[error("{} was not made by flotilla and would be overwritten", .0.escaped())]
+    #[error("{} was not made by flotilla, or has been changed since, and would be overwritten", .0.escaped())]
     NotOurs(PathBuf),
     /// The folder belongs to another user, and the user did not name it as the output folder.
     #[error("{} belongs to another user, so nothing is written there", .0.escaped())]
@@ -273,6 +281,9 @@ impl RecordError {
                 format!("restore it, or {}", again(path))
             }
             RecordError::Newer { .. } => "use that version, or choose another --out".into(),
+            RecordError::OtherPolicies { .. } => {
+                "they are of another config; `flotilla rollout RUN` plays a run's policies in its own".into()
+            }
             RecordError::Damaged { .. } | RecordError::NoTrial { .. } => return None,
         })
     }

@@ -84,8 +84,16 @@ pub fn read<'a>(place: impl Into<Place<'a>>, config: &Config, trial: Option<usiz
         Some(trial) if file.kind().is_none_or(|kind| kind == KIND) && file.info(&tensor(trial)).is_none() => {
             RecordError::NoTrial { path: path.into(), reason }
         }
-        _ => RecordError::damaged(path, reason),
+        _ => rejected(&file, path, config, reason),
     })
+}
+
+/// Returns the error for a file whose policies do not fit a config.
+fn rejected(file: &TensorFile<impl Read + Seek>, path: &Path, config: &Config, reason: String) -> RecordError {
+    match file.metadata(CONFIG).is_some_and(|digest| digest != super::config_digest(config)) {
+        true => RecordError::OtherPolicies { path: path.into(), reason },
+        false => RecordError::damaged(path, reason),
+    }
 }
 
 /// Initial policies of a run, instead of random ones.
@@ -110,7 +118,7 @@ pub fn read_init<'a>(place: impl Into<Place<'a>>, config: &Config) -> Result<Ini
         from_file(&mut file, config, &[config.populations()], own.then_some(trial))
     };
     let trials = (0..config.learning.trials).map(trial).collect::<Result<_, String>>();
-    let trials = trials.map_err(|reason| RecordError::damaged(path, reason))?;
+    let trials = trials.map_err(|reason| rejected(&file, path, config, reason))?;
     Ok(Init { digest: super::hex(&hash.finalize()), trials })
 }
 
