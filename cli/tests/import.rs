@@ -291,7 +291,20 @@ fn leaders_and_followers_become_classes() {
     }
     let earlier = LEADERS
         .replace("FitnessCalculator: {which_G: MinDiscrete, which_D: DFollow}", "reward_type: difference_leader");
-    assert_eq!(import(&earlier).0.learning.fitness.to_string(), "D");
+    for (switch, fitness) in
+        [("", "D"), ("  use_difference_rewards: true\n", "D"), ("  use_difference_rewards: false\n", "G")]
+    {
+        let config = import(&earlier.replace("  num_workers: 5\n", switch)).0;
+        assert_eq!(config.learning.fitness.to_string(), fitness);
+    }
+    for rule in ["spawn_rule: Individual", "position_rule: Set", "poi_spawn_rule: Set"] {
+        let (key, _) = rule.split_once(':').unwrap();
+        let (.., listed) = import(&LEADERS.replacen(rule, &format!("{key}: UniformRandom"), 1));
+        assert!(listed.contains(&format!("{key} = \"UniformRandom\": positions are the listed ones")), "{listed}");
+    }
+    let only = LEADERS.replace("which_D: DFollow", "which_D: DFollow, follower_switch: UseFollowersOnly");
+    let (config, text, _) = import(&only);
+    assert_eq!(config.pois[0].observers, ["follower"], "{text}");
     let (config, ..) =
         import("leader_positions: [[2, 3]]\nfollower_positions: [[4, 5], [6, 7]]\npoi_positions: [[8, 9]]\n");
     assert_eq!((config.world.leaders.len(), config.world.followers.len(), config.world.pois.len()), (1, 2, 1));

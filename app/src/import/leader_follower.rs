@@ -24,6 +24,8 @@ const POLICY: &[Row] = &[("CCEA.nn_hidden", To::List("hidden"))];
 
 const WORLD: &[Row] = &[("CCEA.config.BoidsEnv.max_steps", To::Need("steps"))];
 
+const LISTED: &str = "positions are the listed ones, which other rules ignore";
+
 /// Keys below `CCEA.config.BoidsEnv.config`, for the world.
 const ENVIRONMENT: &[Row] = &[
     ("map_dimensions", To::Code("x y")),
@@ -39,22 +41,22 @@ const ENVIRONMENT: &[Row] = &[
         "StateBounds",
         To::Code("min_velocity max_velocity max_acceleration max_angular_velocity num_leaders num_followers"),
     ),
+    ("BoidSpawner.spawn_rule", To::Only("Individual", LISTED)),
+    ("BoidSpawner.position_rule", To::Only("Set", LISTED)),
     ("BoidSpawner.velocity_rule", To::Only("FixedStart", "speeds at the start are fixed")),
     ("BoidSpawner.heading_rule", To::Only("FixedStart", "headings at the start are fixed")),
-    (
-        "BoidSpawner",
-        To::Code("spawn_rule position_rule velocity_fraction leader_positions follower_positions start_heading"),
-    ),
+    ("BoidSpawner", To::Code("velocity_fraction leader_positions follower_positions start_heading")),
     ("ObservationManager.observation_rule", To::Only("Individual", "each leader senses by itself")),
     ("ObservationManager.poi_sensor_type", To::Only("Density", "inputs are densities of sectors")),
     ("ObservationManager.swarm_sensor_type", To::Only("Density", "inputs are densities of sectors")),
     ("ObservationManager", To::Code("num_poi_bins num_swarm_bins observation_radius full_observability")),
-    ("POISpawner", To::Code("poi_spawn_rule positions")),
+    ("POISpawner.poi_spawn_rule", To::Only("Set", LISTED)),
+    ("POISpawner", To::Code("positions")),
     ("POIColony", To::Code("coupling observation_radius")),
     ("FitnessCalculator.which_G", To::Code("")),
     ("FitnessCalculator.which_D", To::Code("")),
     ("reward_type", To::Code("")),
-    ("FitnessCalculator.follower_switch", To::Only("UseLeadersAndFollowers", "set pois.observers = \"follower\"")),
+    ("FitnessCalculator.follower_switch", To::Code("")),
     ("FitnessCalculator.which_F", To::Only("G", "there are no potentials")),
     ("FitnessCalculator.use_drip", To::Only("Regular", "there are no potentials")),
     ("Renderer", To::Nothing("`flotilla replay` shows episodes")),
@@ -132,6 +134,15 @@ pub(super) fn translate(root: &At<'_>) -> Result<Vec<Section>, Problem> {
     count("leader")?;
     let has_followers = count("follower")? > 0;
     let follower = if has_followers { Some(follower(&env)?) } else { None };
+    let switch = "FitnessCalculator.follower_switch";
+    let all = "UseLeadersAndFollowers";
+    let followers_only = env.word(switch, all, &[(all, false), ("UseFollowersOnly", true)])?;
+    if let Some(switch) = env.get(switch).filter(|_| followers_only) {
+        match has_followers {
+            true => pois.put("observers", quoted("follower"), &switch),
+            false => pois.skip(&switch, "there are no followers"),
+        }
+    }
     let sections =
         [Some(world), Some(leader(&env, has_followers)?), follower, Some(pois), Some(policy), Some(learning)];
     Ok(sections.into_iter().flatten().collect())
@@ -142,13 +153,15 @@ fn fitness(root: &At<'_>, env: &At<'_>) -> Result<&'static str, Problem> {
     if env.get("FitnessCalculator.which_D").is_some() {
         return env.word("FitnessCalculator.which_D", "", &[("G", "G"), ("D", "D"), ("DFollow", "Df")]);
     }
-    if env.get("reward_type").is_some() {
-        let kinds = [("global", "G"), ("difference_leader", "D"), ("difference_leader_follower", "Df")];
-        return env.word("reward_type", "", &kinds);
-    }
-    let switch = |key: &str| root.word(key, "false", &[("false", false), ("true", true)]);
-    let is_difference = switch("CCEA.use_difference_rewards")? || switch("CCEA.use_difference_evaluations")?;
-    Ok(if is_difference { "Df" } else { "G" })
+    let switch = |key: &str| root.word(key, "null", &[("null", None), ("false", Some(false)), ("true", Some(true))]);
+    let default = match switch("CCEA.use_difference_rewards")?.or(switch("CCEA.use_difference_evaluations")?) {
+        // The program ignores the reward type then.
+        Some(false) => return Ok("G"),
+        Some(true) => "difference_leader_follower",
+        None => "global",
+    };
+    let kinds = [("global", "G"), ("difference_leader", "D"), ("difference_leader_follower", "Df")];
+    env.word("reward_type", default, &kinds)
 }
 
 /// Returns the section of a class, with what leaders and followers have in common.
