@@ -147,7 +147,7 @@ fn rovers_and_uavs_become_classes() {
         "{ of = \"pois\", pois = [\"rover\"], sectors = 8, frame = \"map\", range = 4.0",
         "{ of = \"pois\", sectors = 3, frame = \"map\", range = 30.0",
         "{ of = \"pois\", pois = [\"rover\"], sectors = 3, frame = \"map\", range = 30.0",
-        "name = \"hidden_A\" # 2 of them count = 2 # drawn anew for every episode in = { circle = [30.0, 20.0, 10.0] }",
+        "name = \"hidden-A\" # 2 of them count = 2 # drawn anew for every episode in = { circle = [30.0, 20.0, 10.0] }",
         "stays_in = [0.0, 0.0, 30.0, 40.0] # env.agents.rovers[2].bounds (line 16)",
         "led_by = \"any-seen\" # IndirectDifference.automatic.credit",
         "removes = [[0], [1], [2], [3], [0, 3]]",
@@ -162,13 +162,16 @@ fn rovers_and_uavs_become_classes() {
     assert_eq!(classes, expected.map(|(name, of)| (name, fitness(of))));
     let pois: Vec<_> = config.pois.iter().map(|group| (&*group.name, group.radius, group.value)).collect();
     // A rover observes within the smaller radius, or within the capture radius.
-    assert_eq!(pois, [("rover", 3.0, 2.0), ("hidden_A", 8.0, 1.0)]);
+    assert_eq!(pois, [("rover", 3.0, 2.0), ("hidden-A", 8.0, 1.0)]);
     let learning = &config.learning;
-    assert_eq!((learning.population, learning.generations, learning.trials, learning.seed), (20, 7, 6, 9));
+    // Kept teams have slots of the population.
+    assert_eq!((learning.population, learning.generations, learning.trials, learning.seed), (22, 7, 6, 9));
     assert_eq!((learning.team_elites, learning.episodes_per_team, learning.mutation_sigma), (2, 3, 0.2));
     // One line per key that is lost, each with its place, and none for keys that are translated.
     for place in [
-        "disappear_bool = true",
+        "disappear_bool = true: there, it disappears only for rovers with a SmartLidar",
+        "n_individual_elites = 4: there, tournaments compare the team's G, and each elite is listed twice",
+        "team_formation.type = \"softmax_teams\": there, a mutated policy has fitness 0",
         "config.yaml:8: not translated: env.agents.rovers[0].reward_type = \"Difference\": credit.add_g is one for all",
         "config.yaml:53: not translated: ccea.network.uav_max_velocity = 1.5: there, the first UAV has",
         "ccea.weight_initialization.lower_bound = -0.5",
@@ -220,7 +223,10 @@ fn every_word_of_an_influence_config_has_a_translation() {
         )
         .replace("n_individual_elites: 4, n_team_elites: 2", "n_elites: 4");
     let (config, ..) = import(&earlier);
-    assert_eq!((config.learning.population, config.learning.episodes_per_team), (20, 3));
+    let learning = &config.learning;
+    assert_eq!((learning.population, learning.episodes_per_team, learning.test_episodes), (20, 3, 3));
+    let (config, ..) = import(&INFLUENCE.replace("{spawn_rule: fixed, fixed: [31, 20]}", "[31, 20]"));
+    assert_eq!(config.agents, import(INFLUENCE).0.agents);
 }
 
 #[test]
@@ -240,9 +246,12 @@ fn rovers_follow_choose_and_need_uavs() {
     assert_eq!(config.agents[2].reach, Some(6.0));
     // Agents have other numbers then: rovers 0 and 1 are the last.
     assert!(text.contains("removes = [[0], [3, 1], [3, 1]]"), "{text}");
-    assert!(!listed.contains("follow") && !listed.contains("pick_uav"), "{listed}");
+    assert!(listed.contains("policy.type = \"follow\": there, dx and dy") && !listed.contains("pick_uav"), "{listed}");
     let picks = with("      action: {type: pick_uav}\n").replace("RoverLidar", "UavDistanceLidar");
-    let (config, text, _) = import(&picks.replace("needs_uav_to_move: false", "needs_uav_to_move: true"));
+    // The sensor does not use the resolution.
+    let picks = picks.replacen("resolution: 90", "resolution: 1", 1);
+    let (config, text, listed) = import(&picks.replace("needs_uav_to_move: false", "needs_uav_to_move: true"));
+    assert!(listed.contains("action.type = \"pick_uav\": there, dx and dy"), "{listed}");
     let rover = &config.agents[0];
     assert_eq!((rover.control.to_string(), rover.moves_near.as_deref()), ("choose:uav".into(), Some("uav")), "{text}");
     assert_eq!(rover.senses.iter().map(|channel| channel.sectors).collect::<Vec<_>>(), [Sectors::Each(2)], "{text}");
@@ -251,6 +260,69 @@ fn rovers_follow_choose_and_need_uavs() {
     let different = INFLUENCE
         .replace("      reward_type: Difference\n", "      action: {type: pick_uav}\n      reward_type: Difference\n");
     fails(&different, "RoverLidar", "UavDistanceLidar", message);
+    let alone = [&INFLUENCE[..first], &INFLUENCE[end..]].concat();
+    let message = "needs_uav_to_move: found, but there are no UAVs";
+    fails(&alone, "needs_uav_to_move: false", "needs_uav_to_move: true", message);
+    // The inputs in place of UAVs fit a large value.
+    assert!(import(&alone.replace("value: 2.0", "value: 9.0")).1.contains("range = 0.0, measure = \"exponential\""));
+}
+
+#[test]
+fn agents_keep_their_order_and_pois_their_subtypes() {
+    let names = |from: &str, to: &str| {
+        let (config, text, _) = import(&INFLUENCE.replace(from, to));
+        let classes = config.agents.into_iter().map(|class| class.name).collect::<Vec<_>>().join(" ");
+        let pois = config.pois.into_iter().map(|group| group.name).collect::<Vec<_>>().join(" ");
+        (classes, pois, text)
+    };
+    // A neighbour joins a class, and an agent after others does not.
+    assert_eq!(names("    uavs:\n", "    - *rover\n    uavs:\n").0, "rover rover_2 rover_3 uav uav_2");
+    // POIs without a subtype are known to all UAVs.
+    let (_, pois, text) = names("subtype: A", "subtype: ''");
+    assert!(pois == "rover hidden" && !text.contains("pois = [\"rover\"], sectors = 3"), "{text}");
+    // Names are plain, and UAVs know the subtypes in the file.
+    let other = "subtype: A+\n      position: [30, 20]\n    - *hidden\n    - {value: 1, coupling: 1, observation_radius: 5, \
+                 subtype: A, position: [30, 20]}\n    - {value: 3, coupling: 1, observation_radius: 5, subtype: A, \
+                 position: [30, 20]}\n    - value: 1\n      coupling: 1\n      observation_radius: 5";
+    let (_, pois, text) = names("subtype: A", other);
+    assert_eq!(pois, "rover hidden-A hidden-A_2 hidden-A_3 hidden");
+    assert!(text.contains("pois = [\"rover\", \"hidden-A_2\", \"hidden-A_3\", \"hidden\"], sectors = 3"), "{text}");
+}
+
+#[test]
+fn what_an_influence_config_loses_is_listed() {
+    let change = |from: &str, to: &str| {
+        assert!(INFLUENCE.contains(from), "{from}");
+        import(&INFLUENCE.replace(from, to))
+    };
+    // Smaller radii of rovers matter if they are smaller than a POI's.
+    let smaller = "rovers[2].observation_radius = 4: here, POIs count within the largest one";
+    assert!(change("observation_radius: 3.0", "observation_radius: 5.0").2.contains(smaller));
+    assert!(!import(INFLUENCE).2.contains(smaller));
+    // Rovers with a SmartLidar make hidden POIs disappear, and others do not.
+    for (from, to, gone_within) in [
+        ("RoverLidar", "SmartLidar", 1.0),
+        ("      resolution: 45\n", "      resolution: 45\n      sensor: {type: RoverLidar}\n", 0.0),
+    ] {
+        let (config, text, listed) = change(from, to);
+        assert!(config.pois[1].gone_within == gone_within && !listed.contains("disappear_bool"), "{text}{listed}");
+    }
+    // One rule is for all agents, that of UAVs. Twice G is G.
+    let rule = "IndirectDifference\n      IndirectDifference: {automatic: {timescale: timestep, credit: System}}";
+    let (config, _, listed) = change("Global", rule);
+    assert!(
+        config.credit.led_by.to_string() == "any-seen" && listed.contains("rovers[2].IndirectDifference.automatic")
+    );
+    let twice = INFLUENCE
+        .replace("add_G: true", "add_G: false")
+        .replace("Global", "Global\n      IndirectDifference: {add_G: true}");
+    assert!(!import(&twice).0.credit.add_g);
+    // The largest input from a POI is limited, also for a value that no POI of a channel has.
+    let (_, text, listed) = change("- &hidden\n      value: 1.0", "- &hidden\n      value: 8.0");
+    assert!(text.contains("nearest = 0.0632455532") && text.matches("nearest = 0.0316227766").count() == 8, "{text}");
+    assert!(listed.contains("uavs[0].observation_radius = 30.0: here, a POI's value times"), "{listed}");
+    let (config, _, listed) = change("novelty: 1", "novelty: .inf");
+    assert!(listed.contains("novelty = inf: unknown") && config.pois.len() == 2);
 }
 
 #[test]
@@ -337,7 +409,10 @@ fn bad_input_is_refused_with_its_line() {
         "credit: Best",
         "found \"Best\", allowed Local, AllOrNothing, System, Difference",
     );
-    fails(INFLUENCE, "resolution: 90", "resolution: 0", "allowed degrees that make 1 to 16 sectors");
+    for wrong in ["resolution: 0", "resolution: 100", "resolution: .nan"] {
+        fails(INFLUENCE, "resolution: 90", wrong, "allowed degrees that divide 360 into 1 to 16 sectors");
+    }
+    fails(INFLUENCE, "[60.0, 40.0]", ".nan", &at("map_size", "world.map, from env.map_size: found nan"));
     fails(
         INFLUENCE,
         "fixed: [30.0, 20.0]",
@@ -367,7 +442,7 @@ fn bad_input_is_refused_with_its_line() {
 
     // Rovers see all POIs but hidden ones, whatever their subtype.
     let (_, text, _) = import(&INFLUENCE.replace("- {value: 2.0,", "- {subtype: B, value: 2.0,"));
-    assert!(text.contains("pois = [\"rover_B\"]"), "{text}");
+    assert!(text.contains("pois = [\"rover-B\"]"), "{text}");
 
     let (config, ..) = import(&INFLUENCE.replace("    - *rover\n", &"    - *rover\n".repeat(200)));
     assert_eq!(config.agent_count(), 204);

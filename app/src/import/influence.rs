@@ -3,6 +3,7 @@
 use super::table::{Row, Section, To, quoted};
 use super::yaml::At;
 use flotilla::config::Problem;
+use toml::Value;
 
 const WORLD: &[Row] = &[
     ("env.map_size", To::Need("map")),
@@ -36,7 +37,7 @@ const POI: &[Row] = &[
     ("value", To::Code("")),
     ("coupling", To::Need("coupling")),
     ("constraint", To::Word("when", "final", &[("sequential", "ever"), ("final", "end")])),
-    ("disappear_bool", To::Only("false", "UAVs sense POIs also after a rover was there")),
+    ("disappear_bool", To::Code("")),
 ];
 
 const POLICY: &[Row] = &[
@@ -46,8 +47,8 @@ const POLICY: &[Row] = &[
 ];
 
 const LEARNING: &[Row] = &[
-    ("ccea.populations.agent_population_size", To::Key("population")),
-    ("ccea.population.subpopulation_size", To::Key("population")),
+    ("ccea.populations.agent_population_size", To::Code("")),
+    ("ccea.population.subpopulation_size", To::Code("")),
     ("ccea.num_generations", To::Need("generations")),
     ("experiment.num_trials", To::Need("trials")),
     ("debug.random_seed.set_seed", To::Key("seed")),
@@ -92,16 +93,27 @@ const LEARNING: &[Row] = &[
 
 /// Distance up to which the program's UAVs influence rovers, in units.
 const INFLUENCE_RADIUS: f64 = 5.0;
-/// The names of measures here, with the distance below which they do not grow.
-const MEASURES: &[(&str, (&str, &str))] = &[
+/// The largest product of a measure and a POI's value here.
+const MOST_MEASURED: f64 = 2000.0;
+/// The names of measures here, with the power of 1/d and the distance below which they do not grow, or zeros.
+const MEASURES: &[(&str, (&str, f64, f64))] = &[
     // 1/max(0.001, d²).
-    ("inverse_distance_squared", ("inverse-squared", " nearest = 0.03162277660168379,")),
+    ("inverse_distance_squared", ("inverse-squared", 2.0, 0.03162277660168379)),
     // 1/max(0.001, d) there; 0.01 is the least here.
-    ("inverse_distance", ("inverse", " nearest = 0.01,")),
-    ("exponential_negative_distance", ("exponential", "")),
-    ("distance_over_observation_radius", ("distance", "")),
-    ("one_minus_inverse_distance_over_observation_radius", ("closeness", "")),
+    ("inverse_distance", ("inverse", 1.0, 0.01)),
+    ("exponential_negative_distance", ("exponential", 0.0, 0.0)),
+    ("distance_over_observation_radius", ("distance", 0.0, 0.0)),
+    ("one_minus_inverse_distance_over_observation_radius", ("closeness", 0.0, 0.0)),
 ];
+const SENSORS: &[(&str, Sensor)] =
+    &[("SmartLidar", Sensor::Smart), ("RoverLidar", Sensor::Rover), ("UavDistanceLidar", Sensor::UavDistance)];
+
+#[derive(Clone, Copy, PartialEq)]
+enum Sensor {
+    Smart,
+    Rover,
+    UavDistance,
+}
 
 /// Agents that differ in their positions only, or POIs.
 struct Group<'a> {
@@ -116,6 +128,9 @@ struct Group<'a> {
     members: Vec<usize>,
     learns: bool,
     credit: Credit,
+    /// As in the YAML file, of POIs.
+    subtype: Option<Value>,
+    value: f64,
 }
 
 #[derive(Clone, PartialEq)]
@@ -133,7 +148,21 @@ struct Credit {
     adds_g: bool,
 }
 
-impl Group<'_> {
+impl<'a> Group<'a> {
+    fn new(at: &At<'a>, stem: String, section: Section) -> Result<Group<'a>, Problem> {
+        Ok(Group {
+            stem,
+            section,
+            places: vec![place(at)?],
+            position: at.need("position")?,
+            members: vec![],
+            learns: true,
+            credit: Credit::default(),
+            subtype: None,
+            value: 0.0,
+        })
+    }
+
     /// Reports whether another member can be in this group.
     fn fits(&self, other: &Group<'_>) -> bool {
         let texts = |group: &Group<'_>| {
@@ -141,13 +170,16 @@ impl Group<'_> {
             lines.filter(|text| !text.is_empty()).collect::<Vec<_>>()
         };
         let kind = |place: &Place| matches!(place, Place::In(_)).then(|| place.clone());
-        kind(&self.places[0]) == kind(&other.places[0])
+        // Ties between agents depend on their order, and POIs have no members.
+        self.members.last().map(|last| last + 1) == other.members.first().copied()
+            && kind(&self.places[0]) == kind(&other.places[0])
             && (&self.stem, self.learns, &self.credit) == (&other.stem, other.learns, &other.credit)
+            && self.subtype == other.subtype
             && texts(self) == texts(other)
     }
 }
 
-/// Puts members that differ in their positions only together, and names the groups.
+/// Puts POIs, or neighbouring agents, that differ in their positions only together, and names the groups.
 fn grouped(members: Vec<Group<'_>>) -> Vec<(String, Group<'_>)> {
     let mut groups: Vec<Group<'_>> = Vec::new();
     for member in members {
@@ -189,12 +221,14 @@ pub(super) fn translate(root: &At<'_>) -> Result<Vec<Section>, Problem> {
     world.set("start_counts", "true", "the program scores the start, too");
 
     let kinds = [("rover", few(root, "env.agents.rovers")?), ("uav", few(root, "env.agents.uavs")?)];
-    let reach = kinds[0].1.iter().map(|rover| rover.need("observation_radius")?.number());
-    let reach = reach.collect::<Result<Vec<_>, _>>()?.into_iter().fold(0.0, f64::max);
-    let mut pois = Vec::new();
+    let reach = |rover: &At<'_>| Ok((rover.need("observation_radius")?.number()?, sensor(rover)? == Sensor::Smart));
+    let reaches = kinds[0].1.iter().map(reach).collect::<Result<Vec<_>, Problem>>()?;
+    let (mut pois, mut needed) = (Vec::new(), 0.0);
     for kind in ["rover", "hidden"] {
         for poi in few(root, &format!("env.pois.{kind}_pois"))? {
-            pois.push(of_poi(&poi, kind, reach)?);
+            let (group, reach) = of_poi(&poi, kind, &reaches)?;
+            pois.push(group);
+            needed = reach.max(needed);
         }
     }
     let is_random = |group: &Group<'_>| matches!(group.places[0], Place::In(_));
@@ -208,14 +242,18 @@ pub(super) fn translate(root: &At<'_>) -> Result<Vec<Section>, Problem> {
     }
     let all = || kinds.iter().flat_map(|(kind, agents)| agents.iter().map(move |at| (*kind, at)));
     let credits = all().map(|(_, at)| credit_of(at, rovers + uavs)).collect::<Result<Vec<_>, _>>()?;
-    // One rule, and one choice to add G, are for all agents.
-    let led_by = credits.iter().find_map(|credit| credit.led_by);
+    // One rule, and one choice to add G, are for all agents. UAVs have rovers to lead.
+    let led_by = credits[rovers..].iter().chain(&credits).find_map(|credit| credit.led_by);
     let adds_g = credits.iter().any(|credit| credit.adds_g);
     let mut agents = Vec::new();
     for (i, ((kind, at), credit)) in all().zip(credits).enumerate() {
         let max_speed = root.need(&format!("ccea.network.{kind}_max_velocity"))?;
         let mut agent = of_agent(at, kind, &max_speed, &pois, uavs > 0)?;
         agent.members = vec![i];
+        if reaches.get(i).is_some_and(|(reach, _)| *reach < needed) {
+            let radius = at.need("observation_radius")?;
+            agent.section.skip(&radius, "here, POIs count within the largest one for all rovers");
+        }
         if agent.learns {
             agent.section.put("fitness", quoted(credit.fitness), &at.need("reward_type")?);
             if credit.led_by.is_some() && credit.led_by != led_by {
@@ -243,10 +281,24 @@ pub(super) fn translate(root: &At<'_>) -> Result<Vec<Section>, Problem> {
     let mut policy = Section::new("[policy]");
     policy.fill(root, POLICY)?;
     let mut learning = Section::new("[learning]");
+    let elites = |key: &str| root.get(&format!("ccea.selection.n_elites_binary_tournament.{key}"));
+    let kept = elites("n_team_elites").map_or(Ok(0.0), |kept| kept.number())?;
+    let first = |keys: [&str; 2]| keys.iter().find_map(|key| root.get(&format!("ccea.{key}")));
+    if let Some(size) = first(["populations.agent_population_size", "population.subpopulation_size"]) {
+        let added = if kept > 0.0 { " + n_team_elites, which are not part of it there" } else { "" };
+        learning.derive("population", size.number()? + kept, &size, &format!("{}{added}", size.path));
+    }
     learning.fill(root, LEARNING)?;
+    if let Some(elites) = elites("n_individual_elites") {
+        learning.skip(&elites, "there, tournaments compare the team's G, and each elite is listed twice, so that about half as many survive");
+    }
+    if let Some(teams) = root.get("ccea.team_formation.type").filter(|teams| !teams.shown().contains("random")) {
+        learning.skip(&teams, "there, a mutated policy has fitness 0 when teams form, and here its parent's");
+    }
     learning.set("mutation", quoted("additive"), "as in the program");
     learning.set("initial", quoted("uniform"), "as in the program");
-    if let Some(episodes) = root.get("ccea.evaluation.multi_rollout.num_rollouts").filter(|_| random) {
+    let episodes = first(["evaluation.multi_rollout.num_rollouts", "evaluation.multi_evaluation.num_evaluations"]);
+    if let Some(episodes) = episodes.filter(|_| random) {
         learning.put("test_episodes", episodes.value()?, &episodes);
     }
     learning.skip_unknown(root, &[WORLD, POLICY, LEARNING]);
@@ -259,8 +311,11 @@ pub(super) fn translate(root: &At<'_>) -> Result<Vec<Section>, Problem> {
     };
     let of_uav = agents.iter().flat_map(|(_, group)| &group.section.lines).find(|line| line.text.contains(UAV));
     if let (Some(line), true) = (of_uav, agents.iter().filter(|(_, group)| group.stem == "uav").count() != 1) {
-        let message = "found, allowed if all UAVs differ in their positions only".into();
-        return Err(Problem { line: Some(line.line), key: line.path.clone(), message });
+        let message = match uavs {
+            0 => "found, but there are no UAVs",
+            _ => "found, allowed if all UAVs differ in their positions only",
+        };
+        return Err(Problem { line: Some(line.line), key: line.path.clone(), message: message.into() });
     }
     let [rovers, uavs] = ["rover", "uav"].map(names);
     let finish = |(name, group): (String, Group<'_>)| {
@@ -274,7 +329,7 @@ pub(super) fn translate(root: &At<'_>) -> Result<Vec<Section>, Problem> {
             Place::At(_) => {
                 let at =
                     group.places.iter().filter_map(|place| if let Place::At(at) = place { Some(at) } else { None });
-                section.derive("at", format!("{:?}", at.collect::<Vec<_>>()), &group.position, "position.fixed");
+                section.derive("at", format!("{:?}", at.collect::<Vec<_>>()), &group.position, "position");
             }
         }
         section.lines.extend(group.section.lines);
@@ -296,6 +351,10 @@ const UAV: &str = "\u{0}one uav";
 
 fn place(at: &At<'_>) -> Result<Place, Problem> {
     let position = at.need("position")?;
+    // Earlier versions of the program have the position itself.
+    if position.items().is_ok() {
+        return Ok(Place::At(position.point()?));
+    }
     let kinds = [("fixed", 0), ("random_uniform", 1), ("random_circle", 2)];
     position.need("spawn_rule")?;
     Ok(match position.word("spawn_rule", "", &kinds)? {
@@ -313,11 +372,18 @@ fn place(at: &At<'_>) -> Result<Place, Problem> {
     })
 }
 
-/// Translates a POI. `reach` is the largest radius of rovers.
-fn of_poi<'a>(at: &At<'a>, kind: &str, reach: f64) -> Result<Group<'a>, Problem> {
+fn sensor(agent: &At<'_>) -> Result<Sensor, Problem> {
+    agent.word("sensor.type", "SmartLidar", SENSORS)
+}
+
+/// Translates a POI. `rovers` are their radii, and whether each has a SmartLidar. Also returns the radius that
+/// rovers need to count from as far as any other, or 0.
+fn of_poi<'a>(at: &At<'a>, kind: &str, rovers: &[(f64, bool)]) -> Result<(Group<'a>, f64), Problem> {
     let mut section = Section::new("[[pois]]");
     let (observed, captured) = (at.need("observation_radius")?, at.number_or("capture_radius", -1.0)?);
-    let radius = captured.max(reach.min(observed.number()?));
+    let reach = rovers.iter().map(|(reach, _)| *reach).fold(0.0, f64::max);
+    let needed = reach.min(observed.number()?);
+    let radius = captured.max(needed);
     section.derive(
         "radius",
         format!("{radius:?}"),
@@ -326,22 +392,40 @@ fn of_poi<'a>(at: &At<'a>, kind: &str, reach: f64) -> Result<Group<'a>, Problem>
     );
     section.fill(at, POI)?;
     section.set("score", quoted("closeness"), "as in the program");
-    let (value, coupling) = (at.need("value")?, at.need("coupling")?.number()?);
-    section.put("value", format!("{:?}", value.number()? * coupling), &value);
+    let (factor, coupling) = (at.need("value")?, at.need("coupling")?.number()?);
+    let value = factor.number()? * coupling;
+    section.put("value", format!("{value:?}"), &factor);
     if coupling != 1.0 {
         section
-            .skip(&value, "the program scores it times the coupling, as here, but UAVs sense the value itself there");
+            .skip(&factor, "the program scores it times the coupling, as here, but UAVs sense the value itself there");
+    }
+    // A rover with a SmartLidar hides such a POI from UAVs once it is this near.
+    let hides = at.word("disappear_bool", "false", &[("false", false), ("true", kind == "hidden")])?;
+    let near = rovers.iter().filter(|(_, is_smart)| *is_smart).map(|(reach, _)| reach.min(1.0)).fold(0.0, f64::max);
+    if let Some(disappears) = at.get("disappear_bool").filter(|_| hides && near > 0.0) {
+        section.put("gone_within", format!("{near:?}"), &disappears);
+        if rovers.iter().any(|(reach, is_smart)| !is_smart || *reach < near) {
+            section.skip(&disappears, "there, it disappears only for rovers with a SmartLidar that sense it");
+        }
     }
     section.skip_unknown(at, &[POI]);
-    let subtype = at.get("subtype").map_or(String::new(), |subtype| format!("_{}", word(&subtype)));
-    let (position, places, stem) = (at.need("position")?, vec![place(at)?], format!("{kind}{subtype}"));
-    Ok(Group { stem, section, places, position, members: vec![], learns: true, credit: Credit::default() })
+    let subtype = at.get("subtype");
+    let shown = subtype.as_ref().map_or(String::new(), At::shown);
+    let subtype = subtype.map(|subtype| subtype.value()).transpose()?.filter(|name| name.as_str() != Some(""));
+    let plain: String = shown.chars().filter(|c| c.is_ascii_alphanumeric() || *c == '-').collect();
+    // Numbers of groups follow a _, so that names are unique.
+    let stem = if plain.is_empty() { kind.into() } else { format!("{kind}-{plain}") };
+    let needed = if needed > captured { needed } else { 0.0 };
+    Ok((Group { subtype, value, ..Group::new(at, stem, section)? }, needed))
 }
 
-/// Returns a value as part of a name.
-fn word(at: &At<'_>) -> String {
-    at.shown().chars().filter(|c| c.is_ascii_alphanumeric() || *c == '-').collect()
+/// Reports whether an agent follows UAVs and does not learn.
+fn follows(at: &At<'_>) -> Result<bool, Problem> {
+    at.word("policy.type", "network", &[("network", false), ("follow", true)])
 }
+
+/// Why a move to a UAV differs.
+const STRAIGHT: &str = "there, dx and dy of a move to a UAV are limited each by itself; here it is straight";
 
 /// Translates an agent but for its fitness.
 fn of_agent<'a>(
@@ -353,7 +437,7 @@ fn of_agent<'a>(
 ) -> Result<Group<'a>, Problem> {
     let mut section = Section::new("[[agents]]");
     section.fill(at, AGENT)?;
-    let follows = at.word("policy.type", "network", &[("network", false), ("follow", true)])?;
+    let follows = follows(at)?;
     let picks = at.word("action.type", "dxdy", &[("dxdy", false), ("pick_uav", true)])?;
     let needs_uav = at.word("needs_uav_to_move", "false", &[("false", false), ("true", true)])?;
     let motion = format!("{{ kind = \"free\", max_speed = {:?} }}", max_speed.number()?);
@@ -364,12 +448,16 @@ fn of_agent<'a>(
         section.put("stays_in", format!("{stays_in:?}"), &bounds);
     }
     if follows {
-        section.put("control", format!("\"nearest:{UAV}\""), &at.need("policy.type")?);
+        let policy = at.need("policy.type")?;
+        section.put("control", format!("\"nearest:{UAV}\""), &policy);
+        section.skip(&policy, STRAIGHT);
         let radius = at.need("observation_radius")?;
         section.put("reach", format!("{:?}", radius.number()?), &radius);
     } else {
         if picks {
-            section.put("control", format!("\"choose:{UAV}\""), &at.need("action.type")?);
+            let action = at.need("action.type")?;
+            section.put("control", format!("\"choose:{UAV}\""), &action);
+            section.skip(&action, STRAIGHT);
         }
         if needs_uav && kind == "rover" {
             section.put("moves_near", format!("\"{UAV}\""), &at.need("needs_uav_to_move")?);
@@ -382,15 +470,7 @@ fn of_agent<'a>(
         section.set("influence_radius", format!("{INFLUENCE_RADIUS:?}"), "as in the program");
     }
     section.skip_unknown(at, &[AGENT]);
-    Ok(Group {
-        stem: kind.into(),
-        section,
-        places: vec![place(at)?],
-        position: at.need("position")?,
-        members: vec![],
-        learns: !follows,
-        credit: Credit::default(),
-    })
+    Ok(Group { learns: !follows, ..Group::new(at, kind.into(), section)? })
 }
 
 /// Adds what an agent senses.
@@ -401,46 +481,59 @@ fn senses(
     has_uavs: bool,
     section: &mut Section,
 ) -> Result<(), Problem> {
-    let resolution = at.need("resolution")?;
-    let sectors = (360.0 / resolution.number()?).floor();
-    if !(1.0..=16.0).contains(&sectors) {
-        return Err(
-            resolution.problem(format!("found {}, allowed degrees that make 1 to 16 sectors", resolution.shown()))
-        );
-    }
     let radius = at.need("observation_radius")?;
     let range = radius.number()?;
-    let (measure, nearest) = at.word("sensor.measurement_type", "inverse_distance_squared", MEASURES)?;
-    let combine = at.word("sensor.accum_type", "average", &[("average", "mean"), ("sum", "sum")])?;
-    let empty = at.number_or("sensor.default_value", -1.0)?;
-    let channel = |of: &str, range: f64, measure: &str, combine: &str, empty: f64| {
-        format!(
-            "    {{ of = {of}, sectors = {sectors}, frame = \"map\", range = {range:?}, measure = \"{measure}\",{nearest} \
-             combine = \"{combine}\", empty = {empty:?} }},\n"
-        )
-    };
-    let nothing = || channel("\"pois\"", 0.0, measure, combine, empty);
-    let sensor =
-        at.word("sensor.type", "SmartLidar", &[("SmartLidar", 0), ("RoverLidar", 1), ("UavDistanceLidar", 2)])?;
-    let channels = if sensor == 2 {
+    let sensor = sensor(at)?;
+    let channels = if sensor == Sensor::UavDistance {
         format!(
             "    {{ of = {UAVS}, sectors = \"each\", range = {range:?}, measure = \"distance\", combine = \"sum\", empty = -1.0 }},\n"
         )
     } else {
-        let of_uavs = if has_uavs { channel(UAVS, range, measure, combine, empty) } else { nothing() };
-        let of_agents = channel(ROVERS, range, measure, combine, empty) + &of_uavs;
-        let seen = |(_, group): &&(String, Group<'_>)| {
-            let subtypes = at.list("observable_subtypes").unwrap_or_default();
-            let knows = |subtype: &str| subtypes.iter().any(|other| word(other) == subtype);
-            group.stem.starts_with("rover") || kind == "uav" && group.stem.strip_prefix("hidden_").is_none_or(knows)
+        let resolution = at.need("resolution")?;
+        let sectors = 360.0 / resolution.number()?;
+        if !(1.0..=16.0).contains(&sectors) || sectors.fract() != 0.0 {
+            return Err(resolution.problem(format!(
+                "found {}, allowed degrees that divide 360 into 1 to 16 sectors",
+                resolution.shown()
+            )));
+        }
+        let (measure, power, least) = at.word("sensor.measurement_type", "inverse_distance_squared", MEASURES)?;
+        let combine = at.word("sensor.accum_type", "average", &[("average", "mean"), ("sum", "sum")])?;
+        let empty = at.number_or("sensor.default_value", -1.0)?;
+        // The distance below which the measure of POIs with this value does not grow.
+        let nearest = |value: f64| (power > 0.0).then(|| f64::max(least, (value / MOST_MEASURED).powf(1.0 / power)));
+        let channel = |of: &str, range: f64, measure: &str, nearest: Option<f64>| {
+            let nearest = nearest.map_or(String::new(), |nearest| format!(" nearest = {nearest:?},"));
+            format!(
+                "    {{ of = {of}, sectors = {sectors}, frame = \"map\", range = {range:?}, measure = \"{measure}\",{nearest} \
+                 combine = \"{combine}\", empty = {empty:?} }},\n"
+            )
         };
-        let groups: Vec<_> = pois.iter().filter(seen).map(|(name, _)| quoted(name)).collect();
+        let nothing = || channel("\"pois\"", 0.0, "exponential", None);
+        let of_uavs = if has_uavs { channel(UAVS, range, measure, nearest(1.0)) } else { nothing() };
+        let of_agents = channel(ROVERS, range, measure, nearest(1.0)) + &of_uavs;
+        let subtypes = at.list("observable_subtypes")?;
+        let subtypes = subtypes.iter().map(At::value).collect::<Result<Vec<_>, _>>()?;
+        let knows = |group: &Group<'_>| group.subtype.as_ref().is_none_or(|subtype| subtypes.contains(subtype));
+        let seen = |(_, group): &&(String, Group<'_>)| group.stem.starts_with("rover") || kind == "uav" && knows(group);
+        let (groups, values): (Vec<_>, Vec<_>) =
+            pois.iter().filter(seen).map(|(name, group)| (quoted(name), group.value)).unzip();
+        let limit = nearest(values.into_iter().fold(1.0, f64::max));
         let of_pois = match groups.len() {
             0 => nothing(),
-            seen if seen == pois.len() => channel("\"pois\"", range, measure, combine, empty),
-            _ => channel(&format!("\"pois\", pois = {}", toml::Value::Array(groups)), range, measure, combine, empty),
+            seen if seen == pois.len() => channel("\"pois\"", range, measure, limit),
+            _ => channel(&format!("\"pois\", pois = {}", Value::Array(groups)), range, measure, limit),
         };
-        if sensor == 0 { of_agents + &of_pois } else { of_agents }
+        if sensor == Sensor::Rover {
+            of_agents
+        } else {
+            // POIs nearer than the limit then count as at the limit.
+            if limit != nearest(1.0) {
+                let why = format!("here, a POI's value times its measure is at most {MOST_MEASURED}");
+                section.skip(at.get("sensor.measurement_type").as_ref().unwrap_or(&radius), &why);
+            }
+            of_agents + &of_pois
+        }
     };
     section.derive("senses", format!("[\n{channels}]"), &radius, "sensor, resolution and observation_radius");
     Ok(())
@@ -448,13 +541,17 @@ fn senses(
 
 /// Reads how one of `agents` agents is scored.
 fn credit_of(at: &At<'_>, agents: usize) -> Result<Credit, Problem> {
+    if follows(at)? {
+        return Ok(Credit::default());
+    }
     let of = |key: &str| format!("IndirectDifference.{key}");
     let adds_g = at.word(&of("add_G"), "false", &[("false", false), ("true", true)])?;
     let credit = |fitness| Credit { fitness, adds_g, led_by: None, removes: None };
     at.need("reward_type")?;
     let kinds = [("Global", Some("G")), ("Difference", Some("D")), ("IndirectDifference", None)];
     if let Some(fitness) = at.word("reward_type", "", &kinds)? {
-        return Ok(credit(fitness));
+        // Twice G has the same order.
+        return Ok(Credit { adds_g: adds_g && fitness != "G", ..credit(fitness) });
     }
     if at.word(&of("assignment"), "automatic", &[("automatic", false), ("manual", true)])? {
         let manual = at.list(&of("manual"))?;

@@ -123,7 +123,7 @@ impl Section {
             let is_known = |(row, to): &Row| match (path.strip_prefix(row).filter(|rest| ends(rest)), to) {
                 (Some(rest), To::Code(keys)) if !keys.is_empty() => {
                     let rest = rest.trim_start_matches('.');
-                    keys.split_whitespace().any(|key| rest.strip_prefix(key).is_some_and(ends))
+                    rest.is_empty() || keys.split_whitespace().any(|key| rest.strip_prefix(key).is_some_and(ends))
                 }
                 (found, _) => found.is_some(),
             };
