@@ -463,7 +463,6 @@ fn bad_input_is_refused_with_its_line() {
         ("base_dict: {}\nparameter_dicts: []\n".into(), "not a sweep of several"),
         ("env: {}\n".into(), "env.map_size: missing"),
         ("CCEA: 3\n".into(), "CCEA.config.BoidsEnv.config: missing"),
-        ("env:\n  map_size: .nan\n".into(), "line 2"),
         ("env: \u{1}".into(), "not YAML that can be read: "),
         ("[world]\nsteps = 5\n".into(), "; it is TOML, as configs of this program are"),
         ("env: 1\nenv: 2\n".into(), "; remove one of both"),
@@ -487,9 +486,11 @@ fn bad_input_is_refused_with_its_line() {
 
 #[test]
 fn commands_that_take_a_config_say_that_it_is_yaml() {
-    let place = Place::new(&[("in it.yaml", INFLUENCE), ("no-extension", LEADERS), ("mine.yml", "a: 1\n")]);
+    let wrong = format!("{LEADERS}CCEA: 1\n");
+    let files = [("in it.yaml", INFLUENCE), ("no-extension", LEADERS), ("wrong", &wrong), ("mine.yml", "a: 1\n")];
+    let place = Place::new(&files);
     let commands = ["check", "train", "baseline", "sweep", "bench", "verify", "tasks"];
-    for file in ["no-extension", "mine.yml"] {
+    for file in ["no-extension", "wrong", "mine.yml"] {
         for command in commands {
             let error = place.refused(1, &format!("{command} {file}"));
             let first = error.lines().next().unwrap();

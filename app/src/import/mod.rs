@@ -113,6 +113,8 @@ pub fn read_file(path: &Path) -> Result<String, ConfigError> {
 
 fn is_yaml(text: &str, path: &Path) -> bool {
     let has_extension = path.extension().is_some_and(|extension| extension == "yaml" || extension == "yml");
-    let is_known = |node: yaml::Node| PROGRAMS.iter().any(|(key, ..)| At::root(&node).get(key).is_some());
-    has_extension || yaml::parse(text).is_ok_and(is_known)
+    // YAML with an error is YAML, too.
+    let is_known =
+        |line: &str| PROGRAMS.iter().any(|(key, ..)| line.strip_prefix(key).is_some_and(|rest| rest.starts_with(':')));
+    has_extension || text.lines().any(is_known)
 }
