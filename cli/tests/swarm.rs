@@ -28,11 +28,25 @@ fn a_swarm_trains_resumes_and_is_drawn_by_a_sample() {
     place.good("replay whole --out page.html");
     let page = fs::read_to_string(place.path("page.html")).unwrap();
     assert!(page.contains("1 of 3 followers drawn"), "the page does not say that it has a sample");
+    assert!(page.contains(r#""size":5000"#), "the legend does not count all followers");
     // 1667 of 5000 followers, at 76 moments.
     assert!(page.len() < 4 << 20, "{} bytes", page.len());
     place.good("replay whole --out still.svg");
     let still = fs::read_to_string(place.path("still.svg")).unwrap();
     assert!(still.contains("1 of 3 followers drawn") && still.len() < 1 << 20, "{} bytes", still.len());
+}
+
+/// 16 bits are not enough to count 70 000 agents near a POI.
+#[test]
+fn pages_count_all_agents_near_a_poi() {
+    let pois = "at = [[150.0, 100.0], [100.0, 150.0], [50.0, 100.0], [100.0, 50.0]]";
+    let text = config(70_000).replace("steps = 75", "steps = 1").replace("radius = 20.0", "radius = 80.0");
+    let place = Place::new(&[("swarm.toml", &text.replace(pois, "at = [[100.0, 100.0]]"))]);
+    place.good("train swarm.toml --backend cpu --generations 0 --set learning.population=4 --out run");
+    place.good("replay run --out page.html");
+    let page = fs::read_to_string(place.path("page.html")).unwrap();
+    // 0 at the start and 70 000 at the only step.
+    assert!(page.contains(r#""near":"AAAAAHARAQA=""#), "not all agents are counted");
 }
 
 #[test]

@@ -99,7 +99,7 @@ export async function drive_on() {
     track.headings.push(...words.headings);
     track.near.push(...words.near);
     Object.assign(episode, {
-      positions: Float32Array.from(track.positions), headings: Float32Array.from(track.headings), near: Uint16Array.from(track.near),
+      positions: Float32Array.from(track.positions), headings: Float32Array.from(track.headings), near: Uint32Array.from(track.near),
       shown: Array.from({ length: words.step + 1 }, (_, step) => step), observed: words.observed,
     });
   };

@@ -37,7 +37,7 @@ interface Described { toml: string, config: Config, pois: number | null, paramet
 interface Palettes { light: string[], dark: string[] }
 
 /** At which steps POIs were observed, and how many agents were near them, `[shown][pois]`. */
-interface Seen { observed: (number | null)[], near: Uint16Array }
+interface Seen { observed: (number | null)[], near: Uint32Array }
 /** An episode. Starts and steered episodes have no scores. Very long ones have neither `senses` nor `without`. */
 interface Episode extends Seen {
   leaders: number, agents: number, coupling: number[], shown: number[], g: number, generation: number, trial: number, owner: number[],
@@ -45,8 +45,8 @@ interface Episode extends Seen {
   senses?: Float32Array, without?: { alone: Seen, group: Seen }[],
 }
 /** A channel of a class's senses, and a class of agents. Those that learn come first. */
-interface Channel { of: string | string[], sectors: number, each?: boolean, frame: "heading" | "map" }
-interface AgentClass { name: string, count: number, free: boolean, outline: Place[], senses: Channel[], choose?: { name: string, agents: number[] } }
+interface Channel { of: string | string[], pois?: string | string[], sectors: number, each?: boolean, frame: "heading" | "map" }
+interface AgentClass { name: string, size: number, count: number, free: boolean, outline: Place[], senses: Channel[], choose?: { name: string, agents: number[] } }
 /**
  * What only some scenes have: classes of agents, groups of POIs, the radius and value of each POI if they differ, and the population of each
  * agent if they share some and none follows.

@@ -34,7 +34,7 @@ export function start_scene(config) {
     observers: world.observers, windows: world.windows, after: world.after, ...parts,
     episodes: [{
       leaders: world.leaders.length, agents: agents.length, coupling, shown: [0], g: 0, generation: 0, trial: 0, owner,
-      observed: world.pois.map(() => null), near: new Uint16Array(world.pois.length), led: new Uint32Array(0),
+      observed: world.pois.map(() => null), near: new Uint32Array(world.pois.length), led: new Uint32Array(0),
       positions: Float32Array.from(agents.flat()), headings: Float32Array.from(headings.flatMap(angle => [Math.cos(angle), Math.sin(angle)])),
     }],
   };

@@ -2,7 +2,7 @@
 
 /** Names of the quadrants, in the order of a policy's inputs. */
 const QUADRANTS = ["back right", "front right", "front left", "back left"];
-/** What leaders sense if the config has no `[[agents]]`. @type {Omit<AgentClass, "outline">} */
+/** What leaders sense if the config has no `[[agents]]`. @type {Omit<AgentClass, "outline" | "size">} */
 const QUADRANTS_ONLY = { name: "leader", count: 1, free: false, senses: ["pois", "agents"].map(of => ({ of, sectors: 4, frame: "heading" })) };
 
 /**

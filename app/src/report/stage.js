@@ -12,10 +12,10 @@ const stage = (() => {
     for (const episode of data.episodes) {
       episode.positions = data.exact ? new Float32Array(bytes(episode.positions)) : new Uint16Array(bytes(episode.positions));
       episode.headings = data.exact ? new Float32Array(bytes(episode.headings)) : new Uint8Array(bytes(episode.headings));
-      episode.near = new Uint16Array(bytes(episode.near));
+      episode.near = new Uint32Array(bytes(episode.near));
       episode.led = new Uint32Array(bytes(episode.led));
       if (episode.senses) episode.senses = new Float32Array(bytes(episode.senses));
-      for (const { alone, group } of episode.without || []) for (const part of [alone, group]) part.near = new Uint16Array(bytes(part.near));
+      for (const { alone, group } of episode.without || []) for (const part of [alone, group]) part.near = new Uint32Array(bytes(part.near));
     }
     return data;
   }
@@ -103,11 +103,11 @@ const stage = (() => {
   const learns = ({ classes, episodes }, index) => classes.slice(0, index).reduce((sum, { count }) => sum + count, 0) < episodes[0].leaders;
   // Returns, for each class, an element with its mark, number and name.
   function legend(data) {
-    return (data.classes || []).map(({ count, name }, index) => {
+    return (data.classes || []).map(({ size, name }, index) => {
       const item = document.createElement("span"), filled = learns(data, index);
       const points = outline(data, index).map(([ahead, aside]) => `${7 * aside},${-7 * ahead}`).join(" ");
       item.innerHTML = `<svg viewBox="-9 -9 18 18" width="16" height="16"><polygon points="${points}" fill="${filled ? "currentColor" : "none"}" stroke="currentColor" stroke-width="1.5"/></svg> `;
-      item.append(`${count} × ${name}`);
+      item.append(`${size} × ${name}`);
       return item;
     });
   }

@@ -21,12 +21,12 @@ const EXACT_BYTES: usize = 600_000;
 const DETAIL_BYTES: usize = 1_000_000;
 
 impl Counterfactual<'_> {
-    /// Returns the observation steps and the observers near each POI, base64 of u16 `[shown][pois]`.
+    /// Returns the observation steps and the observers near each POI, base64 of u32 `[shown][pois]`.
     fn json(&self, shown: &[usize]) -> serde_json::Value {
         let (sets, pois) = (Strided { words: &self.sets, stride: 1, offset: 0 }, self.world.pois.len());
         let count = |step: usize, poi| step.checked_sub(1).map_or(0, |step| near(self.world, &sets, step * pois + poi));
-        let counts = shown.iter().flat_map(|&step| (0..pois).map(move |poi| count(step, poi) as u16));
-        let near: Vec<u8> = counts.flat_map(u16::to_le_bytes).collect();
+        let counts = shown.iter().flat_map(|&step| (0..pois).map(move |poi| count(step, poi)));
+        let near: Vec<u8> = counts.flat_map(u32::to_le_bytes).collect();
         json!({ "observed": self.observed, "near": BASE64_STANDARD.encode(near) })
     }
 }
@@ -62,7 +62,7 @@ pub fn detailed(name: &str, config: &Config, played: &[Replayed]) -> serde_json:
             });
             episode["senses"] = BASE64_STANDARD.encode(senses.collect::<Vec<u8>>()).into();
         }
-        if shown.len() * leaders * pois * 2 * size_of::<u16>() <= DETAIL_BYTES {
+        if shown.len() * leaders * pois * 2 * size_of::<u32>() <= DETAIL_BYTES {
             let without = (0..leaders).map(|leader| {
                 let [alone, group] = [false, true].map(|group| played.without(leader, group).json(&shown));
                 json!({ "alone": alone, "group": group })
@@ -79,7 +79,7 @@ pub fn data(name: &str, config: &Config, played: &[Replayed]) -> serde_json::Val
     let size = |per_agent: usize, played: &Replayed| {
         let world = &played.world;
         let [drawn, led] = [drawn_agents(world.leaders(), world.agents()).len(), led_words(played)];
-        drawn * per_agent + world.pois.len() * 2 + (drawn - world.leaders()) * led * 4
+        drawn * per_agent + world.pois.len() * size_of::<u32>() + (drawn - world.leaders()) * led * 4
     };
     let exact = played.iter().map(|p| (p.world.steps() + 1) * size(16, p)).sum::<usize>() <= EXACT_BYTES;
     let episodes: Vec<_> = played
@@ -138,9 +138,10 @@ fn sensed(channel: &Channel) -> serde_json::Value {
 /// Returns what only some pages have.
 ///
 /// If agents share populations and none follows, there are `populations`, with that of each agent.
-/// With `[[agents]]`, they have `classes`, those that learn first: their `name`, the `count` of their agents, whether they
-/// move `free`, the `outline` of their marks, the class and the `agents` that they `choose` among, if any, the distance up to which they `influence` others, and the
-/// channels of their `senses`, with the number of `sectors` and whether `each` agent or POI has one. The `groups` of POIs
+/// With `[[agents]]`, they have `classes`, those that learn first: their `name`, their `size`, the `count` of their agents that are
+/// drawn, whether they move `free`, the `outline` of their marks, the class and the `agents` that they `choose` among, if
+/// any, the distance up to which they `influence` others, and the channels of their `senses`, with the number of
+/// `sectors` and whether `each` agent or POI has one. The `groups` of POIs
 /// have their `name`, the `count` of their POIs, and the indices of the classes that are `observers`. Only if POIs differ
 /// in their radius or value, there are `radii` or `values`.
 pub fn parts(config: &Config) -> Vec<(&'static str, serde_json::Value)> {
@@ -161,10 +162,11 @@ pub fn parts(config: &Config) -> Vec<(&'static str, serde_json::Value)> {
             let AgentClass { name, control, .. } = class;
             let senses: Vec<_> = class.senses.iter().map(sensed).collect();
             let places = all.agents_of(index);
-            let size = drawn.iter().filter(|agent| places.contains(agent)).count();
+            let count = drawn.iter().filter(|agent| places.contains(agent)).count();
             let outline = Form::of(index, |class| [is_free(class), config.agents[class].learns()]).outline();
             let mut class = json!({
-                "name": name, "count": size, "free": free, "outline": outline, "influence": influence, "senses": senses,
+                "name": name, "size": class.size(), "count": count, "free": free, "outline": outline, "influence": influence,
+                "senses": senses,
             });
             if let Control::Choose(target) = control {
                 let targets = all.agents.iter().position(|class| class.name == *target);
@@ -221,7 +223,7 @@ fn episode(played: &Replayed, shown: &[usize], exact: bool) -> serde_json::Value
                 headings.push((turn.rem_euclid(1.0) * 256.0).round() as u32 as u8);
             }
         }
-        near.extend((0..world.pois.len()).flat_map(|poi| (played.near(step, poi) as u16).to_le_bytes()));
+        near.extend((0..world.pois.len()).flat_map(|poi| played.near(step, poi).to_le_bytes()));
     }
     let mut followers = vec![0; leaders];
     for &owner in played.owner[leaders..].iter().filter(|&&owner| owner != credit::UNASSIGNED) {
