@@ -322,6 +322,14 @@ def main():
                 label = browser.evaluate("document.querySelector('canvas').getAttribute('aria-label')")
                 assert label.startswith("Map of generation ") and "step 18: " in label, label
                 browser.screenshot(pictures / f"{name}-{width}-{'dark' if dark else 'light'}.png")
+        # Arrow keys in a table scroll it. In a low window, the controls do not cover the map.
+        key = "new KeyboardEvent('keydown', { key: 'ArrowRight', bubbles: true, cancelable: true })"
+        scrolls = f"document.querySelector('.scores').dispatchEvent({key})"
+        assert browser.evaluate(scrolls) and browser.evaluate("replay.step") == 18
+        position = "getComputedStyle(document.querySelector('#controls')).position"
+        assert browser.evaluate(position) == "sticky"
+        browser.window(640, 400, dark=False)
+        assert browser.evaluate(position) == "static"
         browser.close()
         print("replay pages load without errors, play, scrub, and show the traces of rollout")
 
