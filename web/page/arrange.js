@@ -9,13 +9,14 @@ import { aim, draw, only_view, show } from "./views.js";
 /** The view of the start. @type {View | null} */
 let start_view = null;
 export function show_start() {
-  const { config, views } = state, { world } = config;
+  const { config, views } = state;
   if (!start_view || !views.includes(start_view)) {
     start_view = only_view("Where everyone starts", stage.busy(start_scene(config)));
     start_view.describe = describe_start;
   }
-  if (start_view.chosen && !world[start_view.chosen[0]][start_view.chosen[1]]) start_view.chosen = null;
-  aim(start_view, state.mode === "arrange" ? [0, 0, ...world.map] : stage.busy(start_scene(config)));
+  const { chosen } = start_view;
+  if (chosen && !items().some(([list, index]) => list === chosen[0] && index === chosen[1])) start_view.chosen = null;
+  aim(start_view, state.mode === "arrange" ? [0, 0, ...config.world.map] : stage.busy(start_scene(config)));
   if (state.mode === "arrange") hands(start_view);
   show(start_view, start_scene(config), false);
 }
@@ -23,7 +24,7 @@ export function show_start() {
 /** @returns {[string, string]} */
 function describe_start() {
   const { world } = state.config, chosen = start_view && start_view.chosen && name_chosen(start_view.chosen);
-  const who = groups().filter(({ list, from, end }) => list !== "pois" && end > from).map(({ name, table, from, end }) => table === "world" ? count(end - from, name) : `${end - from} × ${name}`);
+  const who = groups().filter(({ list, size }) => list !== "pois" && size > 0).map(({ name, table, size }) => table === "world" ? count(size, name) : `${size} × ${name}`);
   $("remove").disabled = !chosen;
   write_text($("chosen"), chosen ? `Chosen: ${chosen}` : "Nothing is chosen.");
   const status = `${who.join(", ")}, ${count(world.pois.length, "POI")} · ${world.steps} steps`;
@@ -32,20 +33,29 @@ function describe_start() {
 
 /**
  * Returns what lies on the map: leaders, followers and POIs, or classes of agents and groups of POIs. `table` is the config's table with
- * their `places` as its key `key`. They are entries `from` to `end` of a list of the world.
+ * their `places` as its key `key`. They are entries `from` to `end` of a list of the world. Groups that start in a region, or of which
+ * only some are drawn, are `fixed`: they have no places that could be changed.
  */
 function groups() {
-  const { world, agents = [], pois = [] } = state.config, end = { leaders: 0, followers: 0, pois: 0 };
-  const short = (/** @type {List} */ list, /** @type {string} */ name) => ({ list, name, table: "world", key: /** @type {string} */ (list), places: world[list], own: /** @type {Group | Config["world"]} */ (world) });
-  const full = (/** @type {"agents" | "pois"} */ table, /** @type {Group} */ own, /** @type {number} */ index) => ({
-    list: /** @type {List} */ (table === "pois" ? "pois" : own.control === "policy" ? "leaders" : "followers"), name: table === "pois" ? `POI (${own.name})` : own.name,
-    table: `${table}.${index}`, key: "at", places: own.at, own: /** @type {Group | Config["world"]} */ (own),
+  const { world, agents = [], pois = [] } = state.config, { start } = state, end = { leaders: 0, followers: 0, pois: 0 };
+  const short = (/** @type {List} */ list, /** @type {string} */ name) => ({
+    list, name, table: "world", key: /** @type {string} */ (list), places: world[list], fixed: false, count: world[list].length, size: world[list].length,
+    own: /** @type {Group | Config["world"]} */ (world),
   });
+  const full = (/** @type {"agents" | "pois"} */ table, /** @type {Group} */ own, /** @type {number} */ index, /** @type {{ count: number, size?: number } | undefined} */ { count, size = count } = { count: 0 }) => {
+    // Places may have changed since the module resolved them. The rest cannot change here.
+    const at = size === count ? own.at : undefined;
+    return {
+      list: /** @type {List} */ (table === "pois" ? "pois" : /^(policy|choose)/.test(own.control ?? "") ? "leaders" : "followers"), name: table === "pois" ? `POI (${own.name})` : own.name,
+      table: `${table}.${index}`, key: "at", places: at ?? [], fixed: !at, count: at?.length ?? count, size: at?.length ?? size,
+      own: /** @type {Group | Config["world"]} */ (own),
+    };
+  };
   const all = [
-    ...agents.length ? agents.map((own, index) => full("agents", own, index)) : [short("leaders", "leader"), short("followers", "follower")],
-    ...pois.length ? pois.map((own, index) => full("pois", own, index)) : [short("pois", "POI")],
+    ...agents.length ? agents.map((own, index) => full("agents", own, index, start.classes?.[index])) : [short("leaders", "leader"), short("followers", "follower")],
+    ...pois.length ? pois.map((own, index) => full("pois", own, index, start.groups?.[index])) : [short("pois", "POI")],
   ];
-  return all.map(group => ({ ...group, from: end[group.list], end: end[group.list] += group.places.length }));
+  return all.map(group => ({ ...group, from: end[group.list], end: end[group.list] += group.count }));
 }
 /** @typedef {ReturnType<typeof groups>[0]} Placed */
 
@@ -56,8 +66,9 @@ const name_chosen = (/** @type {Chosen} */ chosen) => `${group_of(chosen).name} 
 /** Returns everything on the map: its list, its index and its place. @returns {[List, number, Place][]} */
 const items = () => groups().flatMap(({ list, from, places }) => places.map((place, index) => /** @type {[List, number, Place]} */ ([list, from + index, place])));
 
-part(() => [groups().map(({ name }) => name).join()], () => {
-  $("adds").replaceChildren(...groups().map(({ name, table, key }) => {
+const movable = () => groups().filter(({ fixed }) => !fixed);
+part(() => [movable().map(({ name }) => name).join()], () => {
+  $("adds").replaceChildren(...movable().map(({ name, table, key }) => {
     const button = make("button", `Add a ${name}`, null, { type: "button" });
     button.dataset.add = key === "at" ? table : key;
     button.addEventListener("click", () => add(table, key));
@@ -175,4 +186,6 @@ export function remove() {
   put(group, group.places.toSpliced(index, 1));
   const find = /** @type {Placed} */ (groups().find(({ table, key }) => table === group.table && key === group.key));
   moved(find, list => list.toSpliced(index, 1));
+  // The button that had the focus is now disabled.
+  first.canvas.focus({ preventScroll: true });
 }

@@ -31,7 +31,7 @@ interface Config {
 /** Which agents count at POIs, when, and after which others. */
 interface Rule { observers: "all" | "leaders" | "followers", windows: Place[], after: number[][] }
 /** An entry of `[[agents]]` or `[[pois]]`. The lists have a value for each place, or one for all. */
-interface Group { name: string, at: Place[], motion: { max_speed: number }, control?: string, coupling?: number | number[], windows?: Place[], heading?: number | number[] }
+interface Group { name: string, at?: Place[], motion: { max_speed: number }, control?: string, coupling?: number | number[], windows?: Place[], heading?: number | number[] }
 interface Start extends Parts { owner: number[], coupling: number[], headings: number[] }
 interface Described { toml: string, config: Config, pois: number | null, parameters: number, start: Start }
 interface Palettes { light: string[], dark: string[] }
