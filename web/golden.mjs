@@ -53,28 +53,32 @@ console.log("web/page/opening.json is current");
 
 // If the user drives one leader, the other leaders follow their trained policies. If the driven leader acts like its
 // policy, too, the episode has the same bits as that of the trained team.
-const { words: resolved } = await player.ask({ ask: "resolve", text: text("layout-generally_forward"), name: "", changes: SMALL });
-const trained = new Training([{ ...resolved, label: "", command: "" }], machine);
-await trained.start([player]);
-await trained.play(() => Infinity, () => {});
-const weights = trained.arms[0].ended[0];
 const numbers = text => new Float32Array(Uint8Array.from(atob(text), c => c.charCodeAt(0)).buffer);
-const { words: whole } = await player.ask({ ask: "play", text: resolved.toml, policies: 1 }, weights);
-const [episode] = whole.episodes, { agents, leaders } = episode;
-const [positions, headings, senses] = [episode.positions, episode.headings, episode.senses].map(numbers);
-await player.ask({ ask: "drive", text: resolved.toml, leader: 0, policies: 1 }, weights);
-let driven = null;
-for (let step = 1; step <= whole.steps; step++) {
-  // Per step and leader, there are inputs and 2 outputs.
-  const size = senses.length / (episode.shown.length * leaders), end = (step * leaders + 1) * size;
-  const [turn, speed] = senses.slice(end - 2, end);
-  driven = (await player.ask({ ask: "step", turn, speed })).words;
-  for (const [found, expected] of [[driven.positions, positions], [driven.headings, headings]]) {
-    const frame = expected.slice(step * agents * 2, (step + 1) * agents * 2);
-    assert.deepEqual(Float32Array.from(found), frame, `step ${step} of the driven episode differs`);
+const GROUPS = [["learning.sharing", "'group'"], ["learning.groups", "[[0, 1], [2, 3]]"]];
+for (const sharing of [[], GROUPS]) {
+  const { words: resolved } = await player.ask({ ask: "resolve", text: text("layout-generally_forward"), name: "", changes: [...SMALL, ...sharing] });
+  const trained = new Training([{ ...resolved, label: "", command: "" }], machine);
+  await trained.start([player]);
+  await trained.play(() => Infinity, () => {});
+  const weights = trained.arms[0].ended[0];
+  const { words: whole } = await player.ask({ ask: "play", text: resolved.toml, policies: 1 }, weights);
+  const [episode] = whole.episodes, { agents, leaders } = episode;
+  const [positions, headings, senses] = [episode.positions, episode.headings, episode.senses].map(numbers);
+  await player.ask({ ask: "drive", text: resolved.toml, leader: 0, policies: 1 }, weights);
+  let driven = null;
+  for (let step = 1; step <= whole.steps; step++) {
+    // Per step and leader, there are inputs and 2 outputs.
+    const size = senses.length / (episode.shown.length * leaders), end = (step * leaders + 1) * size;
+    const [turn, speed] = senses.slice(end - 2, end);
+    driven = (await player.ask({ ask: "step", turn, speed })).words;
+    for (const [found, expected] of [[driven.positions, positions], [driven.headings, headings]]) {
+      const frame = expected.slice(step * agents * 2, (step + 1) * agents * 2);
+      assert.deepEqual(Float32Array.from(found), frame, `step ${step} of the driven episode differs`);
+    }
   }
+  assert.ok(driven.learned);
+  assert.equal(driven.scores.g, episode.g);
 }
-assert.equal(driven.scores.g, episode.g);
 console.log("teammates follow their policies");
 
 const folder = mkdtempSync(join(tmpdir(), "flotilla-web-"));

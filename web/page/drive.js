@@ -53,12 +53,20 @@ export function drive_view() {
 
 /**
  * Returns a leader's two outputs, each in -1..1: the wanted turn, in half turns to the left, and speed, or if it moves freely, its speed
- * along x and y. Returns null without input.
+ * along x and y. A leader that chooses an agent has one output, the choice. Returns null without input.
  * @param {number[]} positions @param {number[]} headings @param {number} leader
  */
 function wish(positions, headings, leader) {
-  const { free } = class_of(state.start, leader);
+  const { free, choose } = class_of(state.start, leader);
   const [x, y] = positions.slice(2 * leader, 2 * leader + 2), [cos, sin] = headings.slice(2 * leader, 2 * leader + 2);
+  if (!drive.pointer && !drive.keys.size) return null;
+  const [left, right, up, down] = ["ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown"].map(key => Number(drive.keys.has(key)));
+  if (choose) {
+    // The leader chooses the agent nearest to the pointer. Arrow keys point far away.
+    const to = drive.pointer ?? [x + 1e6 * (right - left), y + 1e6 * (up - down)];
+    const away = choose.agents.map(agent => Math.hypot(positions[2 * agent] - to[0], positions[2 * agent + 1] - to[1]));
+    return [2 * away.indexOf(Math.min(...away)) / away.length - 1, 0];
+  }
   if (drive.pointer) {
     const [dx, dy] = [drive.pointer[0] - x, drive.pointer[1] - y], away = Math.hypot(dx, dy);
     if (free) return [dx, dy].map(part => part / Math.max(2, away));
@@ -66,8 +74,6 @@ function wish(positions, headings, leader) {
     const angle = Math.atan2(cos * dy - sin * dx, cos * dx + sin * dy);
     return [Math.max(-1, Math.min(1, angle / Math.PI)), Math.max(-1, Math.min(1, away / 2 - 1))];
   }
-  if (!drive.keys.size) return null;
-  const [left, right, up, down] = ["ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown"].map(key => Number(drive.keys.has(key)));
   return free ? [right - left, up - down] : [0.4 * (left - right), up || (down ? -1 : 0.2)];
 }
 

@@ -200,6 +200,15 @@ fn inside<'a>(path: &'a str, name: &str) -> Option<&'a str> {
     (folder.is_empty() || folder.ends_with('/')).then_some(folder)
 }
 
+/// Returns the population of each leader, or `None` if these weights are not for the config. `weights` are
+/// `[populations][policies][parameters]`.
+pub fn populations_of(config: &Config, policies: usize, weights: &mut [f32]) -> Option<Vec<u32>> {
+    let numbers = policies.saturating_mul(config.parameters());
+    let populations = weights.len().checked_div(numbers).and_then(|count| config.populations_for(count))?;
+    let fits = weights.len().is_multiple_of(numbers) && evolve::flush_and_validate(weights).is_none();
+    fits.then_some(populations)
+}
+
 /// Plays the champions, the first policy of every leader, in the world of the last generation.
 ///
 /// `weights` are `[populations][policies][parameters]`.
@@ -207,10 +216,7 @@ pub fn play(config: &Config, policies: usize, mut weights: Vec<f32>) -> Result<V
     let config = config.validate()?;
     let config = config.at(config.learning.generations);
     let world = World::new(config);
-    let numbers = policies.saturating_mul(world.parameters());
-    let populations = weights.len().checked_div(numbers).and_then(|count| config.populations_for(count));
-    let populations = populations.filter(|_| weights.len().is_multiple_of(numbers));
-    let Some(populations) = populations.filter(|_| evolve::flush_and_validate(&mut weights).is_none()) else {
+    let Some(populations) = populations_of(config, policies, &mut weights) else {
         return Err(refuse("these policies are not for this config"));
     };
     let (teams, fitnesses) = (vec![0; world.leaders()], flotilla::evaluate::scores_beside(config));

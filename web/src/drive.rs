@@ -1,14 +1,14 @@
 //! An episode in which the visitor drives one leader. The other leaders use trained policies or the zero policy.
 
 use flotilla::backend::cpu;
-use flotilla::config::Config;
-use flotilla::evolve;
+use flotilla::config::{Config, drawn_agents};
 use flotilla::front;
 use flotilla::stepping::Stepper;
 use flotilla::world::OUTPUTS;
 use serde_json::{Value, json};
 
 use crate::answer::{Refusal, refuse};
+use crate::archive;
 
 pub struct Drive {
     stepper: Stepper,
@@ -24,26 +24,23 @@ pub struct Drive {
 impl Drive {
     /// Starts an episode.
     ///
-    /// `weights` are `[leaders][policies][parameters]`, or `[1][policies][parameters]` if all leaders share a policy.
-    /// The first policy of each leader plays. If the weights do not fit, the other leaders use the zero policy.
+    /// `weights` are `[populations][policies][parameters]`. The first policy of each leader's population plays. If the
+    /// weights do not fit, the other leaders use the zero policy.
     pub fn new(config: &Config, leader: usize, policies: usize, mut weights: Vec<f32>) -> Result<Drive, Refusal> {
         let stepper = front::stepper(config, 1, true).map_err(refuse)?;
         let (leaders, parameters) = (stepper.world().leaders(), stepper.world().parameters());
         if leader >= leaders {
             return Err(refuse(format!("no leader {leader}")));
         }
-        let numbers = policies.saturating_mul(parameters);
-        let fits = policies > 0
-            && [numbers, numbers.saturating_mul(leaders)].contains(&weights.len())
-            && evolve::flush_and_validate(&mut weights).is_none();
-        let policies = if fits {
-            let champions = weights.chunks_exact(numbers).map(|policies| &policies[..parameters]);
-            champions.cycle().take(leaders).flatten().copied().collect()
-        } else {
-            vec![0.0; leaders * parameters]
+        let populations = archive::populations_of(config, policies, &mut weights);
+        let learned = populations.is_some();
+        let champion = |population: u32| &weights[population as usize * policies * parameters..][..parameters];
+        let policies = match populations {
+            Some(populations) => populations.into_iter().flat_map(champion).copied().collect(),
+            None => vec![0.0; leaders * parameters],
         };
         let observed = vec![None; stepper.world().pois.len()];
-        Ok(Drive { stepper, leader, learned: fits, policies, observed })
+        Ok(Drive { stepper, leader, learned, policies, observed })
     }
 
     /// Plays one step. `own` is the driven leader's turn and speed, each in -1..1.
@@ -68,25 +65,31 @@ impl Drive {
         Ok(())
     }
 
-    /// Returns positions, headings and observed POIs as JSON. After the last step, also G and each leader's D and Df.
+    /// Returns positions and headings of the agents that are drawn, and observed POIs, as JSON. After the last step, also
+    /// G and each leader's D and Df.
     pub fn state(&mut self) -> Result<Value, Refusal> {
         let step = self.stepper.steps()[0];
         let words = self.stepper.agents_at_poi().len() / self.observed.len();
-        let rule = &self.stepper.world().rule;
+        let world = self.stepper.world();
+        let drawn = drawn_agents(world.leaders(), world.agents());
         let near: Vec<u32> = self
             .stepper
             .agents_at_poi()
             .chunks(words)
             .enumerate()
-            .map(|(poi, set)| rule.count(poi, set.iter().copied()))
+            .map(|(poi, set)| world.rule.count(poi, set.iter().copied()))
             .collect();
         let scores = self.stepper.is_over(0).then(|| self.stepper.scores(0)).transpose().map_err(refuse)?;
         let states = self.stepper.states();
+        let of_drawn = |of_all: &[f32]| -> Vec<[f32; 2]> {
+            let of_all = of_all.as_chunks().0;
+            drawn.iter().map(|&agent| of_all[agent]).collect()
+        };
         Ok(json!({
             "step": step,
             "learned": self.learned,
-            "positions": states.positions,
-            "headings": states.headings,
+            "positions": of_drawn(states.positions).as_flattened(),
+            "headings": of_drawn(states.headings).as_flattened(),
             "near": near,
             "observed": self.observed,
             "scores": scores.map(|scores| json!({ "g": scores.g, "d": scores.d, "df": scores.df })),
