@@ -5,7 +5,7 @@ import { name_of } from "./experiment.js";
 import { clerk } from "./pool.js";
 import { report, save, shown, state, trouble } from "./state.js";
 import { csv } from "./table.js";
-import { draw, end_of, moving } from "./views.js";
+import { draw, end_of, hold, moving } from "./views.js";
 
 // Most frames of a film, and its width in pixels per view.
 const FRAMES = 80, WIDTH = 420;
@@ -16,19 +16,19 @@ const readable = (/** @type {HTMLCanvasElement} */ canvas) => pen_of(canvas, { w
 /** @param {HTMLCanvasElement} canvas @param {number} wide */
 function compose(canvas, wide) {
   const views = shown(), pen = readable(canvas), style = getComputedStyle(document.documentElement);
-  const tall = Math.max(...views.map(view => wide * view.canvas.height / view.canvas.width));
-  const size = [Math.round(views.length * wide), Math.round(tall + 52)];
+  const tall = Math.max(...views.map(view => wide * view.canvas.height / view.canvas.width)), scale = wide / WIDTH;
+  const size = [Math.round(views.length * wide), Math.round(tall + 52 * scale)];
   if (canvas.width !== size[0] || canvas.height !== size[1]) [canvas.width, canvas.height] = size;
   pen.fillStyle = style.getPropertyValue("--card").trim();
   pen.fillRect(0, 0, size[0], size[1]);
   views.forEach((view, index) => {
-    const left = index * wide;
+    const left = index * wide, from = left + 6 * scale, room = wide - 12 * scale;
     pen.fillStyle = style.getPropertyValue("--ink").trim();
-    pen.font = `600 ${Math.round(wide / 28)}px system-ui, sans-serif`;
-    pen.fillText(view.title.textContent ?? "", left + 6, 20, wide - 12);
-    pen.font = `${Math.round(wide / 32)}px system-ui, sans-serif`;
-    pen.fillText(view.status.textContent ?? "", left + 6, 40, wide - 12);
-    pen.drawImage(view.canvas, left, 50, wide, wide * view.canvas.height / view.canvas.width);
+    pen.font = `600 ${15 * scale}px system-ui, sans-serif`;
+    pen.fillText(view.title.textContent ?? "", from, 20 * scale, room);
+    pen.font = `${13 * scale}px system-ui, sans-serif`;
+    pen.fillText(view.status.textContent ?? "", from, 40 * scale, room);
+    pen.drawImage(view.canvas, left, 50 * scale, wide, wide * view.canvas.height / view.canvas.width);
   });
 }
 
@@ -73,7 +73,9 @@ async function one_at_a_time(act) {
   if (busy) return;
   if (!moving().length) return report("There is no film yet: nothing on the map moves. Train first.");
   busy = true;
-  try { await act(); } catch (thrown) { trouble("file", `The film could not be made: ${failure(thrown).message}`); } finally { busy = false; }
+  const made = act();
+  hold(made.catch(() => {}));
+  try { await made; } catch (thrown) { trouble("file", `The film could not be made: ${failure(thrown).message}`); } finally { busy = false; }
 }
 
 export const save_gif = () => one_at_a_time(async () => {

@@ -313,6 +313,11 @@ export function follow() {
   });
 }
 
+/** Ends when the film that is being made of the views has ended. @type {Promise<unknown>} */
+let filmed = Promise.resolve();
+/** Shows no other episodes until a film is made. @param {Promise<unknown>} made */
+export const hold = made => { filmed = made; };
+
 /** Requests an episode for a view, and shows it. @param {View} view @param {number} run @param {number} generation */
 export async function ask(view, run, generation) {
   const { training, trial } = state;
@@ -320,6 +325,7 @@ export async function ask(view, run, generation) {
   view.asking = true;
   try {
     const data = stage.unpack(await training.champion(run, trial, generation));
+    await filmed;
     if (state.training === training && state.views[run] === view && state.mode === "watch") show(view, data);
   } catch (thrown) {
     const { message, stopped, fatal } = failure(thrown);
