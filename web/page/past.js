@@ -1,5 +1,7 @@
 // Experiments that were on show before. Back and Forward return to them with their results.
+import { constants, randoms } from "./baselines.js";
 import { $, failure } from "./dom.js";
+import { intervals } from "./intervals.js";
 import { renew_failed } from "./machine.js";
 import { render, state, trouble } from "./state.js";
 
@@ -37,6 +39,13 @@ export function leave() {
   history.pushState({ entry: on_show }, "", location.href);
 }
 
+/** Finishes the comparison and the baselines of results that were left before. Opened runs have no baselines. @param {Training} training */
+function complete(training) {
+  if (!training.found) intervals(training).catch(() => {});
+  if (training.teams) constants(training).catch(() => {});
+  if (training.teams && training.state === "done") randoms(training).catch(() => {});
+}
+
 /** Shows what was on show at this entry of the history, if it is kept. */
 export async function go_back() {
   if (entry() === undefined || entry() === on_show || !arrive()) return;
@@ -51,4 +60,5 @@ export async function go_back() {
   } catch (thrown) { return trouble("run", failure(thrown).message); }
   $("text").value = found.text ?? "";
   render({ ...found, guide: found.told ?? null, mode: "watch", follow: false, policies: null, troubles: { link: found.troubles?.link ?? "" }, message: "" });
+  if (training) complete(training);
 }
