@@ -33,14 +33,21 @@ export const name_of_leader = (data, leader) => `${class_of(data, leader).name} 
 export function moment(data, { senses = new Float32Array(), leaders, shown }, frame, leader) {
   const size = senses.length / (shown.length * leaders), at = (frame * leaders + leader) * size, own = [...senses.subarray(at, at + size)];
   const { free, choose, senses: channels } = class_of(data, leader), answer = own.slice(-2);
-  return { channels: channels.map(channel => ({ ...channel, values: own.splice(0, channel.sectors) })), free, choose, answer };
+  return { channels: channels.map(channel => ({ ...channel, names: names_of(data, channel), values: own.splice(0, channel.sectors) })), free, choose, answer };
+}
+
+/** Returns names of a channel's sectors: quadrants, or the numbers of agents or POIs. Others have none. @param {Pick<Scene, "classes" | "groups">} data @param {Channel} channel */
+function names_of({ classes = [], groups = [] }, { of, pois = [], sectors, each, frame }) {
+  if (!each) return sectors === 4 && frame === "heading" ? QUADRANTS : [];
+  const own = of === "pois" ? pois : of, all = (of === "pois" ? groups : classes).flatMap(({ name, count }) => Array(count).fill(name));
+  return all.flatMap((name, index) => own.length === 0 || own === "agents" || [own].flat().includes(name) ? [`${index}:`] : []);
 }
 
 /** Describes a moment in words. @param {ReturnType<typeof moment>} now */
 export function words({ channels, free, choose, answer: [turn, speed] }) {
-  const list = channels.map(({ of, sectors, frame, values }) => {
-    const name = [of].flat().map(name => name === "pois" ? "POIs" : name).join(" and "), quadrants = sectors === 4 && frame === "heading";
-    return `${name}: ${values.map((value, sector) => (quadrants ? `${QUADRANTS[sector]} ` : "") + value.toFixed(2)).join(", ")}`;
+  const list = channels.map(({ of, names, values }) => {
+    const name = [of].flat().map(name => name === "pois" ? "POIs" : name).join(" and ");
+    return `${name}: ${values.map((value, sector) => (sector in names ? `${names[sector]} ` : "") + value.toFixed(2)).join(", ")}`;
   });
   if (choose) {
     const chosen = choose.agents[Math.round((turn + 1) / 2 * choose.agents.length)];
