@@ -68,6 +68,24 @@ test("the inputs shown are those of the chosen leader and frame, and quadrants a
   assert.deepEqual(angles(1, free.channels[0]), [Math.PI, 2 * Math.PI]);
 });
 
+test("sectors of their own are named by the numbers of agents and POIs, not as quadrants", () => {
+  const channel = { sectors: 4, each: true, frame: "heading" };
+  const classes = [
+    { name: "scout", size: 1, senses: [{ ...channel, of: "pois" }, { ...channel, of: "sheep" }, { ...channel, of: "pois", pois: "gate", sectors: 2 }] },
+    { name: "sheep", size: 4, senses: [] },
+  ].map(own => ({ ...own, count: own.size, free: false }));
+  const groups = [{ name: "den", count: 2 }, { name: "gate", count: 2 }];
+  const now = moment({ classes, groups }, { senses: new Float32Array(12), leaders: 1, shown: [0] }, 0, 0);
+  const each = from => [0, 1, 2, 3].map(index => `${from + index}: 0.00`).join(", ");
+  assert.equal(words(now).split(". ")[0], `senses POIs: ${each(0)}; sheep: ${each(1)}; POIs: 2: 0.00, 3: 0.00`);
+});
+
+test("a config of any size is packed for a link", async () => {
+  globalThis.matchMedia = () => ({ matches: false });
+  const { configs } = await import("./page/config.js"), text = Array.from({ length: 40000 }, () => Math.random()).join();
+  assert.equal(await configs.unpack(await configs.pack(text)), text);
+});
+
 test("requests open another worker after one has failed or could not be opened", async () => {
   const packed = content => deflateSync(content).toString("base64");
   const texts = { wasm: packed("no module"), worker: "" }, workers = [];

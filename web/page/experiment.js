@@ -98,6 +98,7 @@ part(() => [state.training, state.config, state.valid, state.compared], () => {
 let typed;
 const type = () => { typed = undefined; return take($("text").value, { edited: true }); };
 export function typing() {
+  if (typed === undefined) keep();
   clearTimeout(typed);
   typed = setTimeout(type, 250);
 }

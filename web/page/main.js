@@ -144,23 +144,23 @@ async function start() {
   }
   try {
     [state.gpu] = await Promise.all([pool.gpu(), renew()]);
+    const layout = async (/** @type {string} */ name) => [name, (await clerk.ask({ ask: "resolve", text: configs.layout(name), name, changes: [] })).words.config];
+    state.layouts = Object.fromEntries(await Promise.all(configs.LAYOUTS.map(layout)));
+    state.version = (await clerk.ask({ ask: "about" })).words.version;
+    $("verify").disabled = !state.gpu.name;
+    $("plain-label").hidden = !state.gpu.name;
+    $("verified").textContent = state.gpu.name ? "Compares this browser's GPU with its CPU, bit for bit." : `There is no GPU to verify: ${state.gpu.reason}.`;
+    option($("on"), "gpu").disabled = !state.gpu.name;
+    // The settings become those of the opening, unless others were chosen meanwhile. Its episode goes on.
+    if (!opens) await recall();
+    else if (state.text === text_of(OPENING)) await take(state.text, { linked: false, keeps: true });
+    appear();
+    await settle();
   } catch (thrown) {
     $("machine").textContent = "";
     appear();
     return trouble("run", `This browser cannot run flotilla: ${failure(thrown).message}. It needs WebAssembly with SIMD, which browsers have had since 2023.`);
   }
-  const layout = async (/** @type {string} */ name) => [name, (await clerk.ask({ ask: "resolve", text: configs.layout(name), name, changes: [] })).words.config];
-  state.layouts = Object.fromEntries(await Promise.all(configs.LAYOUTS.map(layout)));
-  state.version = (await clerk.ask({ ask: "about" })).words.version;
-  $("verify").disabled = !state.gpu.name;
-  $("plain-label").hidden = !state.gpu.name;
-  $("verified").textContent = state.gpu.name ? "Compares this browser's GPU with its CPU, bit for bit." : `There is no GPU to verify: ${state.gpu.reason}.`;
-  option($("on"), "gpu").disabled = !state.gpu.name;
-  // The settings become those of the opening, unless others were chosen meanwhile. Its episode goes on.
-  if (!opens) await recall();
-  else if (state.text === text_of(OPENING)) await take(state.text, { linked: false, keeps: true });
-  appear();
-  await settle();
   document.body.dataset.ready = "";
   await autoplay();
 }
