@@ -49,6 +49,52 @@ trials = 2
 from = 3
 set = { world.pois = [[40, 30]], world.coupling = 1, learning.poi_jitter = 1.0 }
 """
+# Agents and POIs in regions. Of the sheep, every second one is drawn.
+REGIONS = """
+[world]
+map = [40.0, 40.0]
+steps = 5
+[[agents]]
+name = "dog"
+at = [[15.0, 20.0], [25.0, 20.0]]
+senses = [{ of = "pois" }]
+leads = "sheep"
+[[agents]]
+name = "sheep"
+count = 2500
+in = { disc = [20.0, 20.0, 8.0] }
+control = "follow"
+motion = { kind = "steered", max_speed = 1.0 }
+rule = [{ of = "dog", to = 20.0, gain = 1.0 }]
+[[pois]]
+name = "gate"
+at = [[20.0, 30.0]]
+coupling = 2000
+radius = 15.0
+[[pois]]
+name = "den"
+count = 2
+in = { box = [5.0, 5.0, 35.0, 12.0] }
+coupling = 3
+[learning]
+population = 2
+generations = 2
+trials = 1
+"""
+# A class whose policies choose among the agents of another.
+CHOOSING = """
+world = { map = [50, 50], steps = 10, dt = 1.0, pois = [[1, 1]], coupling = 1 }
+[[agents]]
+name = "scout"
+at = [[25, 25]]
+control = "choose:post"
+motion = { kind = "free", max_speed = 1 }
+senses = [{ of = "pois" }]
+[[agents]]
+name = "post"
+at = [[15, 25], [25, 35], [35, 25]]
+control = "still"
+"""
 # The comparison of arms (`found`) is shown last, and moves what is below it.
 DONE = (
     "page.state.training && page.state.training.state === 'done' && document.querySelectorAll('.sha').length > 0"
@@ -497,7 +543,7 @@ def check_consistency(tab, page, downloads):
     print("the page says nothing about something else than it shows")
 
 
-def check_classes(tab, page, native):
+def check_classes(tab, page, native, folder):
     """Tests configs in full: they train, and their classes, radii and values are drawn, rearranged and steered."""
     view, episode = "page.state.views[0]", "page.state.views[0].data.episodes[0]"
     choose = f"{view}.chosen = {{}}; dispatchEvent(new Event('resize')); 0".format
@@ -594,6 +640,52 @@ def check_classes(tab, page, native):
     tab.click("#remove")
     tab.wait("page.state.valid && page.state.config.world.windows.length === 2")
     tab.assert_no_errors()
+    # Agents and POIs in regions are shown and counted, and only the others can be rearranged. It trains.
+    tab.load(page)
+    tab.drop("regions.toml", base64(REGIONS.encode()))
+    tab.wait(f"page.state.start.classes?.length === 2 && {episode}.agents === 1252")
+    assert tab.text("#views p").startswith("2 × dog, 2500 × sheep, 3 POIs"), tab.text("#views p")
+    assert [own for own, _ in tab.evaluate(f"[...document.querySelectorAll('.marks span')].map({texts})")] == [
+        "2 × dog", "2500 × sheep"
+    ]
+    tab.click("[data-mode=arrange]")
+    adds = "[...document.querySelectorAll('#adds button')].map(button => button.textContent)"
+    assert tab.evaluate(adds) == ["Add a dog", "Add a POI (gate)"], tab.evaluate(adds)
+    tab.evaluate(f"{view}.canvas.focus()")
+    chosen = []
+    for _ in range(4):
+        tab.press("]", "BracketRight")
+        chosen.append(tab.evaluate(f"{view}.chosen"))
+    assert chosen == [["leaders", 0], ["leaders", 1], ["pois", 0], ["leaders", 0]], chosen
+    tab.click('[data-add="agents.0"]')
+    tab.wait("page.state.start.classes[0].count === 3")
+    tab.set("#pace", "full")
+    (digest,) = tab.train().values()
+    config = folder / "regions.toml"
+    config.write_text(tab.evaluate("page.state.text"))
+    assert digest == native("regions", config)
+    tab.assert_no_errors()
+    # So they are when a leader is steered.
+    tab.click("[data-mode=drive]")
+    tab.click("#again")
+    tab.evaluate(f"{view}.canvas.dispatchEvent(new KeyboardEvent('keydown', {{ key: 'ArrowUp' }})); 0")
+    tab.wait("document.querySelector('#driven').textContent.includes('Yours: D = ')")
+    sizes = tab.evaluate(f"(({{ positions, shown, agents, near }}) => [positions.length, near.length, shown.length, agents])({episode})")
+    assert sizes == [2 * 6 * 1253, 3 * 6, 6, 1253], sizes
+    tab.assert_no_errors()
+    # A leader that chooses an agent goes to the one nearest to the pointer, or in the direction of the arrow keys.
+    tab.load(page)
+    tab.drop("choosing.toml", base64(CHOOSING.encode()))
+    tab.wait("page.state.start.classes?.[0].choose")
+    tab.click("[data-mode=drive]")
+    for key, direction in [("ArrowLeft", [-1, 0]), ("ArrowUp", [0, 1]), ("ArrowRight", [1, 0])]:
+        tab.click("#again")
+        tab.evaluate(f"{view}.canvas.dispatchEvent(new KeyboardEvent('keydown', {{ key: '{key}' }})); 0")
+        tab.wait(f"{view}.place >= 2")
+        tab.evaluate(f"{view}.canvas.dispatchEvent(new KeyboardEvent('keyup', {{ key: '{key}' }})); 0")
+        (x, y), moves = tab.evaluate(f"[{episode}.positions.slice(0, 2), {episode}.positions.slice(8, 10)].map(at => [...at])")
+        assert [moves[0] - x, moves[1] - y] == direction, (key, x, y, moves)
+    tab.assert_no_errors()
     # The value of the POIs that are lost is the credit.
     tab.evaluate("document.querySelector('#guide-end').click(); 0")
     tab.load(page, on="cpu", pace="full")
@@ -630,6 +722,13 @@ def check_history(tab, page):
     tab.wait("page.state.training && page.state.training.arms.length === 3")
     assert tab.evaluate(arms).startswith("start jitter"), tab.evaluate(arms)
     tab.wait("page.state.views.every(view => view.data)")
+    # The intervals and baselines of results that were left early are made after the return.
+    tab.wait("page.state.training.state === 'stopped' && page.state.training.found")
+    tab.wait("page.state.training.arms.every(({ constant }) => constant !== null)")
+    tab.evaluate("history.back(); 0")
+    tab.wait("page.state.training.state === 'done' && page.state.training.arms.every(({ random }) => random.length === 7)")
+    tab.evaluate("history.forward(); 0")
+    tab.wait("page.state.training.arms.length === 3")
     tab.assert_no_errors()
     # Two steps back at once lose no results, either.
     tab.click("[data-exhibit=relay]")
@@ -776,6 +875,27 @@ def check_links_and_devices(tab, page):
     tab.click("#undo")
     tab.wait("document.querySelector('#layout').value === 'own'")
     assert tab.evaluate("page.state.text") == text
+    tab.assert_no_errors()
+    # It takes back what was typed before what was chosen earlier.
+    tab.load(page)
+    tab.set("#layout", "chaotic")
+    tab.wait("document.querySelector('#layout').value === 'chaotic' && page.state.config.world.coupling === 5")
+    text = tab.evaluate("page.state.text")
+    tab.set("#text", f"{text}# typed\n")
+    tab.wait("page.state.text.endsWith('# typed\\n')")
+    tab.click("#undo")
+    tab.wait(f"page.state.text === {json.dumps(text)}")
+    # After a removal, the keys still reach the map.
+    tab.click("[data-mode=arrange]")
+    tab.evaluate("page.state.views[0].canvas.focus()")
+    tab.press("]", "BracketRight")
+    tab.evaluate("document.querySelector('#remove').focus(); document.querySelector('#remove').click()")
+    assert tab.evaluate("document.activeElement === page.state.views[0].canvas"), "the focus is lost"
+    # A setting that is hidden does not block Train, whatever its value.
+    tab.window(390, 844, dark=False)
+    tab.load(page, on="cpu", pace="full", **SMALL)
+    tab.evaluate("document.querySelector('#more').open = false; document.querySelector('#coupling').max = 1; 0")
+    tab.train()
     tab.assert_no_errors()
     # In a small window, the whole map is visible.
     tab.window(1280, 800, dark=False)
@@ -1077,6 +1197,12 @@ def check_former_defects(tab, page, call, downloads, folder):
     gibibytes = float(tab.text("#trouble").split()[2])
     assert 3 < gibibytes < 15, gibibytes
     assert not tab.evaluate("Boolean(page.state.training)")
+    # A large config has a link.
+    tab.load(page, layout="chaotic")
+    text = (CONFIGS / "chaotic.toml").read_text().replace("steps = 50", "steps = 51")
+    tab.drop("large.toml", base64(f"# {base64(os.urandom(200_000))}\n{text}".encode()))
+    tab.wait("page.state.file === 'large' && page.state.valid && location.hash.length > 200000")
+    tab.assert_no_errors()
     # Without CompressionStream, an edited map has no link, and no wrong link is copied. Links to layouts still work.
     script = tab.call("Page.addScriptToEvaluateOnNewDocument", source="delete window.CompressionStream")["identifier"]
     tab.load(page, layout="chaotic", seed=9)
@@ -1094,6 +1220,41 @@ def check_former_defects(tab, page, call, downloads, folder):
     tab.wait("window.copied && window.copied.includes('strictly_forward')")
     tab.assert_no_errors()
     tab.call("Page.removeScriptToEvaluateOnNewDocument", identifier=script)
+    # If the worker fails while the page opens, the page says so.
+    source = "const { postMessage } = Worker.prototype; Worker.prototype.postMessage = function (data, ...more) {"
+    source += " if (data.words?.ask === 'about') throw new Error('no memory'); postMessage.call(this, data, ...more); };"
+    script = tab.call("Page.addScriptToEvaluateOnNewDocument", source=source)["identifier"]
+    tab.open(f"{page.as_uri()}#layout=chaotic")
+    tab.wait("document.body.dataset.shown !== undefined")
+    assert "cannot run flotilla: no memory" in tab.text("#trouble"), tab.text("#trouble")
+    assert not list(tab.complaints())
+    tab.call("Page.removeScriptToEvaluateOnNewDocument", identifier=script)
+    # A picture has its lines below each other on every screen. A film during a training shows one generation.
+    tab.call("Emulation.setDeviceMetricsOverride", width=1280, height=900, deviceScaleFactor=2, mobile=False)
+    tab.load(page, layout="generally_forward", on="cpu", population=20)
+    tab.set("#text", tab.evaluate("page.state.text").replace("steps = 25", "steps = 6"))
+    tab.wait("page.state.config.world.steps === 6")
+    tab.evaluate(
+        "window.lines = []; const { fillText } = CanvasRenderingContext2D.prototype;"
+        " CanvasRenderingContext2D.prototype.fillText = function (text, x, y, ...rest) {"
+        " if (!this.canvas.isConnected) lines.push([text, y, parseFloat(this.font.match(/[0-9.]+px/)[0])]);"
+        " fillText.call(this, text, x, y, ...rest); }; 0"
+    )
+    tab.click("#train")
+    tab.wait("page.state.training && page.state.training.reached >= 2 && page.state.views.every(view => view.data)")
+    tab.click("#png")
+    (_, title, _), (_, status, size) = tab.evaluate("lines.slice(0, 2)")
+    assert status - title > size > 15, (title, status, size)
+    tab.evaluate("lines.length = 0; 0")
+    tab.click("#webm")
+    tab.wait("page.state.message.endsWith('.webm is saved.')")
+    filmed = "[...new Set(lines.flatMap(([text]) => text.match(/^generation [0-9]+/) ?? []))]"
+    assert len(tab.evaluate(filmed)) == 1, tab.evaluate(filmed)
+    assert tab.evaluate("page.state.training.reached") > 10
+    tab.wait("page.state.views.every(view => view.data.episodes[0].generation > 10)")
+    tab.click("#stop")
+    tab.assert_no_errors()
+    tab.window(1280, 900, dark=False)
     # The saved config is that of the training, without later changes. The command names the saved file.
     text = (
         "[world]\nleaders = [[5, 5]]\nfollowers = [[4, 4], [6, 4]]\npois = [[5, 12]]\n"
@@ -1773,7 +1934,7 @@ def main():
         check_slow_network(tab, page)
         check_map_in_view(tab, page)
         check_history(tab, page)
-        check_classes(tab, page, native)
+        check_classes(tab, page, native, folder)
         check_consistency(tab, page, downloads)
         check_links_and_devices(tab, page)
         check_first_visit(tab, page, call, downloads)
