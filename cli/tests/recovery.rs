@@ -1211,7 +1211,7 @@ fn files_of_others_are_not_overwritten() {
             let message = stderr(&refused);
             assert!(
                 refused.status.code() == Some(1)
-                    && message.contains("was not made by flotilla and would be overwritten"),
+                    && message.contains("was not made by flotilla, or has been changed since, and would be"),
                 "{message}"
             );
             assert!(message.contains(name) && message.contains("move it away"), "{message}");
