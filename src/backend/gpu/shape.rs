@@ -105,7 +105,8 @@ impl Uses {
     fn of(world: &World) -> Uses {
         let any = |is: fn(&ClassShape) -> bool| world.classes.iter().any(|class| is(&class.constants.shape));
         Uses {
-            chooses: world.constants.policy.actions() == Actions::Behaviours,
+            // Policies that choose agents may have fewer outputs than there are behaviours.
+            chooses: world.constants.policy.actions() == Actions::Behaviours && world.choices().contains(&0),
             aligns: world.aligns(),
             pursues: any(ClassShape::pursues),
             confines: any(ClassShape::is_confined),

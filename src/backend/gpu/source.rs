@@ -474,3 +474,21 @@ pub fn shaders() -> Vec<(&'static str, String)> {
     ];
     all.map(|(name, pipeline)| (name, pipeline.text())).into()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::sample;
+
+    #[test]
+    fn random_worlds_have_specialised_kernels() {
+        // In some of the later ones, all policies choose agents although others would choose behaviours.
+        for seed in (0..100).chain(9000..9020) {
+            let world = World::new(&sample::any_world(seed).validate().unwrap());
+            let records = Recorded { trace: false, sightings: false };
+            if let Some((shape, _)) = Shape::specialised(&world, Capacity::of_workgroups(MAX_THREADS), records) {
+                Pipeline::Episode(shape).text();
+            }
+        }
+    }
+}
