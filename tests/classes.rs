@@ -683,6 +683,11 @@ fn stages_keep_tables() {
     assert_eq!((&before.coupling[..], before.radii2[0]), (&[1, 1, 2][..], 25.0));
     assert_eq!((&after.coupling[..], after.radii2[0]), (&[1, 1, 1][..], 4.0));
     assert_eq!(parse(&staged.to_toml()), staged);
+    // Not so that policies have other inputs.
+    let each = with("{ of = \"pois\", range = 25 }", "{ of = \"pois\", range = 25, sectors = \"each\" }");
+    let more = format!("{each}[[stages]]\nfrom = 3\nset = {{ \"pois.b.at\" = [[5, 6], [7, 8]] }}\n");
+    let error = Config::parse(&more, "x.toml").unwrap_err().to_string();
+    assert!(error.contains("stages[0]: policies have other inputs or outputs in this stage"), "{error}");
 }
 
 #[test]
@@ -774,7 +779,6 @@ fn classes_and_groups_in_regions_have_their_sizes() {
     assert_eq!((parse(&written), config.validate().unwrap().into_config()), (config.clone(), config));
 }
 
-/// What stages set in short stays in short.
 #[test]
 fn keys_that_stages_set_stay_in_short() {
     let text =

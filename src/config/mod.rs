@@ -29,7 +29,7 @@ pub use crate::model::motion::{Mobility, Motion};
 pub use crate::model::policy::{Actions, MAX_HIDDEN_LAYERS, MAX_HIDDEN_UNITS, Policy};
 pub use crate::model::region::Region;
 pub use crate::model::rule::{Coupling, Observers};
-pub use crate::model::sense::{Density, Sense};
+pub use crate::model::sense::{Density, MOST_MEASURED, Sense};
 pub use crate::model::start::Heading;
 pub use crate::reader::{Definition, Override, Problem, key_path};
 

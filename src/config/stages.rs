@@ -74,15 +74,13 @@ pub(super) struct UnresolvedStage<'a> {
     set: BTreeMap<String, (Option<usize>, Value<'a>)>,
 }
 
-impl UnresolvedStage<'_> {
+impl<'a> UnresolvedStage<'a> {
     /// Returns a stage that a program has set.
     pub fn of((index, stage): (usize, &Stage)) -> Self {
         let set = stage.set.iter().map(|(key, value)| (key.clone(), (None, value.clone().into()))).collect();
         UnresolvedStage { name: name_of(index), from: Some(Value::of(&stage.from)), set, ..UnresolvedStage::default() }
     }
-}
 
-impl<'a> UnresolvedStage<'a> {
     /// Adds a key that the document sets. `set = { world.coupling = 1 }` is the same key without quotes.
     fn add(&mut self, key: &str, line: Option<usize>, value: &'a Spanned<DeValue<'a>>, document: &'a Document<'_>) {
         match value.get_ref() {
@@ -195,8 +193,8 @@ impl UnresolvedStage<'_> {
     /// that of the stage.
     fn config(&self, own: &Config, problems: &mut Vec<Problem>) -> Config {
         let name = &self.name;
-        // A stage changes the values of `own`, so defaults that depend on other keys stay as they are there.
         let names: Vec<String> = self.set.keys().map(|key| format!("{name}.set.{key}")).collect();
+        // A stage changes the values of `own`, so defaults that depend on other keys stay as they are there.
         let mut reader = Reader::of_values(own.values());
         for ((key, (line, value)), name) in self.set.iter().zip(&names) {
             if FIXED.iter().any(|fixed| includes(fixed, key)) {

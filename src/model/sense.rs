@@ -22,7 +22,7 @@ pub(crate) const WGSL: &str = include_str!("../../shaders/sense.wgsl");
 const _: () = assert!(Measure::ALL.len() == 6, "add the new measure to shaders/sense.wgsl, too, and raise this number");
 
 /// Maximum of a measure times a POI's value.
-pub(crate) const MOST_MEASURED: f64 = 2000.0;
+pub const MOST_MEASURED: f64 = 2000.0;
 /// The finest lattice of measures, on which they are added: 2^-20.
 const FINEST: f64 = 1.0 / 1_048_576.0;
 /// A squared range that exceeds every distance on a map.
@@ -303,7 +303,7 @@ impl<S: Simd> Quadrants<S> {
     }
 
     /// Adds an entity with this measure at an offset from an agent with this [heading](ChannelLanes::heading). `PLAIN`
-    /// channels count no entities, and the quadrants of `MAP` channels do not turn with a heading.
+    /// channels count no entities. `MAP` omits the rotation, which is right only if sectors are fixed to the map.
     ///
     /// The signs of the offset along the heading and to its left determine the quadrant. A tie goes to the
     /// counterclockwise quadrant, so that each boundary belongs to exactly one.

@@ -2,7 +2,7 @@
 
 use super::table::{Row, Section, To, quoted};
 use super::yaml::At;
-use flotilla::config::Problem;
+use flotilla::config::{MOST_MEASURED, Problem};
 use toml::Value;
 
 const WORLD: &[Row] = &[
@@ -93,8 +93,6 @@ const LEARNING: &[Row] = &[
 
 /// Distance up to which the program's UAVs influence rovers, in units.
 const INFLUENCE_RADIUS: f64 = 5.0;
-/// The largest product of a measure and a POI's value here.
-const MOST_MEASURED: f64 = 2000.0;
 /// The names of measures here, with the power of 1/d and the distance below which they do not grow, or zeros.
 const MEASURES: &[(&str, (&str, f64, f64))] = &[
     // 1/max(0.001, d²).

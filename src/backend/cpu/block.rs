@@ -517,9 +517,8 @@ impl<S: Simd> Scene<'_, S> {
         sense::measured::<S>(self.channel, const { Measure::of(MEASURE) }, value, dx, dy)
     }
 
-    /// Senses by quadrants. `PLAIN` channels count no entities, and sense POIs of value 1 only. `MAP` says that quadrants do
-    /// not turn with the heading; without it they may or may not. It is a function of its own, so that registers hold its
-    /// constants.
+    /// Senses by quadrants. `PLAIN` channels count no entities, and sense POIs of value 1 only. `MAP` is for quadrants that
+    /// are fixed to the map, which need no rotation. It is a function of its own, so that registers hold its constants.
     fn sense_quadrants<const MEASURE: u32, const PLAIN: bool, const MAP: bool>(
         &self,
         observers: Range<usize>,
