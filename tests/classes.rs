@@ -683,11 +683,34 @@ fn stages_keep_tables() {
     assert_eq!((&before.coupling[..], before.radii2[0]), (&[1, 1, 2][..], 25.0));
     assert_eq!((&after.coupling[..], after.radii2[0]), (&[1, 1, 1][..], 4.0));
     assert_eq!(parse(&staged.to_toml()), staged);
-    // Not so that policies have other inputs.
+    // The same with classes.
+    let staged = parse(&format!("{TEXT}[[stages]]\nfrom = 3\nset = {{ agents.dog.motion.max_speed = 2 }}\n"));
+    let valid = staged.validate().unwrap();
+    assert_eq!([2, 3].map(|generation| valid.at(generation).agents[1].motion.max_speed()), [3.0, 2.0]);
+    assert_eq!(parse(&staged.to_toml()), staged);
+    // Not so that policies have other inputs, or that others learn.
     let each = with("{ of = \"pois\", range = 25 }", "{ of = \"pois\", range = 25, sectors = \"each\" }");
-    let more = format!("{each}[[stages]]\nfrom = 3\nset = {{ \"pois.b.at\" = [[5, 6], [7, 8]] }}\n");
-    let error = Config::parse(&more, "x.toml").unwrap_err().to_string();
-    assert!(error.contains("stages[0]: policies have other inputs or outputs in this stage"), "{error}");
+    let anytime = with("after = \"a\"\n", "");
+    for (text, set) in [
+        (&*each, "\"pois.b.at\" = [[5, 6], [7, 8]]"),
+        (TEXT, "agents.uav.senses = [{ of = \"pois\", range = 25 }]"),
+        (TEXT, "agents.uav.at = [[5, 6]]"),
+        (
+            &anytime,
+            "agents.uav.influence_radius = 5, agents.dog.control = \"policy\", agents.dog.rule = [], \
+             agents.dog.senses = [{ of = \"pois\", range = 25 }]",
+        ),
+    ] {
+        let error = Config::parse(&format!("{text}[[stages]]\nfrom = 3\nset = {{ {set} }}\n"), "x.toml").unwrap_err();
+        let line = text.lines().count() + 1;
+        assert_eq!(
+            error.to_string(),
+            format!(
+                "x.toml:{line}: stages[0]: the classes that learn, their sizes and their policies' inputs and outputs are \
+                 the same in all stages"
+            )
+        );
+    }
 }
 
 #[test]

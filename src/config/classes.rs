@@ -93,13 +93,18 @@ impl Config {
 
     /// Returns the widths of all layers of a policy, from inputs to outputs: the most that the policies of any class use.
     pub fn widths(&self) -> Vec<usize> {
+        let learning = self.agents.iter().filter(|class| class.learns());
+        let outputs = learning.map(|class| self.outputs(class)).max().unwrap_or(self.policy.actions.outputs());
+        [&[self.inputs()], &self.policy.hidden[..], &[outputs]].concat()
+    }
+
+    /// Returns the number of outputs that the policies of a class use.
+    pub(super) fn outputs(&self, class: &AgentClass) -> usize {
         let size = |name: &str| self.agents.iter().find(|class| class.name == name).map_or(0, AgentClass::size);
-        let of_class = |class: &AgentClass| match &class.control {
+        match &class.control {
             Control::Choose(target) => size(target) + 1,
             _ => self.policy.actions.outputs(),
-        };
-        let outputs = self.agents.iter().filter(|class| class.learns()).map(of_class).max();
-        [&[self.inputs()], &self.policy.hidden[..], &[outputs.unwrap_or(self.policy.actions.outputs())]].concat()
+        }
     }
 
     /// Returns the world in short as pictures draw it. Agents that learn are leaders, others are followers, and all POIs

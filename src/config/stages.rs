@@ -9,7 +9,7 @@ use serde::Serialize;
 use toml::Spanned;
 use toml::de::DeValue;
 
-use super::{AGENTS, Config, MAX_GENERATIONS, Override, POIS, Problem};
+use super::{AGENTS, AgentClass, Config, MAX_GENERATIONS, Override, POIS, Problem};
 use crate::reader::{Document, Number, Reader, Value, includes};
 
 /// The list of stages in a config.
@@ -19,9 +19,8 @@ pub const MAX_STAGES: usize = 256;
 /// The key with the length of a run.
 pub const GENERATIONS: &str = "learning.generations";
 /// Keys that stages cannot change. A name that ends with a dot is a whole section.
-const FIXED: [&str; 22] = [
+const FIXED: [&str; 21] = [
     AGENTS,
-    "agents.",
     POIS,
     "policy.",
     "checkpoint.",
@@ -204,7 +203,7 @@ impl UnresolvedStage<'_> {
                     message: "this key cannot change between stages".into(),
                 });
             } else {
-                reader.set_within(key, value.clone(), name, &[POIS]);
+                reader.set_within(key, value.clone(), name, &[AGENTS, POIS]);
             }
         }
         let line = |key: &str| {
@@ -224,14 +223,22 @@ impl UnresolvedStage<'_> {
             }
         };
         let counts = |config: &Config| [config.learners(), config.world.leaders.len()];
-        if counts(&config) != counts(own) {
+        let classes = |config: &Config| {
+            let learning = config.agents.iter().filter(|class| class.learns());
+            let layers = |class: &AgentClass| [class.size(), class.inputs(), config.outputs(class)];
+            learning.map(|class| (class.name.clone(), layers(class))).collect::<Vec<_>>()
+        };
+        if own.agents.is_empty() && counts(&config) != counts(own) {
             let leaders = self.set.contains_key("world.leaders");
             let key = format!("{name}.set.world.{}", if leaders { "leaders" } else { "followers" });
             let [found, expected] = [&config, own].map(Config::learners);
             let message = format!("{found} leaders learn in this stage, {expected} in all others");
             problems.push(Problem { line: line(&key), key, message });
-        } else if config.widths() != own.widths() {
-            let message = "policies have other inputs or outputs in this stage than in all others".into();
+        } else if classes(&config) != classes(own) {
+            let message =
+                "the classes that learn, their sizes and their policies' inputs and outputs are the same in all \
+                           stages"
+                    .into();
             problems.push(Problem { line: self.line, key: name.clone(), message });
         }
         config
