@@ -329,7 +329,7 @@ def rollout(
 def _fields(record: Sequence[str], trace: bool, out: Mapping[str, Any] | None) -> tuple[str, ...]:
     """Returns the fields of a trace that are wanted."""
     named = (record,) if isinstance(record, str) else record
-    fields = FIELDS if trace else tuple(dict.fromkeys([*named, *(out or ())]))
+    fields = tuple(dict.fromkeys([*(FIELDS if trace else ()), *named, *(out or ())]))
     for field in fields:
         if field not in FIELDS:
             raise ValueError(f"record {field!r}, allowed are {', '.join(map(repr, FIELDS))}")

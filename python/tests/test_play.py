@@ -186,6 +186,9 @@ def test_invalid_records_and_outputs_raise(config):
     policies = random_policies(config, 5)
     with pytest.raises(ValueError, match="record 'place'"):
         rollout(config, policies, record=("place",))
+    for given in ({"record": ("place",)}, {"out": {"place": np.empty(1)}}):
+        with pytest.raises(ValueError, match="record 'place'"):
+            rollout(config, policies, trace=True, **given)
     for wrong in (np.empty((5, 26, 12, 1), np.float32), np.empty((5, 26, 12, 2)), [1, 2]):
         with pytest.raises(ValueError, match="positions"):
             rollout(config, policies, out={"positions": wrong})
