@@ -145,7 +145,7 @@ pub use embedded::*;
 #[cfg(not(target_family = "wasm"))]
 pub use threads::MAX_THREADS;
 #[cfg(not(target_family = "wasm"))]
-pub use threads::{Threads, start};
+pub use threads::{Threads, start, start_with_caller};
 
 /// Starts the threads that rayon shares work between, as many as the system allows.
 #[cfg(not(target_family = "wasm"))]
@@ -187,8 +187,19 @@ mod threads {
     /// If rayon fails to start a thread, it cannot be set up again. So this starts the threads first, and rayon gets
     /// those that could be started.
     pub fn start(threads: Option<usize>) -> Threads {
+        start_once(threads, false)
+    }
+
+    /// Starts the threads of this process like [`start`]. The calling thread is one of them, so that it wakes no other
+    /// for a small piece of work. It must not wait for a thread that needs these threads, or both wait forever.
+    pub fn start_with_caller(threads: Option<usize>) -> Threads {
+        start_once(threads, true)
+    }
+
+    fn start_once(threads: Option<usize>, with_caller: bool) -> Threads {
         static STARTED: OnceLock<Threads> = OnceLock::new();
-        *STARTED.get_or_init(|| start_now(threads.unwrap_or_else(|| usual(std::env::var("RAYON_NUM_THREADS").ok()))))
+        let threads = || threads.unwrap_or_else(|| usual(std::env::var("RAYON_NUM_THREADS").ok()));
+        *STARTED.get_or_init(|| start_now(threads(), with_caller))
     }
 
     /// Maximum number of threads. More would spend their time waiting for each other.
@@ -224,13 +235,12 @@ mod threads {
         }
     }
 
-    fn start_now(wanted: usize) -> Threads {
-        let workers = workers(wanted, spawn);
-        let started = workers.len();
-        let built = match started {
-            0 => rayon::ThreadPoolBuilder::new().num_threads(1).use_current_thread().build_global(),
-            _ => rayon::ThreadPoolBuilder::new().num_threads(started).spawn_handler(hand_over(workers)).build_global(),
-        };
+    fn start_now(wanted: usize, with_caller: bool) -> Threads {
+        let workers = workers(wanted - usize::from(with_caller), spawn);
+        let started = workers.len() + usize::from(with_caller);
+        let builder = rayon::ThreadPoolBuilder::new().num_threads(started.max(1));
+        let builder = if workers.len() < started.max(1) { builder.use_current_thread() } else { builder };
+        let built = builder.spawn_handler(hand_over(workers)).build_global();
         match built {
             Ok(()) => Threads { wanted, started },
             // The process has already started a pool.

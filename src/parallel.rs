@@ -7,7 +7,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 pub use rayon::{current_num_threads, join, prelude::*, scope};
 
 #[cfg(not(target_family = "wasm"))]
-pub use crate::host::{Threads, start};
+pub use crate::host::{Threads, start, start_with_caller};
 
 /// Locks a mutex, also after another thread panicked while it held the lock.
 pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {

@@ -55,7 +55,7 @@ pub fn open_gpu(options: &RunOptions, work: Option<Work>) -> Result<(Option<GpuB
 /// Starts the threads of the whole process: as many as `--threads` requests, or fewer if the system does not allow
 /// them.
 pub fn start_threads(threads: Option<u16>) {
-    let threads = parallel::start(threads.map(usize::from));
+    let threads = parallel::start_with_caller(threads.map(usize::from));
     if threads.is_short() {
         say(format_args!("note: {threads}"));
     }
