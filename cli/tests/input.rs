@@ -612,7 +612,7 @@ fn a_training_works_with_fewer_threads_than_requested() {
     if !place.shell(&format!("{user} ./flotilla --version")).status.success() {
         return skip("another user cannot enter the temporary directory");
     }
-    let digests: Vec<String> = [(1, "0 of"), (3, "2 of")]
+    let digests: Vec<String> = [(1, "1 of"), (3, "3 of")]
         .into_iter()
         .map(|(limit, started)| {
             // The limit counts all processes of a user. Only `nobody` (65534) is assumed to have no others.
