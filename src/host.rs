@@ -190,8 +190,9 @@ mod threads {
         start_once(threads, false)
     }
 
-    /// Starts the threads of this process like [`start`]. The calling thread is one of them, so that it wakes no other
-    /// for a small piece of work. It must not wait for a thread that needs these threads, or both wait forever.
+    /// Starts the threads of this process like [`start`], but the calling thread is one of them. It then wakes no other
+    /// for a small piece of work. It must never wait, as with `JoinHandle::join`, for another thread's parallel work:
+    /// if it is the only one of these threads, both wait forever.
     pub fn start_with_caller(threads: Option<usize>) -> Threads {
         start_once(threads, true)
     }
@@ -236,11 +237,11 @@ mod threads {
     }
 
     fn start_now(wanted: usize, with_caller: bool) -> Threads {
-        let workers = workers(wanted - usize::from(with_caller), spawn);
+        let workers = workers(wanted.saturating_sub(usize::from(with_caller)), spawn);
         let started = workers.len() + usize::from(with_caller);
-        let builder = rayon::ThreadPoolBuilder::new().num_threads(started.max(1));
-        let builder = if workers.len() < started.max(1) { builder.use_current_thread() } else { builder };
-        let built = builder.spawn_handler(hand_over(workers)).build_global();
+        let plays = with_caller || workers.is_empty();
+        let builder = rayon::ThreadPoolBuilder::new().num_threads(started.max(1)).spawn_handler(hand_over(workers));
+        let built = if plays { builder.use_current_thread().build_global() } else { builder.build_global() };
         match built {
             Ok(()) => Threads { wanted, started },
             // The process has already started a pool.

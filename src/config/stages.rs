@@ -236,9 +236,7 @@ impl UnresolvedStage<'_> {
             problems.push(Problem { line: line(&key), key, message });
         } else if classes(&config) != classes(own) {
             let message =
-                "the classes that learn, their sizes and their policies' inputs and outputs are the same in all \
-                           stages"
-                    .into();
+                "the classes that learn have other sizes, inputs or outputs in this stage than in all others".into();
             problems.push(Problem { line: self.line, key: name.clone(), message });
         }
         config
