@@ -509,6 +509,13 @@ fn every_problem_names_key_line_found_and_allowed() {
         ),
         (
             steps,
+            "[[stages]]\nfrom = 1\nset = { \"pois.b.radius\" = 3, \"pois[1].radius\" = 4, pois.b.radius = 5 }",
+            "4: stages[0].set.pois.b.radius: pois.b.radius sets this, too: remove one of the two\n\
+             4: stages[0].set.pois[1].radius: pois.b.radius sets this, too: remove one of the two",
+        ),
+        (steps, "[[stages]]\nfrom = 1\nset = { \"pois.b.x\" = {} }", "4: stages[0].set.pois.b.x: unknown key"),
+        (
+            steps,
             "[[stages]]\nfrom = 1\nset = { \"world.coupling\" = 3 }",
             &*format!("4: stages[0].set.world.coupling: {groups}"),
         ),
@@ -687,6 +694,21 @@ fn stages_keep_tables() {
     let staged = parse(&format!("{TEXT}[[stages]]\nfrom = 3\nset = {{ agents.dog.motion.max_speed = 2 }}\n"));
     let valid = staged.validate().unwrap();
     assert_eq!([2, 3].map(|generation| valid.at(generation).agents[1].motion.max_speed()), [3.0, 2.0]);
+    assert_eq!(parse(&staged.to_toml()), staged);
+    // Values may have tables, and a key in quotes may have one, which replaces that of the file.
+    let set = "'agents.dog.motion' = { kind = 'free', max_speed = 2 }, 'pois.b' = { name = 'b', at = [[5, 6]], coupling = 1 }, \
+               agents.uav.senses = [{ of = 'pois', range = 9 }, { of = 'agents' }], agents.dog.rule = [{ of = 'uav', to = 7, gain = 2 }]";
+    let staged = parse(&format!("{TEXT}[[stages]]\nfrom = 3\nset = {{ {set} }}\n"));
+    let valid = staged.validate().unwrap();
+    let changed = Config { stages: vec![], ..Config::clone(valid.at(3)) };
+    let flags = [
+        ("agents.dog.motion", "{ kind = 'free', max_speed = 2 }"),
+        ("agents.dog.rule", "[{ of = 'uav', to = 7, gain = 2 }]"),
+        ("agents.uav.senses", "[{ of = 'pois', range = 9 }, { of = 'agents' }]"),
+        ("pois.b", "{ name = 'b', at = [[5, 6]], coupling = 1 }"),
+    ];
+    let flags = flags.map(|(key, value)| Override::of_text(key, value, "--set"));
+    assert_eq!(changed, *Config::read(TEXT, "x.toml", &[], &flags).unwrap().validate().unwrap());
     assert_eq!(parse(&staged.to_toml()), staged);
     // It is refused if policies get other inputs, or if other classes learn.
     let each = with("{ of = \"pois\", range = 25 }", "{ of = \"pois\", range = 25, sectors = \"each\" }");

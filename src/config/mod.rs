@@ -492,6 +492,13 @@ fn resolve<'a>(
     notes.extend(later.iter().map(|(Stage { from, .. }, _)| {
         format!("the stage from generation {from} on is left out, because this run ends with generation {last}")
     }));
+    for set in &overrides {
+        let path = stages::path_of(&set.key, &own);
+        let sets = |key: &String| stages::path_of(key, &own).starts_with(&path);
+        notes.extend(stages.iter().filter(|(stage, _)| stage.set.keys().any(sets)).map(|(Stage { from, .. }, _)| {
+            format!("{}: the stage from generation {from} on sets this, too, and replaces it", set.name)
+        }));
+    }
     let (stages, configs) = stages.into_iter().unzip();
     let config = ValidConfig::new(Config { stages, ..own }, configs);
     notes.extend(config.notes());

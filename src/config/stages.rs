@@ -10,7 +10,7 @@ use toml::Spanned;
 use toml::de::DeValue;
 
 use super::{AGENTS, AgentClass, Config, MAX_GENERATIONS, Override, POIS, Problem};
-use crate::reader::{Document, Number, Reader, Value, includes};
+use crate::reader::{Document, Number, Reader, Value, includes, key_path};
 
 /// The list of stages in a config.
 pub const STAGES: &str = "stages";
@@ -69,26 +69,49 @@ pub(super) struct UnresolvedStage<'a> {
     from_line: Option<usize>,
     /// The first generation.
     from: Option<Value<'a>>,
-    /// The dotted keys that it sets, each with its line.
-    set: BTreeMap<String, (Option<usize>, Value<'a>)>,
+    /// The dotted keys that it sets, each with its line, in the order of the keys.
+    set: Vec<(String, Option<usize>, Value<'a>)>,
 }
 
 impl<'a> UnresolvedStage<'a> {
     /// Returns a stage that a program has set.
     pub fn of((index, stage): (usize, &Stage)) -> Self {
-        let set = stage.set.iter().map(|(key, value)| (key.clone(), (None, value.clone().into()))).collect();
+        let set = stage.set.iter().map(|(key, value)| (key.clone(), None, value.clone().into())).collect();
         UnresolvedStage { name: name_of(index), from: Some(Value::of(&stage.from)), set, ..UnresolvedStage::default() }
     }
 
-    /// Adds a key that the document sets. `set = { world.coupling = 1 }` is the same key without quotes.
-    fn add(&mut self, key: &str, line: Option<usize>, value: &'a Spanned<DeValue<'a>>, document: &'a Document<'_>) {
+    /// Adds a key that the document sets, below the key `above` without quotes: `set = { world.coupling = 1 }` has the same
+    /// key as `set = { "world.coupling" = 1 }`. A dotted key in quotes may set a whole table.
+    fn add(
+        &mut self,
+        above: &str,
+        key: &str,
+        line: Option<usize>,
+        value: &'a Spanned<DeValue<'a>>,
+        document: &'a Document<'_>,
+    ) {
+        let name = format!("{above}{key}");
         match value.get_ref() {
-            DeValue::Table(leaves) => leaves
+            DeValue::Table(leaves) if !key.contains('.') => leaves
                 .iter()
-                .for_each(|(leaf, value)| self.add(&format!("{key}.{}", leaf.get_ref()), line, value, document)),
-            _ => drop(self.set.insert(key.into(), (line, document.value(value)))),
+                .for_each(|(leaf, value)| self.add(&format!("{name}."), leaf.get_ref(), line, value, document)),
+            _ => self.set.push((name, line, document.value(value))),
         }
     }
+}
+
+/// Returns the parts of a dotted key. A class or a group of POIs has its name there, and not its index.
+pub(super) fn path_of<'a>(key: &'a str, own: &'a Config) -> Vec<&'a str> {
+    let mut path: Vec<&str> = key_path(key).collect();
+    let names: Vec<&str> = match path[0] {
+        AGENTS => own.agents.iter().map(|class| &*class.name).collect(),
+        POIS => own.pois.iter().map(|group| &*group.name).collect(),
+        _ => return path,
+    };
+    if let Some(part) = path.get_mut(1).filter(|part| !names.contains(part)) {
+        *part = part.parse::<usize>().ok().and_then(|index| names.get(index)).unwrap_or(part);
+    }
+    path
 }
 
 /// Returns the name of a stage in problems.
@@ -125,9 +148,9 @@ pub(super) fn unresolved<'a>(document: &'a Document<'_>, outside: bool) -> (Vec<
                 }
                 ("set", DeValue::Table(set)) => {
                     for (key, value) in set {
-                        let (line, key) = (line(key.span().start), key.get_ref());
-                        stage.add(key, line, value, document);
+                        stage.add("", key.get_ref(), line(key.span().start), value, document);
                     }
+                    stage.set.sort_by(|(key, ..), (other, ..)| key.cmp(other));
                 }
                 ("set", _) => report(offset, place, "allowed a table of dotted keys in quotes".into()),
                 _ => report(offset, place, "unknown key; a stage has from, set".into()),
@@ -160,7 +183,7 @@ pub(super) fn resolve(
         let max = if shortened { MAX_GENERATIONS } else { own.learning.generations };
         let from = stage.first_generation([min, max], &mut problems);
         let config = stage.config(own, &mut problems);
-        let set = stage.set.iter().filter_map(|(key, (_, value))| Some((key.clone(), value.to_toml()?))).collect();
+        let set = stage.set.iter().filter_map(|(key, _, value)| Some((key.clone(), value.to_toml()?))).collect();
         stages.push((Stage { from, set }, config));
     }
     problems.sort_by_key(|problem| problem.line);
@@ -192,10 +215,18 @@ impl UnresolvedStage<'_> {
     /// that of the stage.
     fn config(&self, own: &Config, problems: &mut Vec<Problem>) -> Config {
         let name = &self.name;
-        let names: Vec<String> = self.set.keys().map(|key| format!("{name}.set.{key}")).collect();
+        let names: Vec<String> = self.set.iter().map(|(key, ..)| format!("{name}.set.{key}")).collect();
+        let mut paths: Vec<_> = self.set.iter().map(|(key, ..)| path_of(key, own)).zip(&self.set).collect();
+        paths.sort_by(|(path, _), (other, _)| path.cmp(other));
+        for ((path, (key, ..)), (other, (twice, line, _))) in paths.iter().zip(&paths[1.min(paths.len())..]) {
+            if other.starts_with(path) {
+                let message = format!("{key} sets this, too: remove one of the two");
+                problems.push(Problem { line: *line, key: format!("{name}.set.{twice}"), message });
+            }
+        }
         // A stage changes the values of `own`, so defaults that depend on other keys stay as they are there.
         let mut reader = Reader::of_values(own.values());
-        for ((key, (line, value)), name) in self.set.iter().zip(&names) {
+        for ((key, line, value), name) in self.set.iter().zip(&names) {
             if FIXED.iter().any(|fixed| includes(fixed, key)) {
                 problems.push(Problem {
                     line: *line,
@@ -208,8 +239,8 @@ impl UnresolvedStage<'_> {
         }
         let line = |key: &str| {
             let within =
-                |(set, _): &(&String, &(Option<usize>, Value<'_>))| key.starts_with(&format!("{name}.set.{set}"));
-            self.set.iter().find(within).map_or(self.line, |(_, (line, _))| *line)
+                |(set, ..): &&(String, Option<usize>, Value<'_>)| key.starts_with(&format!("{name}.set.{set}"));
+            self.set.iter().rfind(within).map_or(self.line, |(_, line, _)| *line)
         };
         let config = match reader.read(Config::ask) {
             Ok((config, _)) => config,
@@ -229,7 +260,7 @@ impl UnresolvedStage<'_> {
             learning.map(|class| (class.name.clone(), layers(class))).collect::<Vec<_>>()
         };
         if own.agents.is_empty() && counts(&config) != counts(own) {
-            let leaders = self.set.contains_key("world.leaders");
+            let leaders = self.set.iter().any(|(key, ..)| key == "world.leaders");
             let key = format!("{name}.set.world.{}", if leaders { "leaders" } else { "followers" });
             let [found, expected] = [&config, own].map(Config::learners);
             let message = format!("{found} leaders learn in this stage, {expected} in all others");

@@ -102,8 +102,11 @@ impl ValidConfig {
     /// Returns a note for each setting that is valid but likely a mistake.
     pub fn notes(&self) -> Vec<String> {
         let mut shown = HashSet::new();
-        let notes = self.stages.iter().flat_map(|(_, config)| notes(config));
-        notes.filter(|note| shown.insert(note.clone())).collect()
+        let of_stage = |(index, (_, config)): (usize, &(usize, StageConfig))| {
+            let new = notes(config).into_iter().filter(|note| shown.insert(note.clone()));
+            new.map(|note| if index == 0 { note } else { format!("stage {index}: {note}") }).collect::<Vec<_>>()
+        };
+        self.stages.iter().enumerate().flat_map(of_stage).collect()
     }
 
     /// Returns the config as it was read, without its resolved stages.

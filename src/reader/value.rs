@@ -151,7 +151,11 @@ impl<'a> Value<'a> {
             Kind::Word(word) => Some(word.clone().into_owned().into()),
             Kind::Flag(flag) => Some((*flag).into()),
             Kind::List(items) => items.iter().map(Value::to_toml).collect::<Option<Vec<_>>>().map(toml::Value::Array),
-            Kind::Table(_) | Kind::Other(_) => None,
+            Kind::Table(items) => {
+                let of = |(key, value): &(String, Value<'_>)| Some((key.clone(), value.to_toml()?));
+                items.iter().map(of).collect::<Option<toml::Table>>().map(toml::Value::Table)
+            }
+            Kind::Other(_) => None,
         }
     }
 }
