@@ -323,6 +323,19 @@ fn what_an_influence_config_loses_is_listed() {
     assert!(listed.contains("uavs[0].observation_radius = 30.0: here, a POI's value times"), "{listed}");
     let (config, _, listed) = change("novelty: 1", "novelty: .inf");
     assert!(listed.contains("novelty = inf: unknown") && config.pois.len() == 2);
+    // Keys of unknown names are listed wherever they are.
+    let unknown = INFLUENCE
+        .replace("    uavs:\n", "    drones: [{resolution: 90}]\n    uavs:\n")
+        .replace("    hidden_pois:\n", "    secret_pois: [{value: 5}]\n    hidden_pois:\n")
+        .replace("timescale: timestep, credit: Local", "timescal: timestep, credit: Local");
+    let (_, _, listed) = import(&unknown);
+    for key in
+        ["agents.drones[0].resolution = 90", "pois.secret_pois[0].value = 5", "automatic.timescal = \"timestep\""]
+    {
+        assert!(listed.contains(&format!("{key}: unknown")), "{key}\n{listed}");
+    }
+    // Numbers are read as Python's YAML reads them.
+    assert_eq!(change("agent_population_size: 20", "agent_population_size: 030").0.learning.population, 26);
 }
 
 #[test]
@@ -409,6 +422,14 @@ fn bad_input_is_refused_with_its_line() {
         "credit: Best",
         "found \"Best\", allowed Local, AllOrNothing, System, Difference",
     );
+    let (value, radius) = ("value: 2.0, coupling: 1", "observation_radius: 3.0");
+    fails(INFLUENCE, value, "value: .nan, coupling: 1", "rover_pois[0].value: found nan, allowed a number");
+    fails(
+        INFLUENCE,
+        radius,
+        "observation_radius: .nan",
+        "rover_pois[0].observation_radius: found nan, allowed a number",
+    );
     for wrong in ["resolution: 0", "resolution: 100", "resolution: .nan"] {
         fails(INFLUENCE, "resolution: 90", wrong, "allowed degrees that divide 360 into 1 to 16 sectors");
     }
@@ -487,10 +508,12 @@ fn bad_input_is_refused_with_its_line() {
 #[test]
 fn commands_that_take_a_config_say_that_it_is_yaml() {
     let wrong = format!("{LEADERS}CCEA: 1\n");
+    let json = "{\n  \"env\": {\"map_size\": [9, 9]}\n}\n";
     let files = [("in it.yaml", INFLUENCE), ("no-extension", LEADERS), ("wrong", &wrong), ("mine.yml", "a: 1\n")];
     let place = Place::new(&files);
-    let commands = ["check", "train", "baseline", "sweep", "bench", "verify", "tasks"];
-    for file in ["no-extension", "wrong", "mine.yml"] {
+    place.write("json", json);
+    let commands = ["check", "train", "baseline", "sweep", "bench", "verify", "tasks", "rollout --policies x"];
+    for file in ["no-extension", "wrong", "mine.yml", "json"] {
         for command in commands {
             let error = place.refused(1, &format!("{command} {file}"));
             let first = error.lines().next().unwrap();

@@ -8,8 +8,8 @@ use toml::Value;
 const WORLD: &[Row] = &[
     ("env.map_size", To::Need("map")),
     ("ccea.num_steps", To::Need("steps")),
-    ("env.agents", To::Code("")),
-    ("env.pois", To::Code("")),
+    ("env.agents", To::Code("rovers uavs")),
+    ("env.pois", To::Code("rover_pois hidden_pois")),
 ];
 
 const AGENT: &[Row] = &[
@@ -23,7 +23,7 @@ const AGENT: &[Row] = &[
     ("action.type", To::Code("")),
     ("reward_type", To::Code("")),
     ("IndirectDifference.type", To::Only("removal", "credits take agents out")),
-    ("IndirectDifference", To::Code("assignment manual automatic add_G")),
+    ("IndirectDifference", To::Code("assignment manual automatic.timescale automatic.credit add_G")),
     ("influence", To::Nothing("UAVs influence rovers within 5 units, as in the newest version of the program")),
     ("bounds", To::Code("low_x low_y high_x high_y")),
     ("needs_uav_to_move", To::Code("")),
@@ -410,7 +410,7 @@ fn of_poi<'a>(at: &At<'a>, kind: &str, rovers: &[(f64, bool)]) -> Result<(Group<
     let subtype = at.get("subtype");
     let shown = subtype.as_ref().map_or(String::new(), At::shown);
     let subtype = subtype.map(|subtype| subtype.value()).transpose()?.filter(|name| name.as_str() != Some(""));
-    let plain: String = shown.chars().filter(|c| c.is_ascii_alphanumeric() || *c == '-').collect();
+    let plain: String = shown.chars().filter(|c| c.is_ascii_alphanumeric() || *c == '-').take(40).collect();
     // Numbers of groups follow a _, so that names are unique.
     let stem = if plain.is_empty() { kind.into() } else { format!("{kind}-{plain}") };
     let needed = if needed > captured { needed } else { 0.0 };

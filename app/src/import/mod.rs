@@ -113,8 +113,10 @@ pub fn read_file(path: &Path) -> Result<String, ConfigError> {
 
 fn is_yaml(text: &str, path: &Path) -> bool {
     let has_extension = path.extension().is_some_and(|extension| extension == "yaml" || extension == "yml");
-    // YAML with an error is YAML, too.
-    let is_known =
-        |line: &str| PROGRAMS.iter().any(|(key, ..)| line.strip_prefix(key).is_some_and(|rest| rest.starts_with(':')));
+    // YAML with an error is YAML, too, and so is JSON.
+    let is_known = |line: &str| {
+        let after = |key: &str| line.trim_start_matches(['{', ' ', '"']).strip_prefix(key);
+        PROGRAMS.iter().any(|(key, ..)| after(key).is_some_and(|rest| rest.trim_start_matches('"').starts_with(':')))
+    };
     has_extension || text.lines().any(is_known)
 }

@@ -98,6 +98,8 @@ pub(super) fn parse(text: &str) -> Result<Node, Problem> {
         budget: serde_saphyr::budget! { enforce_alias_anchor_ratio: false },
         // The check of the config refuses them with their line. Keys that are not translated may have them.
         non_finite_float_policy: serde_saphyr::NonFiniteFloatPolicy::PassThrough,
+        // As the authors' programs read 010.
+        legacy_octal_numbers: true,
     };
     serde_saphyr::from_str_with_options(text, options).map_err(|error| {
         let line = error.location().map(|location| location.line() as usize);
@@ -185,7 +187,7 @@ impl<'a> At<'a> {
     pub fn number(&self) -> Result<f64, Problem> {
         match &self.node.value {
             Tree::Scalar(Value::Integer(number)) => Ok(*number as f64),
-            Tree::Scalar(Value::Float(number)) => Ok(*number),
+            Tree::Scalar(Value::Float(number)) if !number.is_nan() => Ok(*number),
             _ => Err(self.wrong("a number")),
         }
     }

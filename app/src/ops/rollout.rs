@@ -8,6 +8,7 @@ use serde::Serialize;
 
 use super::{BackendSource, ConfigText, Context, Error, ProcessorInfo, output, points, with_remedy};
 use crate::choice::Work;
+use crate::import;
 use crate::record::digests::{Digests, Verification};
 use crate::record::{folder, policies, tensors};
 use crate::report::map;
@@ -155,7 +156,7 @@ pub fn run(
     };
     let Some(policies) = request.policies.clone().or(trained) else {
         if !config::is_standard_input(path) {
-            config::read_file(path)?;
+            import::read_file(path)?;
         }
         return Err(Error::Usage(with_remedy(
             "--policies: a config file needs a file of policies",
@@ -164,7 +165,7 @@ pub fn run(
     };
     let outputs = [("--scores", request.scores.as_deref()), ("--trace", request.trace.as_deref())];
     output::check(&outputs, &[&config_path, &policies])?;
-    let (text, name) = (config::read_file(&config_path)?, config::name(&config_path));
+    let (text, name) = (import::read_file(&config_path)?, config::name(&config_path));
     let config = ConfigText { text, name, set: request.set.clone() }.read()?;
     let config = match request.stage {
         None => config,
