@@ -235,9 +235,16 @@ pub fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
     let existing = config::read_file(&path)?;
     // A person may have written the file, so the same sweep may be formatted differently. `skip_impossible` only
     // decides whether impossible points are an error, so it makes no other sweep.
-    let normal = |text: &str| Some(Sweep::read(text, SWEEP, &[], true).ok()?.text);
-    if existing == sweep.text || normal(&existing).is_some_and(|there| normal(&sweep.text) == Some(there)) {
+    let normal = |text: &str| Sweep::read(text, SWEEP, &[], true).map(|sweep| sweep.text);
+    if existing == sweep.text {
         return Ok(());
+    }
+    match normal(&existing) {
+        Ok(there) if normal(&sweep.text).is_ok_and(|here| here == there) => return Ok(()),
+        Ok(_) => {}
+        Err(error) => {
+            return refuse(format!("{} is damaged; restore it, or choose another --out\n{error}", path.escaped()));
+        }
     }
     let missing = |from: &str, other: &str, where_: &str| {
         let known: HashSet<&str> = other.lines().collect();

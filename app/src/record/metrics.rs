@@ -214,7 +214,8 @@ impl<R: BufRead> Rows<R> {
             Err(error @ RowsError::Read(_)) => return Err(error),
             Err(_) => None,
         };
-        let optional = optional.ok_or(RowsError::Wrong { line: 1, what: HEADER.into() })?;
+        let what = format!("{HEADER}, with columns test_g and stage if the config asks for them");
+        let optional = optional.ok_or(RowsError::Wrong { line: 1, what })?;
         // The digest must not depend on the column `stage`, so the header without it is hashed.
         let hash = Sha256::new_with_prefix(columns(optional.tested)).chain_update("\n");
         Ok(Rows { optional, hash, ..rows })

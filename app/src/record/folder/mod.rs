@@ -278,6 +278,10 @@ impl Folder {
     /// Removes a run and keeps all other files in the folder. During the removal, `run.json` has the state `Replacing`
     /// and the data of the new run.
     fn clear(&self, by: &Run, config: &Config, found: &mut Resumed) -> Result<(), RecordError> {
+        // If these cannot be removed, the run stays whole.
+        for name in [REPLAY, CURVES] {
+            ownership::remove_published(&self.disk, &self.file(name))?;
+        }
         self.write_run(&Run { state: Status::Replacing, ..by.clone() })?;
         self.sync()?;
         let checkpoints = self.file(CHECKPOINTS);
@@ -285,9 +289,6 @@ impl Folder {
         let old = generations.into_iter().map(|generation| checkpoint::path(&checkpoints, generation));
         for path in old.chain([METRICS, POLICIES].map(|name| self.file(name))) {
             self.disk.remove(&path).map_err(RecordError::write(&path))?;
-        }
-        for name in [CURVES, REPLAY] {
-            ownership::remove_published(&self.disk, &self.file(name))?;
         }
         // The config is replaced as a whole, because the new run may have been read from it.
         if self.config().ok().as_ref() != Some(config) {

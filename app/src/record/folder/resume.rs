@@ -43,6 +43,8 @@ impl Folder {
         if found.run.as_ref().is_some_and(|run| run.own_fitness) {
             return Err(RecordError::OwnFitness(self.path.clone()));
         }
+        // If the folder cannot be written, this fails before anything changes.
+        found.run.as_ref().map_or(Ok(()), |run| self.write_run(run))?;
         let mut kept = checkpoint::remove_temporary_files(&self.disk, &checkpoints)?;
         let origin_error = self.origin_error(config, found.run.as_ref(), before.is_some());
         let (is_other, had_checkpoints) = (origin_error.is_some(), !kept.is_empty());
