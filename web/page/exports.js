@@ -50,6 +50,8 @@ async function film(canvas, each) {
   views.forEach(view => { view.playing = false; });
   const last = Math.max(...views.map(end_of)), many = Math.max(1, Math.min(FRAMES, 2 * last));
   for (let frame = 0; frame <= many; frame++) {
+    const now = shown();
+    if (now.length !== views.length || now.some((view, index) => view !== views[index])) throw new Error("other maps are on show now. Save it again");
     for (const view of views) {
       view.place = Math.min(end_of(view), frame / many * last);
       draw(view);
@@ -100,9 +102,10 @@ export const save_webm = () => one_at_a_time(async () => {
   recorder.ondataavailable = ({ data }) => parts.push(data);
   const stopped = new Promise(done => { recorder.onstop = done; });
   recorder.start();
-  await film(canvas, (_, many) => new Promise(done => setTimeout(done, 1000 * pause_of(many))));
-  await new Promise(done => setTimeout(done, 400));
-  recorder.stop();
+  try {
+    await film(canvas, (_, many) => new Promise(done => setTimeout(done, 1000 * pause_of(many))));
+    await new Promise(done => setTimeout(done, 400));
+  } finally { recorder.stop(); }
   await stopped;
   save(`${base()}.webm`, new Blob(parts, { type: "video/webm" }), "video/webm");
 });
