@@ -1,15 +1,13 @@
 //! Comparison of two backends by traces, scores and breeding.
 
-use std::fmt;
-
 use super::{Backend, BackendError, Group, GroupScores, MOMENT_WORDS, Trace};
 use crate::config::Learning;
 use crate::evolve::{Breeding, Key, Purpose, UNCHANGED};
 use crate::world::World;
 
 /// The quantities of a step, in the order in which a step computes them.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Quantity {
+#[derive(Clone, Copy, Debug, PartialEq, PartialOrd)]
+enum Quantity {
     /// The inputs of a leader's policy.
     Sense,
     /// The outputs of a leader's policy.
@@ -26,55 +24,12 @@ pub enum Quantity {
     Influence,
 }
 
-impl fmt::Display for Quantity {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.pad(match self {
-            Quantity::Sense => "sense",
-            Quantity::Policy => "policy",
-            Quantity::Sight => "sight",
-            Quantity::Follow => "follow",
-            Quantity::Move => "move",
-            Quantity::Couple => "couple",
-            Quantity::Influence => "influence",
-        })
-    }
-}
-
-/// The first difference of a trace from the reference.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Mismatch {
-    /// The step, from 1; 0 is the start. For counts over an episode, the last step.
-    pub step: usize,
-    /// The index of the team in its group.
-    pub team: usize,
-    /// The quantity that differs.
-    pub stage: Quantity,
-    /// The number that differs: "agent 3, input 2".
-    pub place: String,
-    /// The bits of the reference.
-    pub expected: u32,
-    /// The bits of the other trace.
-    pub found: u32,
-}
-
-impl fmt::Display for Mismatch {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Mismatch { step, team, stage, place, expected, found } = self;
-        write!(f, "stage {stage}, team {team}, {place}, step {step}: expected {expected:#010x}")?;
-        if matches!(stage, Quantity::Sight | Quantity::Couple | Quantity::Influence) {
-            return write!(f, ", found {found:#010x}");
-        }
-        let (expected, value) = (f32::from_bits(*expected), f32::from_bits(*found));
-        write!(f, " ({expected:?}), found {found:#010x} ({value:?})")
-    }
-}
-
-/// Traces a group on two backends. Returns the first difference.
+/// Traces a group on two backends. Describes the first difference.
 pub(crate) fn compare_traces(
     group: &Group<'_>,
     reference: &mut dyn Backend,
     backend: &mut dyn Backend,
-) -> Result<Option<Mismatch>, BackendError> {
+) -> Result<Option<String>, BackendError> {
     let (expected, found) = (reference.trace(group)?, backend.trace(group)?);
     Ok(first_mismatch(group.world, &expected, &found))
 }
@@ -134,15 +89,23 @@ pub(crate) fn compare_breeding(
     }))
 }
 
-/// Returns the first difference of two traces of the same group: by step, then stage, then team.
-fn first_mismatch(world: &World, expected: &Trace, found: &Trace) -> Option<Mismatch> {
-    let mut first: Option<Mismatch> = None;
+/// Describes the first difference of two traces of the same group: by step, then stage, then team. Steps count from 1;
+/// step 0 is the start. Counts over an episode belong to its last step.
+fn first_mismatch(world: &World, expected: &Trace, found: &Trace) -> Option<String> {
+    let mut first: Option<((usize, Quantity, usize), String)> = None;
     // Compares two arrays. `locate` returns step, quantity, team and place of a number.
     let mut compare = |a: &[u32], b: &[u32], locate: &dyn Fn(usize) -> (usize, Quantity, usize, String)| {
         for (index, (&expected, &found)) in a.iter().zip(b).enumerate().filter(|(_, (a, b))| a != b) {
             let (step, stage, team, place) = locate(index);
-            if first.as_ref().is_none_or(|earlier| (step, stage, team) < (earlier.step, earlier.stage, earlier.team)) {
-                first = Some(Mismatch { step, team, stage, place, expected, found });
+            if first.as_ref().is_none_or(|(earlier, _)| (step, stage, team) < *earlier) {
+                let shown = |bits: u32| match stage {
+                    Quantity::Sight | Quantity::Couple | Quantity::Influence => format!("{bits:#010x}"),
+                    _ => format!("{bits:#010x} ({:?})", f32::from_bits(bits)),
+                };
+                let (name, expected, found) = (format!("{stage:?}").to_lowercase(), shown(expected), shown(found));
+                let text =
+                    format!("stage {name}, team {team}, {place}, step {step}: expected {expected}, found {found}");
+                first = Some(((step, stage, team), text));
             }
         }
     };
@@ -178,7 +141,7 @@ fn first_mismatch(world: &World, expected: &Trace, found: &Trace) -> Option<Mism
         let place = format!("follower {}, leader {}", pair / leaders, pair % leaders);
         (world.steps(), Quantity::Influence, team, place)
     });
-    first
+    first.map(|(_, text)| text)
 }
 
 /// The quantity and the name of each word of a [`Moment`](super::Moment).
