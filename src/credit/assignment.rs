@@ -94,20 +94,9 @@ fn choose(by: LedBy, seen: u32, leaders: usize) -> u32 {
     match by {
         LedBy::AnySeen => seen,
         LedBy::MostSeen | LedBy::First => seen & seen.wrapping_neg(),
-        LedBy::Alone => {
-            if seen.count_ones() == 1 {
-                seen
-            } else {
-                0
-            }
-        }
-        LedBy::Anyone => {
-            if seen == 0 {
-                0
-            } else {
-                u32::MAX >> (32 - leaders)
-            }
-        }
+        LedBy::Alone if seen.count_ones() == 1 => seen,
+        LedBy::Anyone if seen != 0 => u32::MAX >> (32 - leaders),
+        LedBy::Alone | LedBy::Anyone => 0,
     }
 }
 
