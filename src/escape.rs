@@ -3,7 +3,6 @@
 //! Pictures and pages escape for themselves, tables by the `csv` crate.
 
 use std::borrow::Cow;
-use std::fmt::{self, Display};
 use std::path::Path;
 
 /// Returns whether a character can end the line, control a terminal or reverse the text direction.
@@ -24,25 +23,13 @@ pub fn lines(text: &str) -> Cow<'_, str> {
 /// Paths as text in which different paths look different.
 pub trait PathExt {
     /// Returns the path as text, with every byte that is not UTF-8 as `\xff`.
-    fn escaped(&self) -> EscapedPath<'_>;
+    fn escaped(&self) -> String;
 }
 
 impl PathExt for Path {
-    fn escaped(&self) -> EscapedPath<'_> {
-        EscapedPath(self)
-    }
-}
-
-/// A path that is written as [`PathExt::escaped`] says.
-pub struct EscapedPath<'a>(&'a Path);
-
-impl Display for EscapedPath<'_> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        for chunk in self.0.as_os_str().as_encoded_bytes().utf8_chunks() {
-            f.write_str(chunk.valid())?;
-            chunk.invalid().iter().try_for_each(|byte| write!(f, "\\x{byte:02x}"))?;
-        }
-        Ok(())
+    fn escaped(&self) -> String {
+        let chunks = self.as_os_str().as_encoded_bytes().utf8_chunks();
+        chunks.map(|chunk| format!("{}{}", chunk.valid(), chunk.invalid().escape_ascii())).collect()
     }
 }
 
@@ -89,7 +76,7 @@ mod tests {
     fn different_paths_look_different() {
         use std::ffi::OsStr;
         use std::os::unix::ffi::OsStrExt;
-        let text = |bytes: &[u8]| Path::new(OsStr::from_bytes(bytes)).escaped().to_string();
+        let text = |bytes: &[u8]| Path::new(OsStr::from_bytes(bytes)).escaped();
         assert_eq!(text(b"a\xff/\xfeb"), r"a\xff/\xfeb");
         assert_eq!(text("Zürich".as_bytes()), "Zürich");
     }

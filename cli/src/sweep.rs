@@ -227,7 +227,7 @@ pub fn run(mut args: Args) -> Result<(), Error> {
         let command = args.command(&out, &["--collect"]);
         return match args.json {
             true => print_json(&json!({
-                "folder": out.escaped().to_string(),
+                "folder": out.escaped(),
                 "sweep": sweep.name,
                 "shard": shard.to_string(),
                 "collect": command,

@@ -27,7 +27,7 @@ pub fn is_standard_input(path: &Path) -> bool {
 
 /// Returns the name of a config or sweep file in errors.
 pub fn name(path: &Path) -> String {
-    if is_standard_input(path) { "standard input".into() } else { path.escaped().to_string() }
+    if is_standard_input(path) { "standard input".into() } else { path.escaped() }
 }
 
 /// Reads the text of a config or sweep file, or of standard input if the path is `-`.

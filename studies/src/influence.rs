@@ -97,7 +97,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     context.pause();
     let table = table(&layouts);
     write(&disk, out.join(BASELINES), table.as_bytes())?;
-    Ok(Outcome { folder: out.escaped().to_string(), layouts, text: table })
+    Ok(Outcome { folder: out.escaped(), layouts, text: table })
 }
 
 fn csv_name(layout: &str, ending: &str) -> String {

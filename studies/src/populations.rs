@@ -197,7 +197,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     }
     picture(&found).scene().publish(&disk, out, PICTURE)?;
     Ok(Outcome {
-        folder: out.escaped().to_string(),
+        folder: out.escaped(),
         trials: learning.trials,
         population: learning.population,
         text: csv(&pairs.iter().filter(|row| row.measure == MEASURES[0]).cloned().collect::<Vec<_>>()),

@@ -243,7 +243,7 @@ impl ConfigText {
 
 /// Serialises a path as in messages, with control characters escaped.
 fn escaped<S: serde::Serializer>(path: &Path, serializer: S) -> Result<S::Ok, S::Error> {
-    serializer.collect_str(&path.escaped())
+    serializer.serialize_str(&path.escaped())
 }
 
 /// Refuses configs that need more memory than there is, each alone.

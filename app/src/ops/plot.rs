@@ -64,7 +64,7 @@ pub fn run(request: &PlotRequest, context: Context<'_>) -> Result<PlotOutcome, E
             "note: these runs have one seed, so their trials are pairs; `flotilla compare RUN … --paired` compares them pair by pair",
         );
     }
-    let named = runs.iter().map(|run| run.escaped().to_string()).collect();
+    let named = runs.iter().map(|run| run.escaped()).collect();
     Ok(PlotOutcome { out: out.into(), runs: named, unverified: request.unverified })
 }
 

@@ -195,7 +195,7 @@ pub fn run(
     let Played { config, episodes: played } = play(folder, trial, &generations, team, verification, backends, context)?;
 
     let name = folder.canonicalize().ok().and_then(|path| Some(path.file_name()?.to_string_lossy().into_owned()));
-    let name = name.unwrap_or_else(|| folder.escaped().to_string());
+    let name = name.unwrap_or_else(|| folder.escaped());
     let motion = Film { width, fps: fps.unwrap_or(FPS) };
     let frames = || replay::Frames::new(&config, &played, motion);
     let watch = |number: usize, count: usize| {

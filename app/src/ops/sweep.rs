@@ -212,7 +212,7 @@ pub fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
     }
     let refuse = |message: String| {
         let problems = vec![Problem { line: None, key: String::new(), message }];
-        Err(ConfigError::Invalid { name: path.escaped().to_string(), problems, unlisted: 0 }.into())
+        Err(ConfigError::Invalid { name: path.escaped(), problems, unlisted: 0 }.into())
     };
     if !runs::exists(&path)? {
         let holds = match runs::exists(&out.join(CONFIG))? {
@@ -520,10 +520,10 @@ fn write_results(
     }
     text.extend(note.map(|note| note + "\n"));
     text += &if unverified { format!("{UNVERIFIED}\n") } else { String::new() };
-    let path = |name: &str| out.join(name).escaped().to_string();
+    let path = |name: &str| out.join(name).escaped();
     let point = |((point, outcome), folder): ((&Point, &Result<PointResults, Missing>), &PathBuf)| PointOutcome {
         point: point.index,
-        folder: folder.escaped().to_string(),
+        folder: folder.escaped(),
         values: (sweep.axes.iter().zip(&point.values))
             .map(|(axis, &value)| (axis.key.clone(), serde_json::json!(axis.values[value])))
             .collect(),
@@ -541,7 +541,7 @@ fn write_results(
         described: sweep.describe(point),
     };
     Ok(SweepOutcome {
-        folder: out.escaped().to_string(),
+        folder: out.escaped(),
         sweep: sweep.name.clone(),
         reach,
         unverified,

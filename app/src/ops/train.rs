@@ -233,7 +233,7 @@ pub fn run(
         notes,
         first: GenerationScores::of(&results.rows.first),
         last: GenerationScores::of(&results.rows.last),
-        files: FILES.into_iter().map(|(name, file)| (name, folder.join(file).escaped().to_string())).collect(),
+        files: FILES.into_iter().map(|(name, file)| (name, folder.join(file).escaped())).collect(),
         processor: ProcessorInfo::of_run(session.run(0)),
         rows: results.rows.clone(),
         teams: config.max_teams() - 1,

@@ -60,7 +60,7 @@ impl Cohort {
     /// Returns the arm's name and its directories, for messages.
     fn described(&self) -> String {
         const MAX_NAMED_FOLDERS: usize = 3;
-        let folders: Vec<String> = self.folders.iter().map(|folder| folder.escaped().to_string()).collect();
+        let folders: Vec<String> = self.folders.iter().map(|folder| folder.escaped()).collect();
         match folders.len().checked_sub(MAX_NAMED_FOLDERS) {
             _ if folders == [&*self.name] || self.name.ends_with(&format!("({})", folders.concat())) => {
                 self.name.clone()
@@ -341,7 +341,7 @@ pub fn compare(place: &str, arms: &[Cohort], options: &Question) -> Result<Compa
     }
     let named = |arm: &Cohort| Named {
         name: arm.name.clone(),
-        folders: arm.folders.iter().map(|folder| folder.escaped().to_string()).collect(),
+        folders: arm.folders.iter().map(|folder| folder.escaped()).collect(),
         trials: arm.trials.len(),
     };
     Ok(Comparison { place: place.into(), generation: last, arms: arms.iter().map(named).collect(), measures, notes })

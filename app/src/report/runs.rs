@@ -249,13 +249,13 @@ pub fn labels(folders: &[PathBuf], configs: &[Config]) -> Vec<String> {
             Some(value.trim_matches('"')).filter(|value| value.len() <= 24).map(|value| format!("{leaf} {value}"))
         };
         let parts: Vec<String> = keys.iter().filter_map(part).chain(Some(stages).filter(|_| staged)).collect();
-        if (1..=MOST_KEYS).contains(&parts.len()) { parts.join(", ") } else { folder.escaped().to_string() }
+        if (1..=MOST_KEYS).contains(&parts.len()) { parts.join(", ") } else { folder.escaped() }
     };
     let labels: Vec<String> = folders.iter().zip(&tables).zip(configs).map(label).collect();
     // Equal labels mean that only a long value differs. Such labels also get the directory.
     let twice = |label: &String| labels.iter().filter(|other| *other == label).count() > 1;
     let full = |(label, folder): (&String, &PathBuf)| {
-        let name = folder.escaped().to_string();
+        let name = folder.escaped();
         if twice(label) && *label != name { format!("{label} ({name})") } else { label.clone() }
     };
     labels.iter().zip(folders).map(full).collect()

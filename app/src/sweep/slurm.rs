@@ -37,7 +37,7 @@ impl Job<'_> {
         let words = self.command.iter().map(OsString::as_os_str).chain(options).chain([OsStr::new(self.time)]);
         let is_plain = |word: &OsStr| word.to_str().is_some_and(|word| !word.contains(escape::is_control));
         if let Some(word) = words.into_iter().find(|word| !is_plain(word)) {
-            let word = Path::new(word).escaped().to_string();
+            let word = Path::new(word).escaped();
             let word = escape::line(&word);
             return Err(format!("a batch script cannot hold '{word}'; choose names in UTF-8, without line breaks"));
         }
@@ -45,7 +45,7 @@ impl Job<'_> {
         let name: String =
             name.chars().map(|c| if c.is_ascii_alphanumeric() || "-_.".contains(c) { c } else { '-' }).collect();
         let command = shell::command(command);
-        let out = out.escaped().to_string();
+        let out = out.escaped();
         if out.contains('\\') {
             return Err(format!(
                 "{out}: Slurm cannot number logs in a folder whose name has a backslash; choose another --out"

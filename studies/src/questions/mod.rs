@@ -222,7 +222,7 @@ impl Study {
         let mut named = Vec::new();
         let mut weights = Vec::new();
         for (name, folder) in arms {
-            named.push(Named { name: name.clone(), folders: vec![folder.escaped().to_string()], trials });
+            named.push(Named { name: name.clone(), folders: vec![folder.escaped()], trials });
             weights.push(champions(&folder.join(POLICIES), config)?);
         }
         named.push(Named { name: "best constant speed".into(), folders: vec![], trials });

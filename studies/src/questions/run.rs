@@ -111,11 +111,11 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         comparisons: answers.iter().flat_map(Answer::comparisons).cloned().collect(),
     };
     Ok(Outcome {
-        folder: out.escaped().to_string(),
+        folder: out.escaped(),
         seed: first.seed,
         trials: first.trials,
         questions: answers.iter().map(of).collect(),
-        page: out.join(PAGE).escaped().to_string(),
+        page: out.join(PAGE).escaped(),
         text: page,
     })
 }

@@ -215,7 +215,7 @@ pub(crate) fn extreme_trials(
     let g = all.iter().map(|trial| g_of(trial, generation, which)).collect::<Option<Vec<f64>>>();
     let Some(g) = g else {
         let trial = all.iter().position(|trial| trial.len() <= generation).unwrap_or(0);
-        let (folder, newest) = (folder.escaped().to_string(), all[trial].len().checked_sub(1));
+        let (folder, newest) = (folder.escaped(), all[trial].len().checked_sub(1));
         return Err(ReplayError::NoGeneration { folder, trial, generation, newest });
     };
     let first = |better: fn(f64, f64) -> bool| (0..g.len()).reduce(|a, b| if better(g[b], g[a]) { b } else { a });
@@ -237,7 +237,7 @@ pub fn replay(
     backend: &mut dyn Backend,
     watch: &mut dyn FnMut(usize) -> bool,
 ) -> Result<Vec<Replayed>, ReplayError> {
-    let name = || folder.escaped().to_string();
+    let name = || folder.escaped();
     let config = runs::config(folder, verification)?.validate().map_err(BackendError::from)?;
     let trials = config.learning.trials;
     if trial >= trials {

@@ -131,7 +131,7 @@ impl ExperimentOutcome {
             |trials: &[Vec<f64>]| trials.iter().filter_map(|trial| trial.last()).sum::<f64>() / trials.len() as f64;
         ExperimentOutcome {
             name: folder_name(experiment),
-            folder: folder.escaped().to_string(),
+            folder: folder.escaped(),
             layout: experiment.layout.name,
             paradigm: experiment.paradigm,
             actions: experiment.config.policy.actions,
@@ -259,9 +259,9 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let digest = |index: usize| session.results(experiments.config_of[index]).map(|results| results.digest.clone());
     let outcome =
         |index: usize| ExperimentOutcome::of(&experiments.all[index], &experiments.folders[index], digest(index));
-    let path = |name: &str| out.join(name).escaped().to_string();
+    let path = |name: &str| out.join(name).escaped();
     Ok(Outcome {
-        folder: out.escaped().to_string(),
+        folder: out.escaped(),
         seed: learning.seed,
         trials: learning.trials,
         generations: learning.generations,
