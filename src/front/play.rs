@@ -9,6 +9,7 @@ use crate::backend::{Backend, Group, GroupScores};
 use crate::config::{Config, Fitness, MAX_POPULATION};
 use crate::evaluate::{self, Evaluation, MAX_EPISODES, Starts};
 use crate::evolve::{self, Key, Purpose};
+use crate::memory;
 use crate::stepping::{Recording, Stepper};
 use crate::world::{OUTPUTS, World};
 
@@ -171,8 +172,7 @@ pub fn trace(
     let (states, inputs) = (teams * (world.steps() + 1) * world.agents(), teams * world.steps() * world.leaders());
     let words = states * 5 + inputs * (world.inputs() + OUTPUTS) + teams * world.set_words();
     let bytes = words as u128 * 4;
-    let fits = usize::try_from(bytes).is_ok_and(|bytes| Vec::<u8>::new().try_reserve_exact(bytes).is_ok());
-    if !fits {
+    if !memory::can_allocate(bytes) {
         return Err(Failure::Memory { what: "all steps of all teams", bytes });
     }
     let mut traced = Traced {
@@ -233,7 +233,7 @@ impl<'a> CheckedTeams<'a> {
         };
         // Each leader of a team needs an entry of `teams` and several scores.
         let bytes = teams as u128 * leaders as u128 * 28;
-        if !usize::try_from(bytes).is_ok_and(|bytes| Vec::<u8>::new().try_reserve_exact(bytes).is_ok()) {
+        if !memory::can_allocate(bytes) {
             return Err(Failure::Memory { what: "all teams", bytes });
         }
         let mut weights = Cow::Borrowed(weights);

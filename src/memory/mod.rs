@@ -217,6 +217,11 @@ pub fn check_rollout(world: &World, fitnesses: &[Fitness], threads: usize, trace
     check(traces.saturating_add(threads as u64 * block), 0)
 }
 
+/// Reports whether so many bytes can be allocated now. An allocation that fails later would abort the process.
+pub fn can_allocate(bytes: u128) -> bool {
+    usize::try_from(bytes).is_ok_and(|bytes| Vec::<u8>::new().try_reserve_exact(bytes).is_ok())
+}
+
 /// Reports whether a checkpoint of these configs is copied and written while training continues. Larger checkpoints are
 /// written directly from the populations, and training waits.
 pub fn copies_checkpoint<'a>(configs: impl IntoIterator<Item = &'a Config>) -> bool {

@@ -27,6 +27,7 @@ use crate::backend::cpu::block_bytes;
 use crate::backend::grid::{LARGE_FROM, is_large};
 use crate::config::{Fitness, MAX_POPULATION};
 use crate::credit::{Credit, Scores};
+use crate::memory;
 use crate::parallel::*;
 use crate::world::{GRID, OUTPUTS, World, on_grid};
 
@@ -143,8 +144,9 @@ impl Stepper {
         };
         let numbers = state + trail + leaders * world.inputs() + agents * 5 + pois * (words + 1) + 1;
         let bytes = numbers as u128 * 4 * teams as u128;
-        let probe = usize::try_from(bytes).ok().and_then(|bytes| Vec::<u8>::new().try_reserve_exact(bytes).ok());
-        probe.ok_or(StepError::Memory { teams, bytes })?;
+        if !memory::can_allocate(bytes) {
+            return Err(StepError::Memory { teams, bytes });
+        }
         let vectors = dispatch!(level, simd => if is_large {
             large_teams(simd, &world, teams, recording)
         } else {

@@ -13,6 +13,7 @@ use crate::record::policies::{Init, Policies};
 use flotilla::backend::{BackendError, Machine, OpenBackend};
 use flotilla::config::{Config, ValidConfig};
 use flotilla::host::Instant;
+use flotilla::memory;
 use flotilla::trainer::{Row, Trainer};
 
 /// Interval at which runs pass their metrics to the system.
@@ -64,11 +65,11 @@ impl Session {
         start: Start,
         disk: &Disk,
     ) -> Result<(Session, Vec<(usize, Note)>), RunError> {
-        // This generation and the next one. A failed allocation is an error here, but would abort the process later.
+        // This generation and the next one.
         let bytes = 2 * runs.iter().map(|(config, ..)| config.policy_bytes()).sum::<u64>();
-        Vec::<u8>::new()
-            .try_reserve_exact(bytes.try_into().unwrap_or(usize::MAX))
-            .map_err(|_| RunError::Memory { what: "twice the policies of all trials", bytes })?;
+        if !memory::can_allocate(bytes.into()) {
+            return Err(RunError::Memory { what: "twice the policies of all trials", bytes });
+        }
         // All configs and folders are checked before any folder is changed.
         let configs = runs.iter().map(|(config, ..)| config.validate()).collect::<Result<Vec<ValidConfig>, _>>()?;
         folder::check(disk, runs.iter().map(|(config, path, _)| (&**path, config)), start)?;
