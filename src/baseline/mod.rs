@@ -123,20 +123,15 @@ pub struct Baselines {
 enum Team {
     /// A constant, by its index.
     Constant(usize),
-    /// A random constant action, by its generation and slot.
-    Action(usize, usize),
-    /// A random network, by its generation and slot.
-    Network(usize, usize),
-    /// A random network that all leaders share, by its generation and slot.
-    Shared(usize, usize),
+    /// A random team, by its kind, generation and slot.
+    Random(Purpose, usize, usize),
     /// The team of networks that hill climbing found.
     Climbed,
 }
 
-/// Creates a random team from its generation and slot.
-type MakeTeam = fn(usize, usize) -> Team;
-/// The kinds of random teams, in the order in which they play.
-const RANDOM: [MakeTeam; 3] = [Team::Action, Team::Network, Team::Shared];
+/// The kinds of random teams, in the order in which they play: constant actions, networks, and networks that all leaders
+/// share.
+const RANDOM: [Purpose; 3] = [Purpose::ConstantActions, Purpose::Baseline, Purpose::SharedBaseline];
 
 /// One config and its trials.
 struct Setting {
@@ -430,26 +425,21 @@ impl Setting {
         let (constants, teams) = (self.played_constants(generation), self.config.learning.team_count());
         match place.checked_sub(constants) {
             None => Team::Constant(place),
-            Some(slot) => RANDOM[slot / teams](generation, slot % teams),
+            Some(slot) => Team::Random(RANDOM[slot / teams], generation, slot % teams),
         }
     }
 
     /// Writes a team's policy for one population.
     fn write_policy(&self, level: Level, trial: &Trial, team: Team, population: usize, policy: &mut [f32]) {
-        let key = |purpose| Key::new(self.config.learning.seed, trial.index, purpose);
         match team {
             Team::Constant(index) => constant_policy(&self.constants[index], policy),
-            Team::Action(generation, slot) => {
-                let key = key(Purpose::ConstantActions).at(generation, population, slot);
-                random_action(key, self.config.policy.actions.outputs(), policy);
-            }
-            Team::Network(generation, slot) => {
-                let key = key(Purpose::Baseline).at(generation, population, slot);
-                evolve::initial_policy(level, key, &self.config.learning, policy);
-            }
-            Team::Shared(generation, slot) => {
-                let key = key(Purpose::SharedBaseline).at(generation, 0, slot);
-                evolve::initial_policy(level, key, &self.config.learning, policy);
+            Team::Random(kind, generation, slot) => {
+                let population = if kind == Purpose::SharedBaseline { 0 } else { population };
+                let key = Key::new(self.config.learning.seed, trial.index, kind).at(generation, population, slot);
+                match kind {
+                    Purpose::ConstantActions => random_action(key, self.config.policy.actions.outputs(), policy),
+                    _ => evolve::initial_policy(level, key, &self.config.learning, policy),
+                }
             }
             Team::Climbed => {
                 trial.climbers.iter().for_each(|climbers| climbers.networks.write_policy(population, policy));
@@ -513,13 +503,13 @@ impl Setting {
             }
             let kinds =
                 random.chunks_exact(self.config.learning.team_count()).zip([actions, networks, shared]).zip(RANDOM);
-            for (((observed, best), team), finalists) in kinds.zip(&mut trial.finalists) {
+            for (((observed, best), kind), finalists) in kinds.zip(&mut trial.finalists) {
                 let best = &mut best[place];
                 for (slot, &observed) in observed.iter().enumerate() {
                     // Ties go to the team that was drawn first.
                     let rank = finalists.partition_point(|(other, _)| *other >= observed);
                     if rank < FINALISTS {
-                        finalists.insert(rank, (observed, team(generation, slot)));
+                        finalists.insert(rank, (observed, Team::Random(kind, generation, slot)));
                         finalists.truncate(FINALISTS);
                     }
                 }
