@@ -121,7 +121,7 @@ pub struct Config {
 impl Serialize for Config {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let mut map = serializer.serialize_map(None)?;
-        self.sections().iter().try_for_each(|(section, keys)| map.serialize_entry(section, &keys))?;
+        self.sections().0.iter().try_for_each(|(section, keys)| map.serialize_entry(section, keys))?;
         if !self.agents.is_empty() {
             map.serialize_entry(AGENTS, &self.agents)?;
         }
@@ -135,28 +135,13 @@ impl Serialize for Config {
     }
 }
 
-/// The sections of a config, from the value of each dotted key.
-struct Sections(Vec<(&'static str, Value<'static>)>);
+/// A map in the order of its entries. A dotted key is written as its last part.
+struct Map<V>(Vec<(&'static str, V)>);
 
-/// The keys of one of these sections.
-struct Keys<'v>(&'v [(&'static str, Value<'static>)]);
-
-impl Sections {
-    fn iter(&self) -> impl Iterator<Item = (&'static str, Keys<'_>)> {
-        let sections = self.0.chunk_by(|(one, _), (other, _)| section_of(one) == section_of(other));
-        sections.map(|keys| (section_of(keys[0].0), Keys(keys)))
-    }
-}
-
-impl Serialize for Sections {
+impl<V: Serialize> Serialize for Map<V> {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.collect_map(self.iter())
-    }
-}
-
-impl Serialize for Keys<'_> {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.collect_map(self.0.iter().map(|(key, value)| (&key[section_of(key).len() + 1..], value)))
+        let name = |key: &'static str| key.rsplit_once('.').map_or(key, |(_, name)| name);
+        serializer.collect_map(self.0.iter().map(|(key, value)| (name(key), value)))
     }
 }
 
@@ -218,19 +203,23 @@ impl Config {
         Ok(resolve(OWN_NAME, overrides, || Ok(Reader::of_values(self.values())), stages)?.0)
     }
 
-    /// Returns the values of the sections, without the keys that tables replace.
-    fn sections(&self) -> Sections {
+    /// Returns the sections with the value of each dotted key, without the keys that tables replace.
+    fn sections(&self) -> Map<Map<Value<'static>>> {
         let Config { world, motion, follow, sense, policy, learning, credit, checkpoint, .. } = self;
         let sections = [world.values(), motion.values(), follow.values(), sense.values(), policy.values()];
-        let values = sections.into_iter().chain([learning.values(), credit.values(), checkpoint.values()]).flatten();
-        Sections(values.filter(|(key, _)| self.is_written(key)).collect())
+        let sections = sections.into_iter().chain([learning.values(), credit.values(), checkpoint.values()]);
+        let written = sections.filter_map(|mut values| {
+            values.retain(|(key, _)| self.is_written(key));
+            Some((section_of(values.first()?.0), Map(values)))
+        });
+        Map(written.collect())
     }
 
     /// Returns the value of each dotted key and of the lists of tables, without the stages.
     fn values(&self) -> impl Iterator<Item = (&'static str, Value<'static>)> {
         let agents = (!self.agents.is_empty()).then(|| (AGENTS, Value::of(&self.agents)));
         let pois = (!self.pois.is_empty()).then(|| (POIS, Value::of(&self.pois)));
-        self.sections().0.into_iter().chain(agents).chain(pois)
+        self.sections().0.into_iter().flat_map(|(_, values)| values.0).chain(agents).chain(pois)
     }
 
     /// Returns the text of a config file for this config, with every key written out.
