@@ -3,7 +3,6 @@
 use std::collections::HashSet;
 use std::fmt::Write;
 
-use super::exact;
 use super::shape::{Capacity, ClassKind, MAX_THREADS, ROLE, Recorded, Shape, Sizes, Uses, WIDTHS, WORKGROUPS};
 use crate::backend::grid::LARGE_FROM;
 use crate::backend::{MOMENT_WORDS, VECTOR};
@@ -239,19 +238,21 @@ impl Pipeline {
         match self {
             Pipeline::Probe => include_str!("../../../shaders/probe.wgsl").into(),
             Pipeline::Ceiling => include_str!("../../../shaders/ceiling.wgsl").into(),
-            Pipeline::Breed | Pipeline::Gather => exact::assemble(&[
-                &gpu_constants!(WORKGROUP = POPULATION_WORKGROUP, TILE, UNCHANGED, MIN_WEIGHT, MAX_WEIGHT),
+            Pipeline::Breed | Pipeline::Gather => [
+                &*gpu_constants!(WORKGROUP = POPULATION_WORKGROUP, TILE, UNCHANGED, MIN_WEIGHT, MAX_WEIGHT),
                 &[BreedJob::wgsl(), GatherJob::wgsl()].concat(),
                 include_str!("../../../shaders/lib/math.wgsl"),
                 include_str!("../../../shaders/population.wgsl"),
-            ]),
-            Pipeline::Count => exact::assemble(&[
-                &declarations(),
+            ]
+            .join("\n"),
+            Pipeline::Count => [
+                &*declarations(),
                 RECORD_WORD,
                 &gpu_constants!(WORKGROUP = COUNT_WORKGROUP, MAX_COPIES, COPIES_SHIFT, LEADER, GROUP, COPIES),
                 include_str!("../../../shaders/lib/layout.wgsl"),
                 include_str!("../../../shaders/count.wgsl"),
-            ]),
+            ]
+            .join("\n"),
             Pipeline::Episode(shape) | Pipeline::Swarm(_, shape) => episode(shape),
         }
     }
@@ -337,7 +338,7 @@ fn episode(shape: Shape) -> String {
         false => (RECORD_WORD, include_str!("../../../shaders/episode.wgsl")),
     };
     let parts = [&*constants, &front, &own, &structs, word].into_iter().chain(libraries).chain(model::WGSL);
-    exact::assemble(&parts.chain([include_str!("../../../shaders/agent.wgsl"), driver]).collect::<Vec<_>>())
+    parts.chain([include_str!("../../../shaders/agent.wgsl"), driver]).collect::<Vec<_>>().join("\n")
 }
 
 /// Returns a function that returns an expression.

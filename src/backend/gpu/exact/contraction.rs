@@ -44,7 +44,7 @@ pub fn emit(module: &Module, info: &ModuleInfo, checked: bool) -> Result<Vec<u32
         emit_int_div_checks: checked,
         ..Default::default()
     };
-    Ok(spv::write_vec(module, info, &options, None)?)
+    spv::write_vec(module, info, &options, None).map_err(|error| ShaderError::Other(format!("no SPIR-V: {error}")))
 }
 
 /// The SPIR-V opcodes that the decorating pass needs (SPIR-V 1.6, Sections 3.20 and 3.49).

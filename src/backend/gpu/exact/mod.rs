@@ -19,7 +19,6 @@ mod operations;
 
 use std::borrow::Cow;
 
-use naga::back::spv;
 use naga::valid::{Capabilities, ModuleInfo, ValidationFlags, Validator};
 use naga::{AddressSpace, Module};
 
@@ -45,9 +44,6 @@ config_enum! {
 /// Why a shader could not be compiled.
 #[derive(Debug, thiserror::Error)]
 pub enum ShaderError {
-    /// The text is not WGSL; naga's message.
-    #[error("does not parse:\n{0}")]
-    Parse(String),
     /// naga's validation fails; its message.
     #[error("is not valid: {0}")]
     Invalid(String),
@@ -57,24 +53,9 @@ pub enum ShaderError {
     /// It uses the guard's binding.
     #[error("binds group 0 binding 0, which is the guard's")]
     GuardTaken,
-    /// It exceeds a limit of the device.
-    #[error("needs {what} {needed}, the device allows {allowed}")]
-    Limit {
-        /// The name of the limit.
-        what: &'static str,
-        /// The shader's need.
-        needed: u64,
-        /// The limit.
-        allowed: u64,
-    },
-    /// naga cannot write it as SPIR-V.
-    #[error("no SPIR-V: {0}")]
-    Spirv(#[from] spv::Error),
-}
-
-/// Joins the parts of a shader's text, in order.
-pub fn assemble(parts: &[&str]) -> String {
-    parts.join("\n")
+    /// It does not parse, has no SPIR-V, or exceeds a limit of the device.
+    #[error("{0}")]
+    Other(String),
 }
 
 /// Parses and validates a shader. The capabilities are those of plain WebGPU (no f16, f64, subgroups).
@@ -82,7 +63,8 @@ pub fn assemble(parts: &[&str]) -> String {
 /// # Errors
 /// It does not parse, or is not valid.
 pub fn parse(wgsl: &str) -> Result<(Module, ModuleInfo), ShaderError> {
-    let module = naga::front::wgsl::parse_str(wgsl).map_err(|error| ShaderError::Parse(error.emit_to_string(wgsl)))?;
+    let module = naga::front::wgsl::parse_str(wgsl)
+        .map_err(|error| ShaderError::Other(format!("does not parse:\n{}", error.emit_to_string(wgsl))))?;
     let info = validate(&module).map_err(|error| ShaderError::Invalid(error.emit_to_string(wgsl)))?;
     Ok((module, info))
 }
@@ -97,7 +79,7 @@ fn validate(module: &Module) -> Result<ModuleInfo, Box<Invalid>> {
 fn check_limits(module: &Module, limits: &wgpu::Limits) -> Result<(), ShaderError> {
     let within = |what, needed: u64, allowed: u32| match needed <= allowed.into() {
         true => Ok(()),
-        false => Err(ShaderError::Limit { what, needed, allowed: allowed.into() }),
+        false => Err(ShaderError::Other(format!("needs {what} {needed}, the device allows {allowed}"))),
     };
     for entry in &module.entry_points {
         let [x, y, z] = entry.workgroup_size.map(u64::from);
