@@ -13,6 +13,7 @@ use crate::backend::{Backend, BackendError, Group, Weights};
 use crate::config::{Config, Fitness, Learning};
 use crate::config_enum::Choice;
 use crate::evolve::aligned_teams;
+use crate::kernels::math;
 use crate::model::sense::Density;
 use crate::sample;
 use crate::world::World;
@@ -193,22 +194,11 @@ fn training(executor: &Executor) -> Result<Option<String>, BackendError> {
 /// Returns reproducible values on which rounding shows: zeros, equal pairs, small integers, sums that nearly cancel,
 /// and full mantissas over 2^-12 to 2^12. No intermediate value is below 2^-100 other than 0.
 fn values() -> Vec<f32> {
-    let mut state = 0u64;
-    let mut next = || {
-        // splitmix64
-        state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut word = state;
-        word = (word ^ (word >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        word = (word ^ (word >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        word ^ (word >> 31)
-    };
     let mut values = Vec::with_capacity(ITEMS * 4);
     for item in 0..ITEMS {
-        let mut group: [f32; 4] = std::array::from_fn(|_| {
-            let word = next();
-            let exponent = 127 - 12 + (word >> 32) as u32 % 24;
-            let sign = (word >> 63) as u32;
-            f32::from_bits(sign << 31 | exponent << 23 | word as u32 & 0x7f_ffff)
+        let mut group = math::pcg4d_scalar([item as u32, 0, 0, 0]).map(|word| {
+            let exponent = 127 - 12 + (word >> 23 & 0xff) % 24;
+            f32::from_bits(word & 0x807f_ffff | exponent << 23)
         });
         match item % 8 {
             0 => group[item / 8 % 4] = 0.0,
