@@ -291,6 +291,8 @@ pub fn any_world(seed: u64) -> Config {
 /// values, radii, observers, windows and orders.
 pub fn classes_world(seed: u64) -> Config {
     let mut config = plain_world(seed);
+    // Keys that are not drawn below are those of the short form.
+    let short = config.classes();
     let rng = &mut ChaCha8Rng::seed_from_u64(seed ^ 0x636c_6173);
     let starts = [&config.world.leaders[..], &config.world.followers].concat();
     let classes = rng.random_range(1..=starts.len().min(5));
@@ -311,18 +313,12 @@ pub fn classes_world(seed: u64) -> Config {
         ],
     };
     let is_behaviours = config.policy.actions == Actions::Behaviours;
-    let controls: Vec<Control> = (0..classes)
-        .map(|class| match class < learning {
-            true => Control::Policy,
-            false => {
-                if rng.random_bool(0.8) {
-                    Control::Follow
-                } else {
-                    Control::Still
-                }
-            }
-        })
-        .collect();
+    let control = |class: usize| match class < learning {
+        true => Control::Policy,
+        false if rng.random_bool(0.8) => Control::Follow,
+        false => Control::Still,
+    };
+    let controls: Vec<Control> = (0..classes).map(control).collect();
     let parts = split(rng, &starts, classes);
     let class = |(index, at): (usize, Vec<[f64; 2]>)| {
         let control = &controls[index];
@@ -387,15 +383,10 @@ pub fn classes_world(seed: u64) -> Config {
         AgentClass {
             name: names[index].clone(),
             at,
-            count: None,
-            region: None,
             heading,
             speed: if rng.random_bool(0.5) { slow } else { fast },
             control: control.clone(),
-            reach: None,
             motion,
-            stays_in: None,
-            moves_near: None,
             senses,
             rule,
             wall_radius: if rng.random_bool(0.3) { 0.0 } else { lengths.draw(rng) },
@@ -403,7 +394,7 @@ pub fn classes_world(seed: u64) -> Config {
             leads,
             influence_radius,
             observes: rng.random_bool(0.8),
-            fitness: None,
+            ..short.agents[0].clone()
         }
     };
     let mut agents: Vec<AgentClass> = parts.into_iter().enumerate().map(class).collect();
@@ -445,19 +436,15 @@ pub fn classes_world(seed: u64) -> Config {
         let before = order[..place].iter().filter(|_| rng.random_bool(0.3));
         let after = before.map(|&other| group_names[other].clone()).collect();
         PoiGroup {
-            count: None,
-            region: None,
             name: group_names[index].clone(),
             value: [1.0, 0.5, 3.0][rng.random_range(0..3)],
             coupling,
             radius: lengths.draw(rng),
             observers,
             windows,
-            gone_within: 0.0,
-            score: Score::Observed,
-            when: When::Ever,
             after,
             at,
+            ..short.pois[0].clone()
         }
     };
     let mut pois: Vec<PoiGroup> = parts.into_iter().enumerate().map(group).collect();
