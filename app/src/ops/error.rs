@@ -139,7 +139,7 @@ impl Error {
             | Error::Replayed(ReplayError::Backend(_)) => "backend",
             Error::NoneToVerify(_) => "no_adapter",
             Error::Read(error) | Error::Replayed(ReplayError::Run(error)) => of_read(error),
-            Error::Replayed(ReplayError::Differs { .. }) | Error::Different(_) => "different",
+            Error::Replayed(ReplayError::Differs(_)) | Error::Different(_) => "different",
             Error::Replayed(_) | Error::Refused(_) => "refused",
             Error::Output(_) => "output",
             Error::Signals(_) => "signals",
@@ -178,9 +178,7 @@ impl Error {
             }
             Error::Backend(error) | Error::Replayed(ReplayError::Backend(error)) => backend_help(error),
             Error::NoneToVerify(_) => Some("--adapter cpu compares the processor's instruction sets"),
-            Error::Replayed(ReplayError::NoGeneration { newest: Some(_), .. }) => {
-                Some("or finish the run with --resume")
-            }
+            Error::Replayed(ReplayError::NoSuch(_, remedy)) => *remedy,
             Error::Record(error) => return error.help("run it again"),
             Error::Run(error) => return error.help(),
             Error::Read(error) | Error::Replayed(ReplayError::Run(error)) => return error.help(),
@@ -224,9 +222,7 @@ impl Error {
             | Error::Backend(BackendError::Gpu(DeviceError::UnknownAdapter { .. }))
             | Error::NoneToVerify(DeviceError::UnknownAdapter { .. })
             | Error::Record(RecordError::NoTrial { .. })
-            | Error::Replayed(
-                ReplayError::NoTrial { .. } | ReplayError::NoGeneration { .. } | ReplayError::NoTeam { .. },
-            ) => true,
+            | Error::Replayed(ReplayError::NoSuch(..)) => true,
             Error::Config(error) => error.is_usage(),
             _ => false,
         }

@@ -40,84 +40,26 @@ pub enum ReplayError {
     /// The generations cannot be played.
     #[error(transparent)]
     Backend(#[from] BackendError),
-    /// The run has no such trial.
-    #[error("{folder} has no trial {trial}: its config has {}", numbered(*trials, "trial"))]
-    NoTrial {
-        /// The run's folder.
-        folder: String,
-        /// The requested trial, from 0.
-        trial: usize,
-        /// The number of trials.
-        trials: usize,
-    },
-    /// The run has not reached the generation.
-    #[error(
-        "{folder}: metrics.csv has no generation {generation} of trial {trial}{}",
-        newest.map_or(String::new(), |newest| format!("; the newest is {newest}: choose one up to that"))
-    )]
-    NoGeneration {
-        /// The run's folder.
-        folder: String,
-        /// The requested trial, from 0.
-        trial: usize,
-        /// The requested generation, from 0.
-        generation: usize,
-        /// The trial's newest generation, if any.
-        newest: Option<usize>,
-    },
-    /// A generation has no such team.
-    #[error("no team {team}: a generation has {teams} teams, {}; choose one of them, best or champion", places(*teams))]
-    NoTeam {
-        /// The requested team, from 0.
-        team: usize,
-        /// The number of teams.
-        teams: usize,
-    },
-    /// The policies that the run started from are missing.
-    #[error(
-        "{folder} started from given policies, but no checkpoint is left to start from: it cannot be replayed up to \
-         generation {generation}"
-    )]
-    NoStart {
-        /// The run's folder.
-        folder: String,
-        /// The requested generation, from 0.
-        generation: usize,
-    },
-    /// Only the program that trained the run knows its fitness, so no generation can be trained again.
-    #[error(
-        "{folder} was trained with a fitness that is not the config's, so generation {generation} cannot be trained \
-         again; only the best team of generation 0 and the champion of the last generation can be replayed"
-    )]
-    OwnFitness {
-        /// The run's folder.
-        folder: String,
-        /// The requested generation, from 0.
-        generation: usize,
-    },
+    /// The run has no such trial, generation or team. The second text is the remedy, if there is one.
+    #[error("{0}")]
+    NoSuch(String, Option<&'static str>),
+    /// The generation cannot be trained again.
+    #[error("{0}")]
+    Refused(String),
     /// Retraining gives another result than the run's metrics.
-    #[error(
-        "{folder}: trained again, the {who} of trial {trial}, generation {generation} has G = {found}, but metrics.csv \
-         has {expected}: it was made with another config or another version of this program; repeat the run, then \
-         replay it"
-    )]
-    Differs {
-        /// The run's folder.
-        folder: String,
-        /// Whose G differs: "best team" or "champion".
-        who: &'static str,
-        /// The trial, from 0.
-        trial: usize,
-        /// The generation, from 0.
-        generation: usize,
-        /// G of the replay.
-        found: f64,
-        /// G in the run's metrics.
-        expected: f64,
-    },
+    #[error("{0}")]
+    Differs(String),
     /// The caller's `watch` stopped the replay.
     #[error("stopped")]
     Stopped,
+}
+
+/// Returns the error for a trial of `played` generations that has not reached the given one.
+fn no_generation(folder: &Path, trial: usize, generation: usize, played: usize) -> ReplayError {
+    let newest = played.checked_sub(1);
+    let advice = newest.map_or(String::new(), |newest| format!("; the newest is {newest}: choose one up to that"));
+    let message = format!("{}: metrics.csv has no generation {generation} of trial {trial}{advice}", folder.escaped());
+    ReplayError::NoSuch(message, newest.map(|_| "or finish the run with --resume"))
 }
 
 /// Formats a count and its indices as "3 trials, 0 to 2" or "1 trial, 0".
@@ -215,8 +157,7 @@ pub(crate) fn extreme_trials(
     let g = all.iter().map(|trial| g_of(trial, generation, which)).collect::<Option<Vec<f64>>>();
     let Some(g) = g else {
         let trial = all.iter().position(|trial| trial.len() <= generation).unwrap_or(0);
-        let (folder, newest) = (folder.escaped(), all[trial].len().checked_sub(1));
-        return Err(ReplayError::NoGeneration { folder, trial, generation, newest });
+        return Err(no_generation(folder, trial, generation, all[trial].len()));
     };
     let first = |better: fn(f64, f64) -> bool| (0..g.len()).reduce(|a, b| if better(g[b], g[a]) { b } else { a });
     Ok([first(|b, a| b > a), first(|b, a| b < a)].map(|trial| trial.unwrap_or(0)))
@@ -237,22 +178,25 @@ pub fn replay(
     backend: &mut dyn Backend,
     watch: &mut dyn FnMut(usize) -> bool,
 ) -> Result<Vec<Replayed>, ReplayError> {
-    let name = || folder.escaped();
+    let name = folder.escaped();
     let config = runs::config(folder, verification)?.validate().map_err(BackendError::from)?;
     let trials = config.learning.trials;
     if trial >= trials {
-        return Err(ReplayError::NoTrial { folder: name(), trial, trials });
+        let text = format!("{name} has no trial {trial}: its config has {}", numbered(trials, "trial"));
+        return Err(ReplayError::NoSuch(text, None));
     }
     let teams = generations.iter().map(|&generation| config.at(generation).learning.team_count()).min().unwrap_or(0);
     if let Which::Number(team) = which
         && team >= teams
     {
-        return Err(ReplayError::NoTeam { team, teams });
+        let places = places(teams);
+        let text =
+            format!("no team {team}: a generation has {teams} teams, {places}; choose one of them, best or champion");
+        return Err(ReplayError::NoSuch(text, None));
     }
     let rows = runs::trials(folder, &config, verification)?.swap_remove(trial);
     if let Some(&generation) = generations.iter().find(|&&generation| generation >= rows.len()) {
-        let newest = rows.len().checked_sub(1);
-        return Err(ReplayError::NoGeneration { folder: name(), trial, generation, newest });
+        return Err(no_generation(folder, trial, generation, rows.len()));
     }
     let mut order: Vec<usize> = (0..generations.len()).collect();
     order.sort_by_key(|&index| generations[index]);
@@ -269,11 +213,19 @@ pub fn replay(
             // A checkpoint of other sizes belongs to another config. It is ignored, and training continues without it.
             let _ = trainer.restore(0, snapshot);
         } else if next == 0 && Run::read(&folder.join(RUN)).is_ok_and(|run| run.init.is_some()) {
-            return Err(ReplayError::NoStart { folder: name(), generation });
+            return Err(ReplayError::Refused(format!(
+                "{name} started from given policies, but no checkpoint is left to start from: it cannot be replayed up \
+                 to generation {generation}"
+            )));
         }
         while trainer.generation(0) < wanted {
+            // Only the program that trained the run knows its fitness.
             if own_fitness {
-                return Err(ReplayError::OwnFitness { folder: name(), generation });
+                return Err(ReplayError::Refused(format!(
+                    "{name} was trained with a fitness that is not the config's, so generation {generation} cannot be \
+                     trained again; only the best team of generation 0 and the champion of the last generation can be \
+                     replayed"
+                )));
             }
             if !watch(trainer.generation(0)) {
                 return Err(ReplayError::Stopped);
@@ -292,7 +244,11 @@ pub fn replay(
         let expected = g_of(&rows, generation, which).unwrap_or(f64::NAN);
         if g != expected {
             let who = if which == Which::Champion { "champion" } else { "best team" };
-            return Err(ReplayError::Differs { folder: name(), who, trial, generation, found: g, expected });
+            return Err(ReplayError::Differs(format!(
+                "{name}: trained again, the {who} of trial {trial}, generation {generation} has G = {g}, but \
+                 metrics.csv has {expected}: it was made with another config or another version of this program; \
+                 repeat the run, then replay it"
+            )));
         }
         played[index] = Some(Replayed { unverified: verification.is_skipped(), own_fitness, ..found });
     }
