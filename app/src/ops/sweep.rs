@@ -208,7 +208,7 @@ pub fn picture_axes(sweep: &Sweep, names: &[String]) -> Result<Vec<usize>, Error
 pub fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
     let path = out.join(SWEEP);
     if out.is_file() {
-        return Err(RecordError::NoFolder(out.into()).into());
+        return Err(RecordError::no_folder(out).into());
     }
     let refuse = |message: String| {
         let problems = vec![Problem { line: None, key: String::new(), message }];

@@ -87,14 +87,6 @@ pub enum RecordError {
         /// Description of the problem.
         reason: String,
     },
-    /// The policies in the file are of another config.
-    #[error("{path}: {reason}", path = path.escaped())]
-    OtherPolicies {
-        /// Path of the file.
-        path: PathBuf,
-        /// Description of the problem.
-        reason: String,
-    },
     /// The folder already holds a run, which would be overwritten.
     #[error("{} holds a run already", .0.escaped())]
     Exists(PathBuf),
@@ -104,94 +96,27 @@ pub enum RecordError {
     /// The folder belongs to another user, and the user did not name it as the output folder.
     #[error("{} belongs to another user, so nothing is written there", .0.escaped())]
     OfAnotherUser(PathBuf),
-    /// A file has the path of the folder.
-    #[error("{} is a file", .0.escaped())]
-    NoFolder(PathBuf),
-    /// The run has more generations than requested.
-    #[error("{path} is a run of {existing} generations, which cannot become one of {requested}", path = path.escaped())]
-    Shorter {
-        /// Path of the folder.
-        path: PathBuf,
-        /// Generations of the run.
-        existing: usize,
-        /// Requested generations.
-        requested: usize,
-    },
     /// Another process already trains in the folder.
     #[error("another process is training in {}", .0.escaped())]
     Locked(PathBuf),
-    /// The run started from other policies than those given, so it cannot be resumed with them.
-    #[error("{path} {}, so it cannot continue as a run {}", started(existing), started_from(requested), path = path.escaped())]
-    InitDiffers {
-        /// Path of the folder.
-        path: PathBuf,
-        /// [`policies::Init::digest`] of the policies that the run started from. `None` for a random start.
-        existing: Option<String>,
-        /// Digest of the given policies.
-        requested: String,
-    },
-    /// The run has no usable checkpoint, so it needs the policies that it started from.
-    #[error("{path} {}, and has no checkpoint yet: it can only start again from these", started(&Some(existing.clone())), path = path.escaped())]
-    InitNeeded {
-        /// Path of the folder.
-        path: PathBuf,
-        /// [`policies::Init::digest`] of these policies.
-        existing: String,
-    },
-    /// It is not known which policies the run started from.
-    #[error("{}: its run.json is missing or damaged, so it is not known what policies this run started from", .0.escaped())]
-    OriginUnknown(PathBuf),
-    /// Only the program that trained the run knows its fitness.
-    #[error(
-        "{}: its fitness is not the config's, but came from the program that trained it, so it cannot be extended",
-        .0.escaped()
-    )]
-    OwnFitness(PathBuf),
     /// The config was changed after the run was started.
     #[error("{}: it is not the config that this run was started with (run.json has another digest)", .0.escaped())]
     Edited(PathBuf),
     /// The file has changed since the run wrote it.
     #[error("{}: it has changed since the run wrote it (run.json has another digest)", .0.escaped())]
     Differs(PathBuf),
-    /// A newer version of the program wrote the file.
-    #[error(
-        "{path}: it was written by {}, in a format that is newer than this version ({}) reads",
-        by(version),
-        flotilla::version::VERSION
-    )]
-    Newer {
-        /// Path of the file.
-        path: PathBuf,
-        /// Version that wrote the file, if known.
-        version: Option<String>,
+    /// The files are intact, but do not fit the request.
+    #[error("{message}")]
+    Refused {
+        /// Description of the problem.
+        message: String,
+        /// What the user can do about it.
+        remedy: String,
     },
-    /// The run cannot be resumed with the given config.
-    #[error(
-        "{path} is a run of another config, so it cannot continue with this one; what differs:\n{}",
-        differences.join("\n"),
-        path = path.escaped()
-    )]
-    ConfigDiffers {
-        /// Path of the folder.
-        path: PathBuf,
-        /// One line for each key.
-        differences: Vec<String>,
-    },
-}
-
-fn by(version: &Option<String>) -> String {
-    version.as_ref().map_or("a newer flotilla".into(), |version| format!("flotilla {}", escape::line(version)))
-}
-
-fn started(digest: &Option<String>) -> String {
-    match digest {
-        Some(digest) => format!("started from a file of policies with SHA-256 {}", brief(digest)),
-        None => "did not start from a file of policies".into(),
-    }
 }
 
 fn started_from(digest: &str) -> String {
-    format!("from the file with SHA-256 {}", brief(digest))
+    format!("started from a file of policies with SHA-256 {}", brief(digest))
 }
 
 /// Returns the start of a digest, which is enough to distinguish files.
@@ -212,6 +137,70 @@ impl RecordError {
 
     fn damaged(path: &Path, reason: impl Display) -> RecordError {
         RecordError::Damaged { path: path.into(), reason: reason.to_string() }
+    }
+
+    fn refused(message: String, remedy: impl Into<String>) -> RecordError {
+        RecordError::Refused { message, remedy: remedy.into() }
+    }
+
+    /// Returns the error for a folder whose path is that of a file.
+    pub fn no_folder(path: &Path) -> RecordError {
+        RecordError::refused(format!("{} is a file", path.escaped()), "choose a folder with --out")
+    }
+
+    /// Returns the error for a run with more generations than requested.
+    fn shorter(path: &Path, existing: usize, requested: usize) -> RecordError {
+        let path = path.escaped();
+        RecordError::refused(
+            format!("{path} is a run of {existing} generations, which cannot become one of {requested}"),
+            format!("resume with --generations {existing} or more, or choose another --out"),
+        )
+    }
+
+    /// Returns the error for a run that started from policies with the digest `existing`, or from random ones, and
+    /// should continue from others.
+    fn init_differs(path: &Path, existing: Option<&str>, requested: &str) -> RecordError {
+        let (path, requested) = (path.escaped(), brief(requested));
+        let (started, file) = match existing {
+            Some(existing) => (started_from(existing), " or with that file"),
+            None => ("did not start from a file of policies".into(), ""),
+        };
+        RecordError::refused(
+            format!("{path} {started}, so it cannot continue as a run from the file with SHA-256 {requested}"),
+            format!("resume without --init{file}, or choose another --out"),
+        )
+    }
+
+    /// Returns the error for a run that needs the policies that it started from, because it has no usable checkpoint.
+    pub(crate) fn init_needed(path: &Path, existing: &str) -> RecordError {
+        let (path, started) = (path.escaped(), started_from(existing));
+        RecordError::refused(
+            format!("{path} {started}, and has no checkpoint yet: it can only start again from these"),
+            "pass that file with --init",
+        )
+    }
+
+    /// Returns the error for a file that a newer version of the program wrote. `version` is that version, if known.
+    fn newer(path: &Path, version: Option<String>) -> RecordError {
+        let (path, this) = (path.escaped(), flotilla::version::VERSION);
+        let by = version.map_or("a newer flotilla".into(), |version| format!("flotilla {}", escape::line(&version)));
+        RecordError::refused(
+            format!("{path}: it was written by {by}, in a format that is newer than this version ({this}) reads"),
+            "use that version, or choose another --out",
+        )
+    }
+
+    /// Returns the error for a run that cannot be resumed with the given config. `differences` has a line for each key.
+    fn config_differs(path: &Path, differences: &[String]) -> RecordError {
+        let (path, differences) = (path.escaped(), differences.join("\n"));
+        RecordError::refused(
+            format!(
+                "{path} is a run of another config, so it cannot continue with this one; what differs:\n{differences}"
+            ),
+            format!(
+                "resume with the config and the flags it was started with ({path}/{CONFIG} has both), or choose another --out"
+            ),
+        )
     }
 
     /// Returns what the user can do about it. `next` follows the remedy of a full disk, such as "run it again".
@@ -244,26 +233,7 @@ impl RecordError {
             }
             RecordError::NotOurs { .. } => "move it away, or choose another --out".into(),
             RecordError::OfAnotherUser { .. } => "to write there all the same, name it with --out".into(),
-            RecordError::NoFolder { .. } => "choose a folder with --out".into(),
-            RecordError::Shorter { existing, .. } => {
-                format!("resume with --generations {existing} or more, or choose another --out")
-            }
             RecordError::Locked { .. } => "wait for it, stop it, or choose another --out".into(),
-            RecordError::ConfigDiffers { path, .. } => format!(
-                "resume with the config and the flags it was started with ({}/{CONFIG} has both), or choose another --out",
-                path.escaped()
-            ),
-            RecordError::InitDiffers { existing, .. } => {
-                let file = if existing.is_some() { " or with that file" } else { "" };
-                format!("resume without --init{file}, or choose another --out")
-            }
-            RecordError::InitNeeded { .. } => "pass that file with --init".into(),
-            RecordError::OriginUnknown { .. } => {
-                "pass the policies that it started from with --init, or start over with --force".into()
-            }
-            RecordError::OwnFitness { .. } => {
-                "start a new run from its policies with --init, or choose another --out".into()
-            }
             RecordError::Edited(path) => format!(
                 "restore what it was, or move {} away and name the run's own config, or choose another --out",
                 path.display()
@@ -280,10 +250,7 @@ impl RecordError {
             {
                 format!("restore it, or {}", again(path))
             }
-            RecordError::Newer { .. } => "use that version, or choose another --out".into(),
-            RecordError::OtherPolicies { .. } => {
-                "they are of another config; `flotilla rollout RUN` plays a run's policies in its own".into()
-            }
+            RecordError::Refused { remedy, .. } => remedy.clone(),
             RecordError::Damaged { .. } | RecordError::NoTrial { .. } => return None,
         })
     }

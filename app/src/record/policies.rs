@@ -17,7 +17,7 @@ use super::RecordError;
 use super::disk::{Disk, Place};
 use super::tensors::{self, Tensor, TensorFile};
 use flotilla::config::{Config, MAX_POPULATION};
-use flotilla::escape;
+use flotilla::escape::{self, PathExt};
 use flotilla::evolve::{MAX_WEIGHT, flush_and_validate};
 
 const KIND: &str = "policies 1";
@@ -91,7 +91,10 @@ pub fn read<'a>(place: impl Into<Place<'a>>, config: &Config, trial: Option<usiz
 /// Returns the error for a file whose policies do not fit a config.
 fn rejected(file: &TensorFile<impl Read + Seek>, path: &Path, config: &Config, reason: String) -> RecordError {
     match file.metadata(CONFIG).is_some_and(|digest| digest != super::config_digest(config)) {
-        true => RecordError::OtherPolicies { path: path.into(), reason },
+        true => RecordError::refused(
+            format!("{}: {reason}", path.escaped()),
+            "they are of another config; `flotilla rollout RUN` plays a run's policies in its own",
+        ),
         false => RecordError::damaged(path, reason),
     }
 }

@@ -98,10 +98,7 @@ impl Member {
         }
         let (checkpoint, kept) = self.folder.last_checkpoint(&self.config)?;
         match (&checkpoint, &self.run.init) {
-            (None, Some(existing)) => {
-                let (path, existing) = (self.folder.path.clone(), existing.clone());
-                Err(RecordError::InitNeeded { path, existing }.into())
-            }
+            (None, Some(existing)) => Err(RecordError::init_needed(&self.folder.path, existing).into()),
             _ => self.begin(checkpoint, kept, None),
         }
     }

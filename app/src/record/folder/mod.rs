@@ -166,7 +166,7 @@ impl Folder {
         disk: Disk,
     ) -> Result<(Folder, Resumed), RecordError> {
         if path.is_file() {
-            return Err(RecordError::NoFolder(path.into()));
+            return Err(RecordError::no_folder(path));
         }
         let disk = ownership::create_output_folder(&disk, path, true)?;
         ownership::refuse_links(&disk, path)?;

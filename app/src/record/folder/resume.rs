@@ -41,7 +41,14 @@ impl Folder {
             return Ok(());
         }
         if found.run.as_ref().is_some_and(|run| run.own_fitness) {
-            return Err(RecordError::OwnFitness(self.path.clone()));
+            let path = self.path.escaped();
+            return Err(RecordError::refused(
+                format!(
+                    "{path}: its fitness is not the config's, but came from the program that trained it, so it cannot be \
+                     extended"
+                ),
+                "start a new run from its policies with --init, or choose another --out",
+            ));
         }
         // If the folder cannot be written, this fails before anything changes.
         found.run.as_ref().map_or(Ok(()), |run| self.write_run(run))?;
@@ -88,7 +95,7 @@ impl Folder {
         }
         found.finished = found.run.as_ref().map_or(Ok(None), |run| self.finished(run, config))?;
         if let Some(run) = found.run.as_ref().filter(|_| found.finished.is_some()) {
-            self.check_init(run.init.clone(), from.digest().as_deref())?;
+            self.check_init(run.init.as_deref(), from.digest().as_deref())?;
         }
         Ok(before)
     }
@@ -97,13 +104,13 @@ impl Folder {
     /// be read. It then agrees with the given config, so that a mismatch means that it was edited.
     pub(super) fn origin_error(&self, config: &Config, run: Option<&Run>, has_config: bool) -> Option<RecordError> {
         let origin = Some(&run?.origin).filter(|origin| !origin.allows(config))?;
-        let (path, existing, requested) = (self.path.clone(), origin.generations, config.learning.generations);
+        let (existing, requested) = (origin.generations, config.learning.generations);
         Some(match existing > requested {
-            true => RecordError::Shorter { path, existing, requested },
+            true => RecordError::shorter(&self.path, existing, requested),
             false if has_config => RecordError::Edited(self.file(CONFIG)),
             false => {
-                let differences = vec![format!("  {} has another digest", self.file(RUN).display())];
-                RecordError::ConfigDiffers { path, differences }
+                let difference = format!("  {} has another digest", self.file(RUN).display());
+                RecordError::config_differs(&self.path, &[difference])
             }
         })
     }
@@ -129,7 +136,7 @@ impl Folder {
             let at = |path| self.disk.at(path);
             let reason = match checkpoint::read(at(&path), at(&policies), config) {
                 Ok(Some(checkpoint)) if checkpoint.is_of(config) => {
-                    self.check_init(checkpoint.init.clone(), init)?;
+                    self.check_init(checkpoint.init.as_deref(), init)?;
                     let metrics = self.file(METRICS);
                     let resumed = metrics::Writer::resume(&self.disk, &metrics, &checkpoint.metrics, config);
                     match resumed.map_err(RecordError::write(&metrics))? {
@@ -140,8 +147,8 @@ impl Folder {
                 Ok(Some(_)) if is_other => break,
                 Ok(Some(_)) if before.is_some() => format!("{}: it is of another run", path.escaped()),
                 Ok(Some(_)) => {
-                    let differences = vec![format!("  {} has another digest", path.escaped())];
-                    return Err(RecordError::ConfigDiffers { path: self.path.clone(), differences });
+                    let difference = format!("  {} has another digest", path.escaped());
+                    return Err(RecordError::config_differs(&self.path, &[difference]));
                 }
                 Ok(None) => {
                     // Only the end of a run writes such a checkpoint. Its policies were not written yet, or others
@@ -164,7 +171,6 @@ impl Folder {
     /// Fails if a run without usable checkpoints cannot start over as it began. `run` is the content of `run.json`, if
     /// it can be read.
     fn check_start(&self, run: Option<&Run>, from: StartFrom<'_>, had_checkpoints: bool) -> Result<(), RecordError> {
-        let path = self.path.clone();
         let Some(run) = run else {
             if from == StartFrom::Unspecified
                 && (had_checkpoints
@@ -173,15 +179,22 @@ impl Folder {
                     || self.has(METRICS)?
                     || self.has(POLICIES)?)
             {
-                return Err(RecordError::OriginUnknown(path));
+                let path = self.path.escaped();
+                return Err(RecordError::refused(
+                    format!(
+                        "{path}: its run.json is missing or damaged, so it is not known what policies this run started \
+                         from"
+                    ),
+                    "pass the policies that it started from with --init, or start over with --force",
+                ));
             }
             return Ok(());
         };
         let init = from.digest();
-        self.check_init(run.init.clone(), init.as_deref())?;
-        match run.init.clone().filter(|_| init.is_none()) {
-            Some(existing) => Err(RecordError::InitNeeded { path, existing }),
-            None => Ok(()),
+        self.check_init(run.init.as_deref(), init.as_deref())?;
+        match &run.init {
+            Some(existing) if init.is_none() => Err(RecordError::init_needed(&self.path, existing)),
+            _ => Ok(()),
         }
     }
 
@@ -193,17 +206,17 @@ impl Folder {
             if let Some(version) = tensors::newer(self.disk.at(&path)) {
                 // Only checkpoints contain the version that wrote them.
                 let recorded = || Some(self.read_run().ok()?.version);
-                return Err(RecordError::Newer { path, version: version.or_else(recorded) });
+                return Err(RecordError::newer(&path, version.or_else(recorded)));
             }
         }
         Ok(())
     }
 
     /// Fails if the given policies are not those that the run started from.
-    fn check_init(&self, existing: Option<String>, requested: Option<&str>) -> Result<(), RecordError> {
+    fn check_init(&self, existing: Option<&str>, requested: Option<&str>) -> Result<(), RecordError> {
         match requested {
-            Some(requested) if existing.as_deref() != Some(requested) => {
-                Err(RecordError::InitDiffers { path: self.path.clone(), existing, requested: requested.into() })
+            Some(requested) if existing != Some(requested) => {
+                Err(RecordError::init_differs(&self.path, existing, requested))
             }
             _ => Ok(()),
         }
@@ -218,11 +231,11 @@ impl Folder {
                 let mut as_long = before.clone();
                 as_long.learning.generations = requested;
                 if existing > requested && differences(&as_long, config).is_empty() {
-                    return Err(RecordError::Shorter { path: self.path.clone(), existing, requested });
+                    return Err(RecordError::shorter(&self.path, existing, requested));
                 }
                 let differences = differences(if existing < requested { &as_long } else { &before }, config);
                 if !differences.is_empty() {
-                    return Err(RecordError::ConfigDiffers { path: self.path.clone(), differences });
+                    return Err(RecordError::config_differs(&self.path, &differences));
                 }
                 Ok(Some(before))
             }

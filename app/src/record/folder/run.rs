@@ -142,7 +142,7 @@ impl Run {
         let place = place.into();
         let text = read_text(place, MAX_RUN_BYTES)?;
         Run::parse(&text).map_err(|reason| match newer_version(&text) {
-            Some(version) => RecordError::Newer { path: place.path().into(), version: Some(version) },
+            Some(version) => RecordError::newer(place.path(), Some(version)),
             None => RecordError::damaged(place.path(), reason),
         })
     }

@@ -30,7 +30,7 @@ impl Identity {
     /// The folder holds something else, or a paper that `start` does not allow to be resumed or replaced.
     pub(super) fn check(&self, out: &Path, start: Start) -> Result<(), Error> {
         if out.is_file() {
-            return Err(RecordError::NoFolder(out.into()).into());
+            return Err(RecordError::no_folder(out).into());
         }
         let name = out.escaped();
         let holds = |file: &str| out.join(file).exists();
