@@ -49,6 +49,7 @@ mod recovery;
 mod replay;
 pub mod request;
 mod rollout;
+mod slurm;
 mod sweep;
 mod tasks;
 mod train;

@@ -6,7 +6,9 @@ use std::path::{Path, PathBuf};
 
 use serde_json::json;
 
-use super::{Error, ExistingResults, Overrides, RunOptions, between, console, print, print_json, recovery, say, whole};
+use super::{
+    Error, ExistingResults, Overrides, RunOptions, between, console, print, print_json, recovery, say, slurm, whole,
+};
 use flotilla::config;
 use flotilla::escape::PathExt;
 use flotilla_app::ops::sweep::{SweepRequest, claim};
@@ -20,7 +22,6 @@ use flotilla_app::shell;
 use flotilla_app::sweep::Sweep;
 use flotilla_app::sweep::results::ResultOptions;
 use flotilla_app::sweep::shard::{self, MAX_SHARDS, Shard};
-use flotilla_app::sweep::slurm::Job;
 
 const SCALE_OUT: &str = "Many processes (docs/how-to/clusters.md)";
 const RESULTS: &str = "Results";
@@ -32,7 +33,7 @@ pub struct Args {
     #[command(flatten)]
     overrides: Overrides,
     #[command(flatten)]
-    run: RunOptions,
+    pub(super) run: RunOptions,
     /// Output directory, the same for all shards [default: runs/NAME of the sweep]
     #[arg(long, short, value_name = "DIR")]
     out: Option<PathBuf>,
@@ -65,16 +66,16 @@ pub struct Args {
     slurm: Option<Option<PathBuf>>,
     /// Number of tasks of the job array, or of shards that --list shows
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = shard_count, help_heading = SCALE_OUT)]
-    shards: usize,
+    pub(super) shards: usize,
     /// Time limit of a task of the job array
     #[arg(long, value_name = "HH:MM:SS", default_value = "01:00:00", value_parser = time_limit, help_heading = SCALE_OUT)]
-    time: String,
+    pub(super) time: String,
     /// GPUs per task of the job array [default: 1, or 0 with --backend cpu]
     #[arg(long, value_name = "N", value_parser = whole, help_heading = SCALE_OUT)]
-    gpus: Option<usize>,
+    pub(super) gpus: Option<usize>,
     /// Another option of the batch script, for example --sbatch=--partition=long; can be repeated
     #[arg(long, value_name = "OPTION", allow_hyphen_values = true, value_parser = an_option, help_heading = SCALE_OUT)]
-    sbatch: Vec<String>,
+    pub(super) sbatch: Vec<String>,
 
     /// Write a row of results.csv every N generations, and for the last
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = between(1..=u32::MAX), help_heading = RESULTS)]
@@ -289,20 +290,9 @@ fn write_script(args: &Args, sweep: &Sweep, out: &Path, file: Option<&Path>) -> 
     }
     let absolute = |path: &Path| std::path::absolute(path).unwrap_or_else(|_| path.into());
     let out = absolute(out);
-    let cpu = args.run.backend == super::BackendChoice::Cpu;
-    let command =
-        [super::program().into_os_string()].into_iter().chain(args.words(&absolute(&args.sweep), &out)).collect();
-    let job = Job {
-        name: &sweep.name,
-        command,
-        out: &out,
-        shards: args.shards,
-        time: &args.time,
-        gpus: args.gpus.unwrap_or(usize::from(!cpu)),
-        cpus: args.run.threads.map_or(2, usize::from),
-        options: &args.sbatch,
-    };
-    let script = job.script().map_err(|error| Error::Usage(error.into()))?;
+    let mut command = vec![super::program().into_os_string()];
+    command.extend(args.words(&absolute(&args.sweep), &out));
+    let script = slurm::script(&sweep.name, &command, &out, args).map_err(|error| Error::Usage(error.into()))?;
     // Slurm writes the tasks' logs to this folder, but does not create it.
     ownership::create_output_folder(&Disk::default(), &out, args.out.is_some())?;
     claim(&Disk::default(), sweep, &out)?;

@@ -15,7 +15,6 @@
 //! | [`results`] | the tables `results.csv` and `points.csv` |
 //! | [`pictures`] | heat maps and curves |
 //! | [`arms`] | points grouped by the values of one axis, for comparison |
-//! | [`slurm`] | the batch script of a job array |
 
 use std::collections::hash_map::Entry;
 use std::collections::{BTreeMap, HashMap, HashSet};
@@ -36,7 +35,6 @@ pub mod pictures;
 pub mod results;
 pub mod run;
 pub mod shard;
-pub mod slurm;
 
 /// The key of `[grid]` that is not an axis.
 const SKIP: &str = "skip_impossible";
