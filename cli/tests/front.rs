@@ -19,7 +19,7 @@ use flotilla::world::World;
 use flotilla_app::record::checkpoint;
 use flotilla_app::record::digests::Verification;
 use flotilla_app::record::disk::Disk;
-use flotilla_app::record::folder::Start;
+use flotilla_app::record::folder::{Start, StartFrom};
 use flotilla_app::record::policies::{self, Init, Policies};
 use flotilla_app::record::runs;
 use flotilla_app::run::{Options, Session, SessionEnd};
@@ -52,7 +52,8 @@ fn run_digest(config: &Config, folder: &Path) -> String {
 
 fn run_digest_from(config: &Config, folder: &Path, init: Option<Init>) -> String {
     let runs = vec![(config.clone(), folder.to_path_buf(), init)];
-    let (mut session, _) = Session::open_from(runs, Start::Fresh, &Disk::default()).expect("the directory is empty");
+    let (mut session, _) = Session::open_from(runs, StartFrom::Unspecified, Start::Fresh, &Disk::default())
+        .expect("the directory is empty");
     let unset = std::sync::atomic::AtomicBool::default();
     let ended = session.train(
         &mut front::cpu(),

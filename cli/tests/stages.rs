@@ -177,8 +177,12 @@ fn train(
     start: Start,
     until: usize,
 ) -> Result<Option<Results>, RunError> {
-    let (mut session, _) =
-        Session::open_from(vec![(config.clone(), path.to_path_buf(), init)], start, &Disk::default())?;
+    let (mut session, _) = Session::open_from(
+        vec![(config.clone(), path.to_path_buf(), init)],
+        StartFrom::Unspecified,
+        start,
+        &Disk::default(),
+    )?;
     let ended = train_until(&mut session, |next| next >= until)?;
     Ok((ended == SessionEnd::Finished).then(|| session.results(0).cloned().unwrap()))
 }
@@ -187,7 +191,7 @@ fn train(
 /// last generation.
 fn train_shorter(config: &Config, path: &Path, init: Option<Init>, until: usize, finish: bool) -> usize {
     let runs = vec![(config.clone(), path.to_path_buf(), init)];
-    let (mut session, _) = Session::open_from(runs, Start::Fresh, &Disk::default()).unwrap();
+    let (mut session, _) = Session::open_from(runs, StartFrom::Unspecified, Start::Fresh, &Disk::default()).unwrap();
     assert!(train_until(&mut session, |next| next == until).unwrap() == SessionEnd::Stopped);
     let last = session.end().unwrap();
     if finish {
@@ -485,7 +489,7 @@ fn a_warm_started_run_resumes_to_the_same_results() {
     // The same holds for a run that was killed before its first generation.
     let early = place.path().join("early");
     let runs = vec![(config.clone(), early.clone(), init())];
-    drop(Session::open_from(runs, Start::Fresh, &Disk::default()).unwrap());
+    drop(Session::open_from(runs, StartFrom::Unspecified, Start::Fresh, &Disk::default()).unwrap());
     let error = train(&config, &early, None, Start::Resume, 99).unwrap_err().to_string();
     assert!(error.contains("has no checkpoint yet"), "{error}");
     assert_eq!(train(&config, &early, init(), Start::Resume, 99).unwrap().as_ref(), Some(&expected));

@@ -12,7 +12,7 @@ use crate::choice::Work;
 use crate::record::digests::Verification;
 use crate::record::disk::Disk;
 use crate::record::finished::{Finished, Storage};
-use crate::record::folder::{self, CONFIG, FirstAndLastRows, METRICS, POLICIES, RUN, RUNS, Start};
+use crate::record::folder::{self, CONFIG, FirstAndLastRows, METRICS, POLICIES, RUN, RUNS, Start, StartFrom};
 use crate::record::ownership::{self, CURVES};
 use crate::record::policies::{self, Init};
 use crate::record::runs;
@@ -268,7 +268,8 @@ fn open_session(
             ownership::check(&disk, [folder.join(CURVES)])?;
         }
     }
-    let opened = Session::open_from(vec![(config.clone(), folder.to_path_buf(), policies)], start, &disk);
+    let runs = vec![(config.clone(), folder.to_path_buf(), policies)];
+    let opened = Session::open_from(runs, StartFrom::Unspecified, start, &disk);
     let (mut session, found) = opened.map_err(|error| match error {
         // This avoids the advice to use `--resume`. Until the run's origin is recorded, a resumed run would start from
         // random policies.

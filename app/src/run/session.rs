@@ -31,35 +31,23 @@ pub struct Session {
 }
 
 impl Session {
-    /// Starts or resumes runs, each with a config and a folder. Also returns notes for the user, each with the index of
-    /// its run.
-    ///
-    /// # Errors
-    /// A folder cannot be used (see [`folder::Folder::open`]), or there is not enough memory for the populations.
+    /// Opens runs like [`Session::open_from`]. The caller knows that all of them start from random policies.
     pub fn open(
         runs: Vec<(Config, PathBuf)>,
         start: Start,
         disk: &Disk,
     ) -> Result<(Session, Vec<(usize, Note)>), RunError> {
         let runs = runs.into_iter().map(|(config, path)| (config, path, None)).collect();
-        Session::open_all(runs, StartFrom::Random, start, disk)
+        Session::open_from(runs, StartFrom::Random, start, disk)
     }
 
-    /// Opens runs like [`Session::open`]. Each run may start from given policies, which were read for its config. A
-    /// resumed run without given policies may have started from any.
+    /// Starts or resumes runs, each with a config and a folder. Each run may start from given policies, which were read
+    /// for its config. `otherwise` is the start of the other runs. Also returns notes for the user, each with the index
+    /// of its run.
     ///
     /// # Errors
-    /// See [`Session::open`]. It is also an error if a resumed run started from other policies, or needs its policies
-    /// because it has no checkpoint.
+    /// A folder cannot be used (see [`folder::Folder::open`]), or there is not enough memory for the populations.
     pub fn open_from(
-        runs: Vec<(Config, PathBuf, Option<Init>)>,
-        start: Start,
-        disk: &Disk,
-    ) -> Result<(Session, Vec<(usize, Note)>), RunError> {
-        Session::open_all(runs, StartFrom::Unspecified, start, disk)
-    }
-
-    fn open_all(
         runs: Vec<(Config, PathBuf, Option<Init>)>,
         otherwise: StartFrom<'_>,
         start: Start,

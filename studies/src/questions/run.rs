@@ -13,7 +13,7 @@ use flotilla_app::choice::Work;
 use flotilla_app::ops::sweep::{claim, free_memory, same_sweep, train_points};
 use flotilla_app::ops::{BackendSource, Context, Error, Event, check_memory};
 use flotilla_app::record::disk::Disk;
-use flotilla_app::record::folder::{self, SWEEP};
+use flotilla_app::record::folder::{self, SWEEP, StartFrom};
 use flotilla_app::record::{RecordError, ownership, policies};
 use flotilla_app::report::comparison::{self, Comparison};
 use flotilla_app::report::scene::Format;
@@ -175,7 +175,8 @@ fn train(
                 Some(policies::read_init(disk.at(&run.policies), &run.config)?),
             ))
         });
-        let (mut session, _) = Session::open_from(runs.collect::<Result<_, RecordError>>()?, start, disk)?;
+        let runs = runs.collect::<Result<_, RecordError>>()?;
+        let (mut session, _) = Session::open_from(runs, StartFrom::Unspecified, start, disk)?;
         let mut watch = |_: &flotilla_app::run::Progress<'_>| {
             (context.report)(Event::Fraction(before / whole, format!("{}: warm starts", part.name)));
         };
