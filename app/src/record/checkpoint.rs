@@ -110,7 +110,9 @@ impl<N: AsRef<[f32]>> Checkpoint<N> {
             (tensors::VERSION, flotilla::version::VERSION.into()),
         ];
         let metadata = metadata.into_iter().chain(init.clone().map(|digest| (INIT, digest)));
-        let Shapes { weights, fitness, .. } = Shapes::of(of);
+        let (weights, fitness) = shapes(of);
+        // The scores of rows whose champions have yet to play.
+        let known = |row: &Row| [row.best_g, row.mean_g].into_iter().chain(row.test_g);
         let pending: Vec<f64> = snapshot.pending.iter().flatten().flat_map(known).collect();
         let mut list = Vec::new();
         // The 8-byte numbers come first, so that all tensors are aligned.
@@ -150,7 +152,7 @@ impl Checkpoint {
         if generation > last + 1 {
             return Err(format!("its generation is {generation}, past the last, {last}"));
         }
-        let shapes = Shapes::of(of);
+        let (weights, fitness) = shapes(of);
         // After the last generation, `policies.safetensors` may hold the weights.
         let elsewhere = generation == last + 1 && file.info(WEIGHTS).is_none();
         let mut floats = |name: &str, shape: &[usize]| -> Result<Vec<Vec<f32>>, String> {
@@ -160,8 +162,8 @@ impl Checkpoint {
                 false => Ok(trials),
             }
         };
-        let weights = if elsewhere { vec![] } else { floats(WEIGHTS, &shapes.weights)? };
-        let fitness = floats(FITNESS, &shapes.fitness)?;
+        let weights = if elsewhere { vec![] } else { floats(WEIGHTS, &weights)? };
+        let fitness = floats(FITNESS, &fitness)?;
         // From generation 1 on, rows are pending until their champions have played.
         let columns = 2 + usize::from(learning.test_episodes > 0);
         let pending: Vec<f64> = match generation {
@@ -221,26 +223,11 @@ impl Checkpoint {
     }
 }
 
-/// Returns the scores of a row whose champion has yet to play.
-fn known(row: &Row) -> impl Iterator<Item = f64> + use<> {
-    [row.best_g, row.mean_g].into_iter().chain(row.test_g)
-}
-
-/// Shapes of the tensors, with all trials in one tensor.
-struct Shapes {
-    weights: [usize; 4],
-    fitness: [usize; 3],
-}
-
-impl Shapes {
-    fn of(config: &Config) -> Shapes {
-        let (trials, populations, policies) =
-            (config.learning.trials, config.populations(), config.learning.population);
-        Shapes {
-            weights: [trials, populations, config.learning.slots(), config.parameters()],
-            fitness: [trials, config.fitness_len() / policies, policies],
-        }
-    }
+/// Returns the shapes of the weights and of the fitness, with all trials in one tensor.
+fn shapes(config: &Config) -> ([usize; 4], [usize; 3]) {
+    let (trials, policies) = (config.learning.trials, config.learning.population);
+    let weights = [trials, config.populations(), config.learning.slots(), config.parameters()];
+    (weights, [trials, config.fitness_len() / policies, policies])
 }
 
 /// Returns the generations of the checkpoints in a folder, oldest first. Temporary files are ignored.
