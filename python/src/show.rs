@@ -6,7 +6,7 @@ use std::str::FromStr;
 use flotilla::backend::cpu::Cpu;
 use flotilla::evaluate::Starts;
 use flotilla::front;
-use flotilla_app::ops::replay::{Played, WhichTrial, play};
+use flotilla_app::ops::replay::{WhichTrial, play};
 use flotilla_app::ops::{self, output};
 use flotilla_app::record::RecordError;
 use flotilla_app::record::digests::Verification;
@@ -56,13 +56,13 @@ pub fn replay(
 ) -> PyResult<Replay> {
     let verification = Verification::unless(unverified);
     let (trial, team): (WhichTrial, Which) = (parsed("trial", trial)?, parsed("team", team)?);
-    let Played { config, episodes, .. } = perform(py, backend, "", &|_, _, _| Ok(false), |backends, context| {
+    let (config, played) = perform(py, backend, "", &|_, _, _| Ok(false), |backends, context| {
         let config = runs::config(&folder, verification)?;
         let trial = trial.find(&folder, &config, generations.last().copied(), team, verification)?;
         play(&folder, trial, &generations, team, verification, backends, context)
     })?;
     let name = folder.file_name().map_or("run".into(), |name| name.to_string_lossy().into_owned());
-    Ok(Replay { name, config, played: episodes })
+    Ok(Replay { name, config, played })
 }
 
 /// Plays one episode of each of several teams on the CPU: their numbers, and their policies, `[leaders or 1, 1,

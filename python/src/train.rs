@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use flotilla::front::Trained;
 use flotilla::trainer::{Ending, Row};
-use flotilla_app::ops::train::{InMemory, TrainRequest};
+use flotilla_app::ops::train::TrainRequest;
 use flotilla_app::ops::{self, ConfigText, ProcessorInfo};
 use flotilla_app::record::digests::Verification;
 use flotilla_app::record::disk::Disk;
@@ -175,11 +175,11 @@ pub fn train<'py>(
 ) -> PyResult<(Outcomes<'py>, Played, Vec<f64>)> {
     let started = folder::now();
     let watcher = Watcher { callback: callback.as_ref(), populations: config.0.populations() };
-    let (InMemory { trained, seconds, processor, .. }, digest) =
+    let (trained, digest, seconds, processor) =
         perform(py, backend, "", &|rows, last, champions| watcher.tell(rows, last, champions), |backends, context| {
-            let done = ops::train::in_memory(&config.0, champions, backends, context)?;
-            let digest = done.trained.digest();
-            Ok((done, digest))
+            let (trained, seconds, processor) = ops::train::in_memory(&config.0, champions, backends, context)?;
+            let digest = trained.digest();
+            Ok((trained, digest, seconds, processor))
         })?;
     Ok((outcomes(py, trained, digest)?, played(processor, started, None, false), seconds))
 }

@@ -192,7 +192,7 @@ pub fn run(
         return Err(Error::Usage(format!("--step {step}: the episode has steps 0 to {steps}").into()));
     }
     prepare_output(&place, &kind, &request.folder)?;
-    let Played { config, episodes: played } = play(folder, trial, &generations, team, verification, backends, context)?;
+    let (config, played) = play(folder, trial, &generations, team, verification, backends, context)?;
 
     let name = folder.canonicalize().ok().and_then(|path| Some(path.file_name()?.to_string_lossy().into_owned()));
     let name = name.unwrap_or_else(|| folder.escaped());
@@ -226,15 +226,8 @@ pub fn run(
     Ok(outcome(Written::File { out: out.into(), bytes: content.len() }, &config, &played))
 }
 
-/// Replayed episodes, and the config of their stage.
-pub struct Played {
-    /// The config of the stage that all the generations belong to.
-    pub config: Config,
-    /// The episodes, in the order of the requested generations.
-    pub episodes: Vec<Replayed>,
-}
-
-/// Replays the episode of one team in each given generation of a trial.
+/// Replays the episode of one team in each given generation of a trial. Returns the config of the stage that all the
+/// generations belong to, and the episodes in the order of the generations.
 ///
 /// # Errors
 /// The run cannot be read, the request does not fit it, the generations cannot be shown side by side, the backend
@@ -247,7 +240,7 @@ pub fn play(
     verification: Verification,
     backends: &mut dyn BackendSource,
     context: Context<'_>,
-) -> Result<Played, Error> {
+) -> Result<(Config, Vec<Replayed>), Error> {
     let config = stage(&points::config(folder, verification)?.validate()?, generations)?.clone();
     let learning = Learning { trials: 1, ..config.learning.clone() };
     let trained = Config { learning, ..config.clone() }.validate()?;
@@ -266,7 +259,7 @@ pub fn play(
         ReplayError::Stopped => Error::Stopped("before the episode was played; nothing was written".into()),
         error => error.into(),
     })?;
-    Ok(Played { config, episodes })
+    Ok((config, episodes))
 }
 
 /// Returns the config that all the generations play with.

@@ -331,23 +331,16 @@ fn warn_that_nothing_was_observed(folder: &Path, config: &Config, context: Conte
     ));
 }
 
-/// The results of a training in memory.
-pub struct InMemory {
-    /// The results. If the caller ended the training early, their config has fewer generations.
-    pub trained: Trained,
-    /// Seconds since the start at which each generation was complete.
-    pub seconds: Vec<f64>,
-    /// The processor that trained.
-    pub processor: ProcessorInfo,
-}
-
 /// Trains without a folder. [`save`] writes the results later. `champions` asks for the champions of every generation.
+///
+/// Returns the results, the seconds since the start at which each generation was complete, and the processor. If the
+/// caller ended the training early, the config of the results has fewer generations.
 pub fn in_memory(
     config: &Config,
     champions: bool,
     backends: &mut dyn BackendSource,
     context: Context<'_>,
-) -> Result<InMemory, Error> {
+) -> Result<(Trained, Vec<f64>, ProcessorInfo), Error> {
     let config = &config.validate()?;
     let (backend, on) = backends.open(Work::of([&**config]))?;
     context.notes(&config.notes());
@@ -373,7 +366,7 @@ pub fn in_memory(
     }
     // After an early end, one more generation is played and not reported.
     seconds.resize(trained.config.learning.generations + 1, since.elapsed().as_secs_f64());
-    Ok(InMemory { trained, seconds, processor: ProcessorInfo::of(&backend.1, &on) })
+    Ok((trained, seconds, ProcessorInfo::of(&backend.1, &on)))
 }
 
 /// Writes a finished run that was trained in memory, with the files of [`run`]. Returns its digest.
