@@ -308,22 +308,8 @@ pub fn save(
     let rows: Vec<(Row, f64)> = rows.map(row).collect();
     workers::aside(py, || {
         let (backend, description, adapter, driver, threads, started, init, own_fitness) = played;
-        let run = folder::Run {
-            version: env!("CARGO_PKG_VERSION").into(),
-            backend,
-            description,
-            adapter,
-            driver,
-            threads,
-            started,
-            updated: folder::now(),
-            sessions: 1,
-            command: command.into(),
-            commit: flotilla::COMMIT.map(String::from),
-            init,
-            own_fitness,
-            ..folder::Run::new(config)
-        };
+        let processor = ProcessorInfo { backend, description, adapter, driver, threads };
+        let run = folder::Run { init, own_fitness, ..processor.record(config, command, started) };
         let finished = Finished { config, rows: &rows, policies: &weights, ending, run };
         let start = if force { Start::Force } else { Start::Fresh };
         let (mut kept, _) = Folder::open(&folder, start, config, StartFrom::Random, Disk::default()).raise()?;

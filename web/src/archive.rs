@@ -8,7 +8,7 @@ use flotilla::config::Config;
 use flotilla::evolve;
 use flotilla::trainer::{Ending, Row};
 use flotilla::world::World;
-use flotilla_app::ops;
+use flotilla_app::ops::{self, ProcessorInfo};
 use flotilla_app::record::finished::{Content, Finished, Storage};
 use flotilla_app::record::folder::{self, Origin, Run};
 use flotilla_app::record::{RecordError, hex, metrics, policies};
@@ -33,11 +33,8 @@ pub struct Recorded {
     name: String,
     text: String,
     command: String,
-    description: String,
-    backend: String,
-    adapter: Option<String>,
-    driver: Option<String>,
-    threads: usize,
+    #[serde(flatten)]
+    processor: ProcessorInfo,
     started: String,
     rows: usize,
 }
@@ -74,20 +71,7 @@ pub fn write(recorded: &Recorded, bytes: &[u8]) -> Result<Answer, Refusal> {
         weights: if weights == 0 { vec![] } else { copies(rest..rest + weights) },
         fitness: copies(policies..rest),
     };
-    let run = Run {
-        version: flotilla::VERSION.into(),
-        commit: flotilla::COMMIT.map(String::from),
-        description: recorded.description.clone(),
-        backend: recorded.backend.clone(),
-        adapter: recorded.adapter.clone(),
-        driver: recorded.driver.clone(),
-        threads: recorded.threads,
-        command: recorded.command.clone(),
-        started: recorded.started.clone(),
-        updated: folder::now(),
-        sessions: 1,
-        ..Run::new(&config)
-    };
+    let run = recorded.processor.clone().record(&config, &recorded.command, recorded.started.clone());
     let mut zip = Zip { folder: recorded.name.clone(), writer: ZipWriter::new(Cursor::new(Vec::new())) };
     let finished = Finished { config: &config, rows: &rows, policies: &policies_of, ending: Some(ending), run };
     let digest = ops::train::save(finished, &mut zip).map_err(refuse)?;

@@ -34,10 +34,10 @@ use std::ffi::OsString;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use crate::choice::Work;
-use crate::record::folder::Run;
+use crate::record::folder::{self, Run};
 use crate::run::{Options, Progress, RunError};
 use flotilla::backend::{BackendError, Machine, OpenBackend};
 use flotilla::config::{Config, Override, ValidConfig};
@@ -259,7 +259,7 @@ pub fn check_memory<'a>(
 }
 
 /// The processor that episodes were played on, with the names that `run.json` has.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct ProcessorInfo {
     /// "cpu" or "gpu".
     pub backend: String,
@@ -284,6 +284,25 @@ impl ProcessorInfo {
     pub fn of_run(run: &Run) -> ProcessorInfo {
         let Run { backend, description, adapter, driver, threads, .. } = run.clone();
         ProcessorInfo { backend, description, adapter, driver, threads }
+    }
+
+    /// Returns the record of a run that this processor trained in one session, which ends now.
+    pub fn record(self, config: &Config, command: &str, started: String) -> Run {
+        let ProcessorInfo { backend, description, adapter, driver, threads } = self;
+        Run {
+            version: flotilla::VERSION.into(),
+            backend,
+            description,
+            adapter,
+            driver,
+            threads,
+            started,
+            updated: folder::now(),
+            sessions: 1,
+            command: command.into(),
+            commit: flotilla::COMMIT.map(String::from),
+            ..Run::new(config)
+        }
     }
 
     /// Adds the fields to a JSON object.
