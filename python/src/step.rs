@@ -6,7 +6,7 @@ use flotilla::config::{Choice, Fitness};
 use flotilla::front;
 use flotilla::stepping;
 use flotilla::world::OUTPUTS;
-use flotilla_app::report::map::{self, Form, Marker, Poi, Team, Viewport};
+use flotilla_app::report::map::{Form, Marker, Poi, Team, Viewport};
 use flotilla_app::report::scene::Scene;
 use glam::{DVec2, Vec2};
 use numpy::{
@@ -248,18 +248,8 @@ fn team_of(stepper: &mut stepping::Stepper, team: usize) -> Team {
         let (form, counts) = (Form::of_agent(world, agent), world.rule.counts(agent));
         Marker { place, heading, form, group, counts, trail: vec![place] }
     };
-    let poi = |(poi, place): (usize, &Vec2)| {
-        let (near, needed) = (near(poi), world.coupling[poi]);
-        Poi {
-            place: place.as_dvec2(),
-            radius: map::radius_of(world, poi),
-            size: map::size_of(world, poi),
-            label: map::poi_label(world, poi, format!("{near}/{needed}")),
-            share: Some(f64::from(near) / f64::from(needed)),
-            observed: observed[poi],
-            open: map::is_open(world, poi, step as usize, observed),
-        }
-    };
+    let poi =
+        |(poi, place): (usize, &Vec2)| Poi::new(world, poi, place.as_dvec2(), Some(near(poi)), step as usize, observed);
     Team {
         leaders,
         agents: places.into_iter().enumerate().map(agent).collect(),

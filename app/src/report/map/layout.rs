@@ -3,8 +3,7 @@
 use glam::DVec2;
 
 use super::{
-    FAINT, Form, Legend, Marker, Poi, Team, Viewport, counted, is_open, is_timed, poi_label, radius_of, sample_note,
-    size_of, time_label, values_differ,
+    FAINT, Form, Legend, Marker, Poi, Team, Viewport, counted, is_timed, sample_note, time_label, values_differ,
 };
 use crate::report::scene::{Anchor, BLACK, Pen, Scene, text_width};
 use flotilla::config::{AgentClass, Classes, Observers, PoiGroup, Region, StageConfig, When, drawn_agents};
@@ -22,19 +21,11 @@ fn team(config: &StageConfig, world: &World) -> Team {
         trail: vec![],
     };
     let none = vec![false; world.pois.len()];
-    let poi = |(poi, (&place, needed)): (usize, (&[f64; 2], &u32))| Poi {
-        place: place.into(),
-        radius: radius_of(world, poi),
-        size: size_of(world, poi),
-        label: poi_label(world, poi, needed.to_string()),
-        share: None,
-        observed: false,
-        open: is_open(world, poi, 1, &none),
-    };
+    let poi = |(poi, &place): (usize, &[f64; 2])| Poi::new(world, poi, place.into(), None, 1, &none);
     Team {
         leaders,
         agents: drawn_agents(leaders, world.agents()).into_iter().map(agent).collect(),
-        pois: config.classes().places().iter().zip(&world.coupling).enumerate().map(poi).collect(),
+        pois: config.classes().places().iter().enumerate().map(poi).collect(),
     }
 }
 
@@ -187,7 +178,7 @@ fn pois_in_words(world: &World) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::report::map::{around, label_area, overlap};
+    use crate::report::map::{around, is_open, label_area, overlap, poi_label};
     use crate::report::replay::parts;
 
     #[test]

@@ -133,6 +133,24 @@ pub struct Poi {
     pub open: bool,
 }
 
+impl Poi {
+    /// Returns a POI of a world at a step. `near` is the number of its observers, None before an episode. `observed` are
+    /// the POIs that were observed before.
+    pub fn new(world: &World, poi: usize, place: DVec2, near: Option<u32>, step: usize, observed: &[bool]) -> Poi {
+        let needed = world.coupling[poi];
+        let count = near.map_or(needed.to_string(), |near| format!("{near}/{needed}"));
+        Poi {
+            place,
+            radius: f64::from(world.radii2[poi]).sqrt(),
+            label: poi_label(world, poi, count),
+            size: size_of(world, poi),
+            share: near.map(|near| f64::from(near) / f64::from(needed)),
+            observed: observed[poi],
+            open: is_open(world, poi, step, observed),
+        }
+    }
+}
+
 /// Reports whether POIs have different values.
 pub(crate) fn values_differ(world: &World) -> bool {
     world.values.windows(2).any(|pair| pair[0] != pair[1])
@@ -149,14 +167,9 @@ fn value_label(world: &World, poi: usize) -> String {
 }
 
 /// Returns the size of a POI's mark, see [`Poi::size`].
-pub fn size_of(world: &World, poi: usize) -> f64 {
+fn size_of(world: &World, poi: usize) -> f64 {
     let largest = world.values.iter().copied().fold(0.0, f32::max);
     if values_differ(world) { 0.7 + 0.8 * f64::from(world.values[poi] / largest).sqrt() } else { 1.0 }
-}
-
-/// Returns the observation radius of a POI in map units.
-pub fn radius_of(world: &World, poi: usize) -> f64 {
-    f64::from(world.radii2[poi]).sqrt()
 }
 
 /// Returns the steps at which a POI can be observed, if these are not all.
@@ -173,7 +186,7 @@ pub(crate) fn is_timed(world: &World) -> bool {
 }
 
 /// Reports whether a POI can be observed at a step, if these POIs were observed before.
-pub fn is_open(world: &World, poi: usize, step: usize, before: &[bool]) -> bool {
+fn is_open(world: &World, poi: usize, step: usize, before: &[bool]) -> bool {
     let step = step as u32;
     world.rule.is_open(poi, step, before)
         && window_of(world, poi).is_none_or(|[first, last]| (first..=last).contains(&step))
@@ -192,7 +205,7 @@ fn time_label(world: &World, poi: usize) -> String {
 
 /// Returns a POI's label: `needs`, its value if values differ, and if POIs are timed also the POI's number and when it can be
 /// observed.
-pub fn poi_label(world: &World, poi: usize, needs: String) -> String {
+fn poi_label(world: &World, poi: usize, needs: String) -> String {
     let needs = needs + &value_label(world, poi);
     match (is_timed(world), time_label(world, poi)) {
         (false, _) => needs,

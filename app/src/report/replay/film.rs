@@ -34,20 +34,13 @@ impl Replayed {
         // The POIs that were observed before this step decide which POIs are open.
         let before: Vec<bool> = self.observed.iter().map(|at| at.is_some_and(|at| at < step.max(1))).collect();
         let poi = |(poi, place): (usize, &Vec2)| {
-            let (near, needed) = (self.near(step, poi), world.coupling[poi]);
-            let observed = self.observed[poi].filter(|&observed| observed <= step);
-            Poi {
-                place: place.as_dvec2(),
-                radius: map::radius_of(world, poi),
-                size: map::size_of(world, poi),
+            let open = Poi::new(world, poi, place.as_dvec2(), Some(self.near(step, poi)), step.max(1), &before);
+            match self.observed[poi].filter(|&observed| observed <= step) {
+                None => open,
                 // An observed POI needs no agents any more.
-                label: match observed {
-                    Some(observed) => map::observed_label(world, poi, observed),
-                    None => map::poi_label(world, poi, format!("{near}/{needed}")),
-                },
-                share: Some(if observed.is_some() { 1.0 } else { f64::from(near) / f64::from(needed) }),
-                observed: observed.is_some(),
-                open: map::is_open(world, poi, step.max(1), &before),
+                Some(at) => {
+                    Poi { label: map::observed_label(world, poi, at), share: Some(1.0), observed: true, ..open }
+                }
             }
         };
         Team {
