@@ -1,16 +1,15 @@
 //! Training by ask and tell.
 
-use std::sync::{Mutex, MutexGuard, TryLockError};
+use std::sync::{Mutex, MutexGuard};
 
 use flotilla::front;
 use flotilla::trainer::{Row, Snapshot};
 use flotilla_app::choice::Work;
 use numpy::{PyArray1, PyArray2, PyArray3, PyArray4, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray3};
-use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 
 use crate::config::Config;
-use crate::errors::Raise;
+use crate::errors::{Raise, contiguous};
 use crate::train::{Generation, Outcomes, outcomes};
 use crate::workers;
 
@@ -29,16 +28,8 @@ pub struct Coevolution {
 }
 
 impl Coevolution {
-    /// Returns the training, or an error if another thread uses it. Waiting would hide that two threads share one
-    /// training.
     fn lock(&self) -> PyResult<MutexGuard<'_, front::Coevolution>> {
-        match self.inner.try_lock() {
-            Ok(inner) => Ok(inner),
-            Err(TryLockError::Poisoned(poisoned)) => Ok(poisoned.into_inner()),
-            Err(TryLockError::WouldBlock) => {
-                Err(PyValueError::new_err("another thread uses this Coevolution: make one Coevolution per thread"))
-            }
-        }
+        workers::locked(&self.inner, "another thread uses this Coevolution: make one Coevolution per thread")
     }
 }
 
@@ -133,7 +124,7 @@ impl Coevolution {
 
     /// Breeds the next generation, and returns the generations that became complete.
     fn tell(&self, py: Python<'_>, fitness: PyReadonlyArray3<'_, f32>, backend: &str) -> PyResult<Vec<Generation>> {
-        let fitness = fitness.as_slice().map_err(|_| PyValueError::new_err("fitness is not C-contiguous"))?;
+        let fitness = contiguous("fitness is", fitness.as_slice())?;
         workers::play(py, backend, Work::default(), |(backend, _)| {
             let mut inner = self.lock()?;
             let told = inner.tell(&mut **backend, Some(fitness)).raise()?;

@@ -49,6 +49,12 @@ pub fn failed(text: impl ToString) -> PyErr {
     made("Error", (text.to_string(),))
 }
 
+/// Returns the elements of an array, or an error if they are not contiguous in C order. `what` is the start of the error:
+/// "actions are".
+pub fn contiguous<T, E>(what: &str, slice: Result<T, E>) -> PyResult<T> {
+    slice.map_err(|_| PyValueError::new_err(format!("{what} not C-contiguous")))
+}
+
 impl Raised for ConfigError {
     fn raised(self) -> PyErr {
         let text = self.to_string();

@@ -1,7 +1,7 @@
 //! Plays teams of given policies.
 
 use std::ops::ControlFlow;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use flotilla::backend::cpu::{self, StepArrays};
 use flotilla::config::{Actions, Choice, Fitness, MAX_HIDDEN_UNITS};
@@ -21,8 +21,8 @@ use pyo3::prelude::*;
 use rayon::prelude::*;
 
 use crate::config::Config;
-use crate::errors::Raise;
-use crate::workers;
+use crate::errors::{Raise, contiguous};
+use crate::workers::{self, PATIENCE};
 
 /// Returns the starts of episodes: the config's own, or held-out ones, from `(episodes, seed, jitter, poi_jitter)`.
 pub fn drawn(drawn: Option<(u32, u64, f64, f64)>) -> Starts {
@@ -44,7 +44,7 @@ pub fn weights<'a>(config: &Config, policies: &'a PyReadonlyArray3<'_, f32>) -> 
              {expected}], or [1, 1 or more, {expected}] if leaders share a policy"
         )));
     }
-    Ok((teams, policies.as_slice().map_err(|_| PyValueError::new_err("policies are not C-contiguous"))?))
+    Ok((teams, contiguous("policies are", policies.as_slice())?))
 }
 
 type Scores<'py> = (
@@ -56,9 +56,6 @@ type Scores<'py> = (
 );
 /// See `rollout`.
 type Spreads<'py> = (Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<u32>>);
-
-/// Minimum time between checks for Ctrl-C.
-const PATIENCE: Duration = Duration::from_millis(50);
 
 type PathScores<'py> = (
     Bound<'py, PyArray1<f64>>,
@@ -79,7 +76,7 @@ pub fn score<'py>(
     positions: PyReadonlyArray4<'py, f32>,
 ) -> PyResult<PathScores<'py>> {
     let teams = positions.shape()[0];
-    let positions = positions.as_slice().map_err(|_| PyValueError::new_err("positions are not C-contiguous"))?;
+    let positions = contiguous("positions are", positions.as_slice())?;
     let scored = workers::aside(py, || front::score(&config.0, positions).raise())?;
     let rows = |scores: Vec<f32>| PyArray1::from_vec(py, scores).reshape([teams, config.0.learners()]);
     let Scored { value, g, d, df, dpp, dt, fitness, .. } = scored;
@@ -175,12 +172,12 @@ pub fn record<'py>(
     let (mut arrays, mut near, mut observed_at, mut distances) = (arrays, near, observed_at, distances);
     let mut slices = [(); 6].map(|()| Default::default());
     for (slice, array) in slices.iter_mut().zip(&mut arrays) {
-        *slice = contiguous(array)?;
+        *slice = elements(array)?;
     }
     let [of_pois, of_agents] = &mut distances;
-    let (of_pois, of_agents) = (contiguous(of_pois)?, contiguous(of_agents)?);
+    let (of_pois, of_agents) = (elements(of_pois)?, elements(of_agents)?);
     let [positions, headings, speeds, inputs, outputs, actions] = slices;
-    let (near, observed_at) = (contiguous(&mut near)?, contiguous(&mut observed_at)?);
+    let (near, observed_at) = (elements(&mut near)?, elements(&mut observed_at)?);
     let world = World::new(&config.0.validate().raise()?);
     let sets = if near.is_empty() { 0 } else { near.len() / world.agents() * world.constants.words as usize };
     let deviations: Option<Vec<[f32; OUTPUTS]>> = noise.as_ref().map(|(_, deviations)| {
@@ -289,7 +286,7 @@ fn write_distances(
 }
 
 /// Returns the elements of an array, or none.
-fn contiguous<'a, T: Element>(array: &'a mut Option<PyReadwriteArrayDyn<'_, T>>) -> PyResult<&'a mut [T]> {
+fn elements<'a, T: Element>(array: &'a mut Option<PyReadwriteArrayDyn<'_, T>>) -> PyResult<&'a mut [T]> {
     let Some(array) = array else { return Ok(&mut []) };
     array.as_slice_mut().map_err(|_| PyValueError::new_err("arrays of steps must be C-contiguous"))
 }

@@ -3,7 +3,7 @@
 use std::cell::Cell;
 use std::ffi::OsString;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use flotilla::backend::OpenBackend;
 use flotilla::backend::gpu::device;
@@ -15,7 +15,7 @@ use pyo3::exceptions::{PyRuntimeWarning, PyValueError};
 use pyo3::prelude::*;
 
 use crate::errors::Raise;
-use crate::workers::{self, Lent};
+use crate::workers::{self, Lent, PATIENCE};
 
 /// Runs a command line, with the program's name first, and returns the exit code.
 #[pyfunction]
@@ -30,9 +30,6 @@ pub fn adapters(py: Python<'_>) -> Vec<(String, String, String, String)> {
     let found = workers::aside(py, device::adapters);
     found.into_iter().map(|info| (info.name, info.driver, info.backend.to_string(), info.kind.to_string())).collect()
 }
-
-/// Minimum time between checks for Ctrl-C.
-const PATIENCE: Duration = Duration::from_millis(50);
 
 /// Runs a use case of `flotilla_app::ops`. The request and the outcome are JSON.
 #[pyfunction]

@@ -1,6 +1,6 @@
 //! Steps teams with given actions, with NumPy arrays in and out.
 
-use std::sync::{Mutex, MutexGuard, TryLockError};
+use std::sync::{Mutex, MutexGuard};
 
 use flotilla::config::{Choice, Fitness};
 use flotilla::front;
@@ -18,11 +18,13 @@ use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 
 use crate::config::Config;
-use crate::errors::Raise;
+use crate::errors::{Raise, contiguous};
 use crate::play::write_members;
 use crate::workers;
 
 type States<'py> = (Bound<'py, PyArray3<f32>>, Bound<'py, PyArray3<f32>>, Bound<'py, PyArray2<f32>>);
+
+const SHARED: &str = "another thread is stepping this environment: make one environment per thread";
 
 /// Teams of one world that are stepped with given actions.
 #[pyclass(frozen)]
@@ -32,19 +34,9 @@ pub struct Stepper {
 }
 
 impl Stepper {
-    /// Returns the stepper, or an error if another thread uses it. Waiting would hide that two threads share one
-    /// environment.
     fn stepper(&self) -> PyResult<MutexGuard<'_, stepping::Stepper>> {
-        match self.inner.try_lock() {
-            Ok(stepper) => Ok(stepper),
-            Err(TryLockError::Poisoned(poisoned)) => Ok(poisoned.into_inner()),
-            Err(TryLockError::WouldBlock) => Err(shared()),
-        }
+        workers::locked(&self.inner, SHARED)
     }
-}
-
-fn shared() -> PyErr {
-    PyValueError::new_err("another thread is stepping this environment: make one environment per thread")
 }
 
 /// Copies one of the stepper's arrays to a new NumPy array.
@@ -88,8 +80,8 @@ impl Stepper {
         chosen: Option<PyReadonlyArray1<'_, bool>>,
         starts: Option<PyReadonlyArray3<'_, f32>>,
     ) -> PyResult<()> {
-        let chosen = chosen.as_ref().map(|chosen| contiguous("reset_mask", chosen.as_slice())).transpose()?;
-        let starts = starts.as_ref().map(|starts| contiguous("starts", starts.as_slice())).transpose()?;
+        let chosen = chosen.as_ref().map(|chosen| contiguous("reset_mask are", chosen.as_slice())).transpose()?;
+        let starts = starts.as_ref().map(|starts| contiguous("starts are", starts.as_slice())).transpose()?;
         workers::aside(py, || {
             let mut stepper = self.stepper()?;
             match (chosen, starts) {
@@ -119,9 +111,10 @@ impl Stepper {
             return Err(PyValueError::new_err(text));
         }
         let leaders = self.config.learners();
-        let mut rewards = rewards.map(|rewards| rewards.try_readwrite().map_err(|_| shared())).transpose()?;
-        let rewards = rewards.as_mut().map(|rewards| contiguous("rewards", rewards.as_slice_mut())).transpose()?;
-        let actions = contiguous("actions", actions.as_slice())?;
+        let mut rewards =
+            rewards.map(|rewards| rewards.try_readwrite().map_err(|_| PyValueError::new_err(SHARED))).transpose()?;
+        let rewards = rewards.as_mut().map(|rewards| contiguous("rewards are", rewards.as_slice_mut())).transpose()?;
+        let actions = contiguous("actions are", actions.as_slice())?;
         workers::aside(py, || {
             let mut stepper = self.stepper()?;
             stepper.step(actions).raise()?;
@@ -144,7 +137,7 @@ impl Stepper {
             let names: Vec<_> = Fitness::names().collect();
             return Err(PyValueError::new_err(format!("fitness {fitness:?}, allowed are {}", names.join(", "))));
         };
-        let scores = contiguous("scores", scores.as_slice_mut())?;
+        let scores = contiguous("scores are", scores.as_slice_mut())?;
         workers::aside(py, || self.stepper()?.fitness(fitness, scores).raise())
     }
 
@@ -158,7 +151,7 @@ impl Stepper {
             let text = format!("out is {:?}, allowed is [teams, leaders, inputs] = {shape:?}", out.shape());
             return Err(PyValueError::new_err(text));
         }
-        contiguous("out", out.as_slice_mut())?.copy_from_slice(stepper.inputs());
+        contiguous("out are", out.as_slice_mut())?.copy_from_slice(stepper.inputs());
         Ok(())
     }
 
@@ -255,9 +248,4 @@ fn team_of(stepper: &mut stepping::Stepper, team: usize) -> Team {
         agents: places.into_iter().enumerate().map(agent).collect(),
         pois: stepper.pois(team).iter().enumerate().map(poi).collect(),
     }
-}
-
-/// Returns the elements of an array, or an error if they are not contiguous in C order.
-fn contiguous<T, E>(what: &str, slice: Result<T, E>) -> PyResult<T> {
-    slice.map_err(|_| PyValueError::new_err(format!("{what} are not C-contiguous")))
 }

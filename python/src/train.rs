@@ -20,7 +20,7 @@ use pyo3::prelude::*;
 use pyo3::types::PyBool;
 
 use crate::config::Config;
-use crate::errors::Raise;
+use crate::errors::{Raise, contiguous};
 use crate::program::perform;
 use crate::workers;
 
@@ -190,11 +190,8 @@ pub fn first_policies(policies: &[PyReadonlyArray3<'_, f32>]) -> PyResult<(usize
     if policies.iter().any(|policies| policies.shape()[1] != count) {
         return Err(PyValueError::new_err("init: all trials must have the same number of policies"));
     }
-    let contiguous = |policies: &PyReadonlyArray3<'_, f32>| {
-        let slice = policies.as_slice().map_err(|_| PyValueError::new_err("init is not C-contiguous"))?;
-        PyResult::Ok(slice.to_vec())
-    };
-    Ok((count, policies.iter().map(contiguous).collect::<PyResult<_>>()?))
+    let copied = |policies: &PyReadonlyArray3<'_, f32>| Ok(contiguous("init is", policies.as_slice())?.to_vec());
+    Ok((count, policies.iter().map(copied).collect::<PyResult<_>>()?))
 }
 
 /// Writes policies, one array `[populations, policies, parameters]` per trial, as a file of a config that has so many.

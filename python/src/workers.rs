@@ -1,13 +1,14 @@
 //! Keeps backends open between calls, and starts threads, also in forked processes.
 
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError, TryLockError};
+use std::time::Duration;
 
 use flotilla::backend::OpenBackend;
 use flotilla::front::{self, Processor};
 use flotilla::parallel;
 use flotilla_app::choice::{self, Chosen, Work, WorkTotal};
-use pyo3::exceptions::PyRuntimeWarning;
+use pyo3::exceptions::{PyRuntimeWarning, PyValueError};
 use pyo3::prelude::*;
 
 use crate::errors::Raise;
@@ -18,6 +19,8 @@ static IDLE: Mutex<Vec<(String, OpenBackend)>> = Mutex::new(Vec::new());
 static WORK: Mutex<WorkTotal> = Mutex::new(WorkTotal::new());
 /// Maximum number of idle backends.
 const MAX_IDLE_BACKENDS: usize = 4;
+/// Minimum time between checks for Ctrl-C.
+pub const PATIENCE: Duration = Duration::from_millis(50);
 /// Whether this process was forked. Threads of its parent do not exist in it.
 static FORKED: AtomicBool = AtomicBool::new(false);
 
@@ -73,6 +76,16 @@ fn wanted_threads(otherwise: usize) -> usize {
 #[pyfunction]
 pub fn threads(py: Python<'_>) -> usize {
     aside(py, rayon::current_num_threads)
+}
+
+/// Returns what a Python object holds, or an error with this message if another thread uses it. Waiting would hide that
+/// two threads share the object.
+pub fn locked<'a, T>(inner: &'a Mutex<T>, shared: &'static str) -> PyResult<MutexGuard<'a, T>> {
+    match inner.try_lock() {
+        Ok(inner) => Ok(inner),
+        Err(TryLockError::Poisoned(poisoned)) => Ok(poisoned.into_inner()),
+        Err(TryLockError::WouldBlock) => Err(PyValueError::new_err(shared)),
+    }
 }
 
 /// Runs `work` without the interpreter's lock.
