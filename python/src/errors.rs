@@ -8,7 +8,6 @@ use flotilla::stepping::StepError;
 use flotilla_app::ops;
 use flotilla_app::record::RecordError;
 use flotilla_app::report::runs;
-use flotilla_app::run::RunError;
 use pyo3::exceptions::{PyFileExistsError, PyKeyboardInterrupt, PyMemoryError, PyValueError};
 use pyo3::prelude::*;
 
@@ -90,16 +89,6 @@ impl Raised for Failure {
     }
 }
 
-impl Raised for RunError {
-    fn raised(self) -> PyErr {
-        match self {
-            RunError::Record(error) => error.raised(),
-            RunError::TooLittle(_) | RunError::Memory { .. } => PyMemoryError::new_err(self.to_string()),
-            _ => failed(self),
-        }
-    }
-}
-
 impl Raised for RecordError {
     fn raised(self) -> PyErr {
         match self {
@@ -145,12 +134,6 @@ impl Raised for BackendError {
             BackendError::Gpu(DeviceError::UnknownAdapter { .. }) => PyValueError::new_err(self.to_string()),
             _ => failed(self),
         }
-    }
-}
-
-impl Raised for DeviceError {
-    fn raised(self) -> PyErr {
-        BackendError::from(self).raised()
     }
 }
 
