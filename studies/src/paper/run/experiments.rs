@@ -9,10 +9,9 @@ use flotilla::config::Config;
 use flotilla::escape::PathExt;
 use flotilla::trainer::Row;
 use flotilla_app::ops::{Context, Error, Event};
-use flotilla_app::record::RecordError;
 use flotilla_app::record::digests::Verification;
 use flotilla_app::record::disk::Disk;
-use flotilla_app::record::folder::{self, ARMS, Folder, Start, StartFrom};
+use flotilla_app::record::folder::{ARMS, Folder, Start, StartFrom};
 use flotilla_app::report::runs;
 use flotilla_app::run::{self, Session, SessionEnd, Twin};
 
@@ -44,15 +43,6 @@ impl Experiments {
     /// Returns the experiments that are copies.
     fn copies(&self) -> impl Iterator<Item = usize> {
         (0..self.all.len()).filter(|&experiment| self.trained(self.config_of[experiment]) != experiment)
-    }
-
-    /// Checks whether runs may be started in all folders, without changing them.
-    ///
-    /// # Errors
-    /// See [`folder::check`].
-    pub(super) fn check_folders(&self, disk: &Disk, start: Start) -> Result<(), RecordError> {
-        let configs = self.all.iter().map(|experiment| &experiment.config);
-        folder::check(disk, self.folders.iter().map(|path| &**path).zip(configs), start)
     }
 
     /// Opens the runs of all configs, and warns of damaged files. `Start::Force` also clears the folders of copies.

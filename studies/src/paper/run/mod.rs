@@ -199,7 +199,8 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let _lock = folder::lock(&disk, out)?;
     // Checked again, because another process could write here until the folder was locked.
     identity.check(out, start)?;
-    experiments.check_folders(&disk, start)?;
+    let configs = experiments.all.iter().map(|experiment| &experiment.config);
+    folder::check(&disk, experiments.folders.iter().map(|path| &**path).zip(configs), start)?;
     ownership::check(&disk, products().map(|name| out.join(name)))?;
     // A new paper is marked first, so that it is recognised if it is stopped. A refused resume keeps the old mark.
     let resumes = start == Start::Resume && out.join(folder::PAPER).exists();
