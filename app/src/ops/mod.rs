@@ -54,7 +54,6 @@ pub mod compare;
 pub mod error;
 pub mod output;
 pub mod plot;
-mod points;
 pub mod replay;
 pub mod rollout;
 pub mod sweep;

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 
 use super::output::{self, Destination};
-use super::{BackendSource, Context, Error, check_memory, escaped, points, with_remedy};
+use super::{BackendSource, Context, Error, check_memory, escaped, sweep, with_remedy};
 use crate::choice::Work;
 use crate::record::RecordError;
 use crate::record::digests::Verification;
@@ -177,7 +177,7 @@ pub fn run(
     let out = place.path();
     let kind = Form::of(out)?;
     kind.takes(out, request)?;
-    let config = points::config(folder, verification)?.validate()?;
+    let config = sweep::config_of_run(folder, verification)?.validate()?;
     let trial = request.trial.find(folder, &config, generation, team, verification)?;
     let generation = match generation {
         Some(generation) => generation,
@@ -241,7 +241,7 @@ pub fn play(
     backends: &mut dyn BackendSource,
     context: Context<'_>,
 ) -> Result<(Config, Vec<Replayed>), Error> {
-    let config = stage(&points::config(folder, verification)?.validate()?, generations)?.clone();
+    let config = stage(&sweep::config_of_run(folder, verification)?.validate()?, generations)?.clone();
     let learning = Learning { trials: 1, ..config.learning.clone() };
     let trained = Config { learning, ..config.clone() }.validate()?;
     let (open, _) = backends.open(Work::of([&*trained]))?;

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
-use super::{BackendSource, ConfigText, Context, Error, ProcessorInfo, output, points, with_remedy};
+use super::{BackendSource, ConfigText, Context, Error, ProcessorInfo, output, sweep, with_remedy};
 use crate::choice::Work;
 use crate::import;
 use crate::record::digests::{Digests, Verification};
@@ -143,7 +143,7 @@ pub fn run(
     let path = &request.path;
     let (config_path, trained) = match path.is_dir() {
         true => {
-            points::config(path, Verification::unless(request.unverified))?;
+            sweep::config_of_run(path, Verification::unless(request.unverified))?;
             let policies = path.join(folder::POLICIES);
             if request.policies.is_none() && !policies.exists() {
                 let reason = format!("it has no {} yet", folder::POLICIES);

@@ -11,11 +11,11 @@ use serde_json::Value;
 use super::{BackendSource, Context, Error, Event, check_memory};
 use crate::choice::Work;
 use crate::record::RecordError;
-use crate::record::digests::UNVERIFIED;
+use crate::record::digests::{UNVERIFIED, Verification};
 use crate::record::disk::{Disk, Place};
 use crate::record::folder::{self, CONFIG, RUN, Run, SWEEP, Start};
 use crate::record::ownership;
-use crate::record::runs;
+use crate::record::runs::{self, ReadError};
 use crate::report::comparison;
 use crate::report::runs::TeamKind;
 use crate::run::{Progress, RunError, Session, SessionEnd};
@@ -31,6 +31,9 @@ use flotilla::escape::PathExt;
 use flotilla::memory;
 use flotilla::reach::{self, Unreachable};
 use flotilla::statistics;
+
+/// Maximum number of points that are listed instead of a run.
+const MAX_LISTED_POINTS: usize = 40;
 
 /// A request to train or collect a sweep.
 #[derive(Clone, Debug, Deserialize)]
@@ -582,6 +585,28 @@ fn summary(sweep: &Sweep, outcomes: &[Result<PointResults, Missing>], options: &
             };
             let _ = writeln!(text, "  {mean}  {reached:>11}  {}", sweep.describe(point));
         }
+    }
+    text
+}
+
+/// Reads a run's config. If the folder is a sweep's, the error lists its points with their values.
+pub(super) fn config_of_run(folder: &Path, verification: Verification) -> Result<Config, Error> {
+    runs::config(folder, verification).map_err(|error| match error {
+        ReadError::Collection { what: "a sweep", .. } => match Sweep::load(&folder.join(SWEEP), &[], false) {
+            Ok(sweep) => Error::Refused(list_points(&sweep, folder).into()),
+            Err(error) => error.into(),
+        },
+        error => error.into(),
+    })
+}
+
+fn list_points(sweep: &Sweep, folder: &Path) -> String {
+    let mut text = format!("{} holds a sweep; name one of its points:", folder.escaped());
+    for point in sweep.points.iter().take(MAX_LISTED_POINTS) {
+        let _ = write!(text, "\n  {}  {}", results::point_folder(folder, point).escaped(), sweep.describe(point));
+    }
+    if let more @ 1.. = sweep.points.len().saturating_sub(MAX_LISTED_POINTS) {
+        let _ = write!(text, "\n  … and {more} more");
     }
     text
 }
