@@ -101,11 +101,6 @@ impl<'a> FromIterator<&'a f64> for Average {
 }
 
 /// Returns a share with the exact interval of Clopper and Pearson. None if `of` is 0.
-pub fn share(count: usize, of: usize) -> Option<Estimate> {
-    share_at(CONFIDENCE, count, of)
-}
-
-/// Returns the same as [`share`], with an interval of any confidence level.
 pub fn share_at(confidence: f64, count: usize, of: usize) -> Option<Estimate> {
     let (some, others) = (count as f64, of.checked_sub(count)? as f64);
     let bound = |a: f64, b: f64, at: f64| at.inv_inc_beta(a, b, a.ln_beta(b));

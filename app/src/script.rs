@@ -64,14 +64,6 @@ impl Script {
         Ok(())
     }
 
-    /// Plays one team from the start in the config's own keys, without stages or jitter, see [`Script::play_from`].
-    ///
-    /// # Errors
-    /// See [`Script::play_from`].
-    pub fn play(&self, config: &StageConfig) -> Result<Vec<Option<u32>>, StepError> {
-        self.play_from(config, &Starts::Own, 0)
-    }
-
     /// Plays one team from the start of an episode. Returns the step at which each POI was first observed, `[pois]`.
     ///
     /// # Errors

@@ -9,7 +9,7 @@ use flotilla::baseline::{self, Baseline, Baselines};
 use flotilla::config::{Fitness, Mutation, Override, Paradigm, Sharing, ValidConfig, own_populations};
 use flotilla::evaluate::{self, Starts};
 use flotilla::evolve::{self, Key, Purpose};
-use flotilla::statistics::{self, Average, Estimate, Tested};
+use flotilla::statistics::{self, Average, CONFIDENCE, Estimate, Tested};
 use flotilla::world::World;
 use flotilla_studies::paper::claims::{Claim, Verdict, claims};
 use flotilla_studies::paper::{self, Evidence, Experiment, LAYOUTS, SOURCES, Source, tables};
@@ -47,7 +47,7 @@ fn intervals_and_tests_equal_those_of_scipy() {
     assert!(shares.len() > 20 && spreads.len() > 3);
     for case in shares {
         let [count, of] = ["count", "of"].map(|key| case[key].as_u64().unwrap() as usize);
-        let share = statistics::share(count, of).unwrap();
+        let share = statistics::share_at(CONFIDENCE, count, of).unwrap();
         near(share.value, &(count as f64 / of as f64).into());
         near(share.low, &case["low"]);
         near(share.high, &case["high"]);
@@ -201,7 +201,8 @@ fn intervals_of_few_discrete_scores_cover_the_mean() {
     for few in [&[][..], &[1.0]] {
         assert_eq!(statistics::bounded(&few.iter().collect(), [0.0, 1.0]), None);
     }
-    assert_eq!((statistics::share(0, 0), statistics::share(2, 1)), (None, None));
+    let share = |count, of| statistics::share_at(CONFIDENCE, count, of);
+    assert_eq!((share(0, 0), share(2, 1)), (None, None));
 }
 
 /// Most pairs are equal in the worst case, and the others all differ in one direction.

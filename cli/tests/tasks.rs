@@ -11,6 +11,7 @@ use std::sync::atomic::AtomicBool;
 
 use crate::support::{Place, TINY};
 use assert_cmd::cargo::cargo_bin_cmd;
+use flotilla::evaluate::Starts;
 use flotilla::{Config, front};
 use flotilla_app::ops::{ConfigText, Context};
 use flotilla_app::record::folder::Start;
@@ -33,8 +34,9 @@ fn play(config: &Config, path: &Path) -> Vec<Option<u32>> {
     let script = Script::parse(&fs::read_to_string(path).unwrap()).unwrap();
     let config = &config.validate().unwrap();
     // A team that does not move observes nothing, so the script matters.
-    assert!(Script::default().play(config.as_ref()).unwrap().iter().all(Option::is_none), "{}", path.display());
-    script.play(config.as_ref()).unwrap()
+    let play = |script: &Script| script.play_from(config.as_ref(), &Starts::Own, 0).unwrap();
+    assert!(play(&Script::default()).iter().all(Option::is_none), "{}", path.display());
+    play(&script)
 }
 
 #[test]
