@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
+use super::sweep::command_to_resume;
 use super::{Context, Error, with_remedy};
 use crate::record;
 use crate::record::digests::Verification;
@@ -250,13 +251,11 @@ fn of_sweep(out: &Path, args: &CompareRequest, notes: &mut Vec<String>) -> Resul
             groups.push((group.place, arms));
         }
     }
-    let [file, folder] = [out.join(SWEEP), out.into()].map(|path: PathBuf| shell::argument(&path));
-    let command = shell::command(["flotilla".into(), "sweep".into(), file, "--out".into(), folder, "--resume".into()]);
     match groups.is_empty() {
         false => Ok(groups),
         true => Err(Error::Missing(with_remedy(
             format!("{}: no two values of {} have runs to compare", out.escaped(), sweep.axes[by].key),
-            format!("`{command}` trains them"),
+            format!("`{}` trains them", command_to_resume(out)),
         ))),
     }
 }

@@ -261,15 +261,14 @@ pub fn same_sweep(sweep: &Sweep, out: &Path) -> Result<(), Error> {
         out.escaped(),
         missing(&existing, &sweep.text, "there"),
         missing(&sweep.text, &existing, "here"),
-        shell::command([
-            "flotilla".into(),
-            "sweep".into(),
-            shell::argument(&path),
-            "--out".into(),
-            shell::argument(out),
-            "--resume".into(),
-        ]),
+        command_to_resume(out),
     ))
+}
+
+/// Returns the command that resumes the sweep in a folder with its own file.
+pub(super) fn command_to_resume(out: &Path) -> String {
+    let [file, out] = [&out.join(SWEEP), out].map(shell::argument);
+    shell::command(["flotilla".into(), "sweep".into(), file, "--out".into(), out, "--resume".into()])
 }
 
 /// Marks the folder as this sweep's. Shards that start at the same moment write the same content.
