@@ -6,7 +6,7 @@ use pdf_writer::types::{CidFontType, FontFlags, LineJoinStyle, SystemInfo, TextR
 use pdf_writer::{Content, Filter, Finish, Name, Pdf, Rect, Ref, Str, TextStr};
 
 use super::letters;
-use super::scene::{Anchor, BOLD, Color, Fill, Mark, Pen, Scene};
+use super::scene::{BOLD, Color, Fill, Mark, Pen, Scene};
 
 /// Points per millimetre.
 const POINTS: f64 = 72.0 / 25.4;
@@ -151,12 +151,7 @@ impl Page {
                 }
                 Mark::Text { place: [x, y], text, size, anchor, color, upright, bold } => {
                     let (glyphs, length) = letters::set(text);
-                    let length = f64::from(length) * size / letters::units_per_em();
-                    let start = match anchor {
-                        Anchor::Start => 0.0,
-                        Anchor::Middle => length / 2.0,
-                        Anchor::End => length,
-                    };
+                    let start = f64::from(length) * size / letters::units_per_em() * anchor.share();
                     self.opacity(&mut content, 1.0);
                     let [r, g, b] = rgb(*color);
                     content.set_fill_rgb(r, g, b);

@@ -98,6 +98,17 @@ pub enum Anchor {
     End,
 }
 
+impl Anchor {
+    /// Returns the share of the text's width that is left of the given position.
+    pub(super) fn share(self) -> f64 {
+        match self {
+            Anchor::Start => 0.0,
+            Anchor::Middle => 0.5,
+            Anchor::End => 1.0,
+        }
+    }
+}
+
 #[derive(Clone, Debug)]
 pub(super) enum Mark {
     Shape {
@@ -305,11 +316,7 @@ impl Scene {
                 Mark::Text { place, text, size, anchor, color, upright, bold } => {
                     let (glyphs, length) = letters::set(text);
                     let [x, y] = place.map(|at| Rounded(at * SVG_UNITS));
-                    let start = match anchor {
-                        Anchor::Start => 0,
-                        Anchor::Middle => -i64::from(length / 2),
-                        Anchor::End => -i64::from(length),
-                    };
+                    let start = -((f64::from(length) * anchor.share()) as i64);
                     write!(svg, "<g aria-label=\"{}\" fill=\"{}\"", Escaped(text), hex(*color))?;
                     if *bold {
                         // The font has a single weight, so an outline makes letters bold.
@@ -373,12 +380,7 @@ impl Scene {
                     paint_pixels(&mut pixmap, path, (fill.as_ref(), pen.as_ref()), transform, mask.as_ref());
                 }
                 Mark::Text { place: [x, y], text, size, anchor, color, upright, bold } => {
-                    let width = text_width(text, *size);
-                    let start = match anchor {
-                        Anchor::Start => 0.0,
-                        Anchor::Middle => -width / 2.0,
-                        Anchor::End => -width,
-                    };
+                    let start = -text_width(text, *size) * anchor.share();
                     let turn = if *upright { -90.0 } else { 0.0 };
                     let place = transform.pre_translate(*x as f32, *y as f32).pre_concat(Transform::from_rotate(turn));
                     // The font has a single weight, so an outline makes letters bold.
