@@ -3,7 +3,8 @@
 use std::fmt::{self, Display};
 use std::io;
 
-use serde::ser::{Serialize, SerializeStruct, Serializer};
+use serde::ser::{Serialize, Serializer};
+use serde_json::json;
 
 use crate::record::RecordError;
 use crate::report::comparison::ComparisonError;
@@ -257,11 +258,7 @@ impl From<DeviceError> for Error {
 
 impl Serialize for Error {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let mut fields = serializer.serialize_struct("Error", 3)?;
-        fields.serialize_field("code", self.code())?;
-        fields.serialize_field("message", &self.message())?;
-        fields.serialize_field("remedy", &self.remedy())?;
-        fields.end()
+        json!({ "code": self.code(), "message": self.message(), "remedy": self.remedy() }).serialize(serializer)
     }
 }
 

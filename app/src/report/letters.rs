@@ -9,12 +9,9 @@ use ttf_parser::{Face, OutlineBuilder};
 /// The font file.
 pub(crate) const FILE: &[u8] = include_bytes!("font/dejavu-sans.ttf");
 
-static FONT: LazyLock<Face<'static>> = LazyLock::new(|| Face::parse(FILE, 0).expect("the embedded font is whole"));
-
-/// Returns the parsed font.
-pub(crate) fn font() -> &'static Face<'static> {
-    &FONT
-}
+/// The parsed font.
+pub(crate) static FONT: LazyLock<Face<'static>> =
+    LazyLock::new(|| Face::parse(FILE, 0).expect("the embedded font is whole"));
 
 /// Returns the number of font units per em.
 pub(crate) fn units_per_em() -> f64 {

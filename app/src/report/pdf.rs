@@ -47,7 +47,7 @@ impl Scene {
         sheet.finish();
         pdf.stream(contents, &packed(&content)).filter(Filter::FlateDecode);
 
-        let face = letters::font();
+        let face = &letters::FONT;
         let per_mille = |units: f64| (units * 1000.0 / letters::units_per_em()) as f32;
         pdf.type0_font(font)
             .base_font(FONT)

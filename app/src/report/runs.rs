@@ -199,13 +199,10 @@ fn figure_of_runs(
     Figure {
         panels: vec![Panel { title: String::new(), curves: curves.into_iter().enumerate().collect(), stages }],
         legend,
-        references: vec![],
         y_label,
         y_max: 1.0,
         shares: true,
-        band: Band::Interval,
-        source: None,
-        warning: None,
+        ..Figure::default()
     }
 }
 

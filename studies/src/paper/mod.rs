@@ -13,7 +13,7 @@ use flotilla::config::{self, Config, ConfigError, Fitness, Override, Paradigm, P
 use flotilla::model::policy::Actions;
 use flotilla::statistics::Average;
 use flotilla::trainer::Row;
-use flotilla_app::report::curves::{Band, Curve, Figure, Panel};
+use flotilla_app::report::curves::{Curve, Figure, Panel};
 
 pub mod claims;
 pub mod run;
@@ -307,10 +307,7 @@ pub fn figure(results: Evidence<'_>, layout: usize) -> Figure {
         references: vec!["best constant speed".into(), "best of as many shared random networks".into()],
         y_label: "POIs observed by the champion".into(),
         y_max: PARADIGMS.into_iter().map(pois).fold(1.0, f64::max),
-        shares: false,
-        band: Band::Interval,
-        source: None,
-        warning: None,
+        ..Figure::default()
     }
 }
 
