@@ -715,7 +715,7 @@ fn a_damaged_checkpoint_is_reported_and_the_previous_one_is_used() {
         let outcome = session(&config, &path, Start::Resume, Disk::default(), cpu(), Some(10));
         assert_eq!(outcome.start, 8, "{damage}");
         let note = outcome.notes[0].to_string();
-        assert!(outcome.notes[0].is_damage() && note.contains("000000009.safetensors: "), "{damage}: {note}");
+        assert!(outcome.notes[0].is_damage && note.contains("000000009.safetensors: "), "{damage}: {note}");
         assert_eq!(checkpoint::list(&path.join("checkpoints")).unwrap(), [9, 10]);
         for generation in [9, 10] {
             fs::remove_file(checkpoint::path(&path.join("checkpoints"), generation)).unwrap();

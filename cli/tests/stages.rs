@@ -527,7 +527,7 @@ fn a_run_that_was_ended_early_equals_a_shorter_run() {
         train_shorter(&config, &killed, init.clone(), 3, false);
         let (session, notes) =
             Session::open(vec![(shorter.clone(), killed.clone())], Start::Resume, &Disk::default()).unwrap();
-        assert!(notes.iter().all(|(_, note)| !note.is_damage()), "{number}: {notes:?}");
+        assert!(notes.iter().all(|(_, note)| !note.is_damage), "{number}: {notes:?}");
         drop(session);
         assert_eq!(train(&shorter, &killed, None, Start::Resume, 99).unwrap(), expected, "{number}");
         // Both can be extended.

@@ -45,7 +45,7 @@ seconds = 0
 
 fn train(folder: &Path) {
     let (mut session, notes) = Session::open(vec![(config(), folder.into())], Start::Resume, &Disk::default()).unwrap();
-    assert!(!notes.iter().any(|(_, note)| note.is_damage()), "{notes:?}");
+    assert!(!notes.iter().any(|(_, note)| note.is_damage), "{notes:?}");
     let mut backend: OpenBackend = (Box::new(Cpu::default()), Machine::default());
     let (stop, save) = (AtomicBool::new(false), AtomicBool::new(false));
     let mut options = Options {

@@ -378,7 +378,7 @@ pub fn train_points(
         let runs = batch.iter().map(|point| (Config::clone(&point.config), results::point_folder(out, point)));
         let (mut session, notes) = Session::open(runs.collect(), start, disk)?;
         // Every resumed point has a note. Only damage is reported.
-        for (run, note) in notes.iter().filter(|(_, note)| note.is_damage()) {
+        for (run, note) in notes.iter().filter(|(_, note)| note.is_damage) {
             context.warn(format_args!("{}: {note}", sweep.describe(batch[*run])));
         }
         // Steps of earlier sessions do not count.

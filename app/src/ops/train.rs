@@ -278,7 +278,7 @@ fn open_session(
     })?;
     session.set_name(0, &request.name);
     for (_, note) in found {
-        if note.is_damage() { context.warn(note) } else { context.note(note) }
+        if note.is_damage { context.warn(note) } else { context.note(note) }
     }
     Ok(session)
 }

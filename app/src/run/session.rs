@@ -65,7 +65,7 @@ impl Session {
         let (mut members, mut states, mut notes) = (Vec::new(), Vec::new(), Vec::new());
         for (member, state, own_notes) in opened {
             // One warning about missing locks is enough for all runs.
-            let is_new = |note: &Note| *note != Note::NotLocked || !notes.iter().any(|(_, other)| other == note);
+            let is_new = |note: &Note| *note != Note::not_locked() || !notes.iter().any(|(_, other)| other == note);
             let own_notes: Vec<Note> = own_notes.into_iter().filter(is_new).collect();
             notes.extend(own_notes.into_iter().map(|note| (members.len(), note)));
             members.push(member);

@@ -96,54 +96,30 @@ pub struct Resumed {
 
 /// Observation about a folder and the resulting action, for the user.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Note {
-    /// A checkpoint cannot be used, for this reason.
-    SetAside(String),
-    /// A small file cannot be read, for this reason.
-    Rewritten(String),
-    /// The text of `config.toml` was written by hand, and another text replaces it.
-    ConfigKept {
-        /// Path of the copy of the old text.
-        path: PathBuf,
-    },
-    /// The replacement of a run was interrupted.
-    Replacing,
-    /// The run resumes from a checkpoint.
-    Resuming {
-        /// Generation that is played next.
-        generation: usize,
-    },
-    /// None of the checkpoints can be used.
-    StartingOver,
-    /// There are no checkpoints.
-    Starting,
-    /// The file system does not support locks.
-    NotLocked,
+pub struct Note {
+    text: String,
+    /// Whether the user must be warned. The other notes are normal for a resumed run.
+    pub is_damage: bool,
 }
 
 impl Note {
-    /// Reports whether the user must be warned. The other notes are normal for a resumed run.
-    pub fn is_damage(&self) -> bool {
-        matches!(self, Note::SetAside(_) | Note::Rewritten(_) | Note::StartingOver | Note::NotLocked)
+    fn normal(text: impl Into<String>) -> Note {
+        Note { text: text.into(), is_damage: false }
+    }
+
+    fn damage(text: impl Into<String>) -> Note {
+        Note { text: text.into(), is_damage: true }
+    }
+
+    /// Returns the note for a file system that does not support locks.
+    pub(crate) fn not_locked() -> Note {
+        Note::damage("this file system has no locks, so start only one process at a time in this folder")
     }
 }
 
 impl fmt::Display for Note {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Note::SetAside(reason) => write!(f, "{reason}; set aside, and the one before is used"),
-            Note::Rewritten(reason) => write!(f, "{reason}; it is rewritten"),
-            Note::ConfigKept { path } => {
-                write!(f, "{CONFIG} has changed; its old text is kept as {}", path.display())
-            }
-            Note::Replacing => f.write_str("the replacement of a run was interrupted: the rest of that run is removed"),
-            Note::Resuming { generation } => write!(f, "resuming at generation {generation}"),
-            Note::StartingOver => f.write_str("no checkpoint can be used: starting over, to the same results"),
-            Note::NotLocked => {
-                f.write_str("this file system has no locks, so start only one process at a time in this folder")
-            }
-            Note::Starting => f.write_str("no checkpoint yet: starting from the beginning"),
-        }
+        f.write_str(&self.text)
     }
 }
 
@@ -194,7 +170,7 @@ impl Folder {
         let holds_run = holds_run()?;
         let folder = Folder { path: path.into(), disk, lock };
         let mut found = Resumed::default();
-        found.notes.extend(folder.lock.is_none().then_some(Note::NotLocked));
+        found.notes.extend(folder.lock.is_none().then(Note::not_locked));
         let interrupted = folder.read_run().ok().filter(|run| run.state == Status::Replacing);
         match (start, interrupted) {
             (Start::Force, _) if holds_run => {
@@ -204,7 +180,9 @@ impl Folder {
                 if let Some(error) = folder.origin_error(config, Some(&run), false) {
                     return Err(error);
                 }
-                found.notes.push(Note::Replacing);
+                found
+                    .notes
+                    .push(Note::normal("the replacement of a run was interrupted: the rest of that run is removed"));
                 folder.clear(&run, config, &mut found)?;
             }
             _ => {}
@@ -250,7 +228,9 @@ impl Folder {
     pub(crate) fn write_config(&self, config: &Config) -> Result<Option<Note>, RecordError> {
         let kept = self.keep_config()?;
         self.write_text(CONFIG, &config.to_toml())?;
-        Ok(kept.map(|path| Note::ConfigKept { path }))
+        let note =
+            |path: PathBuf| Note::normal(format!("{CONFIG} has changed; its old text is kept as {}", path.display()));
+        Ok(kept.map(note))
     }
 
     /// Copies `config.toml` unless flotilla wrote its text. Returns the path of the copy.

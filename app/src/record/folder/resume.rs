@@ -64,9 +64,9 @@ impl Folder {
             self.check_start(found.run.as_ref(), from, had_checkpoints)?;
         }
         found.notes.push(match &found.checkpoint {
-            Some((checkpoint, _)) => Note::Resuming { generation: checkpoint.snapshot.generation },
-            None if had_checkpoints => Note::StartingOver,
-            None => Note::Starting,
+            Some((checkpoint, _)) => Note::normal(format!("resuming at generation {}", checkpoint.snapshot.generation)),
+            None if had_checkpoints => Note::damage("no checkpoint can be used: starting over, to the same results"),
+            None => Note::normal("no checkpoint yet: starting from the beginning"),
         });
         found.kept = kept;
         Ok(())
@@ -90,7 +90,9 @@ impl Folder {
         match self.read_run() {
             Ok(run) => found.run = Some(run),
             Err(RecordError::Read { error, .. }) if error.kind() == ErrorKind::NotFound => {}
-            Err(error @ RecordError::Damaged { .. }) => found.notes.push(Note::Rewritten(error.to_string())),
+            Err(error @ RecordError::Damaged { .. }) => {
+                found.notes.push(Note::damage(format!("{error}; it is rewritten")))
+            }
             Err(error) => return Err(error),
         }
         found.finished = found.run.as_ref().map_or(Ok(None), |run| self.finished(run, config))?;
@@ -160,7 +162,7 @@ impl Folder {
                 Err(error @ RecordError::Damaged { .. }) => error.to_string(),
                 Err(error) => return Err(error),
             };
-            notes.push(Note::SetAside(reason));
+            notes.push(Note::damage(format!("{reason}; set aside, and the one before is used")));
             let damaged = checkpoint::quarantine_path(&path);
             self.disk.rename(&path, &damaged).map_err(RecordError::write(&damaged))?;
             kept.pop();
@@ -243,7 +245,7 @@ impl Folder {
                 Ok(None)
             }
             Err(error) => {
-                found.notes.push(Note::Rewritten(error.to_string()));
+                found.notes.push(Note::damage(format!("{error}; it is rewritten")));
                 Ok(None)
             }
         }

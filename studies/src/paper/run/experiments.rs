@@ -52,7 +52,7 @@ impl Experiments {
     pub(super) fn open(&self, start: Start, disk: &Disk, context: Context<'_>) -> Result<Session, Error> {
         let folders = (0..self.configs.len()).map(|config| self.folders[self.trained(config)].clone());
         let (session, notes) = Session::open(self.configs.iter().cloned().zip(folders).collect(), start, disk)?;
-        for (config, note) in notes.iter().filter(|(_, note)| note.is_damage()) {
+        for (config, note) in notes.iter().filter(|(_, note)| note.is_damage) {
             context.warn(format_args!("{}: {note}", self.all[self.trained(*config)].name()));
         }
         if start == Start::Force {
