@@ -107,9 +107,9 @@
 //! | [`statistics`] | confidence intervals and tests |
 //! | [`evaluate`] | evaluation of trained teams from held-out starts |
 //! | [`verify`] | check that two backends agree bit for bit |
+//! | [`memory`] | a run's peak memory |
 //! | [`stepping`] | stepping of teams with given actions |
 //! | [`baseline`] | baselines without coevolution |
-//! | [`memory`] | a run's peak memory |
 //! | [`front`] | the functions that most programs need |
 //!
 //! Only `backend::gpu` uses wgpu. The model does not depend on threads or GPUs. Only [`host`] reads the clock.
