@@ -49,7 +49,6 @@ mod recovery;
 mod replay;
 pub mod request;
 mod rollout;
-mod slurm;
 mod sweep;
 mod tasks;
 mod train;

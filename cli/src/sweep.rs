@@ -6,9 +6,7 @@ use std::path::{Path, PathBuf};
 
 use serde_json::json;
 
-use super::{
-    Error, ExistingResults, Overrides, RunOptions, between, console, print, print_json, recovery, say, slurm, whole,
-};
+use super::{Error, ExistingResults, Overrides, RunOptions, between, console, print, print_json, recovery, say, whole};
 use flotilla::config;
 use flotilla::escape::PathExt;
 use flotilla_app::ops::sweep::{SweepRequest, claim};
@@ -23,6 +21,8 @@ use flotilla_app::sweep::Sweep;
 use flotilla_app::sweep::results::ResultOptions;
 use flotilla_app::sweep::shard::{self, MAX_SHARDS, Shard};
 
+mod slurm;
+
 const SCALE_OUT: &str = "Many processes (docs/how-to/clusters.md)";
 const RESULTS: &str = "Results";
 
@@ -33,7 +33,7 @@ pub struct Args {
     #[command(flatten)]
     overrides: Overrides,
     #[command(flatten)]
-    pub(super) run: RunOptions,
+    run: RunOptions,
     /// Output directory, the same for all shards [default: runs/NAME of the sweep]
     #[arg(long, short, value_name = "DIR")]
     out: Option<PathBuf>,
@@ -66,16 +66,16 @@ pub struct Args {
     slurm: Option<Option<PathBuf>>,
     /// Number of tasks of the job array, or of shards that --list shows
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = shard_count, help_heading = SCALE_OUT)]
-    pub(super) shards: usize,
+    shards: usize,
     /// Time limit of a task of the job array
     #[arg(long, value_name = "HH:MM:SS", default_value = "01:00:00", value_parser = time_limit, help_heading = SCALE_OUT)]
-    pub(super) time: String,
+    time: String,
     /// GPUs per task of the job array [default: 1, or 0 with --backend cpu]
     #[arg(long, value_name = "N", value_parser = whole, help_heading = SCALE_OUT)]
-    pub(super) gpus: Option<usize>,
+    gpus: Option<usize>,
     /// Another option of the batch script, for example --sbatch=--partition=long; can be repeated
     #[arg(long, value_name = "OPTION", allow_hyphen_values = true, value_parser = an_option, help_heading = SCALE_OUT)]
-    pub(super) sbatch: Vec<String>,
+    sbatch: Vec<String>,
 
     /// Write a row of results.csv every N generations, and for the last
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = between(1..=u32::MAX), help_heading = RESULTS)]

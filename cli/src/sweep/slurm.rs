@@ -3,8 +3,8 @@
 use std::ffi::{OsStr, OsString};
 use std::path::Path;
 
-use super::BackendChoice;
-use super::sweep::Args;
+use super::Args;
+use crate::BackendChoice;
 use flotilla::escape::{self, PathExt};
 use flotilla_app::shell;
 
