@@ -355,6 +355,10 @@ mod links {
         symlink(victim.join("new"), place.path("run/replay.html")).unwrap();
         assert_unchanged(&place, &victim, &["replay run --quiet"]);
         fs::remove_file(place.path("run/replay.html")).unwrap();
+        // A run stays whole if its page cannot be removed.
+        symlink(victim.join("file"), place.path("run/replay.html")).unwrap();
+        assert_unchanged(&place, &place.path("run"), &["train small.toml --out run --quiet --force"]);
+        fs::remove_file(place.path("run/replay.html")).unwrap();
         fs::remove_file(place.path("run").join(LIST)).unwrap();
         symlink(victim.join("file"), place.path("run").join(LIST)).unwrap();
         assert_unchanged(&place, &victim, &["replay run --quiet"]);

@@ -646,6 +646,9 @@ fn every_command_supports_stages() {
     good("plot run --unverified --out short.svg");
     let curves = fs::read_to_string(folder.join("short.svg")).unwrap();
     assert!(curves.contains("Stage 1 begins") && !curves.contains("Stage 2 begins"), "{curves}");
+    fs::write(folder.join("run/metrics.csv"), rows.split_once('\n').unwrap().1).unwrap();
+    let (_, _, stderr) = run(&folder, "plot run --unverified --out short.svg");
+    assert!(stderr.contains("line 1 is not trial,") && stderr.contains("test_g and stage if the config"), "{stderr}");
     fs::write(folder.join("run/metrics.csv"), rows).unwrap();
     good("rollout staged.toml --policies run/policies.safetensors");
     assert!(good("rollout staged.toml --policies run/policies.safetensors --stage 2").contains("of 3"));
@@ -656,6 +659,15 @@ fn every_command_supports_stages() {
     let text = String::from_utf8(output.stdout).unwrap();
     let steps = text.lines().find_map(|line| line.strip_prefix("#   team-steps")).map(str::trim);
     assert_eq!(steps, Some(format!("{}", 27 * (2 * 9 + 2 * 2 * 14 + 3 * 9)).as_str()), "{text}");
+    // Notes name their stage, and flags that a stage overrides.
+    fs::write(
+        folder.join("noted.toml"),
+        format!("{SMALL}[[stages]]\nfrom = 2\nset = {{ learning.fitness = 'Df', world.coupling = 1 }}\n"),
+    )
+    .unwrap();
+    let (_, _, stderr) = run(&folder, "check noted.toml --set world.coupling=2 --set world.steps=9");
+    assert!(stderr.contains("--set world.coupling: the stage from generation 2 on sets this, too"), "{stderr}");
+    assert!(!stderr.contains("--set world.steps"), "{stderr}");
     // If --generations ends the run before a stage, the run's config omits the stage. Both configs can resume the run.
     let (code, _, stderr) = run(&folder, "train staged.toml --generations 3 --out short --quiet");
     assert_eq!(code, Some(0), "{stderr}");

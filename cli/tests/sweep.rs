@@ -812,6 +812,14 @@ fn a_folder_with_another_sweep_or_a_run_is_refused() {
     let (_other, same) = write_sweep(&format!("# The same.\n{SMALL}"));
     succeed(flotilla(&same, &out, &["--quiet", "--resume", "--skip-impossible"]));
     assert!(results(&out) == before);
+    // A file that is cut off is damaged, and not another sweep.
+    let text = fs::read_to_string(out.join("sweep.toml")).unwrap();
+    fs::write(out.join("sweep.toml"), &text[..20]).unwrap();
+    for flag in ["--resume", "--force"] {
+        let error = fail(flotilla(&sweep, &out, &["--quiet", flag]), 1);
+        assert!(error.contains("sweep.toml is damaged; restore it, or choose another --out"), "{error}");
+    }
+    fs::write(out.join("sweep.toml"), text).unwrap();
     // A sweep does not write into a run's folder.
     let error = fail(flotilla(&sweep, &out.join("points/0000"), &[]), 1);
     assert!(error.contains("holds a run, not a sweep"), "{error}");
