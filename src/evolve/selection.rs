@@ -11,6 +11,17 @@ use crate::parallel::*;
 
 /// Returns the indices of the `count` best scores, best first. Ties go to the lower index.
 pub fn top_indices(scores: &[f32], count: usize) -> Vec<usize> {
+    if count <= MAX_SEARCHED {
+        // The best so far, in order. Few scores are inserted, so that this is faster than sorting.
+        let mut order: Vec<usize> = Vec::with_capacity(count + 1);
+        for (index, score) in scores.iter().enumerate() {
+            if order.len() < count || order.last().is_some_and(|&last| score.total_cmp(&scores[last]).is_gt()) {
+                order.insert(order.partition_point(|&other| scores[other].total_cmp(score).is_ge()), index);
+                order.truncate(count);
+            }
+        }
+        return order;
+    }
     // Sorting keys of score and index is faster than sorting indices by their scores.
     let key = |(index, score): (u64, &f32)| {
         let bits = score.to_bits();
@@ -18,13 +29,16 @@ pub fn top_indices(scores: &[f32], count: usize) -> Vec<usize> {
         u64::from(!ascending) << 32 | index
     };
     let mut order: Vec<u64> = (0..).zip(scores).map(key).collect();
-    if (1..order.len()).contains(&count) {
+    if count < order.len() {
         order.select_nth_unstable(count - 1);
+        order.truncate(count);
     }
-    order.truncate(count);
     order.sort_unstable();
     order.into_iter().map(|key| key as u32 as usize).collect()
 }
+
+/// Up to this count, [`top_indices`] searches without sorting.
+const MAX_SEARCHED: usize = 16;
 
 /// Returns the winner of one slot's binary tournament: of two distinct random policies, the one with the higher score
 /// (`scores` is `[policies]`). Ties go to the policy that was drawn first.
