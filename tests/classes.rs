@@ -513,7 +513,11 @@ fn every_problem_names_key_line_found_and_allowed() {
             "4: stages[0].set.pois.b.radius: pois.b.radius sets this, too: remove one of the two\n\
              4: stages[0].set.pois[1].radius: pois.b.radius sets this, too: remove one of the two",
         ),
-        (steps, "[[stages]]\nfrom = 1\nset = { \"pois.b.x\" = {} }", "4: stages[0].set.pois.b.x: unknown key"),
+        (
+            steps,
+            "[[stages]]\nfrom = 1\nset = { \"pois.b.x\" = {} }",
+            "4: stages[0].set.pois.b.x: unknown key, allowed after, at, count, coupling, gone_within, in, name, observers, radius, score, value, when, windows",
+        ),
         (
             steps,
             "[[stages]]\nfrom = 1\nset = { \"world.coupling\" = 3 }",
