@@ -423,6 +423,7 @@ fn bad_input_is_refused_with_its_line() {
         "found \"Best\", allowed Local, AllOrNothing, System, Difference",
     );
     let (value, radius) = ("value: 2.0, coupling: 1", "observation_radius: 3.0");
+    fails(INFLUENCE, "resolution: 90", "resolution: .nan", "rovers[0].resolution: found nan, allowed a number");
     fails(INFLUENCE, value, "value: .nan, coupling: 1", "rover_pois[0].value: found nan, allowed a number");
     fails(
         INFLUENCE,
@@ -430,7 +431,7 @@ fn bad_input_is_refused_with_its_line() {
         "observation_radius: .nan",
         "rover_pois[0].observation_radius: found nan, allowed a number",
     );
-    for wrong in ["resolution: 0", "resolution: 100", "resolution: .nan"] {
+    for wrong in ["resolution: 0", "resolution: 100"] {
         fails(INFLUENCE, "resolution: 90", wrong, "allowed degrees that divide 360 into 1 to 16 sectors");
     }
     fails(INFLUENCE, "[60.0, 40.0]", ".nan", &at("map_size", "world.map, from env.map_size: found nan"));
