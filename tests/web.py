@@ -1253,11 +1253,12 @@ def check_former_defects(tab, page, call, downloads, folder):
     assert tab.evaluate("page.state.training.reached") > 10
     tab.wait("page.state.views.every(view => view.data.episodes[0].generation > 10)")
     tab.click("#stop")
+    tab.assert_no_errors()
     # A film ends when other maps are on show.
     tab.click("#webm")
     tab.click("[data-mode=arrange]")
-    tab.wait("document.querySelector('#trouble').textContent.includes('The film could not be made: other maps are on show')")
-    tab.assert_no_errors()
+    ended = "The film could not be made: other maps are on show"
+    tab.wait(f"document.querySelector('#trouble').textContent.includes('{ended}')")
     tab.window(1280, 900, dark=False)
     # The saved config is that of the training, without later changes. The command names the saved file.
     text = (

@@ -75,6 +75,7 @@ async function one_at_a_time(act) {
   if (busy) return;
   if (!moving().length) return report("There is no film yet: nothing on the map moves. Train first.");
   busy = true;
+  trouble("file", "");
   const made = act();
   hold(made.catch(() => {}));
   try { await made; } catch (thrown) { trouble("file", `The film could not be made: ${failure(thrown).message}`); } finally { busy = false; }
