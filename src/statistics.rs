@@ -100,7 +100,7 @@ impl<'a> FromIterator<&'a f64> for Average {
     }
 }
 
-/// Returns a share with the exact interval of Clopper and Pearson. None if `of` is 0.
+/// Returns a share with the exact interval of Clopper and Pearson for a confidence level. None if `of` is 0.
 pub fn share_at(confidence: f64, count: usize, of: usize) -> Option<Estimate> {
     let (some, others) = (count as f64, of.checked_sub(count)? as f64);
     let bound = |a: f64, b: f64, at: f64| at.inv_inc_beta(a, b, a.ln_beta(b));

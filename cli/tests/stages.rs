@@ -662,13 +662,14 @@ fn every_command_supports_stages() {
     // Notes name their stage, and flags that a stage overrides.
     fs::write(
         folder.join("noted.toml"),
-        format!("{SMALL}[[stages]]\nfrom = 2\nset = {{ learning.fitness = 'Df', world.coupling = 1 }}\n"),
+        format!("{SMALL}[[stages]]\nfrom = 2\nset = {{ world.heading = 90, world.coupling = 1 }}\n"),
     )
     .unwrap();
     let flags = ["check", "noted.toml", "--set", "world.coupling=2", "--set", "world.steps=9"];
     let output = cargo_bin_cmd!("flotilla").args(flags).current_dir(&folder).output().unwrap();
     let stderr = String::from_utf8(output.stderr).unwrap();
     assert!(stderr.contains("--set world.coupling: the stage from generation 2 on sets this, too"), "{stderr}");
+    assert!(stderr.contains("note: stage 1: world.heading has 90"), "{stderr}");
     assert!(!stderr.contains("--set world.steps"), "{stderr}");
     // If --generations ends the run before a stage, the run's config omits the stage. Both configs can resume the run.
     let (code, _, stderr) = run(&folder, "train staged.toml --generations 3 --out short --quiet");

@@ -483,9 +483,12 @@ fn resolve<'a>(
     }));
     for set in &overrides {
         let path = stages::path_of(&set.key, &own);
-        let sets = |key: &String| stages::path_of(key, &own).starts_with(&path);
+        let sets = |key: &String| {
+            let other = stages::path_of(key, &own);
+            other.starts_with(&path) || path.starts_with(&other)
+        };
         notes.extend(stages.iter().filter(|(stage, _)| stage.set.keys().any(sets)).map(|(Stage { from, .. }, _)| {
-            format!("{}: the stage from generation {from} on sets this, too, and replaces it", set.name)
+            format!("{}: the stage from generation {from} on sets this, too, and its value counts there", set.name)
         }));
     }
     let (stages, configs) = stages.into_iter().unzip();

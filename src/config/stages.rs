@@ -80,8 +80,9 @@ impl<'a> UnresolvedStage<'a> {
         UnresolvedStage { name: name_of(index), from: Some(Value::of(&stage.from)), set, ..UnresolvedStage::default() }
     }
 
-    /// Adds a key that the document sets, below the key `above` without quotes: `set = { world.coupling = 1 }` has the same
-    /// key as `set = { "world.coupling" = 1 }`. A dotted key in quotes may set a whole table.
+    /// Adds what the document sets under a key. `above` is the key that it is a part of, with its dot, or empty: keys may be
+    /// nested, so that `set = { world.coupling = 1 }` is `set = { "world.coupling" = 1 }`. The value of a dotted key in
+    /// quotes may be a whole table.
     fn add(
         &mut self,
         above: &str,
@@ -218,7 +219,7 @@ impl UnresolvedStage<'_> {
         let names: Vec<String> = self.set.iter().map(|(key, ..)| format!("{name}.set.{key}")).collect();
         let mut paths: Vec<_> = self.set.iter().map(|(key, ..)| path_of(key, own)).zip(&self.set).collect();
         paths.sort_by(|(path, _), (other, _)| path.cmp(other));
-        for ((path, (key, ..)), (other, (twice, line, _))) in paths.iter().zip(&paths[1.min(paths.len())..]) {
+        for ((path, (key, ..)), (other, (twice, line, _))) in paths.iter().zip(paths.iter().skip(1)) {
             if other.starts_with(path) {
                 let message = format!("{key} sets this, too: remove one of the two");
                 problems.push(Problem { line: *line, key: format!("{name}.set.{twice}"), message });

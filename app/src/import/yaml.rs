@@ -98,7 +98,7 @@ pub(super) fn parse(text: &str) -> Result<Node, Problem> {
         budget: serde_saphyr::budget! { enforce_alias_anchor_ratio: false },
         // The check of the config refuses them with their line. Keys that are not translated may have them.
         non_finite_float_policy: serde_saphyr::NonFiniteFloatPolicy::PassThrough,
-        // As the authors' programs read 010.
+        // The authors' programs read 010 as 8.
         legacy_octal_numbers: true,
     };
     serde_saphyr::from_str_with_options(text, options).map_err(|error| {

@@ -110,7 +110,7 @@ pub enum RecordError {
     Refused {
         /// Description of the problem.
         message: String,
-        /// What the user can do about it.
+        /// Advice to the user.
         remedy: String,
     },
 }
