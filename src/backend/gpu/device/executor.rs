@@ -15,8 +15,9 @@ use crate::backend::gpu::source::{Binding, Pipeline};
 use crate::host::{self, Instant};
 use crate::parallel::*;
 
-/// Maximum of pipelines kept from one recording to the next, unless one needs more: a driver needs megabytes for each.
-const KEPT_PIPELINES: usize = 64;
+/// Maximum of pipelines kept from one recording to the next, unless one needs more. A driver needs megabytes for each, and
+/// thousands of random worlds have about 450.
+const KEPT_PIPELINES: usize = 512;
 
 /// Bytes between host and device.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
