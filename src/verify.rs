@@ -187,10 +187,9 @@ fn compare_training(
     let configs = (plan.worlds.iter().take(TRAINED))
         .map(|(_, config)| {
             let mut config = config.clone();
-            // Stages may begin later than the short run ends.
-            config.learning.generations = plan.generations.max(config.last_from());
+            config.learning.generations = plan.generations;
             config.learning.trials = config.learning.trials.min(2);
-            Ok(config.validate()?.ending_at(plan.generations))
+            Ok(config.validate()?)
         })
         .collect::<Result<Vec<ValidConfig>, BackendError>>()?;
     let train = |backend: &mut dyn Backend| {

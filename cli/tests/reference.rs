@@ -94,7 +94,7 @@ keys stay as in the file ([curricula](../explain/model.md#learning-section-43-al
 
 | key | unit | type | range | default | meaning | paper |
 |---|---|---|---|---|---|---|
-| `from` | generations | whole number | 0 to learning.generations, more than that of the stage before | none: it has to be given | the first generation of the stage; it lasts until that of the next | 2.1 |
+| `from` | generations | whole number | 0 to 1000000, more than that of the stage before | none: it has to be given | the first generation of the stage; it lasts until that of the next | 2.1 |
 | `set` |  | table of keys | any of the keys of sections, of classes as `agents.NAME.speed`, and of groups of POIs as `pois.NAME.coupling`, but `policy.*`, `checkpoint.*`, `learning.paradigm`, `sharing`, `groups`, `population`, `hall_of_fame`, `elites`, `team_elites`, `team_g_elites`, `parents`, `method`, `search_sigma`, `generations`, `trials`, `initial`, `initial_scale`, `test_episodes` and `seed`; the classes that learn have the same sizes, inputs and outputs | `{}` | the keys that differ from the file, `{ \"world.coupling\" = 1 }`; a key in quotes can have a whole table | 2.1 |
 ";
 

@@ -458,15 +458,14 @@ fn resolve<'a>(
     };
     let (own, mut notes) =
         without_stages(&overrides).map_err(|reader::Problems { listed, unlisted }| invalid(listed, unlisted))?;
-    let shortened = overrides.iter().any(|set| set.key == stages::GENERATIONS);
     let resolved = match staging.last() {
         Some(set) => {
             let text = format!("{} = {}", stages::STAGES, set.text);
-            stages::resolve(stages::unresolved(&Document::parse(&text), true), &own, shortened)
+            stages::resolve(stages::unresolved(&Document::parse(&text), true), &own)
         }
-        None => stages::resolve(stages(), &own, shortened).map_err(|problems| {
+        None => stages::resolve(stages(), &own).map_err(|problems| {
             let is_valid = |overrides: &[Override]| {
-                without_stages(overrides).is_ok_and(|(own, _)| stages::resolve(stages(), &own, shortened).is_ok())
+                without_stages(overrides).is_ok_and(|(own, _)| stages::resolve(stages(), &own).is_ok())
             };
             stages::attribute(problems, &overrides, is_valid)
         }),
@@ -476,22 +475,17 @@ fn resolve<'a>(
         problems.truncate(reader::MAX_LISTED);
         invalid(problems, unlisted)
     })?;
-    let last = own.learning.generations;
-    let (stages, later): (Vec<_>, Vec<_>) = resolved.into_iter().partition(|(stage, _)| stage.from <= last);
-    notes.extend(later.iter().map(|(Stage { from, .. }, _)| {
-        format!("the stage from generation {from} on is left out, because this run ends with generation {last}")
-    }));
+    let (stages, configs): (Vec<_>, Vec<_>) = resolved.into_iter().unzip();
     for set in &overrides {
         let path = stages::path_of(&set.key, &own);
         let sets = |key: &String| {
             let other = stages::path_of(key, &own);
             other.starts_with(&path) || path.starts_with(&other)
         };
-        notes.extend(stages.iter().filter(|(stage, _)| stage.set.keys().any(sets)).map(|(Stage { from, .. }, _)| {
+        notes.extend(stages.iter().filter(|stage| stage.set.keys().any(sets)).map(|Stage { from, .. }| {
             format!("{}: the stage from generation {from} on sets this, too, and its value counts there", set.name)
         }));
     }
-    let (stages, configs) = stages.into_iter().unzip();
     let config = ValidConfig::new(Config { stages, ..own }, configs);
     notes.extend(config.notes());
     Ok((config, notes))

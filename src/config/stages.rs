@@ -53,9 +53,14 @@ pub struct Stage {
 }
 
 impl Config {
-    /// Returns the first generation of the last stage, or 0 without stages.
+    /// Returns the first generation of the last stage that is played, or 0 without stages.
     pub fn last_from(&self) -> usize {
-        self.stages.last().map_or(0, |stage| stage.from)
+        self.stages.iter().rfind(|stage| self.plays(stage)).map_or(0, |stage| stage.from)
+    }
+
+    /// Reports whether a stage begins before the run ends.
+    pub(super) fn plays(&self, stage: &Stage) -> bool {
+        stage.from <= self.learning.generations
     }
 }
 
@@ -164,15 +169,13 @@ pub(super) fn unresolved<'a>(document: &'a Document<'_>, outside: bool) -> (Vec<
 
 /// Checks stages, and returns each with its resolved config. The config's other keys make the valid config `own`.
 ///
-/// `problems` are those of the form of the stages. `shortened` means that the run's length was set from outside, in which
-/// case stages may begin after its end.
+/// `problems` are those of the form of the stages.
 ///
 /// # Errors
 /// Fails if a stage is invalid. The error lists all problems by line.
 pub(super) fn resolve(
     (unresolved, mut problems): (Vec<UnresolvedStage<'_>>, Vec<Problem>),
     own: &Config,
-    shortened: bool,
 ) -> Result<Vec<(Stage, Config)>, Vec<Problem>> {
     if unresolved.len() > MAX_STAGES {
         let message = format!("found {}, allowed up to {MAX_STAGES}", unresolved.len());
@@ -181,8 +184,7 @@ pub(super) fn resolve(
     let mut stages: Vec<(Stage, Config)> = Vec::new();
     for stage in unresolved {
         let min = stages.last().map_or(0, |(before, _)| before.from + 1);
-        let max = if shortened { MAX_GENERATIONS } else { own.learning.generations };
-        let from = stage.first_generation([min, max], &mut problems);
+        let from = stage.first_generation(min, &mut problems);
         let config = stage.config(own, &mut problems);
         let set = stage.set.iter().filter_map(|(key, _, value)| Some((key.clone(), value.to_toml()?))).collect();
         stages.push((Stage { from, set }, config));
@@ -193,19 +195,18 @@ pub(super) fn resolve(
 
 impl UnresolvedStage<'_> {
     /// Returns the first generation, or the smallest allowed one if it is wrong.
-    fn first_generation(&self, [min, max]: [usize; 2], problems: &mut Vec<Problem>) -> usize {
+    fn first_generation(&self, min: usize, problems: &mut Vec<Problem>) -> usize {
         let Some(from) = &self.from else {
             let message = "missing `from`, the first of its generations".into();
             problems.push(Problem { line: self.line, key: self.name.clone(), message });
             return min;
         };
         let message = match usize::read(from).flatten() {
-            Some(from) if (min..=max).contains(&from) => return from,
-            _ if min > max => format!("the stage before begins in the last generation, {max} ({GENERATIONS})"),
+            Some(from) if (min..=MAX_GENERATIONS).contains(&from) => return from,
             found => {
                 let found = found.map_or_else(|| from.found(), |found| found.to_string());
                 let after = if min > 0 { ", after the stage before" } else { "" };
-                format!("found {found}, allowed a whole number, {min} to {max} ({GENERATIONS}){after}")
+                format!("found {found}, allowed a whole number, {min} to {MAX_GENERATIONS}{after}")
             }
         };
         problems.push(Problem { line: self.from_line, key: format!("{}.from", self.name), message });

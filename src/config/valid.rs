@@ -3,7 +3,7 @@
 use std::collections::HashSet;
 use std::ops::Deref;
 
-use super::{AgentClass, Classes, Config, ConfigError, Fitness, LedBy, Mobility, Score, WorldConfig};
+use super::{AgentClass, Classes, Config, ConfigError, Fitness, LedBy, Mobility, Score, Stage, WorldConfig};
 
 /// A config whose every key is in its range: one that a [`World`](crate::world::World) is made from.
 #[derive(Clone, Debug, PartialEq)]
@@ -21,7 +21,7 @@ impl Deref for StageConfig {
 #[derive(Clone, Debug, PartialEq)]
 pub struct ValidConfig {
     config: StageConfig,
-    /// Each stage's first generation and config; never empty.
+    /// First generation and config of each stage that is played; never empty.
     stages: Vec<(usize, StageConfig)>,
 }
 
@@ -49,8 +49,8 @@ impl AsRef<StageConfig> for ValidConfig {
 impl ValidConfig {
     /// Returns a config with the resolved configs of its stages.
     pub(super) fn new(config: Config, of_stages: Vec<Config>) -> ValidConfig {
-        let mut stages: Vec<_> =
-            config.stages.iter().map(|stage| stage.from).zip(of_stages.into_iter().map(StageConfig)).collect();
+        let played = config.stages.iter().zip(of_stages).filter(|(stage, _)| config.plays(stage));
+        let mut stages: Vec<_> = played.map(|(stage, of_stage)| (stage.from, StageConfig(of_stage))).collect();
         if stages.first().is_none_or(|(from, _)| *from > 0) {
             stages.insert(0, (0, StageConfig(Config { stages: vec![], ..config.clone() })));
         }
@@ -65,8 +65,8 @@ impl ValidConfig {
         configs.iter().map(Config::validate).collect()
     }
 
-    /// Returns the config of each stage with its first generation, in order. If the first stage starts after generation
-    /// 0, the file's own config comes before it.
+    /// Returns the config of each stage that is played with its first generation, in order. If the first stage starts
+    /// after generation 0, the file's own config comes before it.
     pub fn stages(&self) -> &[(usize, StageConfig)] {
         &self.stages
     }
@@ -106,18 +106,19 @@ impl ValidConfig {
             let new = notes(config).into_iter().filter(|note| shown.insert(note.clone()));
             new.map(|note| if index == 0 { note } else { format!("stage {index}: {note}") }).collect::<Vec<_>>()
         };
-        self.stages.iter().enumerate().flat_map(of_stage).collect()
+        let last = self.learning.generations;
+        let never_played =
+            self.config.stages.iter().filter(|stage| !self.plays(stage)).map(|Stage { from, .. }| {
+                format!(
+                    "the stage from generation {from} on is never played, because the run ends with generation {last}"
+                )
+            });
+        never_played.chain(self.stages.iter().enumerate().flat_map(of_stage)).collect()
     }
 
     /// Returns the config as it was read, without its resolved stages.
     pub fn into_config(self) -> Config {
         self.config.0
-    }
-
-    /// Returns the config with at most this number of generations. Stages that begin later are never played.
-    pub(crate) fn ending_at(mut self, generation: usize) -> ValidConfig {
-        self.config.0.learning.generations = self.config.0.learning.generations.min(generation);
-        self
     }
 }
 
@@ -219,7 +220,10 @@ mod tests {
         let valid = config.validate().unwrap();
         assert_eq!((*valid).clone(), config);
         assert_eq!(valid.stages().iter().map(|(from, _)| *from).collect::<Vec<_>>(), [0, 3]);
-        assert_eq!(valid.ending_at(2).learning.generations, 2);
+        config.learning.generations = 2;
+        let shorter = config.validate().unwrap();
+        assert_eq!((shorter.stages().len(), shorter.last_from(), shorter.config.stages.len()), (1, 0, 1));
+        assert!(shorter.notes().iter().any(|note| note.contains("from generation 3 on is never played")));
         config.learning.population = 1;
         let error = config.validate().unwrap_err().to_string();
         assert!(error.contains("learning.population: found 1"), "{error}");

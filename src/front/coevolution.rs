@@ -206,7 +206,6 @@ impl Coevolution {
     /// Makes the next generation the last, unless an earlier one is.
     pub(super) fn end(&mut self) {
         self.config.learning.generations = self.trainer.end(0);
-        self.config.stages.retain(|stage| stage.from <= self.config.learning.generations);
     }
 
     /// Returns the champions of the generation that was told last, `[trials][populations][parameters]`.

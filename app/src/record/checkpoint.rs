@@ -72,11 +72,10 @@ impl<N> Checkpoint<N> {
     }
 }
 
-/// Returns the config with `last` generations. Stages that begin after that generation are removed.
+/// Returns the config with `last` generations.
 pub(crate) fn of_length(config: &Config, last: usize) -> Config {
     let mut config = config.clone();
     config.learning.generations = last;
-    config.stages.retain(|stage| stage.from <= last);
     config
 }
 

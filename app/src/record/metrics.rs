@@ -115,13 +115,9 @@ impl Writer {
     /// Continues a file at a mark and drops everything after it. Returns `None` if the file is missing or its content
     /// up to the mark has changed.
     pub fn resume(disk: &Disk, path: &Path, mark: &Extent, config: &Config) -> io::Result<Option<Writer>> {
-        let Some((first, hash)) = before(disk.at(path), mark)? else { return Ok(None) };
-        // A run that was shortened to end before its later stages keeps the column `stage`.
-        let header = String::from_utf8_lossy(&first);
-        let optional = Optional::of_header(header.trim_end()).unwrap_or(Optional::of(config));
-        let lines = Lines { optional, ..Lines::of(config) };
+        let Some(hash) = before(disk.at(path), mark)? else { return Ok(None) };
         let output = BufWriter::new(disk.append(path, mark.bytes)?);
-        Ok(Some(Writer { output, bytes: mark.bytes, hash, lines }))
+        Ok(Some(Writer { output, bytes: mark.bytes, hash, lines: Lines::of(config) }))
     }
 
     fn write(&mut self, line: &str) -> io::Result<()> {
@@ -148,19 +144,16 @@ impl Writer {
     }
 }
 
-/// Returns the first line of a file and the hash of its content up to a mark. Returns `None` if the file is missing or
-/// has other content.
-fn before(place: Place<'_>, mark: &Extent) -> io::Result<Option<(Vec<u8>, Sha256)>> {
+/// Returns the hash of a file's content up to a mark, or `None` if the file is missing or has other content.
+fn before(place: Place<'_>, mark: &Extent) -> io::Result<Option<Sha256>> {
     let mut file = match place.open() {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
         file => BufReader::new(file?).take(mark.bytes),
     };
-    let (mut first, mut hash) = (Vec::new(), Sha256::new());
-    file.by_ref().take(MAX_LINE).read_until(b'\n', &mut first)?;
-    hash.update(&first);
+    let mut hash = Sha256::new();
     hash_rest(&mut file, &mut hash)?;
     let same = file.limit() == 0 && hex(&hash.clone().finalize()) == mark.sha256;
-    Ok(same.then_some((first, hash)))
+    Ok(same.then_some(hash))
 }
 
 /// Reports whether a file has had the given extent.
