@@ -678,9 +678,15 @@ fn a_folder_that_cannot_be_read_is_not_a_folder_without_checkpoints() {
 #[test]
 fn every_damaged_byte_of_a_checkpoint_is_detected() {
     let config = small();
-    let (_folder, _, paths) = stopped_run(&config);
+    let (folder, _, paths) = stopped_run(&config);
     let whole = fs::read(&paths[1]).unwrap();
-    Checkpoint::read(Cursor::new(&whole), &config).unwrap();
+    // Unlike a weight, a fitness may be of any size.
+    let mut told = Checkpoint::read(Cursor::new(&whole), &config).unwrap();
+    told.snapshot.fitness[0].fill(1e-12);
+    told.snapshot.fitness[1].fill(3e9);
+    let path = folder.path().join("told");
+    told.write(&Disk::default(), &path, &config).unwrap();
+    assert_eq!(Checkpoint::read(fs::File::open(&path).unwrap(), &config).unwrap(), told);
     for (damage, bytes) in damaged(&whole) {
         let read = Checkpoint::read(Cursor::new(&bytes), &config);
         assert!(read.is_err(), "{damage}");
@@ -823,6 +829,13 @@ fn a_changed_config_is_refused_with_the_names_of_its_keys() {
     long.world.pois = vec![[10.0, 10.0]; 20];
     let differences = folder::differences(&config, &long);
     assert!(differences.len() == 1 && differences[0].ends_with("… here"), "{differences:?}");
+    let mut late = long.clone();
+    late.world.pois[18] = [10.0, 11.0];
+    let differences = folder::differences(&long, &late);
+    assert!(
+        differences[0].starts_with("  world.pois: …") && differences[0].contains("[10.0, 11.0]"),
+        "{differences:?}"
+    );
     // Without the config file, the checkpoint still identifies its config.
     fs::remove_file(path.join("config.toml")).unwrap();
     let error = session(&changed, &path, Start::Resume, Disk::default(), cpu(), None).end.unwrap_err().to_string();

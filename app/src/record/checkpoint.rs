@@ -154,15 +154,18 @@ impl Checkpoint {
         let (weights, fitness) = shapes(of);
         // After the last generation, `policies.safetensors` may hold the weights.
         let elsewhere = generation == last + 1 && file.info(WEIGHTS).is_none();
-        let mut floats = |name: &str, shape: &[usize]| -> Result<Vec<Vec<f32>>, String> {
+        let mut floats = |name: &str, shape: &[usize], is_wrong: fn(&mut Vec<f32>) -> bool| {
             let mut trials: Vec<Vec<f32>> = file.read(name, Dtype::F32, shape, shape[0])?;
-            match trials.iter_mut().any(|numbers| evolve::flush_and_validate(numbers).is_some()) {
+            match trials.iter_mut().any(is_wrong) {
                 true => Err(format!("{name} has numbers out of range")),
                 false => Ok(trials),
             }
         };
-        let weights = if elsewhere { vec![] } else { floats(WEIGHTS, &weights)? };
-        let fitness = floats(FITNESS, &fitness)?;
+        let weights = match elsewhere {
+            true => vec![],
+            false => floats(WEIGHTS, &weights, |numbers| evolve::flush_and_validate(numbers).is_some())?,
+        };
+        let fitness = floats(FITNESS, &fitness, |numbers| numbers.iter().any(|number| !number.is_finite()))?;
         // From generation 1 on, rows are pending until their champions have played.
         let columns = 2 + usize::from(learning.test_episodes > 0);
         let pending: Vec<f64> = match generation {

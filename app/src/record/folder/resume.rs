@@ -322,13 +322,23 @@ pub fn differences(old: &Config, new: &Config) -> Vec<String> {
     let [old, new] = [old, new].map(|config| values_by_key(&without_checkpoint(config)));
     let keys: BTreeSet<_> = old.keys().chain(new.keys()).collect();
     let line = |key: &String| {
-        let [there, here] = [&old, &new].map(|values| values.get(key).map_or("nothing".into(), shorten));
+        let [there, here] = [&old, &new].map(|values| values.get(key).map_or("nothing".into(), ToString::to_string));
+        let same = there.chars().zip(here.chars()).take_while(|(there, here)| there == here).count();
+        let [there, here] = [there, here].map(|text| shorten(&text, same));
         format!("  {key}: {there} there, {here} here")
     };
     keys.into_iter().filter(|key| old.get(*key) != new.get(*key)).map(line).collect()
 }
 
-fn shorten(value: &toml::Value) -> String {
-    let text = value.to_string();
-    if text.len() > 60 { text.chars().take(60).chain(['…']).collect() } else { text }
+/// Returns a part of a long text that has the character at index `differs`.
+fn shorten(text: &str, differs: usize) -> String {
+    const LENGTH: usize = 60;
+    let length = text.chars().count();
+    if length <= LENGTH {
+        return text.into();
+    }
+    let start = if differs < LENGTH { 0 } else { differs - LENGTH / 2 };
+    let [before, after] = [start > 0, start + LENGTH < length].map(|is_cut| if is_cut { "…" } else { "" });
+    let part: String = text.chars().skip(start).take(LENGTH).collect();
+    format!("{before}{part}{after}")
 }
