@@ -123,7 +123,9 @@ pub struct Replayed {
     /// The leaders of each follower at each step, as [`credit::find_leading`] writes them. Empty unless the run's
     /// fitness is Dt.
     pub led: Vec<u32>,
-    /// The step at which each POI was first observed, `[pois]`.
+    /// The agents near each POI at the start, `[pois][words]`. Empty unless the start counts as a step.
+    pub start: Vec<u32>,
+    /// The step at which each POI was first observed, `[pois]`: 0 is the start.
     pub observed: Vec<Option<usize>>,
     /// Whether the comparison of the run's files with their digests was skipped.
     pub unverified: bool,
@@ -390,7 +392,8 @@ pub fn one(group: &Group<'_>, backend: &mut dyn Backend) -> Result<Replayed, Bac
     credit::assign(&episode.seen, world, &mut owner);
     let mut led = Vec::new();
     credit::find_leading(&episode.sights, world, &mut led);
-    let observed = observed_at(&episode.sets, world);
+    let start = near_at_start(world, group.moved_pois().unwrap_or(&world.pois), &trace);
+    let observed = observed_at(world, &start, &trace.sets);
     let team_g = f64::from(scores.observed) / f64::from(world.total_worth);
     // POIs are drawn where this episode had them.
     let world = world.clone().with_pois(group.moved_pois().unwrap_or(&world.pois));
@@ -404,6 +407,7 @@ pub fn one(group: &Group<'_>, backend: &mut dyn Backend) -> Result<Replayed, Bac
         scores,
         owner,
         led,
+        start,
         observed,
         trace,
         world,
@@ -413,21 +417,52 @@ pub fn one(group: &Group<'_>, backend: &mut dyn Backend) -> Result<Replayed, Bac
     })
 }
 
-/// Counts the observers in a set.
-fn near(world: &World, sets: &Strided<'_>, set: usize) -> u32 {
+/// Returns the agents near each of some POIs at the start, `[pois][words]`: none where the start does not count. Empty if it
+/// counts nowhere.
+fn near_at_start(world: &World, pois: &[Vec2], trace: &Trace) -> Vec<u32> {
+    if !world.paths.as_ref().is_some_and(|rule| rule.start_counts) {
+        return vec![];
+    }
     let words = world.constants.words as usize;
-    world.rule.count(set % world.pois.len(), (set * words..(set + 1) * words).map(|word| sets.get(word)))
+    let mut start = vec![0; pois.len() * words];
+    for (poi, set) in start.chunks_exact_mut(words).enumerate() {
+        let is_open = world.rule.window(poi).is_none_or(|window| window == [1, world.constants.steps]);
+        let is_near = |agent: usize| {
+            let offset = Vec2::from(trace.moment(0, 0, agent).position) - pois[poi];
+            offset.length_squared() <= world.radii2[poi]
+        };
+        (0..world.agents())
+            .filter(|&agent| is_open && is_near(agent))
+            .for_each(|agent| set[agent / 32] |= 1 << (agent % 32));
+    }
+    start
+}
+
+/// Counts the observers near a POI after a step, from the agents near each POI at the start, see [`near_at_start`], and
+/// after each step.
+fn near(world: &World, start: &[u32], sets: &[u32], step: usize, poi: usize) -> u32 {
+    let words = world.constants.words as usize;
+    let (sets, set) = match step.checked_sub(1) {
+        Some(step) => (sets, step * world.pois.len() + poi),
+        None if start.is_empty() => return 0,
+        None => (start, poi),
+    };
+    world.rule.count(poi, sets[set * words..(set + 1) * words].iter().copied())
 }
 
 /// Returns the step at which each POI is observed, the last one if only that counts, `[pois]`.
-fn observed_at(sets: &Strided<'_>, world: &World) -> Vec<Option<usize>> {
+fn observed_at(world: &World, start: &[u32], sets: &[u32]) -> Vec<Option<usize>> {
     let (pois, steps) = (world.pois.len(), world.steps());
-    let mut observed = credit::observed_at(*sets, world);
+    let mut observed = credit::observed_at(Strided { words: sets, stride: 1, offset: 0 }, world);
+    let is_enough = |step, poi: usize| near(world, start, sets, step, poi) >= world.coupling[poi];
     let scores = world.paths.iter().flat_map(|rule| &rule.scores);
-    for (poi, _) in scores.enumerate().filter(|(_, (_, when))| *when == When::End) {
-        let is_open = world.rule.is_open(poi, steps as u32, &vec![true; pois]);
-        let is_enough = is_open && near(world, sets, (steps - 1) * pois + poi) >= world.coupling[poi];
-        observed[poi] = is_enough.then_some(steps);
+    for (poi, &(_, when)) in scores.enumerate() {
+        if when == When::End {
+            let is_open = world.rule.is_open(poi, steps as u32, &vec![true; pois]);
+            observed[poi] = (is_open && is_enough(steps, poi)).then_some(steps);
+        } else if is_enough(0, poi) {
+            observed[poi] = Some(0);
+        }
     }
     observed
 }
@@ -435,6 +470,8 @@ fn observed_at(sets: &Strided<'_>, world: &World) -> Vec<Option<usize>> {
 /// An episode without some agents: the same motion, and what the others observe.
 pub struct Counterfactual<'a> {
     world: &'a World,
+    /// The remaining agents of [`Replayed::start`].
+    start: Vec<u32>,
     /// The remaining agents at each POI after each step, `[steps][pois][words]`.
     sets: Vec<u32>,
     /// The step at which each POI would be observed, `[pois]`.
@@ -459,10 +496,10 @@ impl Replayed {
         }
     }
 
-    /// Counts the observers within the observation radius of a POI after a step. At the start the count is 0.
+    /// Counts the observers within the observation radius of a POI after a step. At the start the count is 0 unless the
+    /// start counts as a step.
     pub fn near(&self, step: usize, poi: usize) -> u32 {
-        let sets = Strided { words: &self.trace.sets, stride: 1, offset: 0 };
-        step.checked_sub(1).map_or(0, |step| near(&self.world, &sets, step * self.world.pois.len() + poi))
+        near(&self.world, &self.start, &self.trace.sets, step, poi)
     }
 
     /// Removes a leader from the record, and with `group` also the followers that it led. All others move as they did.
@@ -474,13 +511,18 @@ impl Replayed {
             Some(follower) if !led.is_empty() => credit::is_led_by(led, world, step, follower, leader),
             Some(_) => owner[agent] as usize == leader,
         };
-        let mut sets = trace.sets.clone();
-        for (at, set) in sets.chunks_exact_mut(words).enumerate() {
-            let removed = (0..world.agents()).filter(|&agent| agent == leader || group && follows(at / pois, agent));
-            removed.for_each(|agent| set[agent / 32] &= !(1 << (agent % 32)));
-        }
-        let observed = observed_at(&Strided { words: &sets, stride: 1, offset: 0 }, world);
-        Counterfactual { world, sets, observed }
+        let remaining = |sets: &[u32]| {
+            let mut sets = sets.to_vec();
+            for (at, set) in sets.chunks_exact_mut(words).enumerate() {
+                let removed =
+                    (0..world.agents()).filter(|&agent| agent == leader || group && follows(at / pois, agent));
+                removed.for_each(|agent| set[agent / 32] &= !(1 << (agent % 32)));
+            }
+            sets
+        };
+        let [start, sets] = [&self.start, &trace.sets].map(|sets| remaining(sets));
+        let observed = observed_at(world, &start, &sets);
+        Counterfactual { world, start, sets, observed }
     }
 
     fn position(&self, step: usize, agent: usize) -> [f32; 2] {

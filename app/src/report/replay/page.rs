@@ -9,7 +9,7 @@ use crate::record::folder::OWN_FITNESS;
 use crate::report::map::{Form, GROUPS, GROUPS_DARK, sample_note};
 use crate::report::scene::hex;
 use flotilla::config::{AgentClass, Channel, Config, Control, Fitness, Mobility, PoiGroup, Sectors, drawn_agents};
-use flotilla::credit::{self, Strided};
+use flotilla::credit;
 use flotilla::world::OUTPUTS;
 
 /// Maximum number of bytes of motion in a page, before base64 adds a third. Longer motion is thinned out.
@@ -23,9 +23,8 @@ const DETAIL_BYTES: usize = 1_000_000;
 impl Counterfactual<'_> {
     /// Returns the observation steps and the observers near each POI, base64 of u32 `[shown][pois]`.
     fn json(&self, shown: &[usize]) -> serde_json::Value {
-        let (sets, pois) = (Strided { words: &self.sets, stride: 1, offset: 0 }, self.world.pois.len());
-        let count = |step: usize, poi| step.checked_sub(1).map_or(0, |step| near(self.world, &sets, step * pois + poi));
-        let counts = shown.iter().flat_map(|&step| (0..pois).map(move |poi| count(step, poi)));
+        let count = |step: usize, poi| near(self.world, &self.start, &self.sets, step, poi);
+        let counts = shown.iter().flat_map(|&step| (0..self.world.pois.len()).map(move |poi| count(step, poi)));
         let near: Vec<u8> = counts.flat_map(u32::to_le_bytes).collect();
         json!({ "observed": self.observed, "near": BASE64_STANDARD.encode(near) })
     }
