@@ -760,7 +760,10 @@ fn keys_of_tables_have_their_defaults() {
     let group = &config.pois[0];
     assert_eq!((group.value, group.radius, &group.coupling), (1.0, 5.0, &Coupling::Same(1)));
     let timed = parse(&with("coupling = 1", "coupling = 1\nwindows = [[1, 9]]"));
-    assert_eq!(timed.pois[0].windows, [[1, 9]; 2]);
+    // Stages change the values of the file.
+    let more = format!("[[stages]]\nfrom = 3\nset = {{ pois.{}.at = [[5, 6], [7, 8], [9, 9]] }}\n", timed.pois[0].name);
+    let more = parse(&(with("coupling = 1", "coupling = 1\nwindows = [[1, 9]]") + &more)).validate().unwrap();
+    assert_eq!(more.at(3).classes().windows(20), [[1, 9], [1, 9], [1, 9], [1, 20]]);
     assert_eq!(timed.classes().windows(20), [[1, 9], [1, 9], [1, 20]]);
     assert_eq!(config.classes().after(), [vec![], vec![], vec![0, 1]]);
     // The other keys are as in an empty config.

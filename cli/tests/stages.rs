@@ -147,6 +147,11 @@ fn errors_in_stages_name_their_line() {
         assert!(found.len() == 1 && found[0].starts_with(&expected), "{text}: {found:?} is not {expected}");
     }
     assert!(error_lines(&["stages = 3\n", SMALL].concat())[0].starts_with("test.toml:1: stages: allowed a list"));
+    // Groups are those of the file.
+    let grouped = SMALL.replace("population", "paradigm = 'all-leaders'\nsharing = 'group'\npopulation");
+    let swapped = "'world.leaders' = [[20, 5], [10, 5]], 'world.followers' = [[11, 2], [12, 2], [13, 2]]";
+    let error = error_lines(&format!("{grouped}{}", stage("1", swapped)));
+    assert!(error.len() == 1 && error[0].contains("stages[0]: other leaders are nearest"), "{error:?}");
     // In the all-leaders paradigm, followers learn too, so a stage cannot change their number.
     let all_leaders = SMALL.replace("population", "paradigm = 'all-leaders'\npopulation");
     let text = format!("{all_leaders}{}", stage("1", "'world.followers' = [[1, 2]]"));
@@ -649,6 +654,17 @@ fn every_command_supports_stages() {
     assert!(good("rollout staged.toml --policies run/policies.safetensors --stage 2").contains("of 3"));
     let (code, _, stderr) = run(&folder, "rollout staged.toml --policies run/policies.safetensors --stage 3");
     assert!(code == Some(2) && stderr.contains("the config has 3 stages, 0 to 2"), "{stderr}");
+    // A flag counts after the stage's own keys. Stages beyond the end can be played, too.
+    let jitters = ["", " --poi-jitter 3.0"].map(|flag| {
+        let line = "rollout staged.toml --policies run/policies.safetensors --json --episodes 2 --stage 2";
+        let found: serde_json::Value = serde_json::from_str(&good(&format!("{line}{flag}"))).unwrap();
+        (found["pois"].as_u64(), found["poi_jitter"].as_f64())
+    });
+    assert_eq!(jitters, [(Some(3), Some(1.0)), (Some(3), Some(3.0))]);
+    good("rollout staged.toml --policies run/policies.safetensors --set learning.generations=3 --stage 2");
+    let (_, text, stderr) = run(&folder, "baseline staged.toml --seeds 1 --episodes 1");
+    assert!(text.contains("of 2") && stderr.contains("note: this plays in the world before any stage"), "{stderr}");
+    assert!(good("baseline staged.toml --seeds 1 --episodes 1 --stage 2").contains("of 3"));
     // 27 teams play 9 steps in 2 generations, two episodes of 14 steps in 2 generations, and 9 steps in 3.
     let output = cargo_bin_cmd!("flotilla").args(["check", "staged.toml"]).current_dir(&folder).output().unwrap();
     let text = String::from_utf8(output.stdout).unwrap();
@@ -674,4 +690,16 @@ fn every_command_supports_stages() {
     good("train short/config.toml --out short --resume --generations 4");
     good("train staged.toml --out short --resume");
     assert!(policy_bytes(&folder.join("short")) == policy_bytes(&folder.join("run")));
+    // The same with sweeps, whose points tell what a stage overrides.
+    let grid = "[grid]\n'world.coupling' = [1, 2]\n";
+    fs::write(folder.join("sweep.toml"), [SMALL, STAGES, grid].concat()).unwrap();
+    let (code, _, stderr) = run(&folder, "sweep sweep.toml --generations 3 --out swept");
+    assert_eq!(code, Some(0), "{stderr}");
+    let note = "grid.\"world.coupling\"[1]: the stage from generation 2 on sets this, too";
+    assert!(stderr.contains(note) && stderr.contains("4 on is never played, because"), "{stderr}");
+    assert!(stderr.contains("at 2 of 2 points"), "{stderr}");
+    cargo_bin_cmd!("flotilla").args(["compare", "swept"]).current_dir(&folder).assert().success();
+    good("sweep swept/sweep.toml --out swept --resume");
+    let (code, _, stderr) = run(&folder, "train staged.toml --set stages=[{from=true}]");
+    assert!(code == Some(2) && stderr.contains("--set stages: stages[0].from: found"), "{stderr}");
 }

@@ -127,7 +127,7 @@ class Config(Mapping[str, Any]):
         return [Key(*key) for key in native.keys()]
 
     def replace(self, **sections: Mapping[str, Any] | Sequence[Any]) -> Config:
-        """Returns this config with some keys changed. All other keys stay, except stages after a new last generation.
+        """Returns this config with some keys changed. All other keys stay.
 
         Raises:
             ConfigError: everything that is wrong with the keys.

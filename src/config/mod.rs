@@ -165,7 +165,7 @@ impl Config {
     }
 
     /// Reads a config from a parsed text as [`Config::read`] does, and returns notes for its author. The notes report
-    /// defaults that other keys do not allow, stages that are left out, and the results of [`ValidConfig::notes`].
+    /// defaults that other keys do not allow, flags that a stage overrides, and the results of [`ValidConfig::notes`].
     ///
     /// # Errors
     /// Fails if the text or an override is invalid. The error lists their problems.
@@ -462,6 +462,7 @@ fn resolve<'a>(
         Some(set) => {
             let text = format!("{} = {}", stages::STAGES, set.text);
             stages::resolve(stages::unresolved(&Document::parse(&text), true), &own)
+                .map_err(|problems| stages::of_flags(problems, &set.name))
         }
         None => stages::resolve(stages(), &own).map_err(|problems| {
             let is_valid = |overrides: &[Override]| {

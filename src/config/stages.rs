@@ -271,6 +271,9 @@ impl UnresolvedStage<'_> {
             let message =
                 "the classes that learn have other sizes, inputs or outputs in this stage than in all others".into();
             problems.push(Problem { line: self.line, key: name.clone(), message });
+        } else if config.population_of_each() != own.population_of_each() {
+            let message = "other leaders are nearest in this stage, and so share a policy; list learning.groups".into();
+            problems.push(Problem { line: self.line, key: name.clone(), message });
         }
         config
     }
@@ -291,10 +294,14 @@ pub(super) fn attribute(
         causes = flags.iter().collect();
     }
     let names: Vec<&str> = causes.iter().map(|flag| &*flag.name).collect();
-    let name = names.join(", ");
+    of_flags(problems, &names.join(", "))
+}
+
+/// Returns the problems that flags cause.
+pub(super) fn of_flags(problems: Vec<Problem>, flags: &str) -> Vec<Problem> {
     let of_flags = |Problem { line, key, message }: Problem| {
         let line = line.map_or(String::new(), |line| format!(" (line {line})"));
-        Problem { line: None, key: name.clone(), message: format!("{key}: {message}{line}") }
+        Problem { line: None, key: flags.into(), message: format!("{key}: {message}{line}") }
     };
     problems.into_iter().map(of_flags).collect()
 }

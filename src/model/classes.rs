@@ -472,9 +472,10 @@ impl Classes {
         if self.pois.iter().all(|group| group.windows.is_empty()) {
             return vec![];
         }
-        let of_group = |group: &PoiGroup| match group.windows.is_empty() {
-            true => vec![[1, steps]; group.size()],
-            false => group.windows.clone(),
+        let of_group = |group: &PoiGroup| match *group.windows {
+            [] => vec![[1, steps]; group.size()],
+            [of_all] => vec![of_all; group.size()],
+            _ => group.windows.clone(),
         };
         self.pois.iter().flat_map(of_group).collect()
     }

@@ -559,12 +559,11 @@ impl PoiGroup {
     }
 }
 
-/// Reads the windows of a group of POIs, one per POI.
+/// Reads the windows of a group of POIs, one per POI or one for all.
 fn windows_of_group(r: &mut Reader<'_>, steps: usize, pois: usize) -> Vec<[usize; 2]> {
     let windows = windows(PoiGroup::windows(r), ("pois.at, or one for all", None), steps);
     match windows.len() {
-        1 => vec![windows[0]; pois],
-        count if count == 0 || count == pois || pois == 0 => windows,
+        count if count <= 1 || count == pois || pois == 0 => windows,
         count => {
             let message =
                 format!("found a list of {count}, allowed a list of {pois} {WINDOWS}, or of one for all, or none");
