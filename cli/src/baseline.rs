@@ -1,11 +1,11 @@
 //! `flotilla baseline`: plays teams that do not learn.
 
-use super::{ConfigFile, Error, Overrides, Printed, RunOptions, SetKeys, between, console, number};
+use super::{ConfigFile, Error, Overrides, Printed, RunOptions, SetKeys, between, console, number, whole};
 use clap::builder::PossibleValuesParser as Words;
 use flotilla::baseline::{SEGMENTS, SPEEDS};
 use flotilla::config::{Actions, Choice, Paradigm};
 use flotilla::evaluate::MAX_EPISODES;
-use flotilla_app::ops::baseline::{self, BaselineOutcome, BaselineRequest};
+use flotilla_app::ops::baseline::{self, BaselineOutcome, BaselineRequest, Choosing};
 use flotilla_app::report::map::{counted, weighted};
 use flotilla_app::report::table::markdown;
 
@@ -13,6 +13,9 @@ use flotilla_app::report::table::markdown;
 pub struct Args {
     #[command(flatten)]
     config: ConfigFile,
+    /// Play in the world of the config's stage N, from 0 [default: the world before any stage]
+    #[arg(long, value_name = "N", value_parser = whole)]
+    stage: Option<usize>,
     /// Independent repetitions of the random baselines
     #[arg(long, value_name = "N", default_value_t = 10, value_parser = between(1..=4096u32))]
     seeds: u32,
@@ -37,22 +40,25 @@ pub struct Args {
 }
 
 pub fn run(args: Args) -> Result<(), Error> {
-    let Args { config, seeds, episodes, generations, population, paradigm, set, printed, run } = args;
+    let Args { config, stage, seeds, episodes, generations, population, paradigm, set, printed, run } = args;
     let overrides = Overrides { generations, population, paradigm, set, ..Overrides::default() };
     let config = config.text(overrides.list())?;
-    let request = BaselineRequest { config, seeds, episodes };
+    let request = BaselineRequest { config, stage, seeds, episodes };
     let found = console::play(&run, printed.quiet, |backends, context| baseline::run(&request, backends, context))?;
     printed.outcome(&found, in_words)
 }
 
 fn in_words(found: &BaselineOutcome) -> String {
-    let &BaselineOutcome { pois, seeds, teams, ref learners, weighted_by, actions, .. } = found;
+    let &BaselineOutcome { pois, seeds, teams, ref learners, weighted_by, choosing, .. } = found;
     let head =
         [&format!("POIs observed, of {pois}{}", weighted(weighted_by)), "mean [95 % interval]", "lowest", "highest"];
     let mut rows = vec![head.map(|head| head.to_string()).to_vec()];
-    let constants = match actions {
-        Actions::Direct => format!("best of {SPEEDS} constant speeds, straight ahead"),
-        Actions::Behaviours => "best constant behaviour".into(),
+    let constants = match choosing {
+        Choosing::Moves(Actions::Direct) => format!("best of {SPEEDS} constant speeds, straight ahead"),
+        Choosing::Moves(Actions::Behaviours) => "best constant behaviour".into(),
+        Choosing::Agents => "best constant choice".into(),
+        Choosing::Both(Actions::Direct) => "best constant choice and speed, straight ahead".into(),
+        Choosing::Both(Actions::Behaviours) => "best constant choice and behaviour".into(),
     };
     for (name, found) in [
         (constants, &found.constant),
@@ -77,15 +83,15 @@ fn in_words(found: &BaselineOutcome) -> String {
          {played}\n\n{}\n{}\n",
         counted(seeds, "seed"),
         markdown(&rows),
-        described(actions, &solved)
+        described(choosing, &solved)
     )
 }
 
 /// Returns a sentence about the constant actions that observe every POI, by their indices.
-fn described(actions: Actions, solved: &[usize]) -> String {
-    let unit = |index: usize| match actions {
-        Actions::Direct => format!("{} %", (index + 1) * 100 / SPEEDS),
-        Actions::Behaviours => format!("{index}"),
+fn described(choosing: Choosing, solved: &[usize]) -> String {
+    let unit = |index: usize| match choosing {
+        Choosing::Moves(Actions::Direct) => format!("{} %", (index + 1) * 100 / SPEEDS),
+        _ => format!("{index}"),
     };
     let range = |range: &[usize]| match *range {
         [first, .., last] => format!("{} to {}", unit(first), unit(last)),
@@ -93,14 +99,16 @@ fn described(actions: Actions, solved: &[usize]) -> String {
     };
     let ranges: Vec<String> = solved.chunk_by(|index, next| index + 1 == *next).map(range).collect();
     let ranges = ranges.join(", ");
-    match (actions, ranges.is_empty()) {
-        (Actions::Direct, true) => "No constant speed observes every POI.".into(),
-        (Actions::Direct, false) => {
+    match (choosing, ranges.is_empty()) {
+        (Choosing::Moves(Actions::Direct), true) => "No constant speed observes every POI.".into(),
+        (Choosing::Moves(Actions::Direct), false) => {
             format!("A team that drives straight ahead at {ranges} of motion.max_speed observes every POI.")
         }
-        (Actions::Behaviours, true) => "No constant behaviour observes every POI.".into(),
-        (Actions::Behaviours, false) => {
+        (Choosing::Moves(Actions::Behaviours), true) => "No constant behaviour observes every POI.".into(),
+        (Choosing::Moves(Actions::Behaviours), false) => {
             format!("A team that always chooses the behaviour {ranges} observes every POI.")
         }
+        (_, true) => "No constant choice observes every POI.".into(),
+        (_, false) => format!("A team with the constant choice {ranges} observes every POI."),
     }
 }

@@ -116,6 +116,84 @@ coupling = 1
 radius = 3
 "#;
 
+/// The leader starts at the POI and has to leave it at once.
+#[test]
+fn replays_show_what_is_observed_at_the_start() {
+    let text =
+        "world = { steps = 5, dt = 1.0, start_counts = true, leaders = [[10, 10]], pois = [[10, 10]], coupling = 1,
+observation_radius = 0.5, speed = 3 }
+motion = { min_speed = 3, max_speed = 3 }
+learning = { population = 4, generations = 1, trials = 1 }
+";
+    let place = Place::new(&[("start.toml", text)]).on_cpu();
+    place.good("train start.toml --out run --quiet");
+    let (said, _) = place.good("replay run --out start.svg");
+    assert!(said.contains("1 of 1"), "{said}");
+    let picture = place.read("start.svg");
+    assert!(picture.contains("1 of 1 POIs observed") && picture.contains("at step 0"), "{picture}");
+    place.good("replay run --out start.html");
+    assert!(place.read("start.html").contains("\"observed\":[0]"));
+}
+
+/// One scout chooses among four posts, and only the second sees the POI. A walker beside it needs fewer outputs.
+#[test]
+fn baselines_choose_agents() {
+    let choosers = "world = { steps = 30, dt = 0.5 }
+learning = { population = 10, generations = 1, trials = 1 }
+[[agents]]
+name = 'scout'
+at = [[25, 10]]
+control = 'choose:post'
+motion = { kind = 'free', max_speed = 2 }
+senses = [{ of = 'pois' }]
+[[agents]]
+name = 'post'
+at = [[25, 30], [10, 10], [40, 10], [45, 45]]
+control = 'still'
+observes = false
+[[pois]]
+name = 'p'
+at = [[10, 10]]
+coupling = 1
+radius = 2
+";
+    let walker = "[[agents]]
+name = 'walker'
+at = [[45, 30]]
+motion = { kind = 'steered', max_speed = 2 }
+senses = [{ of = 'pois' }]
+";
+    let place = Place::new(&[
+        ("choose.toml", choosers),
+        ("both.toml", &choosers.replacen("[[agents]]", &format!("{walker}[[agents]]"), 1)),
+    ]);
+    let found = |command: &str| -> serde_json::Value { serde_json::from_str(&place.good(command).0).unwrap() };
+    let alone = found("baseline choose.toml --seeds 1 --json --backend cpu");
+    let constants = alone["constants"].as_array().unwrap();
+    let seen: Vec<_> = constants.iter().map(|constant| constant["pois"].as_f64().unwrap()).collect();
+    assert_eq!(
+        (seen, &constants[4]["choice"], &constants[4]["speed"]),
+        (vec![0.0, 1.0, 0.0, 0.0, 0.0], &4.into(), &().into())
+    );
+    assert_eq!(alone["chosen"], serde_json::json!([1]));
+    assert!(
+        place
+            .good("baseline choose.toml --seeds 1")
+            .0
+            .contains("A team with the constant choice 1 observes every POI.")
+    );
+    let both = found("baseline both.toml --seeds 1 --json --backend cpu");
+    let constants = both["constants"].as_array().unwrap();
+    let seen: Vec<_> = constants.iter().map(|constant| constant["pois"].as_f64().unwrap()).collect();
+    assert_eq!((seen.len(), &seen[..7]), (20, &[0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0][..]));
+    assert!(constants[19]["speed"] == 1.0 && constants[6]["choice"] == 6, "{constants:?}");
+    // A policy may have fewer weights than there are behaviours.
+    let set = "--set policy.hidden=[] --set policy.actions=behaviours --set agents.post.at=[[10,10]] \
+               --set agents.scout.senses=[{of='pois',sectors=1}]";
+    let found = found(&format!("baseline choose.toml --seeds 1 --json --backend cpu {set}"));
+    assert_eq!(found["constant"]["mean"].as_f64(), Some(1.0));
+}
+
 #[test]
 fn g_weighs_pois_by_value_in_metrics_replays_and_rollouts() {
     let place = Place::new(&[("herd.toml", HERD)]);

@@ -7,6 +7,7 @@ use fearless_simd::Level;
 
 use crate::config::{Learning, Mutation};
 use crate::evolve::{self, Key, Purpose};
+use crate::model::class::ClassConstants;
 use crate::world::{OUTPUTS, World};
 
 /// Number of segments of an open-loop team's episode, of equal length. In each, every leader makes one turn, as fast as
@@ -147,9 +148,12 @@ pub(super) fn by_population(climber: &Climber, parameters: usize, weights: &mut 
 pub(super) fn segment_action(world: &World, team: &[f32], leader: usize, step: usize) -> [f32; OUTPUTS] {
     let steps = world.steps();
     let segment = step * SEGMENTS / steps;
-    // What is left of the segment's turn, as a fraction of a half turn.
-    let turned = world.class_of(leader).constants.motion.max_turn / std::f32::consts::PI
-        * (step - (segment * steps).div_ceil(SEGMENTS)) as f32;
     let [turn, speed] = [0, 1].map(|output| team[(leader * SEGMENTS + segment) * OUTPUTS + output]);
+    let ClassConstants { motion, shape, .. } = world.class_of(leader).constants;
+    if shape.choices() > 0 {
+        return [turn, speed];
+    }
+    // What is left of the segment's turn, as a fraction of a half turn.
+    let turned = motion.max_turn / std::f32::consts::PI * (step - (segment * steps).div_ceil(SEGMENTS)) as f32;
     [turn.signum() * (turn.abs() - turned).max(0.0), speed]
 }

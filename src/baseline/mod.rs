@@ -83,19 +83,22 @@ impl Outcome {
 pub const NAMES: [&str; 6] =
     ["constant action", "random actions", "random networks", "shared networks", "open-loop actions", "hill climbing"];
 
-/// Returns the outputs of each constant action: straight ahead at each of [`SPEEDS`] speeds, or each behaviour. All
-/// leaders of a team have the same.
+/// Returns the outputs of each constant action of policies that choose no agent: straight ahead at each of [`SPEEDS`]
+/// speeds, or each behaviour. All leaders of a team have the same.
 pub fn constants(actions: Actions) -> Vec<Vec<f64>> {
     match actions {
         Actions::Direct => (1..=SPEEDS).map(|speed| vec![0.0, 2.0 * speed as f64 / SPEEDS as f64 - 1.0]).collect(),
-        Actions::Behaviours => {
-            let chosen = |behaviour| (0..BEHAVIOURS).map(|other| if other == behaviour { 1.0 } else { -1.0 }).collect();
-            (0..BEHAVIOURS).map(chosen).collect()
-        }
+        Actions::Behaviours => each_choice(BEHAVIOURS),
     }
 }
 
-/// Writes a policy with constant outputs, each in -1..1, for all inputs.
+/// Returns outputs that choose each of `count` things.
+fn each_choice(count: usize) -> Vec<Vec<f64>> {
+    let chosen = |choice| (0..count).map(|other| if other == choice { 1.0 } else { -1.0 }).collect();
+    (0..count).map(chosen).collect()
+}
+
+/// Writes a policy with constant outputs, each in -1..1, for all inputs. The last layer has as many.
 pub fn constant_policy(outputs: &[f64], policy: &mut [f32]) {
     let biases = policy.len() - outputs.len();
     policy.fill(0.0);
@@ -109,6 +112,33 @@ pub fn constant_policy(outputs: &[f64], policy: &mut [f32]) {
 fn random_action(key: Key, outputs: usize, policy: &mut [f32]) {
     let uniform = |output| f64::from(key.draw(output)[0]) / (1u64 << 31) as f64 - 1.0;
     constant_policy(&(0..outputs as u32).map(uniform).collect::<Vec<_>>(), policy);
+}
+
+/// Returns the number of outputs of a config's policies.
+fn outputs(config: &Config) -> usize {
+    config.widths().pop().expect("a policy has outputs")
+}
+
+/// Returns the outputs of each constant of a config, `[constants][populations][outputs]`. Policies that choose agents have
+/// a constant per agent, and one for nobody. Those with fewer constants than others play theirs again.
+fn constants_of(config: &Config, world: &World) -> Vec<Vec<Vec<f64>>> {
+    let direct = constants(config.policy.actions);
+    let mut choices = vec![0; config.populations()];
+    for (&population, own) in world.populations.iter().zip(world.choices()) {
+        choices[population as usize] = own;
+    }
+    let of = |&agents: &usize| if agents == 0 { direct.clone() } else { each_choice(agents + 1) };
+    let of_each: Vec<_> = choices.iter().map(of).collect();
+    let count = of_each.iter().map(Vec::len).max().unwrap_or(0);
+    let constant = |index: usize| {
+        let own = |of: &Vec<Vec<f64>>| {
+            let mut constant = of[index % of.len()].clone();
+            constant.resize(outputs(config), 0.0);
+            constant
+        };
+        of_each.iter().map(own).collect()
+    };
+    (0..count).map(constant).collect()
 }
 
 /// Plays the baselines of several configs side by side, generation by generation. Each plays in the world of the
@@ -137,7 +167,8 @@ const RANDOM: [Purpose; 3] = [Purpose::ConstantActions, Purpose::Baseline, Purpo
 struct Setting {
     config: Config,
     world: World,
-    constants: Vec<Vec<f64>>,
+    /// See [`constants_of`].
+    constants: Vec<Vec<Vec<f64>>>,
     trials: Vec<Trial>,
     found: Baseline,
 }
@@ -351,7 +382,7 @@ fn play(
 impl Setting {
     fn new(config: &ValidConfig, trials: std::ops::Range<usize>) -> Setting {
         let (world, config) = (World::new(config), Config::clone(config));
-        let constants = constants(config.policy.actions);
+        let constants = constants_of(&config, &world);
         let Learning { episodes_per_team, generations, .. } = config.learning;
         let none = || vec![Vec::with_capacity(generations + 1); trials.len()];
         let found = Baseline {
@@ -432,12 +463,12 @@ impl Setting {
     /// Writes a team's policy for one population.
     fn write_policy(&self, level: Level, trial: &Trial, team: Team, population: usize, policy: &mut [f32]) {
         match team {
-            Team::Constant(index) => constant_policy(&self.constants[index], policy),
+            Team::Constant(index) => constant_policy(&self.constants[index][population], policy),
             Team::Random(kind, generation, slot) => {
                 let population = if kind == Purpose::SharedBaseline { 0 } else { population };
                 let key = Key::new(self.config.learning.seed, trial.index, kind).at(generation, population, slot);
                 match kind {
-                    Purpose::ConstantActions => random_action(key, self.config.policy.actions.outputs(), policy),
+                    Purpose::ConstantActions => random_action(key, outputs(&self.config), policy),
                     _ => evolve::initial_policy(level, key, &self.config.learning, policy),
                 }
             }

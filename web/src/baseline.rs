@@ -1,7 +1,7 @@
 //! Baselines without learning, for the chart.
 
 use flotilla::backend::cpu::Cpu;
-use flotilla::baseline::{self, Baselines};
+use flotilla::baseline::Baselines;
 use flotilla::config::{Config, ValidConfig};
 use flotilla::host::Instant;
 use serde_json::{Value, json};
@@ -11,7 +11,7 @@ use crate::answer::{Refusal, refuse};
 /// Episodes from which G of a constant action is averaged if starts or POIs move.
 const EPISODES: u32 = 20;
 
-/// Returns G of the best constant action, as a mean over trials, and what that action is.
+/// Returns G of the best constant action, as a mean over trials.
 ///
 /// # Errors
 /// The backend fails.
@@ -22,15 +22,14 @@ pub fn constant(mut config: Config) -> Result<Value, Refusal> {
         let learning = &mut config.learning;
         (learning.generations, learning.trials) = (0, 1);
     }
-    let (actions, trials) = (config.policy.actions, config.learning.trials as f64);
+    let trials = config.learning.trials as f64;
     let (mut baselines, mut cpu) = (Baselines::of_constants(&config.validate()?), Cpu::default());
     while !baselines.is_done() {
         baselines.advance(&mut cpu).map_err(refuse)?;
     }
     let outcomes = baselines.outcomes(&mut cpu, EPISODES).map_err(refuse)?.remove(0);
     let g = outcomes.iter().map(|outcome| outcome.constants[outcome.best_constant]).sum::<f64>() / trials;
-    let constant = outcomes.first().map(|outcome| baseline::constants(actions).swap_remove(outcome.best_constant));
-    Ok(json!({ "g": g, "outputs": constant }))
+    Ok(json!({ "g": g }))
 }
 
 /// The best of as many random networks as training evaluates.

@@ -7,7 +7,7 @@ use super::{BackendSource, ConfigText, Context, Error, ProcessorInfo, check_memo
 use crate::choice::Work;
 use flotilla::backend::Backend;
 use flotilla::baseline::{self, Baselines, SPEEDS};
-use flotilla::config::{Actions, Paradigm, ValidConfig};
+use flotilla::config::{Actions, AgentClass, Config, Control, Paradigm, ValidConfig};
 use flotilla::statistics;
 
 /// A request to play baselines.
@@ -15,6 +15,8 @@ use flotilla::statistics;
 pub struct BaselineRequest {
     /// The config.
     pub config: ConfigText,
+    /// The config's stage to play in. The world before any stage by default.
+    pub stage: Option<usize>,
     /// Independent repetitions of the random baselines.
     pub seeds: u32,
     /// Held-out episodes per team, if starts or POIs vary. As many others choose the team.
@@ -53,9 +55,9 @@ pub struct BaselineOutcome {
     /// The processor.
     #[serde(flatten)]
     pub processor: ProcessorInfo,
-    /// The meaning of the policies' outputs.
+    /// What the policies choose.
     #[serde(skip)]
-    pub actions: Actions,
+    pub choosing: Choosing,
     /// Who learns, for people: the paradigm, or the classes that learn.
     #[serde(skip)]
     pub learners: String,
@@ -67,6 +69,46 @@ pub struct BaselineOutcome {
     pub moves: bool,
 }
 
+/// What policies choose.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Choosing {
+    /// Actions or behaviours.
+    Moves(Actions),
+    /// Agents.
+    Agents,
+    /// Agents, and those of other classes choose actions or behaviours.
+    Both(Actions),
+}
+
+impl Choosing {
+    fn of(config: &Config) -> Choosing {
+        let actions = config.policy.actions;
+        let chooses = |class: &AgentClass| matches!(class.control, Control::Choose(_));
+        let mut learners = config.agents.iter().filter(|class| class.learns());
+        match (learners.clone().any(chooses), learners.all(chooses)) {
+            (false, _) => Choosing::Moves(actions),
+            (true, true) => Choosing::Agents,
+            (true, false) => Choosing::Both(actions),
+        }
+    }
+
+    /// Returns what a constant is, by its index.
+    fn constant(self, index: usize, pois: f64) -> Constant {
+        let none = Constant { speed: None, behaviour: None, choice: None, pois };
+        let choice = Some(index);
+        match self {
+            Choosing::Agents => Constant { choice, ..none },
+            Choosing::Both(actions) => Constant { choice, ..Choosing::Moves(actions).constant(index, pois) },
+            Choosing::Moves(Actions::Direct) => {
+                Constant { speed: Some((index % SPEEDS + 1) as f64 / SPEEDS as f64), ..none }
+            }
+            Choosing::Moves(Actions::Behaviours) => {
+                Constant { behaviour: Some(index % baseline::constants(Actions::Behaviours).len()), ..none }
+            }
+        }
+    }
+}
+
 /// A constant action.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub struct Constant {
@@ -76,6 +118,9 @@ pub struct Constant {
     /// The behaviour, if policies choose one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub behaviour: Option<usize>,
+    /// The agent, by its index in its class, if policies choose one. The number of agents means nobody.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub choice: Option<usize>,
     /// POIs observed, as a mean over seeds.
     pub pois: f64,
 }
@@ -100,14 +145,14 @@ pub fn run(
     if request.seeds == 0 {
         return Err(Error::Usage("--seeds 0: allowed 1 or more".into()));
     }
-    let config = request.config.read()?.validate()?;
+    let config = request.config.in_stage(request.stage, context)?.validate()?;
     let (open, on) = backends.open(Work::of([&*config]))?;
     check_memory([&config], open)?;
     context.message(format_args!("playing on {on}"));
     let outcomes = play(&config, request.seeds as usize, request.episodes, &mut *open.0, context);
     context.pause();
     let outcomes = outcomes?;
-    let (learning, pois, actions) = (&config.learning, config.poi_count(), config.policy.actions);
+    let (learning, pois, choosing) = (&config.learning, config.poi_count(), Choosing::of(&config));
     let moves = config.starts_move() || config.pois_move();
     let observed = |g: &dyn Fn(&baseline::Outcome) -> f64| -> Vec<f64> {
         outcomes.iter().map(|outcome| g(outcome) * pois as f64).collect()
@@ -117,17 +162,10 @@ pub fn run(
         let interval = statistics::bounded(&seeds.iter().collect(), [0.0, pois as f64]).filter(|_| differ);
         BaselineScore { mean: mean(&seeds), interval_95: interval.map(|mean| [mean.low, mean.high]), seeds }
     };
-    let speed = |index: usize| (index + 1) as f64 / SPEEDS as f64;
-    let constant = |index: usize| {
-        let (speed, behaviour) = match actions {
-            Actions::Direct => (Some(speed(index)), None),
-            Actions::Behaviours => (None, Some(index)),
-        };
-        Constant { speed, behaviour, pois: mean(&observed(&|outcome| outcome.constants[index])) }
-    };
-    let chosen = |outcome: &baseline::Outcome| match actions {
-        Actions::Direct => json!(speed(outcome.best_constant)),
-        Actions::Behaviours => json!(outcome.best_constant),
+    let constant = |index: usize| choosing.constant(index, mean(&observed(&|outcome| outcome.constants[index])));
+    let chosen = |outcome: &baseline::Outcome| match choosing.constant(outcome.best_constant, 0.0) {
+        Constant { speed: Some(speed), choice: None, .. } => json!(speed),
+        _ => json!(outcome.best_constant),
     };
     let classes = config.agents.iter().filter(|class| class.learns());
     let classes: Vec<_> = classes.map(|class| format!("{} × {}", class.size(), class.name)).collect();
@@ -139,7 +177,7 @@ pub fn run(
         teams: learning.team_count() * (learning.generations + 1),
         seeds: outcomes.len(),
         episodes: if moves { request.episodes } else { 1 },
-        constants: (0..baseline::constants(actions).len()).map(constant).collect(),
+        constants: (0..outcomes[0].constants.len()).map(constant).collect(),
         chosen: outcomes.iter().map(chosen).collect(),
         constant: found(observed(&|outcome| outcome.constants[outcome.best_constant]), moves),
         action: found(observed(&|outcome| outcome.action), true),
@@ -148,7 +186,7 @@ pub fn run(
         open_loop: found(observed(&|outcome| outcome.open_loop), true),
         hill_climbing: found(observed(&|outcome| outcome.hill_climbing), true),
         processor: ProcessorInfo::of(&open.1, &open.0.describe()),
-        actions,
+        choosing,
         moves,
     })
 }

@@ -38,9 +38,10 @@ use serde::{Deserialize, Serialize};
 
 use crate::choice::Work;
 use crate::record::folder::{self, Run};
+use crate::report::replay::numbered;
 use crate::run::{Options, Progress, RunError};
 use flotilla::backend::{BackendError, Machine, OpenBackend};
-use flotilla::config::{Config, Override, ValidConfig};
+use flotilla::config::{Config, Override, STAGES, ValidConfig};
 use flotilla::escape::PathExt;
 use flotilla::front;
 use flotilla::memory::Peaks;
@@ -230,6 +231,31 @@ impl ConfigText {
     /// Reads the config.
     pub fn read(&self) -> Result<Config, Error> {
         Ok(Config::read(&self.text, &self.name, &[], &self.set)?)
+    }
+
+    /// Reads the config with which a stage plays. Keys are set there, after those of the stage. Without `stage` this is
+    /// the config of the file, and a note says so if it has stages.
+    fn in_stage(&self, stage: Option<usize>, context: Context<'_>) -> Result<Config, Error> {
+        let Some(stage) = stage else {
+            let config = self.read()?;
+            if !config.stages.is_empty() {
+                context.note("note: this plays in the world before any stage; --stage N plays in stage N");
+            }
+            return Ok(config);
+        };
+        let (stages, set): (Vec<_>, Vec<_>) = self.set.iter().cloned().partition(|set| set.key == STAGES);
+        let mut config = Config::read(&self.text, &self.name, &[], &stages)?;
+        let generations = config.learning.generations;
+        // A stage can be played even if the run ended before it.
+        config.learning.generations = config.stages.iter().fold(generations, |last, stage| last.max(stage.from));
+        let valid = config.validate()?;
+        let Some((_, of_stage)) = valid.stages().get(stage) else {
+            let stages = numbered(valid.stages().len(), "stage");
+            return Err(Error::Usage(format!("--stage {stage}: the config has {stages}").into()));
+        };
+        let mut config = Config { stages: vec![], ..Config::clone(of_stage) };
+        config.learning.generations = generations;
+        Ok(config.with(&set)?)
     }
 
     /// Reads the config. Reports notes for its author, and returns them, too.

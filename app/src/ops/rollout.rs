@@ -12,7 +12,6 @@ use crate::import;
 use crate::record::digests::{Digests, Verification};
 use crate::record::{folder, policies, tensors};
 use crate::report::map;
-use crate::report::replay::numbered;
 use crate::report::runs::ReadError;
 use crate::run::RunError;
 use flotilla::backend::{Backend, Group};
@@ -166,18 +165,7 @@ pub fn run(
     let outputs = [("--scores", request.scores.as_deref()), ("--trace", request.trace.as_deref())];
     output::check(&outputs, &[&config_path, &policies])?;
     let (text, name) = (import::read_file(&config_path)?, config::name(&config_path));
-    let config = ConfigText { text, name, set: request.set.clone() }.read()?;
-    let config = match request.stage {
-        None => config,
-        Some(stage) => {
-            let config = config.validate()?;
-            let Some((_, config)) = config.stages().get(stage) else {
-                let stages = numbered(config.stages().len(), "stage");
-                return Err(Error::Usage(format!("--stage {stage}: the config has {stages}").into()));
-            };
-            Config::clone(config)
-        }
-    };
+    let config = ConfigText { text, name, set: request.set.clone() }.in_stage(request.stage, context)?;
     let starts = request.starts(&config)?;
     verify(&config_path, &policies, request.unverified)?;
     let policies = policies::read(&policies, &config, request.trial)?;
