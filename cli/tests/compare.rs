@@ -127,8 +127,9 @@ fn generations_to_reach_count_only_in_the_last_stage() {
     );
     // The last stage has not begun.
     run(&place, "early", &[five, stages], &course.map(|trial| &trial[..3]));
-    let (table, _) = place.good("compare plain early --csv");
+    let (table, stderr) = place.good("compare plain early --csv");
     assert!(table.contains("champion_g") && !table.contains("generations_to_reach"), "{table}");
+    assert!(stderr.contains("not compared, because the last stage has not begun in 1 stage"), "{stderr}");
 }
 
 #[test]

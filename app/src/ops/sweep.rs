@@ -314,7 +314,9 @@ pub fn train(
     let points = shard.take(&sweep.points);
     let (backend, machine) = backends.open(Work::of(points.iter().map(|point| &*point.config)))?;
     check_memory(points.iter().map(|point| &point.config), backend)?;
-    warn_of_unreachable(sweep, &points, context);
+    tell_each(sweep, &points, |point| point.notes.clone(), |line| context.note(format_args!("note: {line}")));
+    let unreachable = |point: &Point| unreachable(&point.config);
+    tell_each(sweep, &points, unreachable, |line| context.warn(format_args!("warning: {line}")));
     // Before anything is written: the folder may be of another user.
     ownership::create_output_folder(&Disk::default(), out, request.named)?;
     claim(&Disk::default(), sweep, out)?;
@@ -412,19 +414,19 @@ pub fn train_points(
 /// Maximum number of POIs that are named one by one.
 const MAX_NAMED_POIS: usize = 6;
 
-/// Warns about every POI of a sweep's points that no team can observe, each warning once.
-fn warn_of_unreachable(sweep: &Sweep, points: &[&Point], context: Context<'_>) {
+/// Tells the lines about the points of a sweep, each line once.
+fn tell_each(sweep: &Sweep, points: &[&Point], lines: impl Fn(&Point) -> Vec<String>, tell: impl Fn(String)) {
     let mut found: BTreeMap<String, (usize, String)> = BTreeMap::new();
     for point in points {
-        for line in unreachable(&point.config) {
+        for line in lines(point) {
             found.entry(line).or_insert_with(|| (0, sweep.describe(point))).0 += 1;
         }
     }
     for (line, (count, first)) in found.iter().take(2 * MAX_NAMED_POIS) {
-        context.warn(format_args!("warning: {line}; at {count} of {} points, the first {first}", points.len()));
+        tell(format!("{line}; at {count} of {} points, the first {first}", points.len()));
     }
     if let more @ 1.. = found.len().saturating_sub(2 * MAX_NAMED_POIS) {
-        context.warn(format_args!("warning: … and {more} more; `flotilla check` lists those of one config"));
+        tell(format!("… and {more} more; `flotilla check` lists those of one config"));
     }
 }
 

@@ -339,6 +339,10 @@ pub fn compare(place: &str, arms: &[Cohort], options: &Question) -> Result<Compa
     if arms.iter().any(|arm| arm.planned > last) {
         notes.push(format!("arms are compared up to generation {last}, which all have reached"));
     }
+    if let Some(arm) = arms.iter().find(|arm| arm.trials.iter().any(|trial| trial.from > last)) {
+        let text = "generations to a G are not compared, because the last stage has not begun in";
+        notes.push(format!("{text} {}", arm.name));
+    }
     let named = |arm: &Cohort| Named {
         name: arm.name.clone(),
         folders: arm.folders.iter().map(|folder| folder.escaped()).collect(),

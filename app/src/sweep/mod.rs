@@ -24,7 +24,7 @@ use toml::de::{DeTable, DeValue};
 use toml::{Table, Value};
 
 use crate::import;
-use flotilla::config::{self, Config, ConfigError, GENERATIONS, GRID, Override, Problem, STAGES, VARY, ValidConfig};
+use flotilla::config::{self, Config, ConfigError, GRID, Override, Problem, VARY, ValidConfig};
 use flotilla::escape;
 use flotilla::file;
 use flotilla::reader::Document;
@@ -116,6 +116,8 @@ pub struct Point {
     pub values: Vec<usize>,
     /// The config.
     pub config: ValidConfig,
+    /// Notes for the author of the config.
+    pub notes: Vec<String>,
 }
 
 impl Sweep {
@@ -184,7 +186,9 @@ impl Sweep {
                 let values = grid.values(index);
                 let overrides = [flags, &grid.overrides(&values), &layout.overrides(&grid, &values)].concat();
                 let config = Config::read_noted(&document, name, &[GRID, VARY], &overrides);
-                Tried { index, values, config: config.map(|(config, _)| config) }
+                let (config, notes) =
+                    config.map_or_else(|error| (Err(error), vec![]), |(read, notes)| (Ok(read), notes));
+                Tried { index, values, config, notes }
             })
             .collect();
         let mut problems = grid.problems(&tried, skip);
@@ -194,7 +198,7 @@ impl Sweep {
         }
         let text = grid.normal(base, flags, skip);
         let axes = grid.axes.into_iter().map(|(axis, _)| axis).collect();
-        let point = |Tried { index, values, config }| config.ok().map(|config| Point { index, values, config });
+        let point = |Tried { index, values, config, notes }| Some(Point { index, values, config: config.ok()?, notes });
         let points: Vec<_> = tried.into_iter().filter_map(point).collect();
         let name = file::stem(Path::new(name), "sweep");
         Ok(Sweep { name, axes, skipped: total - points.len(), points, text })
@@ -216,6 +220,7 @@ struct Tried {
     index: usize,
     values: Vec<usize>,
     config: Result<ValidConfig, ConfigError>,
+    notes: Vec<String>,
 }
 
 fn describe<'a>(axes: impl Iterator<Item = &'a Axis>, values: &[usize]) -> String {
@@ -438,12 +443,6 @@ impl Grid {
             if let (Some(value), Some(place)) = (value, place(&mut base, key)) {
                 *place = value;
             }
-        }
-        // A shorter run has no stages that begin after its end, see `Config::read_noted`.
-        let last = flags.iter().find(|set| set.key == GENERATIONS).and_then(|set| set.text.parse().ok());
-        if let (Some(last), Some(Value::Array(stages))) = (last, base.get_mut(STAGES)) {
-            let from = |stage: &Value| stage.get("from").and_then(Value::as_integer);
-            stages.retain(|stage| from(stage).is_none_or(|from: i64| from <= last));
         }
         let mut text = toml::to_string(&base).unwrap_or_default();
         for (section, varied) in [(GRID, false), (VARY, true)] {
