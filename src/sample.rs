@@ -633,6 +633,36 @@ fn term(rng: &mut ChaCha8Rng, names: &[String], lengths: &Lengths) -> Term {
     }
 }
 
+/// Draws how the policies of a valid config are selected and teamed, and whether starts vary. A hundred consecutive seeds
+/// cover every method, kind of teams, parents and leniency, several partners, a hall of fame, and elites of teams.
+pub fn learn_otherwise(seed: u64, config: &mut Config) {
+    let rng = &mut ChaCha8Rng::seed_from_u64(seed ^ 0x6c65_6172);
+    // Combinations that are not allowed are drawn again.
+    for _ in 0..50 {
+        let mut drawn = config.clone();
+        let few = |rng: &mut ChaCha8Rng| if rng.random() { 0 } else { rng.random_range(1..=2) };
+        drawn.learning = Learning {
+            method: if rng.random() { Method::Tournament } else { word(rng) },
+            teams: word(rng),
+            temperature: [0.1, 1.0][rng.random_range(0..2)],
+            team_elites: few(rng),
+            team_g_elites: few(rng),
+            hall_of_fame: few(rng),
+            partners: 1 + few(rng),
+            leniency: word(rng),
+            parents: word(rng),
+            elites: Elites::Count(rng.random_range(1..=config.learning.population)),
+            // Most worlds keep the ties of their layouts.
+            start_jitter: if rng.random_bool(0.8) { 0.0 } else { rng.random_range(0.0..2.0) },
+            ..config.learning.clone()
+        };
+        if drawn.validate().is_ok() {
+            *config = drawn;
+            return;
+        }
+    }
+}
+
 /// Returns a random word of a choice.
 fn word<T: Choice>(rng: &mut ChaCha8Rng) -> T {
     T::ALL[rng.random_range(0..T::ALL.len())].1

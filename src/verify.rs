@@ -9,10 +9,10 @@ use glam::Vec2;
 
 use crate::backend::compare::{compare_breeding, compare_traces, first_difference};
 use crate::backend::{Backend, BackendError, Group};
-use crate::config::{Config, Fitness, StageConfig, ValidConfig};
+use crate::config::{Config, Fitness, Learning, StageConfig, ValidConfig};
 use crate::credit::RecordRequest;
 use crate::evaluate::{SCORES, SCORES_AND_DT};
-use crate::evolve::{self, Key, Purpose};
+use crate::evolve::{self, Episodes};
 use crate::sample;
 use crate::trainer::Trainer;
 use crate::world::World;
@@ -36,9 +36,13 @@ const TRAINED: usize = 8;
 impl Plan {
     /// Returns a plan with random worlds of every kind, including degenerate ones.
     pub fn random(seeds: Range<u64>, teams: usize) -> Plan {
-        let seed = seeds.start;
-        let worlds = seeds.map(|seed| (format!("random world {seed}"), sample::any_world(seed))).collect();
-        Plan { worlds, teams, seed, generations: 3 }
+        let first = seeds.start;
+        let world = |seed| {
+            let mut config = sample::any_world(seed);
+            sample::learn_otherwise(seed, &mut config);
+            (format!("random world {seed}"), config)
+        };
+        Plan { worlds: seeds.map(world).collect(), teams, seed: first, generations: 3 }
     }
 }
 
@@ -79,10 +83,8 @@ impl Teams {
         let mut weights = sample::weights(&world, policies, seed);
         // With a shared population teams still mix policies, which tests more.
         weights.truncate(config.populations() * policies * world.parameters());
-        let mut places = world.starts.clone();
-        let learning = &config.learning;
-        evolve::jitter_pois(Key::new(seed, 0, Purpose::Pois), 0, 0, &world, learning.poi_jitter, &mut places);
-        evolve::draw_headings(Key::new(seed, 0, Purpose::Starts), 0, 0, &world, &mut places);
+        let (learning, mut places) = (Learning { seed, ..config.learning.clone() }, vec![]);
+        evolve::episode_positions(&learning, 0, 0, (Episodes::Training, 0), &world, &mut places);
         let fitnesses = if sights { SCORES_AND_DT } else { SCORES };
         Teams { policies, weights, choice, places, fitnesses, world }
     }

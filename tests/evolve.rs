@@ -13,12 +13,13 @@ use fearless_simd::Level;
 use flotilla::backend::cpu::{Cpu, level_name};
 use flotilla::backend::{Backend, Group};
 use flotilla::config::{
-    Actions, Config, Elites, Fitness, Initial, Learning, Leniency, Method, Mutation, Paradigm, Parents, Sharing, Teams,
-    ValidConfig, own_populations,
+    Actions, Choice, Config, Elites, Fitness, Initial, Learning, Leniency, Method, Mutation, Paradigm, Parents,
+    Sharing, Teams, ValidConfig, own_populations,
 };
 use flotilla::credit::Credit;
 use flotilla::evaluate::Starts;
 use flotilla::evolve::{self, Episodes, Key, MAX_WEIGHT, MIN_WEIGHT, Purpose, Selection, UNCHANGED};
+use flotilla::sample;
 use flotilla::stepping::{Recording, Stepper};
 use flotilla::trainer::{Row, Trainer};
 use flotilla::world::{GRID, World};
@@ -1040,10 +1041,40 @@ fn experiments_trained_together_equal_experiments_trained_alone() {
     }
 }
 
+/// Returns random worlds that learn in random ways.
+fn random_experiments(count: u64) -> Vec<Config> {
+    let random = |seed| {
+        let mut config = sample::any_world(seed);
+        sample::learn_otherwise(seed, &mut config);
+        config
+    };
+    (0..count).map(random).collect()
+}
+
+#[test]
+fn random_experiments_cover_every_way_to_learn() {
+    let ways: HashSet<String> = random_experiments(100)
+        .into_iter()
+        .flat_map(|Config { learning, .. }| {
+            let Learning { method, teams, parents, leniency, .. } = learning;
+            let words = [method.to_string(), teams.to_string(), parents.to_string(), leniency.to_string()];
+            let more = [
+                ("partners", learning.partners > 1),
+                ("hall of fame", learning.hall_of_fame > 0),
+                ("team elites", learning.team_elites > 0),
+                ("elites by G", learning.team_g_elites > 0),
+                ("start jitter", learning.start_jitter > 0.0),
+            ];
+            words.into_iter().chain(more.map(|(name, is_so)| format!("{name}: {is_so}")))
+        })
+        .collect();
+    assert_eq!(ways.len(), Method::ALL.len() + Teams::ALL.len() + Parents::ALL.len() + Leniency::ALL.len() + 2 * 5);
+}
+
 /// A snapshot that was taken after the last champions played continues with more generations, too.
 #[test]
 fn a_snapshot_of_a_finished_experiment_extends_it() {
-    for (experiment, config) in experiments().into_iter().enumerate() {
+    for (experiment, config) in experiments().into_iter().chain(random_experiments(100)).enumerate() {
         let trials = config.learning.trials;
         let mut longer = config.clone();
         longer.learning.generations += 2;
