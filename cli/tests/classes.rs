@@ -116,6 +116,16 @@ coupling = 1
 radius = 3
 "#;
 
+#[test]
+fn a_stage_that_weighs_pois_is_told() {
+    let alike = HERD.replace("value = 2\n", "").replace("value = 0.5\n", "");
+    let stage = "[[stages]]\nfrom = 1\nset = { pois.far.value = 7.5 }\n";
+    let place = Place::new(&[("herd.toml", &(alike + stage))]);
+    let (report, _) = place.good("train herd.toml --out run");
+    assert!(report.contains("weighted by value"), "{report}");
+    assert!(place.read("run/curves.svg").contains("G (weighted share of POIs)"));
+}
+
 /// The leader starts at the POI and has to leave it at once.
 #[test]
 fn replays_show_what_is_observed_at_the_start() {

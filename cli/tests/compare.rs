@@ -451,7 +451,15 @@ fn keys_of_classes_are_compared_one_by_one() {
     let error = place.refused(1, &format!("{train} --out G --resume --set agents.rover.motion.max_speed=9"));
     assert!(error.contains("agents.rover.motion.max_speed: ") && error.contains(" there, 9.0 here"), "{error}");
     place.good(&format!("{train} --out fast --set agents.rover.motion.max_speed=9"));
-    assert!(place.good("compare G fast").1.contains("the arms play in different layouts: agents differ"));
+    assert!(!place.good("compare G fast").1.contains("layouts"));
+    place.good(&format!("{train} --out turned --set agents.rover.heading=45"));
+    assert!(place.good("compare G turned").1.contains("the arms play in different layouts: agents differ"));
+    // A key that only one run sets names both, in any order.
+    place.good(&format!("{train} --out plain --seed 1"));
+    for arms in ["plain G", "G plain"] {
+        let (text, _) = place.good(&format!("compare {arms}"));
+        assert!(text.contains("drone.fitness G, seed 0") && text.contains("drone.fitness -, seed 1"), "{text}");
+    }
 }
 
 #[cfg(target_os = "linux")]

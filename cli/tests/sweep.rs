@@ -196,6 +196,25 @@ fn places_of_followers_do_not_depend_on_their_number() {
 }
 
 #[test]
+fn flags_count_as_if_they_were_in_the_file() {
+    let text = "[learning]\npopulation = 4\n[grid]\ngroups = [1, 2]\n[vary]\n\"world.map\" = [[80, 60]]\n";
+    let read = |key: &str, value: &str| {
+        let flag = Override::new(key, value.parse::<toml::Value>().unwrap(), "--set");
+        Sweep::read(text, "x.toml", &[flag], false)
+    };
+    let sweep = read("world.pois", "[[20, 20], [30, 30]]").unwrap();
+    assert!(sweep.points.iter().all(|point| point.config.world.pois == [[20.0, 20.0], [30.0, 30.0]]));
+    // The map is laid out where it is not varied.
+    let maps: Vec<_> = sweep.points.iter().map(|point| point.config.world.map == [80.0, 60.0]).collect();
+    assert_eq!(maps, [false, true, false, true]);
+    let again = Sweep::read(&sweep.text, "sweep.toml", &[], false).unwrap();
+    let configs = |sweep: &Sweep| sweep.points.iter().map(|point| point.config.clone()).collect::<Vec<_>>();
+    assert_eq!(configs(&again), configs(&sweep));
+    let error = read("world.leaders", "[[1, 1]]").unwrap_err().to_string();
+    assert!(error.contains("grid.groups: it lays out world.leaders, which is given too"), "{error}");
+}
+
+#[test]
 fn errors_in_sweeps_name_the_line() {
     let error_of = |grid: &str| parse_error(&SMALL.replace("\"world.coupling\" = [1, 3]", grid));
     for (grid, expected) in [

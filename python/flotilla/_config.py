@@ -209,7 +209,7 @@ class Config(Mapping[str, Any]):
         world, learning = sections["world"], sections["learning"]
 
         if "agents" in sections:
-            agents = ", ".join(f"{len(group['at'])} × {group['name']}" for group in sections["agents"])
+            agents = ", ".join(f"{group.get('count') or len(group['at'])} × {group['name']}" for group in sections["agents"])
             who = count(self.num_learners, "learner")
         else:
             agents = f"{count(len(world['leaders']), 'leader')}, {count(len(world['followers']), 'follower')}"

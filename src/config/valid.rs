@@ -99,6 +99,12 @@ impl ValidConfig {
         self.stages.iter().all(|(_, config)| config.poi_value() == value).then_some(value)
     }
 
+    /// Returns what the POIs observed are weighted by in reports, see [`Config::weighted_by`], in the first stage where
+    /// they are.
+    pub fn weighted_by(&self) -> Option<&'static str> {
+        self.stages.iter().find_map(|(_, config)| config.weighted_by())
+    }
+
     /// Returns a note for each setting that is valid but likely a mistake.
     pub fn notes(&self) -> Vec<String> {
         let mut shown = HashSet::new();

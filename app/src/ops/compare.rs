@@ -14,7 +14,7 @@ use crate::report::comparison::{self, At, Cohort, Comparison, ComparisonError, Q
 use crate::report::runs::{self, MAX_RUNS, ReadError};
 use crate::shell;
 use crate::sweep::{Sweep, results};
-use flotilla::config::{AgentClass, Config};
+use flotilla::config::{AgentClass, Config, PoiGroup};
 use flotilla::escape::PathExt;
 use flotilla::file;
 use flotilla::statistics;
@@ -169,14 +169,14 @@ fn of_runs(folders: &[PathBuf], args: &CompareRequest, notes: &mut Vec<String>) 
     let configs = folders.iter().map(|folder| runs::config(folder, verification)).collect::<Result<Vec<_>, _>>()?;
     let differs = |differs: fn(&Config, &Config) -> bool| configs.iter().any(|config| differs(config, &configs[0]));
     // The short form and the long form of one layout are the same.
-    let parts = |config: &Config| (config.world.map, without_fitness(config.classes().agents), config.classes().pois);
+    let parts = |config: &Config| (config.world.map, agents(&config.classes().agents), pois(&config.classes().pois));
     let layouts = [
         ("world.map", differs(|a, b| a.world.map != b.world.map)),
         ("world.leaders", differs(|a, b| a.world.leaders != b.world.leaders)),
         ("world.followers", differs(|a, b| a.world.followers != b.world.followers)),
         ("world.pois", differs(|a, b| a.world.pois != b.world.pois)),
-        ("agents", differs(|a, b| without_fitness(a.agents.clone()) != without_fitness(b.agents.clone()))),
-        ("pois", differs(|a, b| a.pois != b.pois)),
+        ("agents", differs(|a, b| agents(&a.agents) != agents(&b.agents))),
+        ("pois", differs(|a, b| pois(&a.pois) != pois(&b.pois))),
     ];
     let layouts: Vec<&str> = layouts.into_iter().filter(|(_, differ)| *differ).map(|(key, _)| key).collect();
     if !layouts.is_empty() && configs.iter().any(|config| parts(config) != parts(&configs[0])) {
@@ -188,9 +188,15 @@ fn of_runs(folders: &[PathBuf], args: &CompareRequest, notes: &mut Vec<String>) 
     Ok(arms.map(read).collect::<Result<_, _>>()?)
 }
 
-/// Returns classes of agents without what selects their policies.
-fn without_fitness(classes: Vec<AgentClass>) -> Vec<AgentClass> {
-    classes.into_iter().map(|class| AgentClass { fitness: None, ..class }).collect()
+/// Returns the places and headings where classes of agents start.
+fn agents(classes: &[AgentClass]) -> Vec<impl PartialEq + use<>> {
+    let start = |class: &AgentClass| (class.at.clone(), class.count, class.region, class.heading.clone());
+    classes.iter().map(start).collect()
+}
+
+/// Returns the places of groups of POIs.
+fn pois(groups: &[PoiGroup]) -> Vec<impl PartialEq + use<>> {
+    groups.iter().map(|group| (group.at.clone(), group.count, group.region)).collect()
 }
 
 /// Returns a note for each run with the results of another, because there is nothing to compare between them.

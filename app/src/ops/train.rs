@@ -237,7 +237,7 @@ pub fn run(
         processor: ProcessorInfo::of_run(session.run(0)),
         rows: results.rows.clone(),
         teams: config.max_teams() - 1,
-        weighted_by: config.weighted_by(),
+        weighted_by: valid.weighted_by(),
         trained_on: (!was_done).then_some(on),
         folder,
     })

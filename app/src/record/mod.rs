@@ -339,7 +339,10 @@ const DEFAULTS_ADDED_LATER: [&str; 28] = [
 /// Returns the SHA-256 of the part of a config that affects results.
 pub fn config_digest(config: &Config) -> String {
     let text = without_checkpoint(config).to_toml();
-    let lines: String = text.split_inclusive('\n').filter(|line| !DEFAULTS_ADDED_LATER.contains(line)).collect();
+    // Tables of classes, POIs and stages follow the sections.
+    let (sections, tables) = text.split_at(text.find("\n[[").unwrap_or(text.len()));
+    let lines = sections.split_inclusive('\n').filter(|line| !DEFAULTS_ADDED_LATER.contains(line));
+    let lines = lines.chain([tables]).collect::<String>();
     // A section without lines leaves the space before it.
     hex(&Sha256::digest(lines.replace("\n\n\n", "\n\n")))
 }

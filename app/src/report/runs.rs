@@ -1,6 +1,6 @@
 //! The learning curves of finished and unfinished runs.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use serde::de::IntoDeserializer;
@@ -183,7 +183,9 @@ fn figure_of_runs(
         }
     };
     let y_label = match (all.len(), measure) {
-        (1, None) if configs[0].weighted_by().is_some() => "G (weighted share of POIs)".into(),
+        (1, None) if configs[0].validate().is_ok_and(|config| config.weighted_by().is_some()) => {
+            "G (weighted share of POIs)".into()
+        }
         (1, None) => "G (share of POIs observed)".into(),
         (_, kind) => kind.unwrap_or_default().label(),
     };
@@ -231,9 +233,11 @@ pub fn labels(folders: &[PathBuf], configs: &[Config]) -> Vec<String> {
         values
     };
     let tables: Vec<BTreeMap<String, toml::Value>> = configs.iter().zip(folders).map(values).collect();
-    let Some(first) = tables.first() else { return vec![] };
-    let differs = |key: &&String| tables.iter().any(|table| table.get(*key) != first.get(*key));
-    let keys: Vec<_> = first.keys().filter(differs).filter_map(|key| Some((key, key.split_once('.')?.1))).collect();
+    // Some keys are left out unless they are set.
+    let keys: BTreeSet<&String> = tables.iter().flat_map(BTreeMap::keys).collect();
+    let differs = |key: &&String| tables.iter().any(|table| table.get(*key) != tables[0].get(*key));
+    let keys = keys.into_iter().filter(differs);
+    let keys: Vec<_> = keys.filter_map(|key| Some((key, key.split_once('.')?.1))).collect();
     let staged = configs.iter().any(|config| config.stages != configs[0].stages);
     let label = |((folder, table), config): ((&PathBuf, &BTreeMap<String, toml::Value>), &Config)| {
         let stages = match config.stages.len() {

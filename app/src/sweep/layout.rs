@@ -10,7 +10,7 @@
 
 use toml::{Table, Value};
 
-use super::{Grid, problem};
+use super::{Axis, Grid, problem};
 use flotilla::config::{Override, POIS, Problem};
 
 /// The key for followers per leader (0 to 64; 2 if only the other axis is given).
@@ -88,17 +88,19 @@ fn count(value: &Value) -> Option<usize> {
     usize::try_from(value.as_integer()?).ok()
 }
 
-/// Reports whether the sweep sets this key.
-fn sets(grid: &Grid, base: &Table, key: &str) -> bool {
+/// Reports whether the sweep sets this key at a point with these values.
+fn sets(grid: &Grid, base: &Table, values: &[usize], key: &str) -> bool {
     let (section, leaf) = key.split_once('.').unwrap_or((key, ""));
+    let is_set = |(axis, value): (&Axis, &usize)| axis.key == key && (!axis.varied || *value > 0);
     base.get(section).and_then(|section| section.get(leaf)).is_some()
-        || grid.axes.iter().any(|(axis, _)| axis.key == key)
+        || grid.axes.iter().map(|(axis, _)| axis).zip(values).any(is_set)
 }
 
 /// Returns a problem for positions that are given although an axis lays them out.
 pub(super) fn conflicts(grid: &Grid, base: &Table) -> Vec<Problem> {
     let Some((axis, line)) = grid.axes.iter().find(|(axis, _)| AXES.contains(&&*axis.key)) else { return vec![] };
-    let given = ["world.leaders", "world.followers"].into_iter().filter(|key| sets(grid, base, key));
+    let anywhere = vec![usize::MAX; grid.axes.len()];
+    let given = ["world.leaders", "world.followers"].into_iter().filter(|key| sets(grid, base, &anywhere, key));
     given
         .map(|key| {
             let message = format!("it lays out {key}, which is given too; leave one of them out");
@@ -111,24 +113,17 @@ pub(super) fn conflicts(grid: &Grid, base: &Table) -> Vec<Problem> {
 pub(super) struct Arrangement {
     axes: Option<[Option<usize>; 2]>,
     places: Vec<[i32; 2]>,
-    pois: bool,
-    map: bool,
 }
 
 impl Arrangement {
-    pub(super) fn of(grid: &Grid, base: &Table) -> Arrangement {
+    pub(super) fn of(grid: &Grid) -> Arrangement {
         let axes = AXES.map(|key| grid.axes.iter().position(|(axis, _)| axis.key == key));
         let used = axes.iter().any(Option::is_some);
-        Arrangement {
-            axes: used.then_some(axes),
-            places: if used { places() } else { vec![] },
-            pois: !sets(grid, base, "world.pois") && !base.contains_key(POIS),
-            map: !sets(grid, base, "world.map"),
-        }
+        Arrangement { axes: used.then_some(axes), places: if used { places() } else { vec![] } }
     }
 
     /// Returns the positions of one combination, or nothing if no axis lays them out.
-    pub(super) fn overrides(&self, grid: &Grid, values: &[usize]) -> Vec<Override> {
+    pub(super) fn overrides(&self, grid: &Grid, base: &Table, values: &[usize]) -> Vec<Override> {
         let Some(axes) = self.axes else { return vec![] };
         let value = |axis: Option<usize>| axis.and_then(|axis| count(&grid.axes[axis].0.values[values[axis]]));
         let followers = value(axes[0]).unwrap_or(DEFAULT_FOLLOWERS);
@@ -139,10 +134,10 @@ impl Arrangement {
         let name = grid.axes[named].0.name_of(values[named]);
         let set = |key: &str, value: Value| Override::new(format!("world.{key}"), value, &*name);
         let mut overrides = vec![set("leaders", list(leaders)), set("followers", list(followers))];
-        if self.pois {
+        if !sets(grid, base, values, "world.pois") && !base.contains_key(POIS) {
             overrides.push(set("pois", list(pois)));
         }
-        if self.map {
+        if !sets(grid, base, values, "world.map") {
             overrides.push(set("map", map.to_vec().into()));
         }
         overrides

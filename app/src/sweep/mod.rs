@@ -138,6 +138,12 @@ impl Sweep {
             return Err(invalid(name, vec![problem(None, "", "it is not TOML")]));
         };
         let sections = [GRID, VARY].map(|section| base.remove(section));
+        for Override { key, text, .. } in flags {
+            let value = format!("value = {text}").parse::<Table>().ok().and_then(|mut table| table.remove("value"));
+            if let (Some(value), Some(place)) = (value, place(&mut base, key)) {
+                *place = value;
+            }
+        }
         let mut grid = Grid::read(&document, sections).map_err(|list| invalid(name, list))?;
         // Every point reads the rest of the document, so its cost must not depend on the length of the lists.
         let document = document.without(&[GRID, VARY]);
@@ -180,11 +186,11 @@ impl Sweep {
             return Err(invalid(name, problems));
         }
 
-        let layout = layout::Arrangement::of(&grid, &base);
+        let layout = layout::Arrangement::of(&grid);
         let tried: Vec<_> = (0..total)
             .map(|index| {
                 let values = grid.values(index);
-                let overrides = [flags, &grid.overrides(&values), &layout.overrides(&grid, &values)].concat();
+                let overrides = [flags, &grid.overrides(&values), &layout.overrides(&grid, &base, &values)].concat();
                 let config = Config::read_noted(&document, name, &[GRID, VARY], &overrides);
                 let (config, notes) =
                     config.map_or_else(|error| (Err(error), vec![]), |(read, notes)| (Ok(read), notes));
@@ -196,7 +202,7 @@ impl Sweep {
         if !problems.is_empty() {
             return Err(invalid(name, problems));
         }
-        let text = grid.normal(base, flags, skip);
+        let text = grid.normal(&base, skip);
         let axes = grid.axes.into_iter().map(|(axis, _)| axis).collect();
         let point = |Tried { index, values, config, notes }| Some(Point { index, values, config: config.ok()?, notes });
         let points: Vec<_> = tried.into_iter().filter_map(point).collect();
@@ -364,9 +370,9 @@ impl Grid {
         let own = |key: &str| {
             let configs = tried.chunks(variations).filter_map(|of| of[0].config.as_ref().ok());
             let mut values = configs.filter_map(|config| value_of(config, key));
-            let first = values.next().unwrap_or_else(|| Value::from(""));
+            let first = values.next();
             // A default may depend on the keys of the grid.
-            if values.all(|value| value == first) { first } else { Value::from("the file's") }
+            first.filter(|first| values.all(|value| value == *first)).unwrap_or_else(|| Value::from("the file's"))
         };
         for (axis, _) in self.axes.iter_mut().filter(|(axis, _)| axis.varied) {
             axis.values[0] = own(&axis.key);
@@ -437,14 +443,8 @@ impl Grid {
     }
 
     /// Writes the sweep file in normal form.
-    fn normal(&self, mut base: Table, flags: &[Override], skip: bool) -> String {
-        for Override { key, text, .. } in flags {
-            let value = format!("value = {text}").parse::<Table>().ok().and_then(|mut table| table.remove("value"));
-            if let (Some(value), Some(place)) = (value, place(&mut base, key)) {
-                *place = value;
-            }
-        }
-        let mut text = toml::to_string(&base).unwrap_or_default();
+    fn normal(&self, base: &Table, skip: bool) -> String {
+        let mut text = toml::to_string(base).unwrap_or_default();
         for (section, varied) in [(GRID, false), (VARY, true)] {
             let axes: Vec<&Axis> =
                 self.axes.iter().map(|(axis, _)| axis).filter(|axis| axis.varied == varied).collect();

@@ -100,7 +100,7 @@ impl<'a> Screen<'a> {
             (0..world.pois.len()).all(|poi| (0..world.agents()).all(|agent| world.rule.counts_at(poi, agent)))
         };
         let who = if played.iter().all(all_count) { "agents" } else { "observers" };
-        let timed = played.iter().any(|played| played.world.rule.is_timed());
+        let timed = played.iter().any(|played| map::is_timed(&played.world));
         let needed = played.first().and_then(|played| played.world.coupling.first()).map_or(1, |&needed| needed);
         let near = needed.saturating_sub(1);
         let who = if near == 1 { &who[..who.len() - 1] } else { who };
