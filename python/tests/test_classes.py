@@ -71,6 +71,10 @@ def test_a_config_with_classes_is_read_written_and_copied():
     assert (CONFIG.num_inputs, CONFIG.num_learners, CONFIG.parameters) == (8, 5, 9 * 6 + 7 * 2)
     assert CONFIG.replace(world={"steps": 3})["world.steps"] == 3
     assert repr(CONFIG).startswith("<flotilla.Config: 3 × rover, 2 × drone, 4 × sheep, 5 POIs; 5 learners by D, 8 teams")
+    rover = {**CONFIG["agents"][0], "count": 4, "in": {"circle": [20, 20, 5]}}
+    rover.pop("at")
+    drawn = CONFIG.replace(agents=[rover, *CONFIG["agents"][1:]])
+    assert repr(drawn).startswith("<flotilla.Config: 4 × rover, 2 × drone")
     assert [group["value"] for group in CONFIG["pois"]] == [2, 0.5]
     # The widest class decides.
     wide = Config.parse(TEXT.replace("sectors = 3", "sectors = 11"))
