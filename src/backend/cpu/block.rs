@@ -366,8 +366,10 @@ impl<S: Simd> Block<S> {
                 continue;
             }
             let agents = &mut agents[own.clone()];
-            for (agent, &wanted) in agents.iter_mut().zip(&wanted[own]) {
+            for agent in &mut *agents {
                 (agent.hx, agent.hy) = motion::renormalize::<S>(agent.hx, agent.hy);
+            }
+            for (agent, &wanted) in agents.iter_mut().zip(&wanted[own]) {
                 agent.speed = motion::accelerate::<S>(motion, agent.speed, wanted);
             }
             for agent in agents {
@@ -536,10 +538,10 @@ impl<S: Simd> Scene<'_, S> {
         observers: Range<usize>,
         inputs: &mut Inputs<'_, S>,
     ) {
-        let &Scene { simd, channel, pois, values, agents, near, plan } = self;
+        let &Scene { simd, channel, pois, agents, near, plan, .. } = self;
         for observer in observers {
             let &Agent { x, y, hx, hy, .. } = &agents[observer];
-            let heading = channel.heading(hx, hy);
+            let heading = if PLAIN && !MAP { [hx, hy] } else { channel.heading(hx, hy) };
             let mut quadrants = sense::Quadrants::new(simd);
             neighbours::each_near(
                 near,
@@ -555,29 +557,39 @@ impl<S: Simd> Scene<'_, S> {
             );
             for range in &plan.pois {
                 let (fours, rest) = pois[range.clone()].as_chunks::<4>();
-                let (values, last) = values[range.clone()].as_chunks::<4>();
-                for (pois, values) in fours.iter().zip(values) {
-                    let (mut measures, mut within) =
-                        ([S::i32s::splat(simd, 0); 4], [S::mask32s::splat(simd, false); 4]);
-                    for index in 0..4 {
-                        let measured = self.measured::<MEASURE, PLAIN>(values[index], offset(pois[index], x, y));
-                        measures[index] = measured.0;
-                        if !PLAIN {
-                            within[index] = measured.1;
-                        }
-                    }
-                    for index in 0..4 {
-                        let measured = (measures[index], within[index]);
-                        quadrants.add::<PLAIN, MAP>(measured, offset(pois[index], x, y), heading);
-                    }
+                let mut first = range.start;
+                for pois in fours {
+                    self.add_pois::<MEASURE, PLAIN, MAP, 4>(&mut quadrants, first, pois, [x, y], heading);
+                    first += 4;
                 }
-                for (poi, &value) in rest.iter().zip(last) {
-                    let offset = offset(*poi, x, y);
-                    quadrants.add::<PLAIN, MAP>(self.measured::<MEASURE, PLAIN>(value, offset), offset, heading);
+                for (poi, first) in rest.iter().zip(first..) {
+                    self.add_pois::<MEASURE, PLAIN, MAP, 1>(&mut quadrants, first, &[*poi], [x, y], heading);
                 }
             }
             let inputs = inputs.of(observer, channel).as_chunks_mut().0;
             quadrants.write::<PLAIN>(channel, &mut inputs[0]);
+        }
+    }
+
+    /// Adds so many POIs, from index `first` on, to the quadrants of an agent at a place. First all are measured:
+    /// out-of-order execution overlaps them.
+    #[inline(always)]
+    fn add_pois<const MEASURE: u32, const PLAIN: bool, const MAP: bool, const POIS: usize>(
+        &self,
+        quadrants: &mut sense::Quadrants<S>,
+        first: usize,
+        pois: &[[S::f32s; 2]; POIS],
+        [x, y]: [S::f32s; 2],
+        heading: [S::f32s; 2],
+    ) {
+        let none = (S::i32s::splat(self.simd, 0), S::mask32s::splat(self.simd, false));
+        let mut measures = [none; POIS];
+        for index in 0..POIS {
+            let value = if PLAIN { 1.0 } else { self.values[first + index] };
+            measures[index] = self.measured::<MEASURE, PLAIN>(value, offset(pois[index], x, y));
+        }
+        for (measured, &poi) in measures.into_iter().zip(pois) {
+            quadrants.add::<PLAIN, MAP>(measured, offset(poi, x, y), heading);
         }
     }
 

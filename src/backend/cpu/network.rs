@@ -111,21 +111,18 @@ impl<S: Simd> Network<S> {
             }
             // All leaders' tanh together, in short loops: out-of-order execution overlaps iterations only if they are
             // short.
-            for unit in &mut *units {
-                *unit = policy::clamp_preactivation::<S>(*unit);
-            }
             let (eights, rest) = units.as_chunks_mut::<8>();
             for units in eights {
                 let mut halves = [(units[0], units[0]); 8];
                 for (half, &unit) in halves.iter_mut().zip(&*units) {
-                    *half = math::half_tanh::<S>(unit);
+                    *half = math::half_tanh::<S>(policy::clamp_preactivation::<S>(unit));
                 }
                 for (unit, &half) in units.iter_mut().zip(&halves) {
                     *unit = math::whole_tanh::<S>(half);
                 }
             }
             for unit in rest {
-                *unit = math::whole_tanh::<S>(math::half_tanh::<S>(*unit));
+                *unit = math::whole_tanh::<S>(math::half_tanh::<S>(policy::clamp_preactivation::<S>(*unit)));
             }
             first += (rows + 1) * columns;
             std::mem::swap(&mut from, &mut to);
