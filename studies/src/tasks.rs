@@ -317,7 +317,9 @@ fn reason(baselines: &[Vec<f64>], trained: &[Trained], scripted_g: Option<f64>, 
     }
     match scripted_g {
         Some(_) if scripted => None,
-        Some(g) => Some(format!("the scripted team has G {g:.2}; it has to observe every POI")),
+        Some(g) => {
+            Some(format!("the scripted team has G {g:.3}; it has to have 1, or {SOLVED} if starts or POIs move"))
+        }
         None if trained.iter().any(|found| found.solved() > 0) => None,
         None => Some("no champion solves it, and there is no scripted team beside the config".into()),
     }

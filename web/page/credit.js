@@ -97,10 +97,9 @@ export function remove_leader(view, removed) {
 /** Says what the removal costs. @param {Shown} view */
 function lost(view) {
   if (!view.removed) return "Remove a leader: the POIs that are lost are its credit. D removes the leader alone, Df the leader and its followers.";
-  const { leader, group } = view.removed, { data } = view, gone = lost_pois(data, view.removed), pois = data.pois.length;
+  const { leader, group } = view.removed, { data } = view, [episode] = data.episodes, gone = lost_pois(data, view.removed);
   const who = `Without ${name_of_leader(data, leader)}${group ? " and its followers" : ""}`;
-  const worth = (/** @type {number[]} */ values) => values.reduce((sum, value) => sum + value, 0), all = data.values ? worth(data.values) : pois;
-  const lost = data.values ? worth(data.values.filter((_, poi) => gone.includes(poi))) : gone.length;
   const which = gone.length ? `POI${gone.length > 1 ? "s" : ""} ${gone.join(", ")} ${gone.length > 1 ? "are" : "is"} lost` : "no POI is lost";
-  return `${who}, ${which}: its ${group ? data.fitness === "Dt" ? "Dt" : "Df" : "D"} is ${lost} of ${data.values ? `the POIs' value ${all}` : all}, ${number(lost / all)}.`;
+  const [name, values] = !group ? ["D", episode.d] : episode.led ? ["Dt", episode.dt] : ["Df", episode.df];
+  return `${who}, ${which}: its ${name} is ${number(values ? values[leader] : 0)}.`;
 }

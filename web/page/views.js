@@ -29,12 +29,15 @@ export function add_view(label, crop, style = null) {
   return view;
 }
 
-/** Sets the part of the map that a view shows, extended to the shape of its canvas: width divided by height. @param {View} view @param {Crop} crop */
-export function aim(view, [left, below, right, above], shape = (right - left) / (above - below)) {
+/**
+ * Sets the part of a map that a view shows, extended to the shape of its canvas: width divided by height.
+ * @param {View} view @param {Crop} crop
+ */
+export function aim(view, [left, below, right, above], shape = (right - left) / (above - below), map = (view.data ?? state.config.world).map) {
   const wide = Math.max(right - left, (above - below) * shape), tall = wide / shape;
   // The middle moves so that no more than a margin beyond the walls is shown, unless the map is smaller than the canvas.
   const [x, y] = [[left, right, wide], [below, above, tall]].map(([low, high, size], axis) => {
-    const most = state.config.world.map[axis] + 1.5 - size / 2, least = size / 2 - 1.5, middle = (low + high) / 2;
+    const most = map[axis] + 1.5 - size / 2, least = size / 2 - 1.5, middle = (low + high) / 2;
     return most < least ? middle : Math.max(least, Math.min(most, middle));
   });
   view.crop = [x - wide / 2, y - tall / 2, x + wide / 2, y + tall / 2];
@@ -204,11 +207,11 @@ export function show(view, data, moves = true) {
   const last = data.episodes[0].shown.length - 1, plays = moves && !still.matches, crop = join(view.crop, stage.busy(data));
   // What is on show grows with the episodes, and is the same in all views.
   if (crop.some((side, index) => side !== view.crop[index])) {
-    for (const other of state.views) aim(other, crop, Number(other.canvas.style.getPropertyValue("--wide")));
+    for (const other of state.views) aim(other, crop, Number(other.canvas.style.getPropertyValue("--wide")), data.map);
     state.views.forEach(draw);
   }
   // A removed leader stays removed while the episode is the same.
-  if (data !== view.data) view.removed = null;
+  if (data !== view.data) view.removed = view.over = null;
   view.marks.replaceChildren(...stage.legend(data));
   view.marks.hidden = !data.classes;
   if (view.selected && view.selected >= data.episodes[0].leaders) view.selected = null;

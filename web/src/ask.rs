@@ -104,7 +104,7 @@ pub fn answer(session: &mut Session, text: &str, bytes: &[u8]) -> Result<Answer,
     match serde_json::from_str(text).map_err(refuse)? {
         Ask::Resolve { text, name, changes } => words(resolve(&text, &name, changes)?),
         Ask::Edit { text, changes } => words(json!({ "text": edit::set(&text, &changes).map_err(refuse)? })),
-        Ask::Constant { text } => words(baseline::constant(parse(&text)?)?),
+        Ask::Constant { text } => words(baseline::constant(&parse(&text)?.validate()?)?),
         Ask::Compare { experiments } => words(experiments::compare(experiments, bytes)?),
         Ask::Labels { texts, names } => {
             let configs = texts.iter().map(|text| parse(text)).collect::<Result<Vec<_>, _>>()?;
@@ -112,7 +112,7 @@ pub fn answer(session: &mut Session, text: &str, bytes: &[u8]) -> Result<Answer,
             words(json!({ "labels": runs::labels(&names, &configs) }))
         }
         Ask::Random { text } => {
-            session.random = Some(Random::new(&parse(&text)?.validate()?));
+            session.random = Some(Random::new(&parse(&text)?.validate()?)?);
             words(json!({}))
         }
         Ask::MoreRandom { milliseconds } => {

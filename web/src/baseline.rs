@@ -11,12 +11,17 @@ use crate::answer::{Refusal, refuse};
 /// Episodes from which G of a constant action is averaged if starts or POIs move.
 const EPISODES: u32 = 20;
 
+/// Returns the config of the last stage, whose champions baselines are compared with.
+fn in_last_stage(config: &ValidConfig) -> Config {
+    Config::clone(config.at(config.learning.generations))
+}
+
 /// Returns G of the best constant action, as a mean over trials.
 ///
 /// # Errors
 /// The backend fails.
-pub fn constant(mut config: Config) -> Result<Value, Refusal> {
-    config.stages.clear();
+pub fn constant(config: &ValidConfig) -> Result<Value, Refusal> {
+    let mut config = in_last_stage(config);
     // If nothing moves, all generations and trials are equal.
     if !config.starts_move() && !config.pois_move() {
         let learning = &mut config.learning;
@@ -36,8 +41,8 @@ pub fn constant(mut config: Config) -> Result<Value, Refusal> {
 pub struct Random(Baselines);
 
 impl Random {
-    pub fn new(config: &ValidConfig) -> Random {
-        Random(Baselines::new(std::slice::from_ref(config)).without_climbers())
+    pub fn new(config: &ValidConfig) -> Result<Random, Refusal> {
+        Ok(Random(Baselines::new(&[in_last_stage(config).validate()?]).without_climbers()))
     }
 
     /// Plays generations for `time` milliseconds, at least one. Returns G of the best so far per generation, as means

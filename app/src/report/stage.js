@@ -152,7 +152,8 @@ const stage = (() => {
         const [x, y] = moment(data, episode, past, agent), place = `${Math.floor(x)} ${Math.floor(y)}`;
         counts.set(place, (counts.get(place) || 0) + 1);
       }
-    const most = Math.max(1, ...counts.values());
+    let most = 1;
+    for (const many of counts.values()) most = Math.max(most, many);
     draw.fillStyle = tone;
     for (const [place, many] of counts) {
       const [x, y] = place.split(" ").map(Number);
