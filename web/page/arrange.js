@@ -153,11 +153,14 @@ function hands(view) {
   });
 }
 
-/** Writes the places of a group into the config. @param {Placed} group @param {(list: unknown[]) => unknown[]} [fit] changes its lists of a value per place */
-function moved({ list, table, key, places, own }, fit) {
+/**
+ * Writes the places of a group into the config. `fit` changes its lists of a value per place, of which there `were` so many.
+ * @param {Placed} group @param {(list: unknown[]) => unknown[]} [fit]
+ */
+function moved({ list, table, key, places, own }, fit, were = 0) {
   state.file = null;
   const each = fit ? [list === "pois" ? "coupling" : table === "world" ? "" : "heading", list === "pois" ? "windows" : ""] : [];
-  const values = Object.entries(own).filter(([key, value]) => each.includes(key) && Array.isArray(value) && value.length > 1);
+  const values = Object.entries(own).filter(([key, value]) => each.includes(key) && Array.isArray(value) && value.length === were);
   return change([[`${table}.${key}`, configs.positions(places)], ...values.map(([key, value]) => /** @type {[string, string]} */ ([`${table}.${key}`, JSON.stringify(fit?.(value))]))]);
 }
 
@@ -175,7 +178,7 @@ function add(table, key) {
   const find = () => /** @type {Placed} */ (groups().find(group => group.table === table && group.key === key)), group = find();
   put(group, [...group.places, place]);
   choose(first, [group.list, group.end]);
-  moved(find(), list => [...list, list.at(-1)]);
+  moved(find(), list => [...list, list.at(-1)], group.places.length);
 }
 
 export function remove() {
@@ -185,7 +188,7 @@ export function remove() {
   first.chosen = null;
   put(group, group.places.toSpliced(index, 1));
   const find = /** @type {Placed} */ (groups().find(({ table, key }) => table === group.table && key === group.key));
-  moved(find, list => list.toSpliced(index, 1));
+  moved(find, list => list.toSpliced(index, 1), group.places.length);
   // The button that had the focus is now disabled.
   first.canvas.focus({ preventScroll: true });
 }
