@@ -100,6 +100,6 @@ function lost(view) {
   const { leader, group } = view.removed, { data } = view, [episode] = data.episodes, gone = lost_pois(data, view.removed);
   const who = `Without ${name_of_leader(data, leader)}${group ? " and its followers" : ""}`;
   const which = gone.length ? `POI${gone.length > 1 ? "s" : ""} ${gone.join(", ")} ${gone.length > 1 ? "are" : "is"} lost` : "no POI is lost";
-  const [name, values] = !group ? ["D", episode.d] : episode.led ? ["Dt", episode.dt] : ["Df", episode.df];
+  const [name, values] = !group ? ["D", episode.d] : episode.led.length > 0 ? ["Dt", episode.dt] : ["Df", episode.df];
   return `${who}, ${which}: its ${name} is ${number(values ? values[leader] : 0)}.`;
 }
