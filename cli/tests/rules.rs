@@ -227,7 +227,8 @@ fn default_values_do_not_change_a_configs_digest() {
     // A class may be called "all".
     let class = |name| format!("[[agents]]\nname = '{name}'\nat = [[1, 1]]\nsenses = [{{ of = 'pois' }}]\n");
     let observed_by_all = |key| {
-        let text = [&class("all"), &class("other"), "[[pois]]\nname = 'p'\nat = [[2, 2]]\n", key].concat();
+        let text =
+            [&class("all"), &class("other"), "[[pois]]\nname = 'p'\nat = [[2, 2]]\ncoupling = 1\n", key].concat();
         config_digest(&Config::parse(&text, "config").unwrap())
     };
     assert_ne!(observed_by_all(""), observed_by_all("observers = 'all'\n"));

@@ -55,7 +55,7 @@ pub struct BaselineOutcome {
     /// The processor.
     #[serde(flatten)]
     pub processor: ProcessorInfo,
-    /// What the policies choose.
+    /// The things that the policies choose.
     #[serde(skip)]
     pub choosing: Choosing,
     /// Who learns, for people: the paradigm, or the classes that learn.
@@ -69,14 +69,14 @@ pub struct BaselineOutcome {
     pub moves: bool,
 }
 
-/// What policies choose.
+/// The things that policies choose.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Choosing {
     /// Actions or behaviours.
     Moves(Actions),
     /// Agents.
     Agents,
-    /// Agents, and those of other classes choose actions or behaviours.
+    /// Agents in some classes, and actions or behaviours in others.
     Both(Actions),
 }
 
@@ -118,7 +118,8 @@ pub struct Constant {
     /// The behaviour, if policies choose one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub behaviour: Option<usize>,
-    /// The agent, by its index in its class, if policies choose one. The number of agents means nobody.
+    /// The number of the choice, if policies choose agents. Among n agents it counts modulo n + 1: the agent's index, or n
+    /// for nobody.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub choice: Option<usize>,
     /// POIs observed, as a mean over seeds.
