@@ -148,11 +148,9 @@ fn stepping_stone(lost: u32, most: u32, at_most: u32) -> u32 {
 @compute @workgroup_size(WORKGROUP)
 fn count_task(
     @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
     @builtin(local_invocation_index) thread: u32,
 ) {
-    // Empty tasks have no teams.
-    let task = tasks[workgroup.y * workgroups.x + workgroup.x];
+    let task = tasks[workgroup.x];
     let world = task.world;
     let leaders = worlds[world].leaders;
     let agents = leaders + worlds[world].followers;
@@ -189,7 +187,7 @@ fn count_task(
         atomicOr(&counted[task.counted + item * bits / 32u], sum << (item * bits % 32u));
     }
     storageBarrier();
-    if thread == 0u && task.teams > 0u {
+    if thread == 0u {
         atomicStore(&counted[task.counted + end], record[task.status]);
     }
 }

@@ -243,12 +243,9 @@ fn store_state(task: Task, me: ptr<function, Agent>) {
 @compute @workgroup_size(WORKGROUP)
 fn episode(
     @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
     @builtin(local_invocation_index) thread: u32,
 ) {
-    // A dispatch may have a few more workgroups than tasks. Their tasks are empty.
-    let index = workgroup.y * workgroups.x + workgroup.x;
-    let task = tasks[index];
+    let task = tasks[workgroup.x];
     world = worlds[task.world];
     set_shape(task);
 
@@ -295,7 +292,8 @@ fn episode(
             }
             agents[slot] = me;
         }
-        if ALIGNS {
+        // The next step replaces headings, and which POIs are gone.
+        if ALIGNS || GONE {
             storageBarrier();
         }
         workgroupBarrier();
@@ -308,9 +306,9 @@ fn episode(
             store_state(task, &me);
         }
     }
-    // Empty tasks have no status word. Later dispatches of a task count up, so that none of them can be missing.
+    // Later dispatches of a task count up, so that none of them can be missing.
     storageBarrier();
-    if thread == 0u && task.teams > 0u {
+    if thread == 0u {
         record[task.status] = select(record[task.status] + 1u, task.nonce, task.first == 0u);
     }
 }

@@ -10,9 +10,7 @@ var<private> shape: Shape;
 
 fn set_shape(task: Task) {
     let agents = world.leaders + world.followers;
-    // An empty task has no team, but the number is a divisor.
-    let teams = max(task.teams, 1u);
-    shape = Shape(world.leaders, agents, world.pois, world.words, world.class_count, world.widths[0], teams);
+    shape = Shape(world.leaders, agents, world.pois, world.words, world.class_count, world.widths[0], task.teams);
 }
 
 // Returns the shape of a class.

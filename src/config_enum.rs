@@ -13,15 +13,6 @@ pub trait Choice: Copy + Serialize + 'static {
     }
 }
 
-/// Code that is compiled once per variant, with the variant's number as a constant.
-pub trait ConstDispatch {
-    /// The result.
-    type Output;
-
-    /// Runs the code for the variant with this number.
-    fn with<const WORD: u32>(self) -> Self::Output;
-}
-
 /// Defines an enum whose variants are words in configs and messages, and constants in shaders. For `Density::Linear`, `wgsl`
 /// returns `const DENSITY_LINEAR: u32 = 0u;`.
 macro_rules! config_enum {
@@ -40,12 +31,6 @@ macro_rules! config_enum {
             /// Returns the variant with a number.
             pub const fn of(number: u32) -> $name {
                 <$name as $crate::config_enum::Choice>::ALL[number as usize].1
-            }
-
-            /// Runs the code for this variant.
-            #[inline(always)]
-            pub fn dispatch<F: $crate::config_enum::ConstDispatch>(self, dispatch: F) -> F::Output {
-                match self { $($name::$variant => dispatch.with::<{ $name::$variant as u32 }>(),)* }
             }
 
             /// Returns the variants' numbers as WGSL constants.
@@ -77,25 +62,11 @@ mod tests {
         }
     }
 
-    /// Returns the constant.
-    struct Given;
-
-    impl ConstDispatch for Given {
-        type Output = u32;
-
-        fn with<const WORD: u32>(self) -> u32 {
-            WORD
-        }
-    }
-
     #[test]
     fn a_word_is_the_same_number_everywhere() {
         assert_eq!(Colour::wgsl(), "const COLOUR_RED: u32 = 0u;\nconst COLOUR_DARKGREEN: u32 = 1u;\n");
         for (number, (word, colour)) in (0..).zip(Colour::ALL) {
-            assert_eq!(
-                (Colour::of(number), colour.dispatch(Given), colour.to_string()),
-                (*colour, number, word.to_string())
-            );
+            assert_eq!((Colour::of(number), *colour as u32, colour.to_string()), (*colour, number, word.to_string()));
         }
         assert_eq!(Colour::names().collect::<Vec<_>>(), ["red", "dark-green"]);
     }

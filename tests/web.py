@@ -95,6 +95,40 @@ name = "post"
 at = [[15, 25], [25, 35], [35, 25]]
 control = "still"
 """
+# The start counts at the first POI, and the last step alone at the second. The fitness of all is of no use.
+MOMENTS = """
+world = { map = [30, 30], steps = 4, dt = 1.0, start_counts = true }
+[[agents]]
+name = "scout"
+at = [[10, 10], [12, 10]]
+motion = { kind = "free", max_speed = 0.5 }
+senses = [{ of = "pois" }]
+fitness = "D"
+[[pois]]
+name = "first"
+at = [[10, 10]]
+coupling = 1
+[[pois]]
+name = "last"
+at = [[12, 11]]
+coupling = 2
+radius = 6
+when = "end"
+[learning]
+fitness = "G"
+"""
+# Agents and POIs have numbers in other keys.
+NUMBERED = """
+[world]
+leaders = [[5, 5], [6, 6]]
+followers = [[7, 7], [8, 8]]
+heading = [0.0, 1.0, 2.0, 3.0]
+pois = [[1, 1], [20, 20], [30, 30]]
+after = [[], [0], [1]]
+coupling = 1
+[credit]
+removes = [[0, 2], [1, 3]]
+"""
 # The comparison of arms (`found`) is shown last, and moves what is below it.
 DONE = (
     "page.state.training && page.state.training.state === 'done' && document.querySelectorAll('.sha').length > 0"
@@ -640,6 +674,21 @@ def check_classes(tab, page, native, folder):
     tab.click("#remove")
     tab.wait("page.state.valid && page.state.config.world.windows.length === 2")
     tab.assert_no_errors()
+    # Keys that refer to agents and POIs by their numbers still refer to the same ones.
+    tab.load(page)
+    tab.drop("numbered.toml", base64(NUMBERED.encode()))
+    tab.wait("page.state.config.world.heading?.length === 4")
+    tab.click("[data-mode=arrange]")
+    tab.evaluate(choose(["leaders", 0]))
+    tab.click("#remove")
+    tab.wait("page.state.valid && page.state.config.world.heading.join() === '1,2,3'")
+    tab.evaluate(choose(["pois", 0]))
+    tab.click("#remove")
+    tab.wait("page.state.valid && JSON.stringify(page.state.config.world.after) === '[[],[0]]'")
+    tab.click("[data-add=leaders]")
+    tab.wait("page.state.valid && page.state.config.world.heading.join() === '1,1,2,3'")
+    assert tab.evaluate("JSON.stringify(page.state.config.credit.removes)") == "[[0,3]]"
+    tab.assert_no_errors()
     # Agents and POIs in regions are shown and counted, and only the others can be rearranged. It trains.
     tab.load(page)
     tab.drop("regions.toml", base64(REGIONS.encode()))
@@ -685,6 +734,23 @@ def check_classes(tab, page, native, folder):
         tab.evaluate(f"{view}.canvas.dispatchEvent(new KeyboardEvent('keyup', {{ key: '{key}' }})); 0")
         (x, y), moves = tab.evaluate(f"[{episode}.positions.slice(0, 2), {episode}.positions.slice(8, 10)].map(at => [...at])")
         assert [moves[0] - x, moves[1] - y] == direction, (key, x, y, moves)
+    tab.assert_no_errors()
+    # The start and the last step count as in the config. A fitness that no class learns by is neither offered nor compared.
+    tab.load(page)
+    tab.drop("moments.toml", base64(MOMENTS.encode()))
+    tab.wait("page.state.start.common_fitness === false")
+    assert "learning.fitness" in tab.text("#notes") and "has no effect" in tab.text("#notes"), tab.text("#notes")
+    hidden = "[document.querySelector('#fitness').closest('label'), document.querySelector('#compare option[value=fitness]')]"
+    assert tab.evaluate(f"{hidden}.map(({{ hidden }}) => hidden)") == [True, True]
+    tab.click("[data-mode=drive]")
+    tab.click("#again")
+    tab.wait(f"page.state.mode === 'drive' && {episode}.observed[0] === 0")
+    tab.evaluate(f"{view}.canvas.dispatchEvent(new KeyboardEvent('keydown', {{ key: 'ArrowUp' }})); 0")
+    tab.wait(f"{view}.place >= 2")
+    if tab.evaluate(f"{view}.place") < 4:
+        assert tab.evaluate(f"{episode}.observed") == [0, None]
+    tab.wait("document.querySelector('#driven').textContent.includes('The team observed 2 of 2 POIs')")
+    assert tab.evaluate(f"{episode}.observed") == [0, 4] and tab.evaluate(f"[...{episode}.near]") == [2, 2] * 5
     tab.assert_no_errors()
     # The value of the POIs that are lost is the credit.
     tab.evaluate("document.querySelector('#guide-end').click(); 0")
@@ -1510,7 +1576,7 @@ def check_first_visit(tab, page, call, downloads):
     assert none == 0 and 2 <= group <= 3, (none, group)
     assert tab.text("#guide-says").startswith("You said: nothing. It is: two or three. "), tab.text("#guide-says")
     assert f"With followers it was {led:.2f}. " in tab.text("#guide-says"), (led, tab.text("#guide-says"))
-    assert "fewer populations do most of what followers do" in tab.text("#guide-says"), tab.text("#guide-says")
+    assert "shared policies do most of what followers do" in tab.text("#guide-says"), tab.text("#guide-says")
     # Agents of one population have one colour.
     tab.wait("page.state.views.length === 3 && page.state.views.every(view => view.data)")
     tints = "page.state.views.map(({ data }) => Array.from({ length: 12 }, (_, agent) => page.stage.tint(data, agent)))"

@@ -16,7 +16,6 @@
 //! | [`choice`] | the processor that is expected to finish first |
 //! | [`ops`] | the use cases of the program, and their errors |
 
-#![deny(missing_docs)]
 #![allow(rustdoc::private_intra_doc_links, reason = "tables of modules name the internal ones, too")]
 
 pub mod choice;

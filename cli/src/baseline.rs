@@ -49,15 +49,15 @@ pub fn run(args: Args) -> Result<(), Error> {
 }
 
 fn in_words(found: &BaselineOutcome) -> String {
-    let &BaselineOutcome { pois, seeds, teams, ref learners, weighted_by, choosing, .. } = found;
+    let &BaselineOutcome { pois, seeds, teams, ref learners, weighted_by, choosing, free, .. } = found;
     let head =
         [&format!("POIs observed, of {pois}{}", weighted(weighted_by)), "mean [95 % interval]", "lowest", "highest"];
     let mut rows = vec![head.map(|head| head.to_string()).to_vec()];
     let constants = match choosing {
-        Choosing::Moves(Actions::Direct) => format!("best of {SPEEDS} constant speeds, straight ahead"),
+        Choosing::Moves(Actions::Direct) => format!("best of {SPEEDS} constant {}", speeds(free)),
         Choosing::Moves(Actions::Behaviours) => "best constant behaviour".into(),
         Choosing::Agents => "best constant choice".into(),
-        Choosing::Both(Actions::Direct) => "best constant choice and speed, straight ahead".into(),
+        Choosing::Both(Actions::Direct) => format!("best of the constant choices and {}", speeds(free)),
         Choosing::Both(Actions::Behaviours) => "best constant choice and behaviour".into(),
     };
     for (name, found) in [
@@ -83,13 +83,21 @@ fn in_words(found: &BaselineOutcome) -> String {
          {played}\n\n{}\n{}\n",
         counted(seeds, "seed"),
         markdown(&rows),
-        described(choosing, &solved)
+        described(choosing, free, &solved)
     )
 }
 
-/// Returns a sentence about the constant actions that observe every POI, by their indices.
-fn described(choosing: Choosing, solved: &[usize]) -> String {
+/// Returns what constant actions are. `free` tells whether some agents move freely.
+fn speeds(free: bool) -> &'static str {
+    if free { "speeds, straight ahead, or along y with free motion" } else { "speeds, straight ahead" }
+}
+
+/// Returns a sentence about the constant actions that observe every POI, by their indices. `free` tells whether some agents
+/// move freely.
+fn described(choosing: Choosing, free: bool, solved: &[usize]) -> String {
     let unit = |index: usize| match choosing {
+        // Agents that move freely have no speed from 0 on, but an action.
+        Choosing::Moves(Actions::Direct) if free => format!("{:.1}", 2.0 * (index + 1) as f64 / SPEEDS as f64 - 1.0),
         Choosing::Moves(Actions::Direct) => format!("{} %", (index + 1) * 100 / SPEEDS),
         _ => format!("{index}"),
     };
@@ -101,6 +109,9 @@ fn described(choosing: Choosing, solved: &[usize]) -> String {
     let ranges = ranges.join(", ");
     match (choosing, ranges.is_empty()) {
         (Choosing::Moves(Actions::Direct), true) => "No constant speed observes every POI.".into(),
+        (Choosing::Moves(Actions::Direct), false) if free => {
+            format!("A team whose actions are always 0 and {ranges} observes every POI.")
+        }
         (Choosing::Moves(Actions::Direct), false) => {
             format!("A team that drives straight ahead at {ranges} of motion.max_speed observes every POI.")
         }

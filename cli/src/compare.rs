@@ -50,9 +50,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     let request = CompareRequest { folders, by, at, reach, paired, unverified };
     let found = console::run_without_backend(false, |context| ops::compare::run(&request, context))?;
     if csv {
-        let mut text = Vec::new();
-        comparison::csv(&found.comparisons, &mut text).map_err(Error::Output)?;
-        return print(&String::from_utf8_lossy(&text));
+        return print(&String::from_utf8_lossy(&comparison::csv(&found.comparisons)));
     }
     if json {
         return print_json(&found);

@@ -220,25 +220,13 @@ fn of_clap(error: &clap::Error) -> Error {
     })
 }
 
-/// Flags that were removed, and what replaces each.
-const REMOVED: [(&str, &str); 4] = [
-    ("--note", "`verify` writes no reports; --json prints the comparisons"),
-    ("--on-device-loss", "training always continues on the CPU if a GPU fails; leave it out"),
-    ("--report", "`verify` writes no reports; --json prints the comparisons"),
-    ("--tensorboard", "`train` writes no event files; in Python, pass `callback=flotilla.loggers.tensorboard(FOLDER)`"),
-];
-
-/// Removes clap's advice to pass an unknown flag as a value, which does not apply to any command. Says what replaces a
-/// removed flag. Suggests `--team` in place of `--champion` and `--best`, and `--set` in place of flags named like
-/// config keys.
+/// Removes clap's advice to pass an unknown flag as a value, which does not apply to any command. Suggests `--team` in
+/// place of `--champion` and `--best`, and `--set` in place of flags named like config keys.
 fn hinted(mut error: clap::Error) -> clap::Error {
     if error.kind() == ErrorKind::UnknownArgument {
         error.remove(ContextKind::Suggested);
         let unknown = error.get(ContextKind::InvalidArg).map(ToString::to_string);
-        if let Some((_, advice)) = REMOVED.iter().find(|(flag, _)| unknown.as_deref() == Some(*flag)) {
-            error.remove(ContextKind::SuggestedArg);
-            error.insert(ContextKind::Suggested, ContextValue::StyledStrs(vec![(*advice).into()]));
-        } else if let Some(flag @ ("--champion" | "--best")) = unknown.as_deref() {
+        if let Some(flag @ ("--champion" | "--best")) = unknown.as_deref() {
             let meant = format!("--team {}", flag.trim_start_matches('-'));
             error.insert(ContextKind::SuggestedArg, ContextValue::String(meant));
         } else if let Some(key) = unknown.and_then(|flag| key_of(&flag)).filter(|key| takes_key(key)) {

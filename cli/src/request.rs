@@ -15,17 +15,12 @@ use flotilla_app::ops::{BackendSource, Context, Error, compare, sweep, verify};
 use flotilla_studies::paper;
 use serde::Deserialize;
 
-/// A request as data.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(tag = "use_case", rename_all = "snake_case")]
 pub enum Request {
-    /// See [`paper`].
     Paper(paper::run::Request),
-    /// See [`sweep`].
     Sweep(sweep::SweepRequest),
-    /// See [`compare`].
     Compare(compare::CompareRequest),
-    /// See [`verify`].
     Verify(verify::VerifyRequest),
 }
 

@@ -25,7 +25,7 @@ pub struct Args {
     #[command(flatten)]
     existing: ExistingResults,
     /// Start from the policies in a safetensors file instead of random ones. Trial i takes the tensor `weights.i`, or
-    /// all take `weights`: f32 [leaders, policies, parameters]. Missing policies are random
+    /// all take `weights`: f32 [populations, policies, parameters]. Missing policies are random
     #[arg(long, value_name = "FILE")]
     init: Option<PathBuf>,
     #[command(flatten)]

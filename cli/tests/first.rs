@@ -362,8 +362,6 @@ fn errors_suggest_what_was_meant() {
     let place = small();
     let stderr = place.refused(2, "replay run --champion");
     assert!(stderr.contains("--team champion") && !stderr.contains("as a value"), "{stderr}");
-    let stderr = place.refused(2, "train small.toml --on-device-loss cpu");
-    assert!(stderr.contains("training always continues") && stderr.contains("leave it out"), "{stderr}");
     let stderr = place.refused(2, "compare run --set world.steps=3");
     assert!(!stderr.contains("as a value"), "{stderr}");
     assert!(place.refused(1, "sweep small.toml").contains("small.toml: grid: missing"));

@@ -115,6 +115,46 @@ fn policies_cannot_be_replaced_once_they_were_played() {
 }
 
 #[test]
+fn policies_of_one_wrong_trial_change_no_trial() {
+    let (config, mut backend) = (config(1), Cpu::default());
+    let mut first = flotilla::train(&config, &mut backend, |_| Continue(())).expect("training succeeds").policies;
+    *first.last_mut().and_then(|trial| trial.last_mut()).expect("there are policies") = f32::NAN;
+    let new = || Coevolution::new(&config).expect("a valid config");
+    let before = new().state().expect("there is enough memory").snapshot.weights;
+    let mut coevolution = new();
+    let refused = coevolution.start_from(config.learning.population, &first);
+    assert!(matches!(refused, Err(Failure::Weight { .. })), "{refused:?}");
+    assert_eq!(coevolution.state().expect("there is enough memory").snapshot.weights, before);
+}
+
+/// Credits are means over the episodes that were played.
+#[test]
+fn an_evaluation_that_is_stopped_has_the_scores_of_its_episodes() {
+    let text = include_str!("../../configs/chaotic.toml");
+    let alone = text.replace("coupling = 5", "coupling = 1");
+    assert_ne!(alone, text);
+    let mut config = Config::parse(&alone, "chaotic.toml").expect("a valid config");
+    config.learning.fitness = Fitness::Dt;
+    let weights = vec![0.5; config.populations() * config.parameters()];
+    let play = |episodes, stops: bool| {
+        let (starts, mut played) = (Starts::Drawn { episodes, seed: 0, jitter: 3.0, poi_jitter: 0.0 }, 0);
+        let mut each = |batch: flotilla::evaluate::Batch<'_>| {
+            played += batch.observed.len() as u32;
+            if stops && played > 0 { Break(()) } else { Continue(()) }
+        };
+        let found = front::play_until(&config, &mut Cpu::default(), 1, &weights, &starts, &mut each);
+        (found.expect("the policies play"), played)
+    };
+    let (stopped, played) = play(100_000, true);
+    assert!((1..100_000).contains(&played), "{played}");
+    let (whole, _) = play(played, false);
+    let scores = |found: &flotilla::evaluate::Evaluation, leader| (found.scores(0, leader), found.dt(0, leader));
+    let leaders = config.learners();
+    assert!((0..leaders).any(|leader| scores(&whole, leader).0[2] > 0.0));
+    (0..leaders).for_each(|leader| assert_eq!(scores(&stopped, leader), scores(&whole, leader), "leader {leader}"));
+}
+
+#[test]
 fn a_finished_run_has_no_ending_without_its_own_last_checkpoint() {
     let folder = tempfile::tempdir().expect("a folder for runs");
     let [own, other] = ["own", "other"].map(|name| folder.path().join(name));

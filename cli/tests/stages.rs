@@ -602,6 +602,8 @@ fn a_shared_policy_fits_any_number_of_leaders() {
     // Training can start from it with a larger population and more leaders that share a policy.
     good("train more.toml --out warm --init run/policies.safetensors");
     good("replay warm --generation 1 --out replay.html");
+    let (code, _, stderr) = run(&folder, "train shared.toml --population 3 --out few --init run/policies.safetensors");
+    assert!(code == Some(0) && stderr.contains("8 policies of each leader, of which the first 3 start"), "{stderr}");
     let (code, _, stderr) = run(&folder, "train small.toml --out cold --init run/policies.safetensors");
     let reason = "weights.0 is F32 [1, 8, 57], but the config needs F32 [2, 1 to 1048576, 57]";
     assert!(code == Some(1) && stderr.contains(reason) && stderr.lines().count() == 1, "{stderr}");
@@ -615,6 +617,14 @@ fn a_shared_policy_fits_any_number_of_leaders() {
     assert!(code == Some(1) && stderr.contains("missing.safetensors: cannot be read"), "{stderr}");
     assert!(!folder.join("cold").exists());
     assert_eq!(Config::load(&folder.join("run/config.toml")).unwrap().learning.sharing, Sharing::Shared);
+}
+
+#[test]
+fn all_problems_of_a_stage_are_counted() {
+    let keys: String = (0..60).map(|key| format!("\"world.no_{key}\" = 1\n")).collect();
+    let text = format!("{SMALL}\n[[stages]]\nfrom = 1\n[stages.set]\n{keys}");
+    let error = Config::parse(&text, "many.toml").unwrap_err().to_string();
+    assert!(error.starts_with("60 problems in many.toml\n") && error.ends_with("\n… and 10 more"), "{error}");
 }
 
 #[test]

@@ -86,6 +86,12 @@ fn invalid_scripts_are_refused_before_training() {
     fs::write(folder.path().join("task.csv"), format!("{head}0,5,1,1,1\n")).unwrap();
     let (code, _, error) = run(folder.path(), "task.toml --trials 2");
     assert!(code == Some(1) && error.contains("the scripted team has G 0.00"), "{error}");
+    // Baselines and teams would play in different worlds.
+    let staged = fs::read_to_string(folder.path().join("task.toml")).unwrap()
+        + "\n[[stages]]\nfrom = 1\nset = { \"world.coupling\" = 1 }\n";
+    fs::write(folder.path().join("staged.toml"), staged).unwrap();
+    let (code, _, error) = run(folder.path(), "staged.toml --trials 2 --resume");
+    assert!(code == Some(1) && error.contains("leave the stages out"), "{error}");
     // Without a scripted team, a champion has to solve the task.
     fs::remove_file(folder.path().join("task.csv")).unwrap();
     let (code, _, error) = run(folder.path(), "task.toml --trials 2 --resume");

@@ -14,7 +14,7 @@ use flotilla_app::ops::train::TrainRequest;
 use flotilla_app::record::RecordError;
 use flotilla_app::record::disk::Disk;
 use flotilla_app::record::finished::{Content, Finished, Storage};
-use flotilla_app::record::folder::{Folder, Run, Start, StartFrom};
+use flotilla_app::record::folder::{Folder, ProcessorInfo, Run, Start, StartFrom};
 use flotilla_app::record::hex;
 use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
@@ -630,7 +630,7 @@ fn a_trace_has_the_inputs_and_outputs_of_leaders() {
 fn held_out_starts_are_never_training_starts() {
     use flotilla::config::Config;
     use flotilla::evaluate::Starts;
-    use flotilla::evolve::{Episodes, episode_positions};
+    use flotilla::evolve::{TRAINING, episode_positions};
     use flotilla::world::World;
 
     let mut config = Config::parse(SMALL, "small").unwrap();
@@ -652,7 +652,7 @@ fn held_out_starts_are_never_training_starts() {
     for (seed, trial) in (0..4).flat_map(|seed| (0..3).map(move |trial| (seed, trial))) {
         config.learning.seed = seed;
         for (generation, episode) in (0..64).flat_map(|generation| (0..4).map(move |episode| (generation, episode))) {
-            episode_positions(&config.learning, trial, generation, (Episodes::Training, episode), &world, &mut drawn);
+            episode_positions(&config.learning, trial, generation, (TRAINING, episode), &world, &mut drawn);
             assert!(
                 bits(&drawn).iter().all(|places| !held_out.contains(places)),
                 "seed {seed}, generation {generation}"
@@ -830,9 +830,7 @@ fn compare_files(method: &str) {
         run: Run {
             version: flotilla::VERSION.into(),
             commit: flotilla::COMMIT.map(String::from),
-            backend: backend.1.backend.clone(),
-            description: backend.0.describe(),
-            threads: backend.1.threads,
+            processor: ProcessorInfo::of(&backend.1, &backend.0.describe()),
             sessions: 1,
             ..Run::new(&config)
         },

@@ -246,11 +246,7 @@ pub fn open(py: Python<'_>, folder: PathBuf, unverified: bool) -> PyResult<(Outc
         });
         Ok::<_, PyErr>((trained, digest, run, times.collect::<Result<_, _>>().raise()?))
     })?;
-    Ok((
-        outcomes(py, trained, digest)?,
-        played(ProcessorInfo::of_run(&run), run.started, run.init, run.own_fitness),
-        times,
-    ))
+    Ok((outcomes(py, trained, digest)?, played(run.processor, run.started, run.init, run.own_fitness), times))
 }
 
 /// Writes the results of a training in memory as a run directory, and returns the digest.

@@ -4,7 +4,7 @@ use bytemuck::Zeroable;
 use glam::Vec2;
 
 use super::Group;
-use crate::credit::{Episode, Paths, Strided};
+use crate::credit::Episode;
 use crate::gpu_struct::gpu_struct;
 use crate::world::{OUTPUTS, World};
 
@@ -103,10 +103,7 @@ impl Trace {
         let part = |words, size: usize| <[u32]>::get(words, team * size..(team + 1) * size).unwrap_or_default();
         let counts = part(&self.seen, world.leaders() * world.followers());
         let sets = part(&self.sets, world.set_words());
-        if world.paths.is_none() {
-            return Episode::whole(sets, counts, part(&self.trail, world.sight_words()));
-        }
-        let positions = Strided::contiguous(part(&self.trail, world.path_words()));
-        Episode { paths: Some(Paths { positions, pois: &self.pois }), ..Episode::whole(sets, counts, &[]) }
+        let trail = part(&self.trail, if world.paths.is_some() { world.path_words() } else { world.sight_words() });
+        Episode::whole(sets, counts, trail, world.paths.is_some().then_some(&self.pois))
     }
 }

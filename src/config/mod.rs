@@ -446,18 +446,21 @@ impl Config {
 fn resolve<'a>(
     name: &str,
     overrides: &[Override],
-    values: impl Fn() -> Result<Reader<'a>, reader::Problems>,
+    values: impl Fn() -> Result<Reader<'a>, Vec<Problem>>,
     stages: impl Fn() -> (Vec<stages::UnresolvedStage<'a>>, Vec<Problem>),
 ) -> Result<(ValidConfig, Vec<String>), ConfigError> {
     let (staging, overrides): (Vec<_>, Vec<_>) = overrides.iter().cloned().partition(|set| set.key == stages::STAGES);
-    let invalid = |problems, unlisted| ConfigError::Invalid { name: name.to_string(), problems, unlisted };
+    let invalid = |mut problems: Vec<Problem>| {
+        let unlisted = problems.len().saturating_sub(reader::MAX_LISTED);
+        problems.truncate(reader::MAX_LISTED);
+        ConfigError::Invalid { name: name.to_string(), problems, unlisted }
+    };
     let without_stages = |overrides: &[Override]| {
         let mut reader: Reader<'_> = values()?;
         reader.set_all(overrides, &[AGENTS, POIS]);
         reader.read(Config::ask)
     };
-    let (own, mut notes) =
-        without_stages(&overrides).map_err(|reader::Problems { listed, unlisted }| invalid(listed, unlisted))?;
+    let (own, mut notes) = without_stages(&overrides).map_err(invalid)?;
     let resolved = match staging.last() {
         Some(set) => {
             let text = format!("{} = {}", stages::STAGES, set.text);
@@ -471,12 +474,7 @@ fn resolve<'a>(
             stages::attribute(problems, &overrides, is_valid)
         }),
     };
-    let resolved = resolved.map_err(|mut problems| {
-        let unlisted = problems.len().saturating_sub(reader::MAX_LISTED);
-        problems.truncate(reader::MAX_LISTED);
-        invalid(problems, unlisted)
-    })?;
-    let (stages, configs): (Vec<_>, Vec<_>) = resolved.into_iter().unzip();
+    let (stages, configs): (Vec<_>, Vec<_>) = resolved.map_err(invalid)?.into_iter().unzip();
     for set in &overrides {
         let path = stages::path_of(&set.key, &own);
         let sets = |key: &String| {

@@ -247,7 +247,7 @@ impl UnresolvedStage<'_> {
         let config = match reader.read(Config::ask) {
             Ok((config, _)) => config,
             Err(found) => {
-                problems.extend(found.listed.into_iter().map(|Problem { key, message, .. }| Problem {
+                problems.extend(found.into_iter().map(|Problem { key, message, .. }| Problem {
                     line: line(&key),
                     key: if key.starts_with(STAGES) { key } else { format!("{name}: {key}") },
                     message,

@@ -19,10 +19,12 @@ pub struct Episode<'a> {
 }
 
 impl<'a> Episode<'a> {
-    /// Returns the record of a team whose words are not interleaved with those of other teams.
-    pub fn whole(sets: &'a [u32], counts: &'a [u32], sights: &'a [u32]) -> Episode<'a> {
-        let [sets, counts, sights] = [sets, counts, sights].map(Strided::contiguous);
-        Episode { sets, seen: counts, sights, paths: None }
+    /// Returns the record of a team whose words are not interleaved with those of other teams. `trail` are the sightings, or
+    /// if scores need paths, the positions; `pois` are then where the POIs were.
+    pub fn whole(sets: &'a [u32], seen: &'a [u32], trail: &'a [u32], pois: Option<&'a [Vec2]>) -> Episode<'a> {
+        let [sets, seen, trail] = [sets, seen, trail].map(Strided::contiguous);
+        let sights = if pois.is_some() { Strided::NONE } else { trail };
+        Episode { sets, seen, sights, paths: pois.map(|pois| Paths { positions: trail, pois }) }
     }
 
     /// Returns the sightings, or the positions of its paths.

@@ -126,24 +126,10 @@ fn shuffle<S: Simd>(simd: S, key: Key, order: &mut [u32]) {
     }
 }
 
-/// Episodes of a trial's generation, all with random numbers of their own.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Episodes {
-    /// Those that all teams play.
-    Training,
-    /// Those that test the best team.
-    Test,
-}
-
-impl Episodes {
-    /// Returns the purposes of random starts and POIs.
-    fn purposes(self) -> [Purpose; 2] {
-        match self {
-            Episodes::Training => [Purpose::Starts, Purpose::Pois],
-            Episodes::Test => [Purpose::TestStarts, Purpose::TestPois],
-        }
-    }
-}
+/// The purposes of random starts and POIs in the episodes that all teams play.
+pub const TRAINING: [Purpose; 2] = [Purpose::Starts, Purpose::Pois];
+/// The purposes of random starts and POIs in the episodes that test the best team.
+pub const TEST: [Purpose; 2] = [Purpose::TestStarts, Purpose::TestPois];
 
 /// Writes the positions of one episode of a trial's generation, as [`Group::starts`](crate::backend::Group::starts) has
 /// them: the agents' starts, then the POIs if they move, then headings if any are drawn.
@@ -151,11 +137,11 @@ pub fn episode_positions(
     learning: &Learning,
     trial: usize,
     generation: usize,
-    (episodes, episode): (Episodes, usize),
+    (purposes, episode): ([Purpose; 2], usize),
     world: &World,
     positions: &mut Vec<Vec2>,
 ) {
-    let [starts, pois] = episodes.purposes().map(|purpose| Key::new(learning.seed, trial, purpose));
+    let [starts, pois] = purposes.map(|purpose| Key::new(learning.seed, trial, purpose));
     jitter_starts(starts, generation, episode, world, learning.start_jitter, positions);
     jitter_pois(pois, generation, episode, world, learning.poi_jitter, positions);
     draw_headings(starts, generation, episode, world, positions);

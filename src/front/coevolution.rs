@@ -79,7 +79,7 @@ impl Coevolution {
         if first.len() > 1 && first.len() != trials {
             return Err(Failure::Trials { found: first.len(), trials });
         }
-        for (trial, weights) in (0..trials).zip(first.iter().cycle()) {
+        let flushed = |weights: &Vec<f32>| {
             let mut weights = weights.clone();
             if weights.is_empty() || Some(weights.len()) != (leaders * parameters).checked_mul(policies) {
                 return Err(Failure::Weights { found: weights.len(), leaders, teams: policies, parameters });
@@ -88,7 +88,11 @@ impl Coevolution {
                 let (policy, parameter, value) = (place / parameters, place % parameters, weights[place]);
                 return Err(Failure::Weight { leader: policy / policies, team: policy % policies, parameter, value });
             }
-            if !self.trainer.start_from(0, trial, policies, &weights) {
+            Ok(weights)
+        };
+        first.iter().try_for_each(|weights| flushed(weights).map(drop))?;
+        for (trial, weights) in (0..trials).zip(first.iter().cycle()) {
+            if !self.trainer.start_from(0, trial, policies, &flushed(weights)?) {
                 unreachable!("the weights are as many as the config takes");
             }
         }

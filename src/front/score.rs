@@ -2,7 +2,7 @@
 
 use super::Failure;
 use crate::config::{Config, Fitness};
-use crate::credit::{Credit, Episode, Paths, Strided};
+use crate::credit::{Credit, Episode};
 use crate::parallel::*;
 use crate::world::World;
 
@@ -57,9 +57,7 @@ pub fn score(config: &Config, positions: &[f32]) -> Result<Scored, Failure> {
     let teams: Vec<_> = positions
         .par_chunks_exact(size)
         .map_init(Credit::default, |credit, positions| {
-            let positions = Strided::contiguous(bytemuck::cast_slice(positions));
-            let paths = Some(Paths { positions, pois: &world.pois });
-            credit.all(&Episode { paths, ..Episode::whole(&[], &[], &[]) }, &world)
+            credit.all(&Episode::whole(&[], &[], bytemuck::cast_slice(positions), Some(&world.pois)), &world)
         })
         .collect();
     let (values, total) = (world.values.iter().map(|&value| f64::from(value)).sum::<f64>(), world.total_worth);

@@ -84,15 +84,6 @@ pub struct Problem {
     pub message: String,
 }
 
-/// The problems of a text by line, then those of [`Override`]s.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Problems {
-    /// The first [`MAX_LISTED`] problems.
-    pub listed: Vec<Problem>,
-    /// The number of further problems.
-    pub unlisted: usize,
-}
-
 /// A parsed text. A sweep reads all its points from one document, because parsing takes longer than reading.
 #[derive(Clone)]
 pub struct Document<'a> {
@@ -328,7 +319,7 @@ impl<'a> Reader<'a> {
         ignored: &[&str],
         refused: &[&str],
         message: &str,
-    ) -> Result<Reader<'a>, Problems> {
+    ) -> Result<Reader<'a>, Vec<Problem>> {
         let Document { text, table, errors, lines } = document;
         let mut reader = Reader { lines: Some(lines), ..Reader::default() };
         // Other errors follow from these: one can invalidate the rest of its line, and an unclosed list the rest of the
@@ -420,7 +411,7 @@ impl<'a> Reader<'a> {
     ///
     /// # Errors
     /// All problems of the values.
-    pub fn read<T>(mut self, ask: impl FnOnce(&mut Reader<'_>) -> T) -> Result<(T, Vec<String>), Problems> {
+    pub fn read<T>(mut self, ask: impl FnOnce(&mut Reader<'_>) -> T) -> Result<(T, Vec<String>), Vec<Problem>> {
         let read = ask(&mut self);
         self.report_unknown();
         if self.problems.is_empty() { Ok((read, self.notes)) } else { Err(self.into_problems()) }
@@ -675,17 +666,17 @@ impl<'a> Reader<'a> {
         }
     }
 
-    fn into_problems(mut self) -> Problems {
+    /// Returns the problems of a text by line, then those of [`Override`]s.
+    fn into_problems(mut self) -> Vec<Problem> {
         self.problems.sort_by_key(|problem| problem.0);
-        let unlisted = self.problems.len().saturating_sub(MAX_LISTED);
-        let listed = self.problems.into_iter().take(MAX_LISTED).map(|(place, key, message)| {
+        let problems = self.problems.into_iter().map(|(place, key, message)| {
             let line = match place {
                 Place::Offset(offset) => self.lines.map(|lines| lines.line(offset)),
                 Place::Outside => None,
             };
             Problem { line, key, message }
         });
-        Problems { listed: listed.collect(), unlisted }
+        problems.collect()
     }
 }
 

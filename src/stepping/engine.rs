@@ -6,7 +6,7 @@ use fearless_simd::{Simd, prelude::*};
 use glam::Vec2;
 
 use crate::backend::cpu::{Agent, Block, BlockState, StepArrays, step_sizes, transpose_rows};
-use crate::credit::{Episode, Paths, Strided};
+use crate::credit::Episode;
 use crate::kernels::{clamp_to, count_ones, splat};
 use crate::parallel::*;
 use crate::world::{OUTPUTS, World};
@@ -157,12 +157,8 @@ impl<S: Simd> Vectors for TeamBlocks<S> {
         seen.extend(block.state.counts.iter().map(|count| count[lane]));
         let words = block.trail.len() / block.teams;
         let trail = &block.trail[lane * words..][..words];
-        if world.paths.is_none() {
-            return Some(Episode::whole(sets, seen, trail));
-        }
         let pois = moved.chunks_exact(world.pois.len()).nth(team).unwrap_or(&world.pois);
-        let paths = Some(Paths { positions: Strided::contiguous(trail), pois });
-        Some(Episode { paths, ..Episode::whole(sets, seen, &[]) })
+        Some(Episode::whole(sets, seen, trail, world.paths.is_some().then_some(pois)))
     }
 }
 

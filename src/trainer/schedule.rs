@@ -8,7 +8,7 @@ use glam::Vec2;
 
 use super::stages::{Stage, Stages};
 use crate::config::population_count;
-use crate::evolve::{self, Episodes};
+use crate::evolve::{self, TEST, TRAINING};
 use crate::parallel::*;
 
 /// Minimum number of policies per rayon task for cheap work. Fewer are finished before another thread wakes up.
@@ -62,21 +62,18 @@ impl TeamSchedule {
         let before = stages.of(generation.saturating_sub(1));
         let value: f64 = before.world.values.iter().map(|&value| f64::from(value)).sum();
         self.form_teams(level, stage, [trial, generation], |of, slot| value * f64::from(fitness(of, slot)));
-        let draw_starts = |stage: &Stage, episodes: Episodes, all: &mut Vec<Vec<Vec2>>| {
+        let draw_starts = |stage: &Stage, purposes, episodes: usize, all: &mut Vec<Vec<Vec2>>| {
             let (learning, world) = (&stage.config.learning, &stage.world);
-            let count = match episodes {
-                Episodes::Training => learning.episodes_per_team,
-                Episodes::Test => learning.test_episodes,
-            };
-            all.resize(count, vec![]);
+            all.resize(episodes, vec![]);
             for (episode, starts) in all.iter_mut().enumerate() {
-                evolve::episode_positions(learning, trial, generation, (episodes, episode), world, starts);
+                evolve::episode_positions(learning, trial, generation, (purposes, episode), world, starts);
             }
         };
-        draw_starts(stage, Episodes::Training, &mut self.starts);
-        draw_starts(stage, Episodes::Test, &mut self.test_starts);
+        let learning = |stage: &Stage| stage.config.learning.episodes_per_team;
+        draw_starts(stage, TRAINING, learning(stage), &mut self.starts);
+        draw_starts(stage, TEST, stage.config.learning.test_episodes, &mut self.test_starts);
         match stages.ending_before(generation) {
-            Some(stage) => draw_starts(stage, Episodes::Training, &mut self.previous_stage_starts),
+            Some(stage) => draw_starts(stage, TRAINING, learning(stage), &mut self.previous_stage_starts),
             None => self.previous_stage_starts.clear(),
         }
     }

@@ -11,7 +11,6 @@ use flotilla::escape::PathExt;
 use flotilla_app::choice::Work;
 use flotilla_app::ops::sweep::{PointOutcome, SweepRequest, same_sweep};
 use flotilla_app::ops::{BackendSource, Context, Error, check_memory, compare, sweep};
-use flotilla_app::record::disk::Disk;
 use flotilla_app::record::folder::POINTS;
 use flotilla_app::record::{RecordError, ownership};
 use flotilla_app::report::comparison::{self, Comparison, Measure};
@@ -22,7 +21,6 @@ macro_rules! layouts {
     ($($name:literal),*) => {
         /// The layouts: the name of each, and its sweep.
         const LAYOUTS: &[(&str, &str)] = &[$(($name, include_str!(concat!("../configs/influence/", $name, ".toml")))),*];
-        /// The names of the layouts.
         pub const LAYOUT_NAMES: &[&str] = &[$($name),*];
     };
 }
@@ -32,22 +30,17 @@ layouts!("rover_uav", "3_rovers_1_uav", "3_rovers_3_uavs", "4_rovers_4_uavs", "3
 /// The file with the baselines of all layouts.
 const BASELINES: &str = "baselines.csv";
 
-/// Results of the study.
 #[derive(Clone, Debug, Serialize)]
 pub struct Outcome {
-    /// The folder.
     pub folder: String,
-    /// The layouts.
     pub layouts: Vec<LayoutOutcome>,
     /// The results for people.
     #[serde(skip)]
     pub text: String,
 }
 
-/// Results of a layout.
 #[derive(Clone, Debug, Serialize)]
 pub struct LayoutOutcome {
-    /// The name.
     pub name: &'static str,
     /// The credits.
     pub points: Vec<PointOutcome>,
@@ -86,26 +79,21 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         let points = train(sweep, folder.clone(), request, &mut backend, context)?;
         let path = folder.join(POINTS);
         let table = std::fs::read(&path).map_err(RecordError::read(&path))?;
-        write(&disk, out.join(csv_name(name, "")), &table)?;
+        ownership::publish_bytes(&disk, &out.join(csv_name(name, "")), &table)?;
         let pairs = pairs(sweep.points.iter().map(|point| point_folder(&folder, point)).collect(), context)?;
-        let mut table = Vec::new();
-        comparison::csv(std::slice::from_ref(&pairs), &mut table).map_err(Error::Output)?;
-        write(&disk, out.join(csv_name(name, "_pairs")), &table)?;
+        let table = comparison::csv(std::slice::from_ref(&pairs));
+        ownership::publish_bytes(&disk, &out.join(csv_name(name, "_pairs")), &table)?;
         let baselines = play_baselines(&sweep.points[0].config, &mut *backend.0, context)?;
         layouts.push(LayoutOutcome { name, points, pairs, baselines });
     }
     context.pause();
     let table = table(&layouts);
-    write(&disk, out.join(BASELINES), table.as_bytes())?;
+    ownership::publish_bytes(&disk, &out.join(BASELINES), table.as_bytes())?;
     Ok(Outcome { folder: out.escaped(), layouts, text: table })
 }
 
 fn csv_name(layout: &str, ending: &str) -> String {
     format!("{layout}{ending}.csv")
-}
-
-fn write(disk: &Disk, path: PathBuf, bytes: &[u8]) -> Result<(), Error> {
-    Ok(ownership::publish(disk, &path, |output| output.write_all(bytes))?)
 }
 
 /// Trains the points of a sweep, and collects their results.

@@ -10,7 +10,6 @@
 //! | [`populations`] | followers against the number of populations |
 //! | [`influence`] | credits for rovers and UAVs |
 
-#![deny(missing_docs)]
 #![allow(rustdoc::private_intra_doc_links, reason = "tables of modules name the internal ones, too")]
 
 pub mod influence;

@@ -89,10 +89,8 @@ impl Cell {
     }
 }
 
-/// Results of the study.
 #[derive(Clone, Debug, Serialize)]
 pub struct Outcome {
-    /// The folder.
     pub folder: String,
     /// The number of trials of each experiment.
     pub trials: usize,
@@ -110,13 +108,10 @@ pub struct Outcome {
 /// A row of a table: one cell, or one contrast of two.
 #[derive(Clone, Debug, Serialize)]
 pub struct Row {
-    /// The layout.
     pub layout: &'static str,
-    /// The fitness.
     pub fitness: Fitness,
     /// The largest speed, in units per second.
     pub max_speed: f64,
-    /// The density.
     pub density: Density,
     /// The arm, or what the contrast isolates.
     pub what: String,
@@ -193,7 +188,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     }
     let (found, pairs) = (rows(&cells), contrasts(&cells));
     for (name, rows) in [(CELLS, &found), (PAIRS, &pairs)] {
-        ownership::publish(&disk, &out.join(name), |file| file.write_all(csv(rows).as_bytes()))?;
+        ownership::publish_bytes(&disk, &out.join(name), csv(rows).as_bytes())?;
     }
     picture(&found).scene().publish(&disk, out, PICTURE)?;
     Ok(Outcome {

@@ -13,7 +13,7 @@ use crate::questions::run::stopped;
 use crate::questions::{champions, play};
 use flotilla::backend::{Backend, OpenBackend};
 use flotilla::baseline::NAMES;
-use flotilla::config::{Config, Fitness, Learning, Override, ValidConfig};
+use flotilla::config::{Config, ConfigError, Fitness, Learning, Override, Problem, ValidConfig};
 use flotilla::evaluate::Starts;
 use flotilla::world::World;
 use flotilla_app::choice::Work;
@@ -169,6 +169,11 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         let mut configs = vec![read(&[set("population", SMALL.0.into())])?];
         if request.population > 0 {
             configs.push(read(&[set("population", request.population.into()), set("elites", "10%".into())])?);
+        }
+        if !configs[0].stages.is_empty() {
+            let message = "a task is one world for baselines, scripted teams and training: leave the stages out".into();
+            let problems = vec![Problem { line: None, key: "stages".into(), message }];
+            return Err(ConfigError::Invalid { name: name.clone(), problems, unlisted: 0 }.into());
         }
         let scripted_g = task.script.as_ref().map(|script| play_script(script, name, &configs[0])).transpose()?;
         tasks.push((task, scripted_g, configs));

@@ -154,14 +154,43 @@ function hands(view) {
 }
 
 /**
- * Writes the places of a group into the config. `fit` changes its lists of a value per place, of which there `were` so many.
- * @param {Placed} group @param {(list: unknown[]) => unknown[]} [fit]
+ * What is put onto the map (`by` 1) or taken off it (`by` -1): its group as before, and its index in it.
+ * @typedef {{ group: Placed, at: number, by: 1 | -1 }} Fit
  */
-function moved({ list, table, key, places, own }, fit, were = 0) {
+
+/** Returns a list with a value more, or without one, at an index. @param {unknown[]} list @param {number} at @param {1 | -1} by @param {unknown} value */
+const fitted = (list, at, by, value) => by > 0 ? list.toSpliced(at, 0, value) : list.toSpliced(at, 1);
+/** Returns lists of indices that refer to the same things as before. @param {number[][]} lists @param {number} at @param {1 | -1} by */
+const renumbered = (lists, at, by) => lists.map(list => list.filter(index => by > 0 || index !== at).map(index => index >= at ? index + by : index));
+
+/**
+ * Returns the keys that have a value per place, or refer to places by their numbers, as they have to be changed.
+ * @param {Fit} fit @returns {[string, unknown[]][]}
+ */
+function fitted_keys({ group: { list, table, own, places }, at, by }) {
+  const { world, credit: { removes = [] } = {}, learning: { paradigm } } = state.config, is_poi = list === "pois", whole = table === "world", all = groups();
+  const each = is_poi ? ["coupling", "windows"] : whole ? [] : ["heading"];
+  /** @type {[string, unknown[]][]} */
+  const keys = Object.entries(own).filter(([key, value]) => each.includes(key) && Array.isArray(value) && value.length === places.length)
+    .map(([key, value]) => [`${table}.${key}`, fitted(value, at, by, value.at(-1))]);
+  if (is_poi) return whole && world.after.length ? [...keys, ["world.after", fitted(renumbered(world.after, at, by), at, by, [])]] : keys;
+  // Agents that learn have the first numbers.
+  const before = all.filter((group, place) => group.list === list ? place < all.findIndex(other => other.table === table && other.list === list) : group.list === "leaders" && list === "followers");
+  const agent = at + before.reduce((sum, { size }) => sum + size, 0), is_within = (/** @type {unknown[]} */ list) => agent < list.length + (by > 0 ? 1 : 0);
+  const { heading } = world;
+  if (whole && Array.isArray(heading) && is_within(heading)) keys.push(["world.heading", fitted(heading, agent, by, heading[agent - 1])]);
+  if (removes.length) {
+    const others = renumbered(removes, agent, by), learns = list === "leaders" || paradigm === "all-leaders";
+    keys.push(["credit.removes", learns && removes.length > 1 ? fitted(others, agent, by, [agent]) : others]);
+  }
+  return keys;
+}
+
+/** Writes the places of a group into the config. @param {Placed} group @param {Fit} [fit] */
+function moved({ table, key, places }, fit) {
   state.file = null;
-  const each = fit ? [list === "pois" ? "coupling" : table === "world" ? "" : "heading", list === "pois" ? "windows" : ""] : [];
-  const values = Object.entries(own).filter(([key, value]) => each.includes(key) && Array.isArray(value) && value.length === were);
-  return change([[`${table}.${key}`, configs.positions(places)], ...values.map(([key, value]) => /** @type {[string, string]} */ ([`${table}.${key}`, JSON.stringify(fit?.(value))]))]);
+  const keys = fit ? fitted_keys(fit) : [];
+  return change([[`${table}.${key}`, configs.positions(places)], ...keys.map(([key, value]) => /** @type {[string, string]} */ ([key, JSON.stringify(value)]))]);
 }
 
 /** Adds an agent or a POI to a group. @param {string} table @param {string} key */
@@ -178,7 +207,7 @@ function add(table, key) {
   const find = () => /** @type {Placed} */ (groups().find(group => group.table === table && group.key === key)), group = find();
   put(group, [...group.places, place]);
   choose(first, [group.list, group.end]);
-  moved(find(), list => [...list, list.at(-1)], group.places.length);
+  moved(find(), { group, at: group.places.length, by: 1 });
 }
 
 export function remove() {
@@ -188,7 +217,7 @@ export function remove() {
   first.chosen = null;
   put(group, group.places.toSpliced(index, 1));
   const find = /** @type {Placed} */ (groups().find(({ table, key }) => table === group.table && key === group.key));
-  moved(find, list => list.toSpliced(index, 1), group.places.length);
+  moved(find, { group, at: index, by: -1 });
   // The button that had the focus is now disabled.
   first.canvas.focus({ preventScroll: true });
 }

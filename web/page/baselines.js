@@ -3,11 +3,17 @@ import { clerk } from "./pool.js";
 import { news, state } from "./state.js";
 import { last_of } from "./training.js";
 
+/** Milliseconds of a slice of a baseline. The clerk answers other requests between slices. */
+const SLICE = 60;
+
 /** Plays the constant actions of those arms of a training that lack them. @param {Training} training */
 export async function constants(training) {
   for (const arm of training.arms.filter(({ constant }) => constant === null)) {
-    if (state.training !== training) return;
-    arm.constant = (await clerk.ask({ ask: "constant", text: arm.toml })).words.g;
+    while (arm.constant === null) {
+      await clerk.is_free();
+      if (state.training !== training) return;
+      arm.constant = (await clerk.ask({ ask: "constant", text: arm.toml, milliseconds: SLICE })).words.g;
+    }
     news(training);
   }
 }
@@ -15,8 +21,8 @@ export async function constants(training) {
 /** Identifies the latest call of `randoms`. The clerk plays the random teams of one arm at a time. */
 let turn = {};
 /**
- * Plays as many random teams as the training evaluated, in slices, so that the clerk still answers other requests. They cost as much as
- * the training, and are played after it, and after what the guide waits for. Arms that have them are left out.
+ * Plays as many random teams as the training evaluated, in slices. They cost as much as the training, and are played after it, and after
+ * what the guide waits for. Arms that have them are left out.
  * @param {Training} training
  */
 export async function randoms(training) {
@@ -26,7 +32,7 @@ export async function randoms(training) {
     await clerk.ask({ ask: "random", text: arm.toml });
     for (let done = false; !done;) {
       if (await ended()) return;
-      const { words } = await clerk.ask({ ask: "more_random", milliseconds: 60 });
+      const { words } = await clerk.ask({ ask: "more_random", milliseconds: SLICE });
       arm.random = words.g;
       done = words.done;
       news(training);

@@ -109,8 +109,10 @@ export async function entered() {
 
 // Returns whether the experiment has paradigms. Without followers there is only one, and classes replace them.
 const has_paradigms = () => state.config.learning.paradigm !== undefined && state.config.world.followers.length > 0;
+/** Returns whether a key is of use: where every class has its own fitness, the common one is not. @param {string} key */
+const is_used = key => key === "learning.paradigm" ? has_paradigms() : key !== "learning.fitness" || state.start.common_fitness;
 /** Returns what the arms differ in, or null for a single arm. */
-export const effective = () => state.compared && (state.compared.key !== "learning.paradigm" || has_paradigms()) ? state.compared : null;
+export const effective = () => state.compared && is_used(state.compared.key) ? state.compared : null;
 
 // Sets the controls to the values of the config. Settings that it does not have are hidden.
 export function fill() {
@@ -123,10 +125,10 @@ export function fill() {
   const compared = effective(), choice = choice_of(compared, learning.population), own = option($("compare"), "own");
   own.hidden = choice !== "own";
   own.textContent = compared && choice === "own" ? `${compared.key.split(".")[1].replaceAll("_", " ")} ${compared.values.join(", ")}` : "";
-  option($("compare"), "paradigm").hidden = !has_paradigms();
+  for (const key of ["paradigm", "fitness"]) option($("compare"), key).hidden = !is_used(`learning.${key}`);
   $("compare").value = choice;
   if (learning.paradigm) $("paradigm").value = learning.paradigm;
-  for (const [id, has] of /** @type {const} */ ([["paradigm", has_paradigms()], ["coupling", !state.config.pois?.length]])) {
+  for (const [id, has] of /** @type {const} */ ([["paradigm", has_paradigms()], ["fitness", state.start.common_fitness], ["coupling", !state.config.pois?.length]])) {
     const label = $(id).closest("label");
     if (label) label.hidden = !has;
   }
@@ -143,6 +145,13 @@ const rest_of = (/** @type {Config | undefined} */ config) => {
   const { paradigm, fitness, seed, trials, generations, population, ...learning } = config.learning;
   return JSON.stringify({ ...config, learning });
 };
+
+// Shows what is valid in the config, but likely a mistake.
+part(() => [state.start], () => {
+  const { notes } = state.start;
+  $("notes").hidden = notes.length === 0;
+  $("notes").textContent = notes.map(note => `Note: ${note}.`).join("\n");
+});
 
 part(() => [state.problems], () => {
   const { problems } = state;

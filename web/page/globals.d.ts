@@ -18,10 +18,11 @@ type Kind = "leader-follower" | "all-leaders";
 
 /** The keys of a config that the page reads. The seed is text, because numbers cannot represent every seed. */
 interface Config {
-  world: Record<List, Place[]> & Rule & { map: Place, coupling: number | number[], observation_radius: number, steps: number, dt: number };
+  world: Record<List, Place[]> & Rule & { map: Place, coupling: number | number[], observation_radius: number, steps: number, dt: number, heading: number | number[] };
   motion: { max_speed: number };
   follow: { attraction_radius: number };
   agents?: Group[];
+  credit?: { removes?: number[][] };
   pois?: Group[];
   learning: {
     paradigm?: Kind, fitness: string, seed: string, generations: number, trials: number, population: number, partners?: number, hall_of_fame?: number,
@@ -32,7 +33,8 @@ interface Config {
 interface Rule { observers: "all" | "leaders" | "followers", windows: Place[], after: number[][] }
 /** An entry of `[[agents]]` or `[[pois]]`. The lists have a value for each place, or one for all. */
 interface Group { name: string, at?: Place[], motion: { max_speed: number }, control?: string, coupling?: number | number[], windows?: Place[], heading?: number | number[] }
-interface Start extends Parts { owner: number[], coupling: number[], headings: number[] }
+/** What the page needs of a config besides its keys. `common_fitness` tells whether any class learns by `learning.fitness`. */
+interface Start extends Parts { owner: number[], coupling: number[], headings: number[], notes: string[], common_fitness: boolean }
 interface Described { toml: string, config: Config, pois: number | null, parameters: number, start: Start }
 interface Palettes { light: string[], dark: string[] }
 
@@ -179,6 +181,6 @@ type Elements =
   & Record<"text", HTMLTextAreaElement> & Record<"curves", HTMLCanvasElement> & Record<"config" | "more", HTMLDetailsElement>
   & Record<"setup" | "guide" | "guide-text" | "guide-step" | "guide-says" | "guide-choices" | "bar" | "arrange" | "adds" | "drive" | "modes" | "views" | "plain-label", HTMLElement>
   & Record<"credit" | "play" | "training" | "team" | "credits" | "lost" | "compared" | "compared-says" | "means" | "pairs" | "tests" | "gallery" | "digests", HTMLElement>
-  & Record<"trouble" | "stale" | "announced" | "machine" | "version" | "legend" | "needless" | "problems" | "lines" | "marks", HTMLElement>
+  & Record<"trouble" | "stale" | "notes" | "announced" | "machine" | "version" | "legend" | "needless" | "problems" | "lines" | "marks", HTMLElement>
   & Record<"chosen" | "driven" | "generation" | "message" | "verified", HTMLElement>
   & Record<"wasm" | "worker" | "opening" | `layout-${string}` | `gallery-${string}`, HTMLElement>;

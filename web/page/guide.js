@@ -50,7 +50,7 @@ const STEPS = [
     of: "groups",
     asks: "Do followers make the difference? Take them away: all twelve agents learn, from a population for each (twelve), from one for the three agents of a group (four), or from one for all. How many POIs do the champions of four populations observe?",
     choices: ["Nothing", "Two or three", "All four"], right: 1,
-    why: "With followers it was 3.00. With twelve populations, six learners have to coincide again. A group starts side by side, and with one policy (one colour) it goes much the same way, as followers do. So fewer populations do most of what followers do. In 30 trials of another layout it was 0.7 with twelve, 3.1 with four, 3.6 with followers. Four trials cannot rank four and one.",
+    why: "With followers it was 3.00. With twelve populations, six learners have to coincide again. A group starts side by side, and with one policy (one colour) it goes much the same way, as followers do. So shared policies do most of what followers do. In 30 trials of another layout it was 0.7 with twelve, 3.1 with four, 3.6 with followers. Four trials cannot rank four and one.",
   },
 ];
 

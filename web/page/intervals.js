@@ -6,7 +6,7 @@ import { news, part, state } from "./state.js";
 /** Shows the intervals and tests of a training that has ended, or of opened runs. @param {Training} training */
 export async function intervals(training) {
   const arms = training.arms.map(({ label, toml, trials }) => ({ name: label, text: toml, lengths: trials.map(trial => trial.length) }));
-  const numbers = Float64Array.from(training.arms.flatMap(({ trials }) => trials.flatMap(rows => rows.flatMap(({ best, champion }) => [best, champion]))));
+  const numbers = Float64Array.from(training.arms.flatMap(({ trials }) => trials.flatMap(rows => rows.flatMap(({ best, champion, test }) => [best, champion, test]))));
   const { words } = await clerk.ask({ ask: "compare", arms }, new Uint8Array(numbers.buffer));
   if (state.training !== training) return;
   training.found = words;

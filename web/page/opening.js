@@ -8,7 +8,7 @@ export const OPENING = "two_groups";
 export const OPENED = (() => {
   const { config, trial, generation } = opening, data = stage.unpack(opening.data), [{ agents, coupling, headings }] = data.episodes;
   // Until the module has resolved a config, everyone starts as in this episode.
-  state.start = { owner: [], coupling, headings: Array.from({ length: agents }, (_, agent) => Math.atan2(headings[2 * agent + 1], headings[2 * agent])) };
+  Object.assign(state.start, { coupling, headings: Array.from({ length: agents }, (_, agent) => Math.atan2(headings[2 * agent + 1], headings[2 * agent])) });
   return {
     name: "opening",
     scenes: [{

@@ -25,7 +25,7 @@ export const join = (one, other) => [Math.min(one[0], other[0]), Math.min(one[1]
  * @param {Config} config @returns {Scene}
  */
 export function start_scene(config) {
-  const { world, follow } = config, agents = [...world.leaders, ...world.followers], { coupling, headings, owner: owners, ...parts } = state.start;
+  const { world, follow } = config, agents = [...world.leaders, ...world.followers], { coupling, headings, owner: owners, notes, common_fitness, ...parts } = state.start;
   // After an addition or a removal, the owners are those of the former agents until the module has resolved it.
   const owner = agents.map((_, agent) => owners[agent] < world.leaders.length ? owners[agent] : -1);
   return {

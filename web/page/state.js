@@ -16,7 +16,7 @@ export const opening = JSON.parse($("opening").textContent);
 
 /** @type {State} */
 export const state = {
-  text: "", valid: false, config: opening.config, toml: null, pois: opening.config.world.pois.length, start: { owner: [], coupling: [], headings: [] },
+  text: "", valid: false, config: opening.config, toml: null, pois: opening.config.world.pois.length, start: { owner: [], coupling: [], headings: [], notes: [], common_fitness: true },
   compared: { key: "learning.paradigm", values: ["leader-follower", "all-leaders"] }, file: null, past: [], problems: [], linked: false, mode: "watch",
   training: null, exhibit: null, follow: true, generation: 0, over: null, trial: 0, views: [], chosen: null, guide: null, told: null, troubles: {}, message: "", note: "", gpu: {},
   machine: { description: "", backend: "cpu", adapter: null, driver: null, threads: 0 }, settled: null, players: [], policies: null, layouts: {}, version: "",

@@ -43,7 +43,8 @@ pub fn floats(bytes: &[u8]) -> Vec<f32> {
 }
 
 /// Returns a config as TOML and as JSON, with its number of POIs (null if stages or the values of POIs differ, because G
-/// does not count POIs then), parameters per policy, and start.
+/// does not count POIs then), parameters per policy, and start. The start also has
+/// the notes, and whether any class learns by the config's own fitness.
 pub fn described(config: &ValidConfig) -> Value {
     let (toml, pois, parameters) = (config.to_toml(), config.pois(), config.parameters());
     let mut words = json!({ "toml": toml, "config": **config, "pois": pois, "parameters": parameters });
@@ -55,6 +56,9 @@ pub fn described(config: &ValidConfig) -> Value {
         words["config"]["follow"] = json!({ "attraction_radius": config.influence_radius() });
     }
     words["start"] = start_of(config);
+    words["start"]["notes"] = config.notes().into();
+    let mut learners = config.classes().agents.into_iter().filter(|class| class.learns());
+    words["start"]["common_fitness"] = learners.any(|class| class.fitness.is_none()).into();
     if !words["start"]["values"].is_null() {
         words["pois"] = Value::Null;
     }

@@ -16,7 +16,7 @@ use serde_json::{Value, json};
 
 use crate::answer::{Answer, Refusal, described, floats, refuse};
 use crate::archive::{self, Recorded};
-use crate::baseline::{self, Random};
+use crate::baseline::{Constant, Random};
 use crate::drive::Drive;
 use crate::edit;
 use crate::experiments;
@@ -30,8 +30,8 @@ enum Ask {
     Resolve { text: String, name: String, changes: Vec<(String, String)> },
     /// Returns a config's text with some keys set to TOML values. Comments and layout are kept.
     Edit { text: String, changes: Vec<(String, String)> },
-    /// Returns G of the best constant action.
-    Constant { text: String },
+    /// Plays generations of the constant actions, and returns G of the best after the last.
+    Constant { text: String, milliseconds: f64 },
     /// Returns learning curves with their intervals, and the comparison of experiments. The numbers are G, see
     /// [`experiments::compare`].
     Compare {
@@ -86,12 +86,13 @@ pub struct Session {
     backend: OpenBackend,
     training: Training,
     drive: Option<Drive>,
+    constant: Option<Constant>,
     random: Option<Random>,
 }
 
 impl Default for Session {
     fn default() -> Session {
-        Session { backend: front::cpu(), training: Training::default(), drive: None, random: None }
+        Session { backend: front::cpu(), training: Training::default(), drive: None, constant: None, random: None }
     }
 }
 
@@ -104,7 +105,11 @@ pub fn answer(session: &mut Session, text: &str, bytes: &[u8]) -> Result<Answer,
     match serde_json::from_str(text).map_err(refuse)? {
         Ask::Resolve { text, name, changes } => words(resolve(&text, &name, changes)?),
         Ask::Edit { text, changes } => words(json!({ "text": edit::set(&text, &changes).map_err(refuse)? })),
-        Ask::Constant { text } => words(baseline::constant(&parse(&text)?.validate()?)?),
+        Ask::Constant { text, milliseconds } => {
+            let begun = session.constant.take().filter(|begun| begun.text == text);
+            let begun = begun.map_or_else(|| Constant::new(&parse(&text)?.validate()?, text), Ok)?;
+            words(session.constant.insert(begun).advance(milliseconds)?)
+        }
         Ask::Compare { experiments } => words(experiments::compare(experiments, bytes)?),
         Ask::Labels { texts, names } => {
             let configs = texts.iter().map(|text| parse(text)).collect::<Result<Vec<_>, _>>()?;

@@ -16,25 +16,49 @@ fn in_last_stage(config: &ValidConfig) -> Config {
     Config::clone(config.at(config.learning.generations))
 }
 
-/// Returns G of the best constant action, as a mean over trials.
-///
-/// # Errors
-/// The backend fails.
-pub fn constant(config: &ValidConfig) -> Result<Value, Refusal> {
-    let mut config = in_last_stage(config);
-    // If nothing moves, all generations and trials are equal.
-    if !config.starts_move() && !config.pois_move() {
-        let learning = &mut config.learning;
-        (learning.generations, learning.trials) = (0, 1);
-    }
-    let trials = config.learning.trials as f64;
-    let (mut baselines, mut cpu) = (Baselines::of_constants(&config.validate()?), Cpu::default());
+/// Plays generations of baselines for `time` milliseconds, at least one.
+fn play(baselines: &mut Baselines, time: f64) -> Result<(), Refusal> {
+    let (start, mut cpu) = (Instant::now(), Cpu::default());
     while !baselines.is_done() {
         baselines.advance(&mut cpu).map_err(refuse)?;
+        if start.elapsed().as_secs_f64() * 1000.0 >= time {
+            break;
+        }
     }
-    let outcomes = baselines.outcomes(&mut cpu, EPISODES).map_err(refuse)?.remove(0);
-    let g = outcomes.iter().map(|outcome| outcome.constants[outcome.best_constant]).sum::<f64>() / trials;
-    Ok(json!({ "g": g }))
+    Ok(())
+}
+
+/// The best constant action.
+pub struct Constant {
+    /// The config as text.
+    pub text: String,
+    baselines: Baselines,
+}
+
+impl Constant {
+    pub fn new(config: &ValidConfig, text: String) -> Result<Constant, Refusal> {
+        let mut config = in_last_stage(config);
+        // If nothing moves, all generations and trials are equal.
+        if !config.starts_move() && !config.pois_move() {
+            let learning = &mut config.learning;
+            (learning.generations, learning.trials) = (0, 1);
+        }
+        Ok(Constant { text, baselines: Baselines::of_constants(&config.validate()?) })
+    }
+
+    /// Plays generations for `time` milliseconds, at least one. After the last, returns G as a mean over trials, else null.
+    ///
+    /// # Errors
+    /// The backend fails.
+    pub fn advance(&mut self, time: f64) -> Result<Value, Refusal> {
+        play(&mut self.baselines, time)?;
+        if !self.baselines.is_done() {
+            return Ok(json!({ "g": null }));
+        }
+        let outcomes = self.baselines.outcomes(&mut Cpu::default(), EPISODES).map_err(refuse)?.remove(0);
+        let sum: f64 = outcomes.iter().map(|outcome| outcome.constants[outcome.best_constant]).sum();
+        Ok(json!({ "g": sum / outcomes.len() as f64 }))
+    }
 }
 
 /// The best of as many random networks as training evaluates.
@@ -51,13 +75,7 @@ impl Random {
     /// # Errors
     /// The backend fails.
     pub fn advance(&mut self, time: f64) -> Result<Value, Refusal> {
-        let (start, mut cpu) = (Instant::now(), Cpu::default());
-        while !self.0.is_done() {
-            self.0.advance(&mut cpu).map_err(refuse)?;
-            if start.elapsed().as_secs_f64() * 1000.0 >= time {
-                break;
-            }
-        }
+        play(&mut self.0, time)?;
         let trials = self.0.so_far().next().map_or(&[][..], |found| &found.random);
         let mean = |generation: usize| trials.iter().map(|g| g[generation]).sum::<f64>() / trials.len() as f64;
         let g: Vec<f64> = (0..self.0.generation()).map(mean).collect();

@@ -26,11 +26,12 @@ pub struct Experiment {
 
 /// Returns the curves of the champions with their 95 % intervals, and the tables of `flotilla compare`.
 ///
-/// `bytes` are G of the best team and of the champion as f64, `[experiments][trials][generations][2]`. If they cannot be
-/// compared, `refused` says why, and there are no tables.
+/// `bytes` are G of the best team, of the champion and of the tested best team as f64,
+/// `[experiments][trials][generations][3]`. The last is NaN without test episodes. If they cannot be compared, `refused` says
+/// why, and there are no tables.
 pub fn compare(experiments: Vec<Experiment>, bytes: &[u8]) -> Result<Value, Refusal> {
     let numbers: Vec<f64> = bytemuck::pod_collect_to_vec(&bytes[..bytes.len() / 8 * 8]);
-    let mut pairs = numbers.as_chunks::<2>().0;
+    let mut pairs = numbers.as_chunks::<3>().0;
     let (mut cohorts, mut curves) = (Vec::new(), Vec::new());
     for Experiment { name, text, lengths } in experiments {
         let config = Config::parse(&text, "the config")?;
@@ -40,16 +41,16 @@ pub fn compare(experiments: Vec<Experiment>, bytes: &[u8]) -> Result<Value, Refu
         for (trial, length) in lengths.into_iter().enumerate() {
             let (scores, rest) = pairs.split_at_checked(length).ok_or_else(|| refuse("the rows are incomplete"))?;
             pairs = rest;
-            champions.iter_mut().zip(scores).for_each(|(champion, [_, g])| champion.add(*g));
+            champions.iter_mut().zip(scores).for_each(|(champion, [_, g, _])| champion.add(*g));
             let key = (config.learning.seed, trial);
-            let row = |(generation, &[best_g, champion_g]): (usize, &[f64; 2])| Row {
+            let row = |(generation, &[best_g, champion_g, test_g]): (usize, &[f64; 3])| Row {
                 experiment: 0,
                 trial,
                 generation,
                 best_g,
                 mean_g: best_g,
                 champion_g,
-                test_g: None,
+                test_g: Some(test_g).filter(|g| !g.is_nan()),
             };
             trials.push(Trial { key, rows: scores.iter().enumerate().map(row).collect(), from: config.last_from() });
         }

@@ -214,7 +214,6 @@ fn leader(env: &At<'_>, has_followers: bool) -> Result<Section, Problem> {
     Ok(section)
 }
 
-/// Returns the section of the followers.
 fn follower(env: &At<'_>) -> Result<Section, Problem> {
     let mut section = class("follower", env, FOLLOWERS)?;
     let colony = env.need("BoidsColony")?;

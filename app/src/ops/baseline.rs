@@ -7,7 +7,7 @@ use super::{BackendSource, ConfigText, Context, Error, ProcessorInfo, check_memo
 use crate::choice::Work;
 use flotilla::backend::Backend;
 use flotilla::baseline::{self, Baselines, SPEEDS};
-use flotilla::config::{Actions, AgentClass, Config, Control, Paradigm, ValidConfig};
+use flotilla::config::{Actions, AgentClass, Config, Control, Mobility, Paradigm, ValidConfig};
 use flotilla::statistics;
 
 /// A request to play baselines.
@@ -58,6 +58,9 @@ pub struct BaselineOutcome {
     /// The things that the policies choose.
     #[serde(skip)]
     pub choosing: Choosing,
+    /// Whether a class that learns moves freely, so that its actions are velocities along x and y.
+    #[serde(skip)]
+    pub free: bool,
     /// Who learns, for people: the paradigm, or the classes that learn.
     #[serde(skip)]
     pub learners: String,
@@ -169,6 +172,7 @@ pub fn run(
         _ => json!(outcome.best_constant),
     };
     let classes = config.agents.iter().filter(|class| class.learns());
+    let free = classes.clone().any(|class| matches!(class.motion, Mobility::Free { .. }));
     let classes: Vec<_> = classes.map(|class| format!("{} × {}", class.size(), class.name)).collect();
     Ok(BaselineOutcome {
         learners: if classes.is_empty() { learning.paradigm.to_string() } else { classes.join(", ") },
@@ -188,6 +192,7 @@ pub fn run(
         hill_climbing: found(observed(&|outcome| outcome.hill_climbing), true),
         processor: ProcessorInfo::of(&open.1, &open.0.describe()),
         choosing,
+        free,
         moves,
     })
 }

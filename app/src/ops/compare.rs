@@ -19,35 +19,21 @@ use flotilla::escape::PathExt;
 use flotilla::file;
 use flotilla::statistics;
 
-/// A request to compare runs.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CompareRequest {
     /// Folders of runs, two at least, or the folder of one sweep.
     pub folders: Vec<PathBuf>,
     /// The axis of a sweep whose values are compared. The default is the only axis.
-    #[serde(default)]
     pub by: Option<String>,
     /// Generations at which to compare G, as numbers, or `last`.
-    #[serde(default = "last")]
     pub at: Vec<String>,
     /// G whose first generation is compared, 0 to 1.
-    #[serde(default = "reach")]
     pub reach: f64,
     /// Whether to compare pair by pair.
-    #[serde(default)]
     pub paired: bool,
     /// Whether files that differ from their digests are read.
-    #[serde(default)]
     pub unverified: bool,
-}
-
-fn last() -> Vec<String> {
-    vec!["last".into()]
-}
-
-fn reach() -> f64 {
-    0.75
 }
 
 /// Parses a generation to compare at.
@@ -58,16 +44,13 @@ pub fn at(text: &str) -> Result<At, String> {
     }
 }
 
-/// Results of a comparison.
 #[derive(Clone, Debug, Serialize)]
 pub struct CompareOutcome {
     /// The confidence of every interval.
     pub confidence: f64,
     /// The test: `mann-whitney` or `wilcoxon`.
     pub test: &'static str,
-    /// The comparisons.
     pub comparisons: Vec<Comparison>,
-    /// Notes for the reader.
     pub notes: Vec<String>,
     /// Whether files were read that differ from their digests.
     pub unverified: bool,

@@ -19,13 +19,10 @@ use flotilla::front::Failure;
 /// An error with its remedy. It is displayed as one text.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct MessageWithRemedy {
-    /// The error.
     pub message: String,
-    /// The remedy, if there is one.
     pub remedy: Option<String>,
 }
 
-/// Returns a message with its remedy.
 pub fn with_remedy(message: impl Into<String>, remedy: impl Into<String>) -> MessageWithRemedy {
     MessageWithRemedy { message: message.into(), remedy: Some(remedy.into()) }
 }

@@ -34,13 +34,10 @@ use std::ffi::OsString;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 
-use serde::{Deserialize, Serialize};
-
 use crate::choice::Work;
-use crate::record::folder::{self, Run};
 use crate::report::replay::numbered;
 use crate::run::{Options, Progress, RunError};
-use flotilla::backend::{BackendError, Machine, OpenBackend};
+use flotilla::backend::{BackendError, OpenBackend};
 use flotilla::config::{Config, Override, STAGES, ValidConfig};
 use flotilla::escape::PathExt;
 use flotilla::front;
@@ -61,6 +58,7 @@ pub mod sweep;
 pub mod train;
 pub mod verify;
 
+pub use crate::record::folder::ProcessorInfo;
 pub use error::{Error, MessageWithRemedy, with_remedy};
 
 /// An event while a use case runs.
@@ -156,7 +154,6 @@ impl Context<'_> {
         sweep::unreachable(config).iter().for_each(|line| self.warn(format_args!("warning: {line}")));
     }
 
-    /// Reports a warning.
     pub fn warn(&self, text: impl ToString) {
         (self.report)(Event::Warning(text.to_string()));
     }
@@ -219,7 +216,6 @@ impl BackendSource for &mut OpenBackend {
 /// A config as a request carries it.
 #[derive(Clone, Debug)]
 pub struct ConfigText {
-    /// The text of the file.
     pub text: String,
     /// The file's name in errors.
     pub name: String,
@@ -228,7 +224,6 @@ pub struct ConfigText {
 }
 
 impl ConfigText {
-    /// Reads the config.
     pub fn read(&self) -> Result<Config, Error> {
         Ok(Config::read(&self.text, &self.name, &[], &self.set)?)
     }
@@ -281,60 +276,4 @@ pub fn check_memory<'a>(
         plan.check(machine.backend == "gpu").map_err(RunError::from)?;
     }
     Ok(())
-}
-
-/// The processor that episodes were played on, with the names that `run.json` has.
-#[derive(Clone, Debug, Serialize, Deserialize)]
-pub struct ProcessorInfo {
-    /// "cpu" or "gpu".
-    pub backend: String,
-    /// The processor in words.
-    pub description: String,
-    /// The GPU's name.
-    pub adapter: Option<String>,
-    /// The GPU's driver.
-    pub driver: Option<String>,
-    /// CPU threads.
-    pub threads: usize,
-}
-
-impl ProcessorInfo {
-    /// Describes the processor of an open backend.
-    pub fn of(machine: &Machine, description: &str) -> ProcessorInfo {
-        let Machine { backend, adapter, driver, threads, .. } = machine.clone();
-        ProcessorInfo { backend, description: description.into(), adapter, driver, threads }
-    }
-
-    /// Returns the processor of a run's last session.
-    pub fn of_run(run: &Run) -> ProcessorInfo {
-        let Run { backend, description, adapter, driver, threads, .. } = run.clone();
-        ProcessorInfo { backend, description, adapter, driver, threads }
-    }
-
-    /// Returns the record of a run that this processor trained in one session, which ends now.
-    pub fn record(self, config: &Config, command: &str, started: String) -> Run {
-        let ProcessorInfo { backend, description, adapter, driver, threads } = self;
-        Run {
-            version: flotilla::VERSION.into(),
-            backend,
-            description,
-            adapter,
-            driver,
-            threads,
-            started,
-            updated: folder::now(),
-            sessions: 1,
-            command: command.into(),
-            commit: flotilla::COMMIT.map(String::from),
-            ..Run::new(config)
-        }
-    }
-
-    /// Adds the fields to a JSON object.
-    pub fn add_to(&self, object: &mut serde_json::Value) {
-        let fields = serde_json::to_value(self).expect("texts and numbers are JSON");
-        for (name, value) in fields.as_object().into_iter().flatten() {
-            object[name] = value.clone();
-        }
-    }
 }

@@ -17,7 +17,6 @@ use flotilla::escape::PathExt;
 /// A request to draw learning curves.
 #[derive(Clone, Debug)]
 pub struct PlotRequest {
-    /// Folders of runs.
     pub runs: Vec<PathBuf>,
     /// The picture. By default `curves.svg` in the folder of one run, or `comparison.svg` here of several.
     pub out: Option<PathBuf>,
@@ -29,7 +28,6 @@ pub struct PlotRequest {
     pub unverified: bool,
 }
 
-/// The picture.
 #[derive(Clone, Debug, Serialize)]
 pub struct PlotOutcome {
     /// The file.

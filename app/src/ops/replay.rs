@@ -23,16 +23,13 @@ use flotilla::file;
 use flotilla::memory;
 use flotilla::world::World;
 
-/// A request to replay episodes.
 #[derive(Clone, Debug)]
 pub struct ReplayRequest {
     /// A run's folder.
     pub folder: PathBuf,
-    /// The trial.
     pub trial: WhichTrial,
     /// The generation. The newest by default.
     pub generation: Option<usize>,
-    /// The team.
     pub team: Which,
     /// Another generation of the trial, side by side.
     pub compare: Option<usize>,
@@ -48,13 +45,10 @@ pub struct ReplayRequest {
     pub unverified: bool,
 }
 
-/// Results of a replay.
 #[derive(Clone, Debug, Serialize)]
 pub struct ReplayOutcome {
-    /// The written files.
     #[serde(flatten)]
     pub written: Written,
-    /// The played episodes.
     pub episodes: Vec<Episode>,
     /// Whether files were read that differ from their digests.
     pub unverified: bool,
@@ -64,12 +58,9 @@ pub struct ReplayOutcome {
 #[derive(Clone, Debug, Serialize)]
 #[serde(untagged)]
 pub enum Written {
-    /// One file.
     File {
-        /// The file.
         #[serde(serialize_with = "escaped")]
         out: PathBuf,
-        /// Size of the file.
         bytes: usize,
     },
     /// Numbered pictures.
@@ -85,12 +76,9 @@ pub enum Written {
     },
 }
 
-/// An episode that was played.
 #[derive(Clone, Debug, Serialize)]
 pub struct Episode {
-    /// The trial.
     pub trial: usize,
-    /// The generation.
     pub generation: usize,
     /// The team as it was requested: best, champion or number.
     pub which: &'static str,
@@ -116,7 +104,6 @@ impl Episode {
     }
 }
 
-/// The trial to show.
 #[derive(Clone, Copy, Debug)]
 pub enum WhichTrial {
     /// The one with the largest G.

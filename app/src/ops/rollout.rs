@@ -74,14 +74,11 @@ pub struct RolloutRequest {
     pub seed: Option<u64>,
 }
 
-/// Results of a rollout.
 #[derive(Clone, Debug, Serialize)]
 pub struct RolloutOutcome {
-    /// Number of teams.
     pub teams: usize,
     /// Leaders per team.
     pub leaders: usize,
-    /// Number of POIs.
     pub pois: usize,
     /// Episodes per team.
     pub episodes: usize,
@@ -102,7 +99,6 @@ pub struct RolloutOutcome {
     /// See [`Config::weighted_by`].
     #[serde(skip)]
     pub weighted_by: Option<&'static str>,
-    /// The processor.
     #[serde(flatten)]
     pub processor: ProcessorInfo,
 }

@@ -67,25 +67,21 @@ pub struct SweepRequest {
 }
 
 impl SweepRequest {
-    /// Reads the sweep.
     pub fn read(&self) -> Result<Sweep, Error> {
         Ok(Sweep::read(&self.text, &self.name, &self.set, self.skip_impossible)?)
     }
 }
 
-/// The results of a point.
 #[derive(Clone, Debug, Serialize)]
 pub struct PointOutcome {
     /// The number among all combinations.
     pub point: usize,
-    /// The run's folder.
     pub folder: String,
     /// The values by axis.
     pub values: BTreeMap<String, Value>,
     /// Why there are no results.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub missing: Option<String>,
-    /// The results.
     #[serde(flatten)]
     pub found: Option<PointScores>,
     /// The values for people.
@@ -96,7 +92,6 @@ pub struct PointOutcome {
 /// Results of a finished point.
 #[derive(Clone, Debug, Serialize)]
 pub struct PointScores {
-    /// The run's digest.
     pub digest: Option<String>,
     /// G of the champion in the last generation, mean over trials.
     pub champion_g: f64,
@@ -122,14 +117,11 @@ pub struct Files {
     pub results: String,
     /// Every point.
     pub points: String,
-    /// The pictures.
     pub pictures: Vec<String>,
 }
 
-/// The results of a sweep.
 #[derive(Clone, Debug, Serialize)]
 pub struct SweepOutcome {
-    /// The folder.
     pub folder: String,
     /// The sweep's name.
     pub sweep: String,
@@ -137,9 +129,7 @@ pub struct SweepOutcome {
     pub reach: f64,
     /// Whether files were read that differ from their digests.
     pub unverified: bool,
-    /// The points.
     pub points: Vec<PointOutcome>,
-    /// The files.
     pub files: Files,
     /// The results for people.
     #[serde(skip)]

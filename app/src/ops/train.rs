@@ -33,10 +33,8 @@ use flotilla::trainer::Row;
 const FILES: [(&str, &str); 5] =
     [("config", CONFIG), ("run", RUN), ("metrics", METRICS), ("policies", POLICIES), ("curves", CURVES)];
 
-/// A request to train.
 #[derive(Clone, Debug)]
 pub struct TrainRequest {
-    /// The config.
     pub config: ConfigText,
     /// The name of the run. Its folder has this name by default.
     pub name: String,
@@ -48,19 +46,14 @@ pub struct TrainRequest {
     pub init: Option<PathBuf>,
 }
 
-/// Results of a run.
 #[derive(Clone, Debug, Serialize)]
 pub struct TrainOutcome {
-    /// The run's folder.
     #[serde(serialize_with = "escaped")]
     pub folder: PathBuf,
     /// The run's name.
     pub config: String,
-    /// The run's digest.
     pub digest: String,
-    /// Random seed.
     pub seed: u64,
-    /// Number of trials.
     pub trials: usize,
     /// Policies per population.
     pub population: usize,
@@ -78,7 +71,6 @@ pub struct TrainOutcome {
     pub notes: Vec<String>,
     /// Scores of the random start.
     pub first: GenerationScores,
-    /// Scores of the last generation.
     pub last: GenerationScores,
     /// The files by their content.
     pub files: BTreeMap<&'static str, String>,
@@ -102,11 +94,8 @@ pub struct TrainOutcome {
 /// Scores of a generation, over trials.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub struct GenerationScores {
-    /// G of the best team.
     pub best_g: Extremes,
-    /// G of the mean team.
     pub mean_g: Extremes,
-    /// G of the champion.
     pub champion_g: Extremes,
     /// G of the tested best team, if the config has test episodes.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -132,11 +121,8 @@ impl GenerationScores {
 /// The mean, lowest and highest value over trials.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub struct Extremes {
-    /// The mean.
     pub mean: f64,
-    /// The lowest value.
     pub lowest: f64,
-    /// The highest value.
     pub highest: f64,
 }
 
@@ -186,6 +172,13 @@ pub fn run(
     context.warn_of_unreachable(&config);
     // Read before a folder is chosen, which is created.
     let init = request.init.as_deref().map(|path| policies::read_init(path, &config)).transpose()?;
+    let most = init.iter().flat_map(|init| &init.trials).map(|trial| trial.policies).max().unwrap_or(0);
+    if most > config.learning.population {
+        context.note(format_args!(
+            "note: --init has {most} policies of each leader, of which the first {} start",
+            config.learning.population
+        ));
+    }
     let folder = request.folder()?;
     let mut session = open_session(request, &config, init, &folder, context)?;
     let (since, from, was_done) = (Instant::now(), session.generations()[0], session.is_done());
@@ -208,7 +201,7 @@ pub fn run(
     };
     if !was_done || !is_drawn() {
         let svg = figure_of(config, metrics, &results.digest).scene().svg();
-        let drawn = ownership::publish(disk, &curves, |output| output.write_all(svg.as_bytes()))
+        let drawn = ownership::publish_bytes(disk, &curves, svg.as_bytes())
             .and_then(|()| disk.sync_folder(&folder).map_err(RecordError::write(&folder)));
         if let Err(error) = drawn.map_err(Error::from) {
             // Everything that was learned is already saved.
@@ -234,7 +227,7 @@ pub fn run(
         first: GenerationScores::of(&results.rows.first),
         last: GenerationScores::of(&results.rows.last),
         files: FILES.into_iter().map(|(name, file)| (name, folder.join(file).escaped())).collect(),
-        processor: ProcessorInfo::of_run(session.run(0)),
+        processor: session.run(0).processor.clone(),
         rows: results.rows.clone(),
         teams: config.max_teams() - 1,
         weighted_by: valid.weighted_by(),

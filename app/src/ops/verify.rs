@@ -113,6 +113,9 @@ pub fn run(args: &VerifyRequest, context: Context<'_>) -> Result<VerifyOutcome, 
         name => gpus(name, args)?,
     };
     let count = combinations.len();
+    if count == 0 {
+        return Err(Error::Usage("no adapter has this pass or kernel".into()));
+    }
     if args.adapter.as_deref() != Some(CPU) {
         context.message(expected(&plan, budget, count));
     }

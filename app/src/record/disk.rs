@@ -57,7 +57,6 @@ impl<'a, P: AsRef<Path> + ?Sized> From<&'a P> for Place<'a> {
 }
 
 impl<'a> Place<'a> {
-    /// Returns the path.
     pub fn path(&self) -> &'a Path {
         self.path
     }
@@ -130,7 +129,6 @@ impl Disk {
         self.root().is_some_and(RootedFolder::has_moved)
     }
 
-    /// Returns the place of a path on this disk.
     pub fn at<'a>(&'a self, path: &'a Path) -> Place<'a> {
         Place { disk: Some(self).filter(|disk| disk.root.is_some()), path }
     }
@@ -336,7 +334,6 @@ impl Disk {
         self.replace_with(path, permissions, content, || Ok(()))
     }
 
-    /// Renames a file.
     pub(crate) fn rename(&self, from: &Path, to: &Path) -> io::Result<()> {
         self.check(Operation::Rename, to)?;
         self.entry(from)?.rename(&self.entry(to)?)
@@ -434,7 +431,6 @@ impl Output {
         self.file.sync_all()
     }
 
-    /// Returns the path of the file.
     pub fn path(&self) -> &Path {
         &self.path
     }

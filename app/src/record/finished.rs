@@ -35,7 +35,7 @@ impl Storage for Folder {
     }
 
     fn publish(&mut self, name: &str, content: &[u8]) -> Result<(), RecordError> {
-        ownership::publish(&self.disk, &self.file(name), |output| output.write_all(content))?;
+        ownership::publish_bytes(&self.disk, &self.file(name), content)?;
         let checkpoints = self.file(CHECKPOINTS);
         self.disk.sync_folder(&checkpoints).map_err(RecordError::write(&checkpoints))?;
         self.sync()
@@ -44,7 +44,6 @@ impl Storage for Folder {
 
 /// A finished run in memory.
 pub struct Finished<'a> {
-    /// The config.
     pub config: &'a Config,
     /// All rows by generation and trial, each with the seconds of training until it was complete.
     pub rows: &'a [(Row, f64)],

@@ -81,7 +81,6 @@ impl Lines {
         Lines { stages, optional: Optional::of(config) }
     }
 
-    /// Returns the header.
     pub fn header(&self) -> String {
         self.optional.header() + "\n"
     }
@@ -282,7 +281,6 @@ impl<R: BufRead> Iterator for Rows<R> {
     }
 }
 
-/// Opens the metrics of a run.
 pub fn open<'a>(place: impl Into<Place<'a>>) -> Result<Rows<BufReader<File>>, RecordError> {
     let place = place.into();
     let file = place.open().map_err(RecordError::read(place.path()))?;
@@ -291,7 +289,6 @@ pub fn open<'a>(place: impl Into<Place<'a>>) -> Result<Rows<BufReader<File>>, Re
 
 /// The result of reading a file of metrics.
 pub(crate) struct Extracted {
-    /// Number of rows.
     pub rows: usize,
     /// Whether an incomplete line follows them. It belongs to a run that is still training or was killed.
     pub is_torn: bool,

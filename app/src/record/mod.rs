@@ -55,38 +55,16 @@ const INPUT_OUTPUT: i32 = 5;
 /// Reason why the files of a run could not be written, read or used.
 #[derive(Debug, thiserror::Error)]
 pub enum RecordError {
-    /// A write failed.
     #[error("{path}: cannot be written: {error}", path = path.escaped())]
-    Write {
-        /// Path of the file or folder.
-        path: PathBuf,
-        /// Error that the system returned.
-        error: io::Error,
-    },
-    /// A read failed.
+    Write { path: PathBuf, error: io::Error },
     #[error("{path}: cannot be read: {error}", path = path.escaped())]
-    Read {
-        /// Path of the file or folder.
-        path: PathBuf,
-        /// Error that the system returned.
-        error: io::Error,
-    },
+    Read { path: PathBuf, error: io::Error },
     /// A file has invalid content.
     #[error("{path}: {reason}", path = path.escaped())]
-    Damaged {
-        /// Path of the file or folder.
-        path: PathBuf,
-        /// Description of the problem.
-        reason: String,
-    },
+    Damaged { path: PathBuf, reason: String },
     /// The file has no policies of the requested trial.
     #[error("{path}: {reason}", path = path.escaped())]
-    NoTrial {
-        /// Path of the file or folder.
-        path: PathBuf,
-        /// Description of the problem.
-        reason: String,
-    },
+    NoTrial { path: PathBuf, reason: String },
     /// The folder already holds a run, which would be overwritten.
     #[error("{} holds a run already", .0.escaped())]
     Exists(PathBuf),
@@ -107,12 +85,7 @@ pub enum RecordError {
     Differs(PathBuf),
     /// The files are intact, but do not fit the request.
     #[error("{message}")]
-    Refused {
-        /// Description of the problem.
-        message: String,
-        /// Advice to the user.
-        remedy: String,
-    },
+    Refused { message: String, remedy: String },
 }
 
 fn started_from(digest: &str) -> String {
@@ -303,48 +276,9 @@ pub(crate) fn load_config(place: Place<'_>) -> Result<Config, ConfigError> {
     Config::parse(&config::read_text(place.open(), &name)?, &name)
 }
 
-/// Keys of later versions with their default values. A config's digest omits these lines, so that runs of earlier
-/// versions can be resumed.
-const DEFAULTS_ADDED_LATER: [&str; 28] = [
-    "[credit]\n",
-    "start_counts = false\n",
-    "removes = []\n",
-    "add_g = false\n",
-    "observers = \"all\"\n",
-    "windows = []\n",
-    "after = []\n",
-    "actions = \"direct\"\n",
-    "sharing = \"none\"\n",
-    "groups = []\n",
-    "led_within = 0\n",
-    "led_by = \"most-seen\"\n",
-    "poi_jitter = 0.0\n",
-    "gain = 1.0\n",
-    "parents = \"all\"\n",
-    "partners = 1\n",
-    "leniency = \"mean\"\n",
-    "hall_of_fame = 0\n",
-    "method = \"tournament\"\n",
-    "search_sigma = 0.3\n",
-    "search_step = 1.0\n",
-    "initial = \"normal\"\n",
-    "initial_scale = 1.0\n",
-    "teams = \"random\"\n",
-    "temperature = 1.0\n",
-    "team_elites = 0\n",
-    "team_g_elites = 0\n",
-    "test_episodes = 0\n",
-];
-
 /// Returns the SHA-256 of the part of a config that affects results.
 pub fn config_digest(config: &Config) -> String {
-    let text = without_checkpoint(config).to_toml();
-    // Tables of classes, POIs and stages follow the sections.
-    let (sections, tables) = text.split_at(text.find("\n[[").unwrap_or(text.len()));
-    let lines = sections.split_inclusive('\n').filter(|line| !DEFAULTS_ADDED_LATER.contains(line));
-    let lines = lines.chain([tables]).collect::<String>();
-    // A section without lines leaves the space before it.
-    hex(&Sha256::digest(lines.replace("\n\n\n", "\n\n")))
+    hex(&Sha256::digest(without_checkpoint(config).to_toml()))
 }
 
 /// Returns the config with the default `[checkpoint]`, because that section may differ between sessions of a run.

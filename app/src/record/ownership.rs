@@ -206,6 +206,11 @@ pub fn publish(
     disk.replace_with(path, None, content, list).map_err(RecordError::write(path))
 }
 
+/// Writes a file made from runs like [`publish`].
+pub fn publish_bytes(disk: &Disk, path: &Path, content: &[u8]) -> Result<(), RecordError> {
+    publish(disk, path, |output| output.write_all(content))
+}
+
 /// Deletes a file made from runs. A file that flotilla did not create, or that has changed, is kept.
 pub fn remove_published(disk: &Disk, path: &Path) -> Result<(), RecordError> {
     match check(disk, [path]) {

@@ -1,6 +1,6 @@
 //! `policies.safetensors`: the policies that a run learned.
 //!
-//! The file has one f32 tensor `weights.N` per trial, `[leaders, policies, parameters]`. The first size is 1 if all
+//! The file has one f32 tensor `weights.N` per trial, `[populations, policies, parameters]`. The first size is 1 if all
 //! leaders share a policy. Each population is sorted with the best policy first. The first policies of all populations
 //! therefore form the champion team of the trial.
 //!
@@ -37,7 +37,6 @@ pub struct Policies {
     pub weights: Vec<f32>,
 }
 
-/// Returns the name of the tensor of a trial.
 fn tensor(trial: usize) -> String {
     format!("weights.{trial}")
 }

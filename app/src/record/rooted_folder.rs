@@ -19,7 +19,6 @@ pub struct RootedFolder {
 pub enum FileKind {
     /// A plain file.
     File,
-    /// A folder.
     Folder,
     /// A symbolic link, whatever its target.
     Link,

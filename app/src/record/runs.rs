@@ -29,23 +29,16 @@ pub enum ReadError {
     /// The folder is not a run.
     #[error("{folder}: not a run directory (it has no {name})", folder = folder.escaped())]
     Foreign {
-        /// The given folder.
         folder: PathBuf,
         /// The missing file that every run has.
         name: &'static str,
     },
     /// The run's config is invalid.
     #[error("{folder}: {error}", folder = folder.escaped())]
-    Config {
-        /// The given folder.
-        folder: PathBuf,
-        /// The error in the config.
-        error: ConfigError,
-    },
+    Config { folder: PathBuf, error: ConfigError },
     /// The folder contains several runs.
     #[error("{folder} holds {what}; name one of the runs in it, as {folder}/{example}", folder = folder.escaped())]
     Collection {
-        /// The given folder.
         folder: PathBuf,
         /// The kind of its contents, such as "a sweep".
         what: &'static str,
@@ -54,20 +47,10 @@ pub enum ReadError {
     },
     /// The run lacks the requested data.
     #[error("{folder}: {reason}", folder = folder.escaped())]
-    Unfinished {
-        /// The given folder.
-        folder: PathBuf,
-        /// The missing data.
-        reason: String,
-    },
+    Unfinished { folder: PathBuf, reason: String },
     /// The run tested no teams.
     #[error("{}: {reason}", folder.escaped())]
-    Untested {
-        /// The run.
-        folder: PathBuf,
-        /// Why.
-        reason: String,
-    },
+    Untested { folder: PathBuf, reason: String },
     /// The run's files cannot be read.
     #[error(transparent)]
     Record(#[from] RecordError),

@@ -31,7 +31,6 @@ compile_error!("safetensors hold little-endian numbers, which are read and writt
 pub struct Tensor<'a> {
     /// Name in the file, such as `weights.0`.
     pub name: String,
-    /// Type of the numbers.
     pub dtype: Dtype,
     /// Shape, in row-major order.
     pub shape: Vec<usize>,
@@ -40,7 +39,6 @@ pub struct Tensor<'a> {
 }
 
 impl<'a> Tensor<'a> {
-    /// Creates a tensor of f32.
     pub fn floats(name: String, shape: Vec<usize>, parts: impl IntoIterator<Item = &'a [f32]>) -> Tensor<'a> {
         Tensor { name, dtype: Dtype::F32, shape, parts: parts.into_iter().map(bytemuck::cast_slice).collect() }
     }
@@ -153,7 +151,6 @@ impl<R: Read + Seek> TensorFile<R> {
         self.metadata(KIND)
     }
 
-    /// Returns the metadata value of a key.
     pub(crate) fn metadata(&self, key: &str) -> Option<&str> {
         self.header.metadata().as_ref()?.get(key).map(String::as_str)
     }
@@ -163,7 +160,6 @@ impl<R: Read + Seek> TensorFile<R> {
         self.header.info(name)
     }
 
-    /// Returns the names of all tensors.
     pub fn names(&self) -> Vec<String> {
         self.header.offset_keys()
     }
@@ -213,7 +209,6 @@ pub(crate) fn newer(place: Place<'_>) -> Option<Option<String>> {
     later.then(|| metadata.get(VERSION).cloned())
 }
 
-/// Opens a file.
 pub fn open<'a>(place: impl Into<Place<'a>>) -> Result<TensorFile<std::fs::File>, RecordError> {
     let place = place.into();
     let file = place.open().map_err(RecordError::read(place.path()))?;

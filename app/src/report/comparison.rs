@@ -1,7 +1,6 @@
 //! Compares arms: the mean of every measure over trials with its 95 % interval, and a test of every pair of arms.
 
 use std::fmt::Write;
-use std::io;
 use std::path::PathBuf;
 
 use serde::Serialize;
@@ -27,7 +26,6 @@ pub struct Cohort {
     pub trials: Vec<Trial>,
 }
 
-/// One trial of a run.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Trial {
     /// The run's seed and the trial's number. Trials of two arms with the same key form a pair.
@@ -164,7 +162,6 @@ pub enum Measure {
     Played {
         /// The largest shift per axis, in world units.
         poi_jitter: f64,
-        /// Number of episodes.
         episodes: u32,
     },
 }
@@ -226,7 +223,6 @@ impl std::fmt::Display for Measure {
     }
 }
 
-/// The result of a comparison.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Comparison {
     /// Settings that all arms of a sweep share, such as "coupling 3". Empty when runs are compared.
@@ -249,14 +245,11 @@ pub struct Named {
     pub name: String,
     /// The directories of the arm's runs, escaped for output.
     pub folders: Vec<String>,
-    /// Number of trials.
     pub trials: usize,
 }
 
-/// The result of one measure.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Measured {
-    /// The measure.
     #[serde(flatten)]
     pub measure: Measure,
     /// Means of the arms, or their medians of generations, `[arms]`.
@@ -285,7 +278,6 @@ pub struct Versus {
     /// difference if a median is infinite. NaN is null in JSON.
     #[serde(flatten)]
     pub difference: Estimate,
-    /// The test of the difference.
     #[serde(flatten)]
     pub test: Tested,
     /// The p value with Holm's correction for the number of pairs.
@@ -521,10 +513,10 @@ pub fn latex(all: &[Comparison], options: &Question) -> String {
 /// Columns of the comparisons as CSV.
 const COLUMNS: &str = "where,measure,generation,reach,arm,other,trials,other_trials,value,low,high,reached,a,p,p_holm";
 
-/// Writes the comparisons as CSV: one row per measure and arm, then one per measure and pair.
-pub fn csv(all: &[Comparison], output: impl io::Write) -> io::Result<()> {
-    let mut table = csv::Writer::from_writer(output);
-    table.write_record(COLUMNS.split(','))?;
+/// Returns the comparisons as CSV: one row per measure and arm, then one per measure and pair.
+pub fn csv(all: &[Comparison]) -> Vec<u8> {
+    let mut table = csv::Writer::from_writer(format!("{COLUMNS}\n").into_bytes());
+    let mut write = |row: &[String]| table.write_record(row).expect("memory takes all rows");
     for Comparison { place, generation: last, arms: named, measures, .. } in all {
         for Measured { measure, arms, pairs } in measures {
             let (generation, reach) = match *measure {
@@ -544,16 +536,16 @@ pub fn csv(all: &[Comparison], output: impl io::Write) -> io::Result<()> {
                 let whose = [name, String::new(), arm.trials.to_string(), String::new()];
                 let reached = reached.map_or(String::new(), |count| count.to_string());
                 let rest = [reached, String::new(), String::new(), String::new()];
-                table.write_record([&place()[..], &whose, &numbers(*mean), &rest].concat())?;
+                write(&[&place()[..], &whose, &numbers(*mean), &rest].concat());
             }
             for Versus { arms, difference, test, p_holm } in pairs {
                 let [one, other] = arms.map(|arm| &named[arm]);
                 let names = [one, other].map(|arm| escape::csv_cell(&arm.name).into_owned());
                 let whose = [names, [one, other].map(|arm| arm.trials.to_string())].concat();
                 let rest = [String::new(), test.a.to_string(), test.p.to_string(), p_holm.to_string()];
-                table.write_record([&place()[..], &whose, &numbers(*difference), &rest].concat())?;
+                write(&[&place()[..], &whose, &numbers(*difference), &rest].concat());
             }
         }
     }
-    table.flush()
+    table.into_inner().expect("memory takes all rows")
 }

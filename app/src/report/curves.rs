@@ -2,7 +2,6 @@
 
 use std::collections::BTreeSet;
 
-use serde::de::IntoDeserializer;
 use serde::{Deserialize, Serialize};
 
 use super::scene::{Anchor, BLACK, COLORS, Color, Fill, GREY, LIGHT, Pen, Scene, WHITE, rounded, text_width};
@@ -29,24 +28,10 @@ pub enum Band {
     Interval,
     /// One standard error on both sides.
     Error,
-    /// No band.
     None,
 }
 
-impl std::fmt::Display for Band {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        self.serialize(f)
-    }
-}
-
-impl std::str::FromStr for Band {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Band, String> {
-        let read = Band::deserialize(text.into_deserializer());
-        read.map_err(|_: serde::de::value::Error| "allowed interval, error or none".into())
-    }
-}
+named_by_serde!(Band, "interval, error or none");
 
 impl Band {
     /// Describes the band, for captions: "mean and 95 % interval".
@@ -180,7 +165,6 @@ pub struct Figure {
     pub y_max: f64,
     /// Whether values are shares of the POIs instead of numbers of POIs.
     pub shares: bool,
-    /// Meaning of the bands.
     pub band: Band,
     /// The digest of the run, if the figure shows a single finished run.
     pub source: Option<String>,

@@ -71,7 +71,6 @@ pub(crate) struct HeatMap {
 }
 
 impl HeatMap {
-    /// Draws the figure.
     pub fn scene(&self) -> Scene {
         const HIGH: f64 = 9.0;
         const NOTE: f64 = 2.0;
@@ -203,14 +202,12 @@ pub(crate) struct Curves {
     pub by: Scale,
     /// Number of panels per row; 0 for as many as fit.
     pub columns: usize,
-    /// Meaning of the bands.
     pub band: Band,
     /// Title of each panel, and its curves, each with the index of its value.
     pub panels: Vec<(String, Vec<(usize, Curve)>)>,
 }
 
 impl Curves {
-    /// Draws the figure.
     pub fn scene(&self) -> Scene {
         const HEIGHT: f64 = 26.0;
         const LEFT: f64 = 14.0;
@@ -303,7 +300,6 @@ pub type Interval = [f64; 3];
 pub struct Dots {
     /// Title above all panels.
     pub title: String,
-    /// Label of the x axis.
     pub x_label: String,
     /// The varied keys, from top to bottom: a label with the key's unvaried value, and its other values.
     pub groups: Vec<(String, Vec<String>)>,
@@ -333,7 +329,6 @@ impl Dots {
         self.panels.iter().map(panel).collect::<Vec<_>>().join(" ")
     }
 
-    /// Draws the figure.
     pub fn scene(&self) -> Scene {
         const HIGH: f64 = 4.0;
         const RADIUS: f64 = 0.75;

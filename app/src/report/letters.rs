@@ -9,7 +9,6 @@ use ttf_parser::{Face, OutlineBuilder};
 /// The font file.
 pub(crate) const FILE: &[u8] = include_bytes!("font/dejavu-sans.ttf");
 
-/// The parsed font.
 pub(crate) static FONT: LazyLock<Face<'static>> =
     LazyLock::new(|| Face::parse(FILE, 0).expect("the embedded font is whole"));
 

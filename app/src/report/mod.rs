@@ -12,6 +12,24 @@
 //! | [`replay`] | episodes of any trial and generation, as a page or a picture |
 //! | [`table`] | text tables, for people and for LaTeX |
 
+/// Implements `Display` and `FromStr` for an enum by the names that serde gives its variants.
+macro_rules! named_by_serde {
+    ($name:ident, $allowed:literal) => {
+        impl std::fmt::Display for $name {
+            fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+                serde::Serialize::serialize(self, f)
+            }
+        }
+        impl std::str::FromStr for $name {
+            type Err = String;
+            fn from_str(text: &str) -> Result<$name, String> {
+                let text = serde::de::IntoDeserializer::into_deserializer(text);
+                $name::deserialize(text).map_err(|_: serde::de::value::Error| concat!("allowed ", $allowed).into())
+            }
+        }
+    };
+}
+
 pub mod comparison;
 pub mod curves;
 pub mod grid;

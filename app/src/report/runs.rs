@@ -3,7 +3,6 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use serde::de::IntoDeserializer;
 use serde::{Deserialize, Serialize};
 
 use super::curves::{Band, Curve, Figure, Panel};
@@ -36,7 +35,6 @@ pub enum TeamKind {
 }
 
 impl TeamKind {
-    /// All kinds.
     pub const ALL: [TeamKind; 4] = [TeamKind::Champion, TeamKind::Best, TeamKind::Mean, TeamKind::Test];
 
     /// Returns the kind's name in pictures.
@@ -71,20 +69,7 @@ impl TeamKind {
     }
 }
 
-impl std::fmt::Display for TeamKind {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        self.serialize(f)
-    }
-}
-
-impl std::str::FromStr for TeamKind {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<TeamKind, String> {
-        let read = TeamKind::deserialize(text.into_deserializer());
-        read.map_err(|_: serde::de::value::Error| "allowed champion, best, mean or test".into())
-    }
-}
+named_by_serde!(TeamKind, "champion, best, mean or test");
 
 /// A run's metrics by generation, as shares of the POIs averaged over trials: G of each [`TeamKind`].
 #[derive(Clone, Debug, Default, PartialEq)]

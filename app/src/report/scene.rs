@@ -55,7 +55,6 @@ pub(crate) const COLORS: [Color; 7] = colors([0x0072b2, 0xd55e00, 0x009e73, 0xcc
 /// The style of a line.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Pen {
-    /// Colour of the line.
     pub color: Color,
     /// Width in millimetres.
     pub width: f64,
@@ -75,7 +74,6 @@ impl Pen {
 /// The fill of an area.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Fill {
-    /// Colour of the area.
     pub color: Color,
     /// Opacity from 0 (invisible) to 1.
     pub opacity: f64,
@@ -144,7 +142,6 @@ pub struct Scene {
     pub width: f64,
     /// Height in millimetres.
     pub height: f64,
-    /// A short title.
     pub title: String,
     /// A description in sentences, with numbers, for readers who cannot see the picture.
     pub description: String,
@@ -165,7 +162,6 @@ pub enum Format {
 }
 
 impl Format {
-    /// All formats.
     pub const ALL: [Format; 3] = [Format::Svg, Format::Png, Format::Pdf];
 
     /// Returns the names of a picture's files, one per format.
@@ -214,7 +210,6 @@ impl Scene {
         svg.contains(&Scene::metadata(source))
     }
 
-    /// Draws a line through points.
     pub fn line(&mut self, points: Vec<[f64; 2]>, pen: Pen) {
         self.marks.push(Mark::Shape { points, closed: false, fill: None, pen: Some(pen) });
     }
@@ -229,7 +224,6 @@ impl Scene {
         self.polygon(vec![[x, y], [x + width, y], [x + width, y + height], [x, y + height]], fill, pen);
     }
 
-    /// Draws a circle.
     pub fn circle(&mut self, center: [f64; 2], radius: f64, fill: Option<Fill>, pen: Option<Pen>) {
         self.marks.push(Mark::Circle { center, radius, fill, pen });
     }
@@ -439,7 +433,7 @@ impl Scene {
         for (kind, name) in Format::ALL.into_iter().zip(Format::names(name)) {
             let path = folder.join(name);
             let content = self.file(kind, PRINT).map_err(RecordError::write(&path))?;
-            ownership::publish(disk, &path, |output| output.write_all(&content))?;
+            ownership::publish_bytes(disk, &path, &content)?;
         }
         Ok(())
     }

@@ -39,7 +39,6 @@ pub enum RunError {
     /// The backend failed. The message also reports whether the earlier generations are saved.
     #[error("{error}\ngeneration {generation} could not be played{}", after(saved))]
     Backend {
-        /// Error of the backend.
         error: BackendError,
         /// Generation that could not be played.
         generation: usize,
@@ -53,10 +52,8 @@ pub enum RunError {
     Memory {
         /// Purpose of the memory.
         what: &'static str,
-        /// Requested bytes.
         bytes: u64,
     },
-    /// The config of a run is invalid.
     #[error(transparent)]
     Config(#[from] ConfigError),
     /// The populations could not be read back from the backend for a checkpoint.
@@ -119,7 +116,6 @@ pub struct Progress<'a> {
     pub rows: &'a [Row],
 }
 
-/// Results of a finished run.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Results {
     /// Rows of the first and the last generation of every trial.
@@ -128,10 +124,8 @@ pub struct Results {
     pub digest: String,
 }
 
-/// How a session ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SessionEnd {
-    /// Every run is finished.
     Finished,
     /// The session was asked to stop, and everything is saved.
     Stopped,

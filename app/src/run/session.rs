@@ -8,7 +8,7 @@ use super::member::{InitialState, Member, Unfinished};
 use super::{MAX_WRITERS, Options, Progress, Results, RunError, SessionEnd, on_threads};
 use crate::record::checkpoint;
 use crate::record::disk::Disk;
-use crate::record::folder::{self, Note, Origin, Run, Start, StartFrom, Status};
+use crate::record::folder::{self, Note, Origin, ProcessorInfo, Run, Start, StartFrom, Status};
 use crate::record::policies::{Init, Policies};
 use flotilla::backend::{BackendError, Machine, OpenBackend};
 use flotilla::config::{Config, ValidConfig};
@@ -255,12 +255,11 @@ impl Session {
 
     /// Records the backend of all unfinished runs.
     fn record_machine(&mut self, (backend, machine): &OpenBackend) {
-        let description = backend.describe();
+        let processor = ProcessorInfo::of(machine, &backend.describe());
         for run in self.members.iter_mut().filter(|member| member.unfinished.is_some()).map(|member| &mut member.run) {
-            let Machine { backend, adapter, driver, adapter_index, adapter_pci, threads } = machine.clone();
+            let (processor, Machine { adapter_index, adapter_pci, .. }) = (processor.clone(), machine.clone());
             let (version, commit) = (flotilla::version::VERSION.into(), flotilla::version::COMMIT.map(String::from));
-            let session = Run { version, commit, description: description.clone(), backend, ..run.clone() };
-            *run = Run { adapter, driver, adapter_index, adapter_pci, threads, ..session };
+            *run = Run { version, commit, processor, adapter_index, adapter_pci, ..run.clone() };
         }
     }
 

@@ -15,9 +15,7 @@ pub struct Twin {
     pub of: PathBuf,
     /// Config of the other run.
     pub of_config: Config,
-    /// Folder of this run.
     pub folder: PathBuf,
-    /// Config of this run.
     pub config: Config,
 }
 

@@ -52,7 +52,6 @@ pub fn places() -> Vec<[i32; 2]> {
 
 /// The start positions of a world.
 pub struct Positions {
-    /// The positions of the leaders.
     pub leaders: Vec<[i32; 2]>,
     /// The positions of the followers, group by group.
     pub followers: Vec<[i32; 2]>,

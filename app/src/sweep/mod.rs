@@ -114,7 +114,6 @@ pub struct Point {
     pub index: usize,
     /// The index of its value on each axis.
     pub values: Vec<usize>,
-    /// The config.
     pub config: ValidConfig,
     /// Notes for the author of the config.
     pub notes: Vec<String>,
@@ -465,7 +464,6 @@ impl Grid {
     }
 }
 
-/// Returns the value of a key in a config.
 fn value_of(config: &Config, key: &str) -> Option<Value> {
     let mut table = Table::try_from(config).ok()?;
     let value = place(&mut table, key)?.clone();

@@ -6,12 +6,10 @@ use flotilla::config::{StageConfig, ValidConfig};
 /// Maximum number of points per batch. Each keeps two files open, and most systems allow a process at least 1024.
 const MAX_BATCH: usize = 400;
 
-/// The progress of the points.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct SweepProgress {
     /// Number of finished points, including those finished earlier.
     pub done: usize,
-    /// Number of points.
     pub points: usize,
     /// Number of unfinished points in the batch.
     pub batch: usize,
@@ -36,7 +34,6 @@ pub fn bytes(config: &ValidConfig) -> usize {
     bytes.try_into().unwrap_or(usize::MAX)
 }
 
-/// Returns the team-steps of a point.
 pub(crate) fn team_steps(config: &ValidConfig) -> u128 {
     let of_stage = |(generations, config): (usize, &StageConfig)| {
         let teams = config.learning.trials * config.max_teams() * config.learning.episodes_per_team;

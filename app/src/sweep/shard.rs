@@ -17,7 +17,6 @@ pub const MAX_SHARDS: usize = 1 << 16;
 pub struct Shard {
     /// The number of this shard, from 1.
     pub index: usize,
-    /// The number of shards.
     pub count: usize,
 }
 

@@ -37,12 +37,10 @@ const TRACED_PAIRS: usize = 1 << 28;
 pub(crate) enum Subject {
     /// The CPU, with an instruction set.
     Cpu(Cpu, Level),
-    /// A GPU.
     Gpu(Box<GpuBackend>),
 }
 
 impl Subject {
-    /// Returns the backend.
     pub fn backend(&mut self) -> &mut dyn Backend {
         match self {
             Subject::Cpu(cpu, _) => cpu,

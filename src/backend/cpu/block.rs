@@ -9,7 +9,6 @@ use super::agent::Agent;
 use super::neighbours::{self, Bounds, Masks, masks};
 use crate::backend::Moment;
 use crate::config::{Combine, ControlKind, Frame, Measure};
-use crate::config_enum::ConstDispatch;
 use crate::kernels::math::{on_lattice, within};
 use crate::kernels::{clamp_to, select, splat};
 use crate::model::class::{Class, ClassLanes};
@@ -218,7 +217,7 @@ impl<S: Simd> Block<S> {
                 if channel.shape.each != 0 {
                     scene.sense_each(observers, inputs);
                 } else if channel.shape.is_in_quadrants() {
-                    Measure::of(channel.shape.measure).dispatch(Quartering { scene, observers, inputs });
+                    scene.sense_measured_quadrants(observers, inputs);
                 } else {
                     scene.sense_sectors(observers, inputs);
                 }
@@ -519,6 +518,28 @@ impl<S: Simd> Scene<'_, S> {
         sense::measured::<S>(self.channel, const { Measure::of(MEASURE) }, value, dx, dy)
     }
 
+    /// Senses by quadrants, compiled once for each measure.
+    #[inline(always)]
+    fn sense_measured_quadrants(&self, observers: Range<usize>, inputs: Inputs<'_, S>) {
+        match Measure::of(self.channel.shape.measure) {
+            Measure::Linear => self.sense_framed::<{ Measure::Linear as u32 }>(observers, inputs),
+            Measure::Inverse => self.sense_framed::<{ Measure::Inverse as u32 }>(observers, inputs),
+            Measure::InverseSquared => self.sense_framed::<{ Measure::InverseSquared as u32 }>(observers, inputs),
+            Measure::Exponential => self.sense_framed::<{ Measure::Exponential as u32 }>(observers, inputs),
+            Measure::Distance => self.sense_framed::<{ Measure::Distance as u32 }>(observers, inputs),
+            Measure::Closeness => self.sense_framed::<{ Measure::Closeness as u32 }>(observers, inputs),
+        }
+    }
+
+    #[inline(always)]
+    fn sense_framed<const MEASURE: u32>(&self, observers: Range<usize>, inputs: Inputs<'_, S>) {
+        match (self.plan.is_plain, self.channel.shape.frame == Frame::Map as u32) {
+            (true, true) => self.sense_quadrants::<MEASURE, true, true>(observers, inputs),
+            (true, false) => self.sense_quadrants::<MEASURE, true, false>(observers, inputs),
+            (false, _) => self.sense_quadrants::<MEASURE, false, false>(observers, inputs),
+        }
+    }
+
     /// Senses by quadrants. `PLAIN` channels count no entities, and sense POIs of value 1 only. `MAP` is for quadrants that
     /// are fixed to the map, which need no rotation. It is a function of its own, so that registers hold its constants.
     fn sense_quadrants<const MEASURE: u32, const PLAIN: bool, const MAP: bool>(
@@ -642,27 +663,6 @@ impl<S: Simd> Scene<'_, S> {
                 sectors.add(channel, measured, offset, heading);
             }
             sectors.write(channel, inputs.of(observer, channel));
-        }
-    }
-}
-
-/// [`Scene::sense_quadrants`] with the measure as a constant.
-struct Quartering<'a, 'b, S: Simd> {
-    scene: Scene<'a, S>,
-    observers: Range<usize>,
-    inputs: Inputs<'b, S>,
-}
-
-impl<S: Simd> ConstDispatch for Quartering<'_, '_, S> {
-    type Output = ();
-
-    #[inline(always)]
-    fn with<const MEASURE: u32>(self) {
-        let Quartering { scene, observers, inputs } = self;
-        match (scene.plan.is_plain, scene.channel.shape.frame == Frame::Map as u32) {
-            (true, true) => scene.sense_quadrants::<MEASURE, true, true>(observers, inputs),
-            (true, false) => scene.sense_quadrants::<MEASURE, true, false>(observers, inputs),
-            (false, _) => scene.sense_quadrants::<MEASURE, false, false>(observers, inputs),
         }
     }
 }

@@ -48,15 +48,11 @@ pub const FITNESSES: [Fitness; 3] = [Fitness::G, Fitness::D, Fitness::Df];
 /// One experiment: a curve of a figure, or a comparison for one.
 #[derive(Clone, Debug)]
 pub struct Experiment {
-    /// The layout.
     pub layout: Layout,
-    /// The paradigm.
     pub paradigm: Paradigm,
     /// Whether policies choose among known behaviours.
     pub selects: bool,
-    /// The fitness.
     pub fitness: Fitness,
-    /// The whole config.
     pub config: Config,
     /// G of the champion, the team of every population's best policy, `[trials][generations + 1]`.
     pub champion: Vec<Vec<f64>>,
@@ -151,7 +147,6 @@ pub fn baseline_configs(arms: &[Experiment]) -> Vec<Config> {
     firsts.map(|arm| arm.config.clone()).collect()
 }
 
-/// All results.
 #[derive(Clone, Copy, Debug)]
 pub struct Evidence<'a> {
     /// The experiments of [`arms()`], with their results.
@@ -347,9 +342,7 @@ pub(crate) struct Summary<'a> {
 /// One curve: the POIs observed by the champion of each generation. For baselines, by the best team so far.
 #[derive(Serialize)]
 pub(crate) struct Trajectory {
-    /// Name of the layout.
     pub layout: &'static str,
-    /// The paradigm.
     pub paradigm: Paradigm,
     /// The name of the baseline, or the fitness.
     pub source: String,

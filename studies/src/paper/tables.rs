@@ -10,14 +10,14 @@ use flotilla_app::report::table::markdown;
 /// search.
 pub fn without_learning(results: Evidence<'_>) -> String {
     let last = results.arms.first().map_or(0, |arm| arm.config.learning.generations).min(END);
-    let population = results.arms.first().map_or(0, |arm| arm.config.learning.population);
-    let teams = population * (last + 1);
+    let each = results.arms.first().map_or(0, |arm| arm.config.learning.team_count());
+    let teams = each * (last + 1);
     let mut sources = vec!["POIs at generation ".to_string() + &last.to_string(), "of".into()];
     sources.extend(SOURCES.map(|source| match source {
         Source::Constant => "best constant speed".into(),
         Source::Actions | Source::Random | Source::Shared => format!("best of {teams} {source}"),
         Source::OpenLoop | Source::HillClimbing => format!("{source}, {teams} teams"),
-        Source::Evolved(_) => format!("{source}: champion (best of {population} teams)"),
+        Source::Evolved(_) => format!("{source}: champion (best of {each} teams)"),
     }));
     let mut rows = vec![sources];
     let mut races = vec![vec![

@@ -31,7 +31,6 @@ const SHARING: (&str, &[&str]) = ("sharing", &["own policies", "one policy"]);
 /// The pairs G − Df, G − Dt and Df − Dt by their index among G, D, Df and Dt.
 const OF_CREDIT: &[[usize; 2]] = &[[0, 2], [0, 3], [2, 3]];
 
-/// All questions.
 pub const QUESTIONS: &[OpenQuestion] = &[
     OpenQuestion {
         letter: 'a',

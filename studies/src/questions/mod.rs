@@ -80,7 +80,6 @@ pub struct Study {
 pub struct Warm {
     /// The name of the arm.
     pub from: &'static str,
-    /// The config to train.
     pub config: Config,
     /// The folder of the run, which may not exist yet.
     pub folder: PathBuf,
@@ -286,7 +285,6 @@ pub fn champions<'a>(place: impl Into<Place<'a>>, config: &Config) -> Result<Vec
     Ok(champions)
 }
 
-/// The results of a study.
 pub struct Answer {
     part: Study,
     rows: Vec<AnswerRow>,
@@ -300,7 +298,6 @@ struct AnswerRow {
 }
 
 impl Answer {
-    /// Returns all comparisons.
     pub(crate) fn comparisons(&self) -> impl Iterator<Item = &Comparison> {
         self.rows.iter().map(|row| &row.comparison)
     }

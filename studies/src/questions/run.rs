@@ -25,27 +25,21 @@ use flotilla_app::sweep::{Sweep, shard};
 /// The page with the results.
 const PAGE: &str = "questions.md";
 
-/// Results of one question.
 #[derive(Clone, Debug, Serialize)]
 pub struct QuestionOutcome {
-    /// The question's letter.
     pub letter: char,
-    /// The question.
     pub title: &'static str,
     /// The comparisons of all its parts.
     pub comparisons: Vec<Comparison>,
 }
 
-/// Results of all questions.
 #[derive(Clone, Debug, Serialize)]
 pub struct Outcome {
-    /// The folder.
     pub folder: String,
     /// The random seed of all experiments.
     pub seed: u64,
     /// The number of trials of each.
     pub trials: usize,
-    /// The questions.
     pub questions: Vec<QuestionOutcome>,
     /// The path of the page with the results.
     pub page: String,
@@ -54,7 +48,6 @@ pub struct Outcome {
     pub text: String,
 }
 
-/// Returns all parts of all questions.
 fn all_parts() -> impl Iterator<Item = &'static Study> {
     QUESTIONS.iter().flat_map(|question| question.parts)
 }
@@ -104,7 +97,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         first.team_count()
     );
     let page = questions::page(&answers, &heading);
-    write(&disk, &out.join(PAGE), Ok(page.clone().into_bytes()))?;
+    ownership::publish_bytes(&disk, &out.join(PAGE), page.as_bytes())?;
     let of = |(question, answers): &(OpenQuestion, Vec<Answer>)| QuestionOutcome {
         letter: question.letter,
         title: question.title,
@@ -211,19 +204,12 @@ fn compare(
             (context.report)(Event::Fraction(1.0, format!("comparing {}", part.name)));
             let answer = part.answer(sweep, out, &mut *backend.0)?;
             answer.scene().publish(disk, out, part.name)?;
-            let mut csv = Vec::new();
             let all: Vec<_> = answer.comparisons().cloned().collect();
-            let path = out.join(format!("{}.csv", part.name));
-            write(disk, &path, comparison::csv(&all, &mut csv).map(|()| csv))?;
+            ownership::publish_bytes(disk, &out.join(format!("{}.csv", part.name)), &comparison::csv(&all))?;
             of_parts.push(answer);
         }
         answers.push((*question, of_parts));
     }
     (context.report)(Event::Pause);
     Ok(answers)
-}
-
-fn write(disk: &Disk, path: &Path, bytes: std::io::Result<Vec<u8>>) -> Result<(), Error> {
-    let bytes = bytes.map_err(RecordError::write(path))?;
-    Ok(ownership::publish(disk, path, |output| output.write_all(&bytes))?)
 }

@@ -28,7 +28,7 @@ pub use paths::{around, collection, owner};
 pub use paths::{holds_run, latest, next_free, other_name};
 pub use resume::{FirstAndLastRows, differences};
 pub(crate) use run::RunSums;
-pub use run::{FileSums, OWN_FITNESS, Origin, Run, Status, now};
+pub use run::{FileSums, OWN_FITNESS, Origin, ProcessorInfo, Run, Status, now};
 
 /// The folder for runs whose folder is not named.
 pub const RUNS: &str = "runs";
@@ -72,9 +72,7 @@ impl StartFrom<'_> {
 
 /// A folder in which this process trains. No other process can, if the file system supports locks.
 pub struct Folder {
-    /// Path of the folder.
     pub path: PathBuf,
-    /// Disk that writes in the folder.
     pub disk: Disk,
     lock: Option<File>,
 }
@@ -90,7 +88,6 @@ pub struct Resumed {
     pub run: Option<Run>,
     /// Results of a finished run, if all its files match their digests. Checkpoints are not searched in that case.
     pub finished: Option<FirstAndLastRows>,
-    /// Notes for the user.
     pub notes: Vec<Note>,
 }
 
@@ -309,7 +306,6 @@ impl Folder {
         self.disk.at(&path).exists().map_err(RecordError::read(&path))
     }
 
-    /// Returns the path of a file in the folder.
     pub fn file(&self, name: &str) -> PathBuf {
         self.path.join(name)
     }

@@ -9,6 +9,7 @@ use std::path::Path;
 use crate::record::disk::Place;
 use crate::record::ownership::{MAX_RUN_BYTES, RUN};
 use crate::record::{RecordError, checkpoint, config_digest, read_text};
+use flotilla::backend::Machine;
 use flotilla::config::Config;
 use flotilla::host;
 
@@ -17,29 +18,21 @@ use flotilla::host;
 pub struct Run {
     /// Version of the program.
     pub version: String,
-    /// Progress of the run.
     pub state: Status,
     /// Name of a run that `flotilla train` started, by default that of its config.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub name: Option<String>,
     /// Random seed in the config.
     pub seed: u64,
-    /// Backend, "cpu" or "gpu".
-    pub backend: String,
-    /// Description of the backend.
-    pub description: String,
-    /// Name of the GPU, if one was used.
-    pub adapter: Option<String>,
-    /// Driver of the GPU.
-    pub driver: Option<String>,
+    /// Processor of the last session.
+    #[serde(flatten)]
+    pub processor: ProcessorInfo,
     /// Index of the GPU in `flotilla devices`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub adapter_index: Option<usize>,
     /// PCI address of the GPU, if its driver reports it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub adapter_pci: Option<String>,
-    /// Number of CPU threads that work.
-    pub threads: usize,
     /// Start of the first session, in UTC.
     pub started: String,
     /// Time of the last write to this file, in UTC.
@@ -71,6 +64,51 @@ pub struct Run {
     pub commit: Option<String>,
 }
 
+/// The processor that episodes were played on.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct ProcessorInfo {
+    /// "cpu" or "gpu".
+    pub backend: String,
+    /// The processor in words.
+    pub description: String,
+    /// Name of the GPU, if one was used.
+    pub adapter: Option<String>,
+    /// Driver of the GPU.
+    pub driver: Option<String>,
+    /// Number of CPU threads that work.
+    pub threads: usize,
+}
+
+impl ProcessorInfo {
+    /// Describes the processor of an open backend.
+    pub fn of(machine: &Machine, description: &str) -> ProcessorInfo {
+        let Machine { backend, adapter, driver, threads, .. } = machine.clone();
+        ProcessorInfo { backend, description: description.into(), adapter, driver, threads }
+    }
+
+    /// Returns the record of a run that this processor trained in one session, which ends now.
+    pub fn record(self, config: &Config, command: &str, started: String) -> Run {
+        Run {
+            version: flotilla::VERSION.into(),
+            processor: self,
+            started,
+            updated: now(),
+            sessions: 1,
+            command: command.into(),
+            commit: flotilla::COMMIT.map(String::from),
+            ..Run::new(config)
+        }
+    }
+
+    /// Adds the fields to a JSON object.
+    pub fn add_to(&self, object: &mut serde_json::Value) {
+        let fields = serde_json::to_value(self).expect("texts and numbers are JSON");
+        for (name, value) in fields.as_object().into_iter().flatten() {
+            object[name] = value.clone();
+        }
+    }
+}
+
 /// Identity of the config that a run was started with. A resumed run keeps it.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Origin {
@@ -81,7 +119,6 @@ pub struct Origin {
 }
 
 impl Origin {
-    /// Returns the origin of a run with this config.
     pub fn of(config: &Config) -> Origin {
         Origin { config: config_digest(config), generations: config.learning.generations }
     }
@@ -116,7 +153,6 @@ pub struct RunSums {
     pub metrics: String,
 }
 
-/// Progress of a run.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Status {
@@ -125,7 +161,6 @@ pub enum Status {
     Running,
     /// The run stopped because of a signal or an error, after an attempt to save its state.
     Stopped,
-    /// The run is finished.
     Done,
     /// The run replaces another one, some of whose files may remain. The files in the folder must not be used.
     Replacing,

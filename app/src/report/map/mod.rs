@@ -104,7 +104,6 @@ pub struct Marker {
     pub place: DVec2,
     /// Heading, a vector of any length except 0. Marks of agents that move freely ignore it.
     pub heading: DVec2,
-    /// The form of the mark.
     pub form: Form,
     /// The leader in whose group the agent is.
     pub group: Option<usize>,
@@ -222,7 +221,6 @@ pub(crate) fn observed_label(world: &World, poi: usize, step: usize) -> String {
 
 /// A team at one moment, to draw.
 pub struct Team {
-    /// Number of leaders.
     pub leaders: usize,
     /// The agents, leaders first.
     pub agents: Vec<Marker>,
@@ -276,7 +274,6 @@ impl Viewport {
         [self.left + x, self.above + self.size()[1] - y]
     }
 
-    /// Draws the team on its map.
     pub fn draw(&self, scene: &mut Scene, team: &Team) {
         scene.rectangle(self.area(), Some(PALE.into()), Some(Pen::new(LIGHT, 0.2)));
         let labels = self.poi_labels(team);

@@ -346,7 +346,7 @@ impl<'a> Episodes<'a> {
     ) -> Episodes<'a> {
         let starts = |episode| {
             let mut starts = Vec::new();
-            let episode = (evolve::Episodes::Training, episode);
+            let episode = (evolve::TRAINING, episode);
             evolve::episode_positions(&config.learning, trial, generation, episode, world, &mut starts);
             starts
         };
@@ -392,7 +392,8 @@ pub fn one(group: &Group<'_>, backend: &mut dyn Backend) -> Result<Replayed, Bac
     credit::assign(&episode.seen, world, &mut owner);
     let mut led = Vec::new();
     credit::find_leading(&episode.sights, world, &mut led);
-    let start = near_at_start(world, group.moved_pois().unwrap_or(&world.pois), &trace);
+    let position = |agent| Vec2::from(trace.moment(0, 0, agent).position);
+    let start = near_at_start(world, group.moved_pois().unwrap_or(&world.pois), position);
     let observed = observed_at(world, &start, &trace.sets);
     let team_g = f64::from(scores.observed) / f64::from(world.total_worth);
     // POIs are drawn where this episode had them.
@@ -417,9 +418,9 @@ pub fn one(group: &Group<'_>, backend: &mut dyn Backend) -> Result<Replayed, Bac
     })
 }
 
-/// Returns the agents near each of some POIs at the start, `[pois][words]`: none where the start does not count. Empty if it
-/// counts nowhere.
-fn near_at_start(world: &World, pois: &[Vec2], trace: &Trace) -> Vec<u32> {
+/// Returns the agents near each of some POIs at the start, `[pois][words]`, from each agent's position: none where the start
+/// does not count. Empty if it counts nowhere.
+pub fn near_at_start(world: &World, pois: &[Vec2], position: impl Fn(usize) -> Vec2) -> Vec<u32> {
     if !world.paths.as_ref().is_some_and(|rule| rule.start_counts) {
         return vec![];
     }
@@ -427,10 +428,7 @@ fn near_at_start(world: &World, pois: &[Vec2], trace: &Trace) -> Vec<u32> {
     let mut start = vec![0; pois.len() * words];
     for (poi, set) in start.chunks_exact_mut(words).enumerate() {
         let is_open = world.rule.window(poi).is_none_or(|window| window == [1, world.constants.steps]);
-        let is_near = |agent: usize| {
-            let offset = Vec2::from(trace.moment(0, 0, agent).position) - pois[poi];
-            offset.length_squared() <= world.radii2[poi]
-        };
+        let is_near = |agent: usize| (position(agent) - pois[poi]).length_squared() <= world.radii2[poi];
         (0..world.agents())
             .filter(|&agent| is_open && is_near(agent))
             .for_each(|agent| set[agent / 32] |= 1 << (agent % 32));
@@ -450,11 +448,22 @@ fn near(world: &World, start: &[u32], sets: &[u32], step: usize, poi: usize) -> 
     world.rule.count(poi, sets[set * words..(set + 1) * words].iter().copied())
 }
 
-/// Returns the step at which each POI is observed, the last one if only that counts, `[pois]`.
+/// Returns the step at which each POI is observed, `[pois]`, see [`as_scored`].
 fn observed_at(world: &World, start: &[u32], sets: &[u32]) -> Vec<Option<usize>> {
+    let first = credit::observed_at(Strided { words: sets, stride: 1, offset: 0 }, world);
+    as_scored(world, first, |step, poi| near(world, start, sets, step, poi))
+}
+
+/// Returns the step at which each POI is observed, `[pois]`, from the first step that observed it: the last step if only that
+/// counts, and 0 if the start counts and suffices. `near` returns the number of observers near a POI at a step, the first or
+/// the last.
+pub fn as_scored(
+    world: &World,
+    mut observed: Vec<Option<usize>>,
+    near: impl Fn(usize, usize) -> u32,
+) -> Vec<Option<usize>> {
     let (pois, steps) = (world.pois.len(), world.steps());
-    let mut observed = credit::observed_at(Strided { words: sets, stride: 1, offset: 0 }, world);
-    let is_enough = |step, poi: usize| near(world, start, sets, step, poi) >= world.coupling[poi];
+    let is_enough = |step, poi: usize| near(step, poi) >= world.coupling[poi];
     let scores = world.paths.iter().flat_map(|rule| &rule.scores);
     for (poi, &(_, when)) in scores.enumerate() {
         if when == When::End {

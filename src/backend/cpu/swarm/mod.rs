@@ -15,7 +15,7 @@ use super::network::Network;
 use super::together::{Observer, Together};
 use super::{Moment, ScoreTable, StepArrays};
 use crate::config::{Combine, ControlKind, Measure};
-use crate::credit::{Episode, Paths, Strided};
+use crate::credit::Episode;
 use crate::kernels::math::on_lattice;
 use crate::kernels::{clamp_to, splat};
 use crate::model::class::{Class, ClassLanes};
@@ -201,14 +201,11 @@ impl<S: Simd> Swarm<S> {
 
     /// Returns the record of the team that was played.
     pub fn episode(&self) -> Episode<'_> {
-        let positions = Strided::contiguous(&self.paths);
-        let paths = (!self.paths.is_empty()).then_some(Paths { positions, pois: &self.pois });
-        Episode {
-            sets: Strided::contiguous(&self.sets),
-            seen: Strided::contiguous(&self.counts),
-            sights: Strided::contiguous(&self.sights),
-            paths,
-        }
+        let (trail, pois) = match self.paths.is_empty() {
+            true => (&self.sights, None),
+            false => (&self.paths, Some(&*self.pois)),
+        };
+        Episode::whole(&self.sets, &self.counts, trail, pois)
     }
 
     /// Computes the inputs of the leaders' policies, channel by channel.
@@ -492,13 +489,14 @@ impl<S: Simd> Swarm<S> {
         }
     }
 
-    /// Records the agents at each POI.
+    /// Records the agents at each POI. A restored team may have played the step before.
     #[inline(always)]
     fn record_poi_sets(&mut self, step: usize) {
         let Swarm { simd, cells, pois, radii2, sets, .. } = self;
         let words = self.world.constants.words as usize;
         let sets = sets[step * pois.len() * words..].chunks_exact_mut(words);
         for ((&at, &radius2), set) in pois.iter().zip(&*radii2).zip(sets) {
+            set.fill(0);
             for cells in &*cells {
                 each_within(
                     *simd,

@@ -5,20 +5,10 @@ use naga::back::spv;
 use naga::proc::{BoundsCheckPolicies, BoundsCheckPolicy};
 use naga::valid::ModuleInfo;
 
-use super::{ShaderError, parse};
+use super::ShaderError;
 
-/// Returns the SPIR-V of all entry points, with every float result decorated `NoContraction`.
-///
-/// `checked` keeps naga's bounds checks, loop bounds, division checks and zeroed workgroup memory.
-///
-/// # Errors
-/// It does not parse, is not valid, or has no SPIR-V.
-pub fn spirv(wgsl: &str, checked: bool) -> Result<Vec<u32>, ShaderError> {
-    let (module, info) = parse(wgsl)?;
-    Ok(decorate(&emit(&module, &info, checked)?))
-}
-
-/// Returns naga's own SPIR-V of a module, which is not yet exact.
+/// Returns naga's own SPIR-V of a module, which is not yet exact. `checked` keeps naga's bounds checks, loop bounds, division
+/// checks and zeroed workgroup memory.
 ///
 /// # Errors
 /// It has no SPIR-V.

@@ -22,7 +22,7 @@ use std::borrow::Cow;
 use naga::valid::{Capabilities, ModuleInfo, ValidationFlags, Validator};
 use naga::{AddressSpace, Module};
 
-pub use contraction::{decorate, emit, spirv, undecorated};
+pub use contraction::{decorate, emit, undecorated};
 pub use guard::{guarded, unguarded};
 pub use operations::inexact_operations;
 

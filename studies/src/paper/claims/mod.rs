@@ -71,12 +71,10 @@ pub struct Finding {
     pub p_holm: Option<f64>,
 }
 
-/// One claim of the paper.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Claim {
     /// The section of the paper.
     pub place: &'static str,
-    /// The layout that the claim is about.
     pub layout: &'static str,
     /// The paper's words.
     pub words: &'static str,

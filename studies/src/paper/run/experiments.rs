@@ -18,7 +18,6 @@ use flotilla_app::run::{self, Session, SessionEnd, Twin};
 /// The experiments of a paper and their folders. Experiments with the same training are trained once. The first of them
 /// is trained, and the others are copies.
 pub(super) struct Experiments {
-    /// All experiments.
     pub(super) all: Vec<Experiment>,
     /// The folder of each experiment.
     pub(super) folders: Vec<PathBuf>,
@@ -40,7 +39,6 @@ impl Experiments {
         self.config_of.iter().position(|&of| of == config).expect("each config is that of an experiment")
     }
 
-    /// Returns the experiments that are copies.
     fn copies(&self) -> impl Iterator<Item = usize> {
         (0..self.all.len()).filter(|&experiment| self.trained(self.config_of[experiment]) != experiment)
     }

@@ -100,14 +100,11 @@ pub(crate) fn check_trials<'a>(configs: impl IntoIterator<Item = &'a Config>) ->
     }
 }
 
-/// A trained experiment.
 #[derive(Clone, Debug, Serialize)]
 pub struct ExperimentOutcome {
     /// The name, which is that of its folder.
     pub name: String,
-    /// The run's folder.
     pub folder: String,
-    /// The layout.
     pub layout: &'static str,
     /// Who learns.
     pub paradigm: Paradigm,
@@ -115,9 +112,7 @@ pub struct ExperimentOutcome {
     pub actions: Actions,
     /// The score that policies are selected by.
     pub fitness: Fitness,
-    /// The number of POIs.
     pub pois: usize,
-    /// The run's digest.
     pub digest: Option<String>,
     /// The mean over trials of G of the last generation's champion.
     pub champion_g: f64,
@@ -144,21 +139,18 @@ impl ExperimentOutcome {
     }
 }
 
-/// The files that were written.
 #[derive(Clone, Debug, Serialize)]
 pub struct Files {
     /// The claims with every figure.
     pub claims: String,
     /// The curves and claims for programs.
     pub summary: String,
-    /// The pictures.
     pub figures: Vec<String>,
 }
 
 /// Results of the paper's experiments.
 #[derive(Clone, Debug, Serialize)]
 pub struct Outcome {
-    /// The folder.
     pub folder: String,
     /// The random seed of all experiments.
     pub seed: u64,
@@ -171,11 +163,9 @@ pub struct Outcome {
     pub processor: ProcessorInfo,
     /// Training time in seconds, including earlier sessions.
     pub seconds: f64,
-    /// The experiments.
     pub arms: Vec<ExperimentOutcome>,
     /// The paper's claims with their verdicts.
     pub claims: Vec<Claim>,
-    /// The files.
     pub files: Files,
     /// The tables for people.
     #[serde(skip)]
@@ -224,8 +214,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     )?;
 
     let found = Evidence { arms: &experiments.all, baselines: &baselines };
-    let publish =
-        |name: &str, content: &[u8]| ownership::publish(&disk, &out.join(name), |file| file.write_all(content));
+    let publish = |name: &str, content: &[u8]| ownership::publish_bytes(&disk, &out.join(name), content);
     for (index, layout) in paper::LAYOUTS.iter().enumerate() {
         let Some(number) = layout.figure else { continue };
         paper::figure(found, index).scene().publish(&disk, out, &format!("figure{number}"))?;
@@ -242,8 +231,8 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
     let seconds = (0..experiments.configs.len()).map(|run| session.run(run).seconds).fold(0.0, f64::max);
     let summary = Summary {
         version: flotilla::version::VERSION,
-        backend: session.run(0).backend.clone(),
-        description: session.run(0).description.clone(),
+        backend: session.run(0).processor.backend.clone(),
+        description: session.run(0).processor.description.clone(),
         seconds,
         seed: learning.seed,
         trials: learning.trials,
@@ -266,7 +255,7 @@ pub fn run(request: &Request, backends: &mut dyn BackendSource, context: Context
         seed: learning.seed,
         trials: learning.trials,
         generations: learning.generations,
-        processor: ProcessorInfo::of_run(session.run(0)),
+        processor: session.run(0).processor.clone(),
         seconds,
         arms: (0..experiments.all.len()).map(outcome).collect(),
         files: Files {
