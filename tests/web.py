@@ -124,10 +124,7 @@ leaders = [[5, 5], [6, 6]]
 followers = [[7, 7], [8, 8]]
 heading = [0.0, 1.0, 2.0, 3.0]
 pois = [[1, 1], [20, 20], [30, 30]]
-after = [[], [0], [1]]
 coupling = 1
-[credit]
-removes = [[0, 2], [1, 3]]
 """
 # The comparison of arms (`found`) is shown last, and moves what is below it.
 DONE = (
@@ -676,18 +673,22 @@ def check_classes(tab, page, native, folder):
     tab.assert_no_errors()
     # Keys that refer to agents and POIs by their numbers still refer to the same ones.
     tab.load(page)
-    tab.drop("numbered.toml", base64(NUMBERED.encode()))
-    tab.wait("page.state.config.world.heading?.length === 4")
+    tab.drop("removes.toml", base64((NUMBERED + "[credit]\nremoves = [[0, 2], [1, 3]]\n").encode()))
+    tab.wait("page.state.valid && page.state.config.world.heading?.length === 4")
     tab.click("[data-mode=arrange]")
     tab.evaluate(choose(["leaders", 0]))
     tab.click("#remove")
     tab.wait("page.state.valid && page.state.config.world.heading.join() === '1,2,3'")
-    tab.evaluate(choose(["pois", 0]))
-    tab.click("#remove")
-    tab.wait("page.state.valid && JSON.stringify(page.state.config.world.after) === '[[],[0]]'")
+    assert tab.evaluate("JSON.stringify(page.state.config.credit.removes)") == "[[0,2]]"
     tab.click("[data-add=leaders]")
     tab.wait("page.state.valid && page.state.config.world.heading.join() === '1,1,2,3'")
     assert tab.evaluate("JSON.stringify(page.state.config.credit.removes)") == "[[0,3]]"
+    tab.drop("after.toml", base64((NUMBERED + "after = [[], [0], [1]]\n").encode()))
+    tab.wait("page.state.valid && page.state.config.world.after?.length === 3")
+    tab.click("[data-mode=arrange]")
+    tab.evaluate(choose(["pois", 0]))
+    tab.click("#remove")
+    tab.wait("page.state.valid && JSON.stringify(page.state.config.world.after) === '[[],[0]]'")
     tab.assert_no_errors()
     # Agents and POIs in regions are shown and counted, and only the others can be rearranged. It trains.
     tab.load(page)
