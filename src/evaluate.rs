@@ -188,17 +188,17 @@ impl Evaluation {
     /// Returns a leader's mean G, D, Df and D++ over episodes.
     pub fn scores(&self, team: usize, leader: usize) -> [f32; 4] {
         let g = self.observed[team].mean() / self.worth;
-        let [d, df, dpp, _] = self.credits(team, leader);
+        let [d, df, dpp, _] = self.mean_credits(team, leader);
         [g, d, df, dpp].map(|score| score as f32)
     }
 
     /// Returns a leader's mean Dt over episodes, if the group was scored by it.
     pub fn dt(&self, team: usize, leader: usize) -> Option<f32> {
-        self.timed.then(|| self.credits(team, leader)[3] as f32)
+        self.timed.then(|| self.mean_credits(team, leader)[3] as f32)
     }
 
     /// Returns a leader's mean credits over the episodes that were played.
-    fn credits(&self, team: usize, leader: usize) -> [f64; 4] {
+    fn mean_credits(&self, team: usize, leader: usize) -> [f64; 4] {
         let played = self.observed[team].count.max(1) as f64;
         self.credits[team * self.leaders + leader].map(|sum| sum / played)
     }

@@ -12,7 +12,7 @@ use crate::backend::{Backend, BackendError, Group};
 use crate::config::{Config, Fitness, Learning, StageConfig, ValidConfig};
 use crate::credit::RecordRequest;
 use crate::evaluate::{SCORES, SCORES_AND_DT};
-use crate::evolve::{self, TRAINING};
+use crate::evolve::{self, TRAINING_EPISODES};
 use crate::sample;
 use crate::trainer::Trainer;
 use crate::world::World;
@@ -84,7 +84,7 @@ impl Teams {
         // With a shared population teams still mix policies, which tests more.
         weights.truncate(config.populations() * policies * world.parameters());
         let (learning, mut places) = (Learning { seed, ..config.learning.clone() }, vec![]);
-        evolve::episode_positions(&learning, 0, 0, (TRAINING, 0), &world, &mut places);
+        evolve::episode_positions(&learning, 0, 0, (TRAINING_EPISODES, 0), &world, &mut places);
         let fitnesses = if sights { SCORES_AND_DT } else { SCORES };
         Teams { policies, weights, choice, places, fitnesses, world }
     }

@@ -18,7 +18,9 @@ use flotilla::config::{
 };
 use flotilla::credit::Credit;
 use flotilla::evaluate::Starts;
-use flotilla::evolve::{self, Key, MAX_WEIGHT, MIN_WEIGHT, Purpose, Selection, TEST, TRAINING, UNCHANGED};
+use flotilla::evolve::{
+    self, Key, MAX_WEIGHT, MIN_WEIGHT, Purpose, Selection, TEST_EPISODES, TRAINING_EPISODES, UNCHANGED,
+};
 use flotilla::sample;
 use flotilla::stepping::{Recording, Stepper};
 use flotilla::trainer::{Row, Trainer};
@@ -288,7 +290,7 @@ coupling = 1
         assert!(seen.insert(places[8..].iter().map(|at| at.to_array().map(f32::to_bits)).collect::<Vec<_>>()));
     };
     for (generation, episode) in (0..100).flat_map(|generation| (0..5).map(move |episode| (generation, episode))) {
-        for purposes in [TRAINING, TEST] {
+        for purposes in [TRAINING_EPISODES, TEST_EPISODES] {
             evolve::episode_positions(&config.learning, 0, generation, (purposes, episode), &world, &mut places);
             add(&places);
         }
@@ -359,8 +361,8 @@ coupling = 1
     };
     for (generation, episode) in (0..20).flat_map(|generation| (0..5).map(move |episode| (generation, episode))) {
         for trial in 0..2 {
-            add(draw(&config.learning, trial, generation, (TRAINING, episode)));
-            add(draw(&config.learning, trial, generation, (TEST, episode)));
+            add(draw(&config.learning, trial, generation, (TRAINING_EPISODES, episode)));
+            add(draw(&config.learning, trial, generation, (TEST_EPISODES, episode)));
         }
     }
     let held_out = Starts::Drawn { episodes: 100, seed: 0, jitter: 0.0, poi_jitter: 0.0 };
@@ -369,7 +371,7 @@ coupling = 1
     assert!(is_within(&[&world.starts[..], &world.pois].concat(), 0.0));
     assert_eq!(Starts::Own.of(0, &world), world.starts);
     let moved = Learning { start_jitter: 0.5, poi_jitter: 0.5, ..config.learning.clone() };
-    let (still, moved) = [&config.learning, &moved].map(|learning| draw(learning, 0, 3, (TRAINING, 1))).into();
+    let (still, moved) = [&config.learning, &moved].map(|learning| draw(learning, 0, 3, (TRAINING_EPISODES, 1))).into();
     assert!(is_within(&moved, 0.5) && still.iter().zip(&moved).all(|(still, moved)| still != moved));
 }
 

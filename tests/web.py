@@ -672,23 +672,22 @@ def check_classes(tab, page, native, folder):
     tab.wait("page.state.valid && page.state.config.world.windows.length === 2")
     tab.assert_no_errors()
     # Keys that refer to agents and POIs by their numbers still refer to the same ones.
-    tab.load(page)
-    tab.drop("removes.toml", base64((NUMBERED + "[credit]\nremoves = [[0, 2], [1, 3]]\n").encode()))
-    tab.wait("page.state.valid && page.state.config.world.heading?.length === 4")
-    tab.click("[data-mode=arrange]")
-    tab.evaluate(choose(["leaders", 0]))
-    tab.click("#remove")
-    tab.wait("page.state.valid && page.state.config.world.heading.join() === '1,2,3'")
+    def remove(text, list_, until):
+        """Opens NUMBERED with more text, removes the first entry of a list from the map, and waits."""
+        tab.load(page)
+        tab.drop("numbered.toml", base64((NUMBERED + text).encode()))
+        tab.wait("page.state.valid && page.state.config.world.heading?.length === 4")
+        tab.click("[data-mode=arrange]")
+        tab.evaluate(choose([list_, 0]))
+        tab.click("#remove")
+        tab.wait(f"page.state.valid && {until}")
+
+    remove("[credit]\nremoves = [[0, 2], [1, 3]]\n", "leaders", "page.state.config.world.heading.join() === '1,2,3'")
     assert tab.evaluate("JSON.stringify(page.state.config.credit.removes)") == "[[0,2]]"
     tab.click("[data-add=leaders]")
     tab.wait("page.state.valid && page.state.config.world.heading.join() === '1,1,2,3'")
     assert tab.evaluate("JSON.stringify(page.state.config.credit.removes)") == "[[0,3]]"
-    tab.drop("after.toml", base64((NUMBERED + "after = [[], [0], [1]]\n").encode()))
-    tab.wait("page.state.valid && page.state.config.world.after?.length === 3")
-    tab.click("[data-mode=arrange]")
-    tab.evaluate(choose(["pois", 0]))
-    tab.click("#remove")
-    tab.wait("page.state.valid && JSON.stringify(page.state.config.world.after) === '[[],[0]]'")
+    remove("after = [[], [0], [1]]\n", "pois", "JSON.stringify(page.state.config.world.after) === '[[],[0]]'")
     tab.assert_no_errors()
     # Agents and POIs in regions are shown and counted, and only the others can be rearranged. It trains.
     tab.load(page)

@@ -96,7 +96,7 @@ fn speeds(free: bool) -> &'static str {
 /// move freely.
 fn described(choosing: Choosing, free: bool, solved: &[usize]) -> String {
     let unit = |index: usize| match choosing {
-        // Agents that move freely have no speed from 0 on, but an action.
+        // With free motion this is a velocity, from -1 to 1.
         Choosing::Moves(Actions::Direct) if free => format!("{:.1}", 2.0 * (index + 1) as f64 / SPEEDS as f64 - 1.0),
         Choosing::Moves(Actions::Direct) => format!("{} %", (index + 1) * 100 / SPEEDS),
         _ => format!("{index}"),

@@ -25,7 +25,7 @@ pub struct Args {
     paradigm: Option<String>,
     #[command(flatten)]
     run: RunOptions,
-    /// Safetensors file with a tensor `weights` or `weights.N`, f32 [leaders, policies, parameters] [default: the
+    /// Safetensors file with a tensor `weights` or `weights.N`, f32 [populations, policies, parameters] [default: the
     /// run's policies.safetensors]
     #[arg(long, value_name = "FILE")]
     policies: Option<PathBuf>,

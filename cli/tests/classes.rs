@@ -175,6 +175,7 @@ senses = [{ of = 'pois' }]
 ";
     let place = Place::new(&[
         ("choose.toml", choosers),
+        ("free.toml", &choosers.replace("control = 'choose:post'\n", "")),
         ("both.toml", &choosers.replacen("[[agents]]", &format!("{walker}[[agents]]"), 1)),
     ]);
     let found = |command: &str| -> serde_json::Value { serde_json::from_str(&place.good(command).0).unwrap() };
@@ -192,6 +193,10 @@ senses = [{ of = 'pois' }]
     let constants = &both["constants"];
     assert_eq!((pois(constants).len(), &pois(constants)[..7]), (20, &[0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0][..]));
     assert!(constants[19]["speed"] == 1.0 && constants[6]["choice"] == 6, "{constants}");
+    // An agent that moves freely has no heading: its constant actions are velocities along y.
+    let (text, _) = place.good("baseline free.toml --seeds 1 --set pois.p.at=[[25,18.5]]");
+    assert!(text.contains("straight ahead, or along y with free motion"), "{text}");
+    assert!(text.contains("A team whose actions are always 0 and 0.3 to 1.0 observes every POI."), "{text}");
     // A policy may have fewer weights than there are behaviours.
     let set = "--set policy.hidden=[] --set policy.actions=behaviours --set agents.post.at=[[10,10]] \
                --set agents.scout.senses=[{of='pois',sectors=1}]";

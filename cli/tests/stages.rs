@@ -603,7 +603,7 @@ fn a_shared_policy_fits_any_number_of_leaders() {
     good("train more.toml --out warm --init run/policies.safetensors");
     good("replay warm --generation 1 --out replay.html");
     let (code, _, stderr) = run(&folder, "train shared.toml --population 3 --out few --init run/policies.safetensors");
-    assert!(code == Some(0) && stderr.contains("8 policies of each leader, of which the first 3 start"), "{stderr}");
+    assert!(code == Some(0) && stderr.contains("8 policies of each leader; only the first 3 are used"), "{stderr}");
     let (code, _, stderr) = run(&folder, "train small.toml --out cold --init run/policies.safetensors");
     let reason = "weights.0 is F32 [1, 8, 57], but the config needs F32 [2, 1 to 1048576, 57]";
     assert!(code == Some(1) && stderr.contains(reason) && stderr.lines().count() == 1, "{stderr}");

@@ -630,7 +630,7 @@ fn a_trace_has_the_inputs_and_outputs_of_leaders() {
 fn held_out_starts_are_never_training_starts() {
     use flotilla::config::Config;
     use flotilla::evaluate::Starts;
-    use flotilla::evolve::{TRAINING, episode_positions};
+    use flotilla::evolve::{TRAINING_EPISODES, episode_positions};
     use flotilla::world::World;
 
     let mut config = Config::parse(SMALL, "small").unwrap();
@@ -652,7 +652,7 @@ fn held_out_starts_are_never_training_starts() {
     for (seed, trial) in (0..4).flat_map(|seed| (0..3).map(move |trial| (seed, trial))) {
         config.learning.seed = seed;
         for (generation, episode) in (0..64).flat_map(|generation| (0..4).map(move |episode| (generation, episode))) {
-            episode_positions(&config.learning, trial, generation, (TRAINING, episode), &world, &mut drawn);
+            episode_positions(&config.learning, trial, generation, (TRAINING_EPISODES, episode), &world, &mut drawn);
             assert!(
                 bits(&drawn).iter().all(|places| !held_out.contains(places)),
                 "seed {seed}, generation {generation}"

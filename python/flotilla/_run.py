@@ -376,7 +376,7 @@ def train(
         resume: continue the run in `out`, or start it if there is none.
         force: overwrite the run in `out`.
         init: initial policies in place of random ones: a `Run`, a `policies.safetensors`, or arrays
-            `[leaders, policies, parameters]`, one for each trial or one for all. Trial i starts from trial i of a run or
+            `[populations, policies, parameters]`, one for each trial or one for all. Trial i starts from trial i of a run or
             file. Larger populations are filled with random policies. A run that starts from policies is kept in `out`,
             or else in a temporary folder that is removed with the `Run`.
         backend: where to play, with the same bits: `"auto"` (a GPU if it is expected to finish first), `"cpu"`,
@@ -454,15 +454,15 @@ def _together(callback: Any) -> list[Callback]:
 
 
 def first_policies(init: Any) -> list[Floats]:
-    """Returns initial policies as one array `[leaders, policies, parameters]` per trial, or one for all."""
+    """Returns initial policies as one array `[populations, policies, parameters]` per trial, or one for all."""
     trials = init if isinstance(init, (list, tuple)) and len(init) and np.ndim(init[0]) == 3 else [init]
     try:
         if np.ndim(init) == 0:
             raise TypeError
-        return [floats("init", trial, "leaders, policies, parameters") for trial in trials]
+        return [floats("init", trial, "populations, policies, parameters") for trial in trials]
     except TypeError:
         kind = type(init).__name__
-        raise TypeError(f"init is {kind}, allowed are a Run, a file of policies, or arrays [leaders, policies, parameters]") from None
+        raise TypeError(f"init is {kind}, allowed are a Run, a file of policies, or arrays [populations, policies, parameters]") from None
 
 
 def init_file(init: Any, config: Config, aside: str) -> str:
@@ -475,12 +475,12 @@ def init_file(init: Any, config: Config, aside: str) -> str:
     trials = int(config["learning.trials"])
     if len(policies) not in (1, trials):
         raise ValueError(f"init has policies of {len(policies)} trials, allowed are {trials}, or one array for all")
-    leaders = config._native.populations
+    populations = config._native.populations
     population = policies[0].shape[1]
-    shape = (leaders, population, config.parameters)
+    shape = (populations, population, config.parameters)
     for trial in policies:
         if trial.shape != shape or population < 2:
-            allowed = f"[leaders, policies, parameters] = [{leaders}, 2 or more, {config.parameters}]"
+            allowed = f"[populations, policies, parameters] = [{populations}, 2 or more, {config.parameters}]"
             raise ValueError(f"init has the shape {list(trial.shape)}, allowed is {allowed}, the same for all trials")
     sizes = {"population": population, "trials": trials, "elites": 1, "team_elites": 0, "team_g_elites": 0}
     sized = config.replace(learning=sizes)

@@ -20,7 +20,7 @@ use crate::backend::cpu::Cpu;
 use crate::backend::{Backend, BackendError, Group, GroupScores};
 use crate::config::{Actions, Config, Learning, ValidConfig};
 use crate::evaluate::Starts;
-use crate::evolve::{self, Key, MIN_WEIGHT, Purpose, TRAINING};
+use crate::evolve::{self, Key, MIN_WEIGHT, Purpose, TRAINING_EPISODES};
 use crate::model::policy::BEHAVIOURS;
 use crate::parallel::*;
 use crate::world::World;
@@ -492,7 +492,7 @@ impl Setting {
     fn start(&mut self, generation: usize) {
         for Trial { index, starts, observed, .. } in &mut self.trials {
             for (episode, starts) in starts.iter_mut().enumerate() {
-                let episode = (TRAINING, episode);
+                let episode = (TRAINING_EPISODES, episode);
                 evolve::episode_positions(&self.config.learning, *index, generation, episode, &self.world, starts);
             }
             observed.clear();
@@ -572,7 +572,7 @@ impl Setting {
                 &self.config.learning,
                 trial.index,
                 generations + 2,
-                (TRAINING, episode),
+                (TRAINING_EPISODES, episode),
                 &self.world,
                 starts,
             );

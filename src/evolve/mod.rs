@@ -18,8 +18,8 @@ pub(crate) use mutation::{Offspring, breed};
 pub(crate) use random::noise;
 pub use random::{Key, Purpose};
 pub use schedule::{
-    TEST, TRAINING, aligned_teams, contemporary_teams, draw_headings, episode_positions, jitter_pois, jitter_starts,
-    order_policies, past_champions,
+    TEST_EPISODES, TRAINING_EPISODES, aligned_teams, contemporary_teams, draw_headings, episode_positions, jitter_pois,
+    jitter_starts, order_policies, past_champions,
 };
 pub use selection::{Selection, UNCHANGED, draw_parents, keep_parents, keep_teams, ranking, top_indices, tournament};
 pub use strategy::{Samples, Strategy};

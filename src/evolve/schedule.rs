@@ -127,9 +127,9 @@ fn shuffle<S: Simd>(simd: S, key: Key, order: &mut [u32]) {
 }
 
 /// The purposes of random starts and POIs in the episodes that all teams play.
-pub const TRAINING: [Purpose; 2] = [Purpose::Starts, Purpose::Pois];
+pub const TRAINING_EPISODES: [Purpose; 2] = [Purpose::Starts, Purpose::Pois];
 /// The purposes of random starts and POIs in the episodes that test the best team.
-pub const TEST: [Purpose; 2] = [Purpose::TestStarts, Purpose::TestPois];
+pub const TEST_EPISODES: [Purpose; 2] = [Purpose::TestStarts, Purpose::TestPois];
 
 /// Writes the positions of one episode of a trial's generation, as [`Group::starts`](crate::backend::Group::starts) has
 /// them: the agents' starts, then the POIs if they move, then headings if any are drawn.

@@ -95,24 +95,13 @@ impl Selection {
 /// Teams are rotations, see [`order_policies`](super::order_policies). With ties to the lowest index, the champions of
 /// all populations would therefore come from one team too often.
 fn champion(key: Key, scores: &[f32]) -> usize {
-    let best = largest(scores);
+    let best = scores.iter().copied().fold(f32::NEG_INFINITY, f32::max);
     if scores.first() == Some(&best) {
         return 0;
     }
     let [word, ..] = key.draw(0);
     let tied = index_below(word, scores.iter().filter(|&&score| score == best).count());
     (0..).zip(scores).filter(|&(_, &score)| score == best).nth(tied).map_or(0, |(policy, _)| policy)
-}
-
-/// Returns the largest score. Lanes are compared side by side, in which the compiler finds vectors.
-fn largest(scores: &[f32]) -> f32 {
-    let larger = |most: f32, score: f32| if score > most { score } else { most };
-    let mut lanes = [f32::NEG_INFINITY; 32];
-    let (chunks, rest) = scores.as_chunks::<32>();
-    for chunk in chunks {
-        lanes.iter_mut().zip(chunk).for_each(|(most, &score)| *most = larger(*most, score));
-    }
-    lanes.iter().chain(rest).copied().fold(f32::NEG_INFINITY, larger)
 }
 
 /// Returns the policies of a population that has played, best first: the elites, then the others by score, ties to the

@@ -79,7 +79,7 @@ impl Coevolution {
         if first.len() > 1 && first.len() != trials {
             return Err(Failure::Trials { found: first.len(), trials });
         }
-        let flushed = |weights: &Vec<f32>| {
+        let checked = |weights: &Vec<f32>| {
             let mut weights = weights.clone();
             if weights.is_empty() || Some(weights.len()) != (leaders * parameters).checked_mul(policies) {
                 return Err(Failure::Weights { found: weights.len(), leaders, teams: policies, parameters });
@@ -90,9 +90,9 @@ impl Coevolution {
             }
             Ok(weights)
         };
-        first.iter().try_for_each(|weights| flushed(weights).map(drop))?;
+        let first = first.iter().map(checked).collect::<Result<Vec<_>, _>>()?;
         for (trial, weights) in (0..trials).zip(first.iter().cycle()) {
-            if !self.trainer.start_from(0, trial, policies, &flushed(weights)?) {
+            if !self.trainer.start_from(0, trial, policies, weights) {
                 unreachable!("the weights are as many as the config takes");
             }
         }

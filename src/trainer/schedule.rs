@@ -8,7 +8,7 @@ use glam::Vec2;
 
 use super::stages::{Stage, Stages};
 use crate::config::population_count;
-use crate::evolve::{self, TEST, TRAINING};
+use crate::evolve::{self, TEST_EPISODES, TRAINING_EPISODES};
 use crate::parallel::*;
 
 /// Minimum number of policies per rayon task for cheap work. Fewer are finished before another thread wakes up.
@@ -69,11 +69,11 @@ impl TeamSchedule {
                 evolve::episode_positions(learning, trial, generation, (purposes, episode), world, starts);
             }
         };
-        let learning = |stage: &Stage| stage.config.learning.episodes_per_team;
-        draw_starts(stage, TRAINING, learning(stage), &mut self.starts);
-        draw_starts(stage, TEST, stage.config.learning.test_episodes, &mut self.test_starts);
+        let count = |stage: &Stage| stage.config.learning.episodes_per_team;
+        draw_starts(stage, TRAINING_EPISODES, count(stage), &mut self.starts);
+        draw_starts(stage, TEST_EPISODES, stage.config.learning.test_episodes, &mut self.test_starts);
         match stages.ending_before(generation) {
-            Some(stage) => draw_starts(stage, TRAINING, learning(stage), &mut self.previous_stage_starts),
+            Some(stage) => draw_starts(stage, TRAINING_EPISODES, count(stage), &mut self.previous_stage_starts),
             None => self.previous_stage_starts.clear(),
         }
     }

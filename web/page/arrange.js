@@ -164,7 +164,7 @@ const fitted = (list, at, by, value) => by > 0 ? list.toSpliced(at, 0, value) : 
 const renumbered = (lists, at, by) => lists.map(list => list.filter(index => by > 0 || index !== at).map(index => index >= at ? index + by : index));
 
 /**
- * Returns the keys that have a value per place, or refer to places by their numbers, as they have to be changed.
+ * Returns the new values of the keys that have a value per place or refer to places by their numbers.
  * @param {Fit} fit @returns {[string, unknown[]][]}
  */
 function fitted_keys({ group: { list, table, own, places }, at, by }) {
@@ -175,10 +175,11 @@ function fitted_keys({ group: { list, table, own, places }, at, by }) {
     .map(([key, value]) => [`${table}.${key}`, fitted(value, at, by, value.at(-1))]);
   if (is_poi) return whole && world.after.length ? [...keys, ["world.after", fitted(renumbered(world.after, at, by), at, by, [])]] : keys;
   // Agents that learn have the first numbers.
-  const before = all.filter((group, place) => group.list === list ? place < all.findIndex(other => other.table === table && other.list === list) : group.list === "leaders" && list === "followers");
-  const agent = at + before.reduce((sum, { size }) => sum + size, 0), is_within = (/** @type {unknown[]} */ list) => agent < list.length + (by > 0 ? 1 : 0);
-  const { heading } = world;
-  if (whole && Array.isArray(heading) && is_within(heading)) keys.push(["world.heading", fitted(heading, agent, by, heading[agent - 1])]);
+  const ordered = ["leaders", "followers"].flatMap(of => all.filter(group => group.list === of));
+  const before = ordered.slice(0, ordered.findIndex(group => group.table === table && group.list === list));
+  const agent = at + before.reduce((sum, { size }) => sum + size, 0), { heading } = world;
+  // There may be a heading for each leader only.
+  if (whole && Array.isArray(heading) && agent < heading.length + (by > 0 ? 1 : 0)) keys.push(["world.heading", fitted(heading, agent, by, heading[agent - 1])]);
   if (removes.length) {
     const others = renumbered(removes, agent, by), learns = list === "leaders" || paradigm === "all-leaders";
     keys.push(["credit.removes", learns && removes.length > 1 ? fitted(others, agent, by, [agent]) : others]);

@@ -43,8 +43,8 @@ pub fn floats(bytes: &[u8]) -> Vec<f32> {
 }
 
 /// Returns a config as TOML and as JSON, with its number of POIs (null if stages or the values of POIs differ, because G
-/// does not count POIs then), parameters per policy, and start. The start also has
-/// the notes, and whether any class learns by the config's own fitness.
+/// does not count POIs then), parameters per policy, and start. With the start come the notes, and whether any class learns
+/// by the config's own fitness.
 pub fn described(config: &ValidConfig) -> Value {
     let (toml, pois, parameters) = (config.to_toml(), config.pois(), config.parameters());
     let mut words = json!({ "toml": toml, "config": **config, "pois": pois, "parameters": parameters });

@@ -175,7 +175,7 @@ pub fn run(
     let most = init.iter().flat_map(|init| &init.trials).map(|trial| trial.policies).max().unwrap_or(0);
     if most > config.learning.population {
         context.note(format_args!(
-            "note: --init has {most} policies of each leader, of which the first {} start",
+            "note: --init has {most} policies of each leader; only the first {} are used, as learning.population says",
             config.learning.population
         ));
     }

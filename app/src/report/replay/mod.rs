@@ -346,7 +346,7 @@ impl<'a> Episodes<'a> {
     ) -> Episodes<'a> {
         let starts = |episode| {
             let mut starts = Vec::new();
-            let episode = (evolve::TRAINING, episode);
+            let episode = (evolve::TRAINING_EPISODES, episode);
             evolve::episode_positions(&config.learning, trial, generation, episode, world, &mut starts);
             starts
         };
@@ -418,8 +418,8 @@ pub fn one(group: &Group<'_>, backend: &mut dyn Backend) -> Result<Replayed, Bac
     })
 }
 
-/// Returns the agents near each of some POIs at the start, `[pois][words]`, from each agent's position: none where the start
-/// does not count. Empty if it counts nowhere.
+/// Returns the agents near each POI at the start, `[pois][words]`. Where the start does not count there are none, and if it
+/// counts nowhere the result is empty. `position` returns where an agent starts.
 pub fn near_at_start(world: &World, pois: &[Vec2], position: impl Fn(usize) -> Vec2) -> Vec<u32> {
     if !world.paths.as_ref().is_some_and(|rule| rule.start_counts) {
         return vec![];
@@ -454,9 +454,9 @@ fn observed_at(world: &World, start: &[u32], sets: &[u32]) -> Vec<Option<usize>>
     as_scored(world, first, |step, poi| near(world, start, sets, step, poi))
 }
 
-/// Returns the step at which each POI is observed, `[pois]`, from the first step that observed it: the last step if only that
-/// counts, and 0 if the start counts and suffices. `near` returns the number of observers near a POI at a step, the first or
-/// the last.
+/// Returns the step at which each POI is observed, `[pois]`. `observed` has the first step with enough observers. If only the
+/// last step counts, that is replaced by the last step or `None`; if the start counts and has enough, by 0. `near` returns
+/// the number of observers near a POI at step 0 or at the last.
 pub fn as_scored(
     world: &World,
     mut observed: Vec<Option<usize>>,

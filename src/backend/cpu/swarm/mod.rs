@@ -489,7 +489,7 @@ impl<S: Simd> Swarm<S> {
         }
     }
 
-    /// Records the agents at each POI. A restored team may have played the step before.
+    /// Records the agents at each POI after a step. A restored team may play the step again.
     #[inline(always)]
     fn record_poi_sets(&mut self, step: usize) {
         let Swarm { simd, cells, pois, radii2, sets, .. } = self;
