@@ -11,20 +11,15 @@
 // The host prepends:
 //   INPUTS           room for the inputs of a policy
 //   MOMENT_WORDS     words of a moment
-//   ALIGNS           whether any rule aligns headings
-//   PURSUES          whether agents of any class move straight to others
-//   CONFINES         whether agents of any class cannot leave a part of the map, or move only near others
-//   GONE             whether any POI is gone once an observer has come near
 //   TRACE            whether every stage of every step is recorded
-//   SIGHTINGS        whether the leaders that each follower sees at each step are recorded
 //   COUNTED_LEADERS  leaders that a follower counts in registers, not in the record; at least 1
-//   shape            the sizes
+//   shape            the sizes, and what the world uses
 //   class_shape      the shape of a class
 //   sense_all        what an agent senses
 //   obey_all         the force of a rule's terms
 //   decide           a leader's policy
 
-// Sizes that are constant in a kernel, or for a task.
+// What is constant in a kernel, or for a task.
 struct Shape {
     leaders: u32,
     agents: u32,
@@ -35,12 +30,24 @@ struct Shape {
     inputs: u32,
     // Teams per workgroup. A task may have fewer.
     teams: u32,
+    // Whether any rule aligns headings.
+    aligns: bool,
+    // Whether agents of any class may move straight to others, or only near others.
+    pursues: bool,
+    // Whether agents of any class may be unable to leave a part of the map.
+    confines: bool,
+    // Whether any POI is gone once an observer has come near.
+    gone: bool,
+    // Whether the leaders that each follower sees at each step are recorded.
+    sightings: bool,
 }
 
 // The task's world, and the class of the agent that the thread plays.
 var<private> world: Constants;
 var<private> own: ClassConstants;
 var<private> own_class: u32;
+// The steps of the episode so far, with the one that the thread plays.
+var<private> moment: u32;
 
 // What one thread plays: an agent of a team, its state, and its wanted course.
 struct Agent {
@@ -59,10 +66,6 @@ struct Agent {
     next: Steering,
     // The number of steps at which it saw each leader.
     counts: array<u32, COUNTED_LEADERS>,
-    // For the trace: a leader's inputs and outputs, or a follower's force.
-    inputs: array<f32, INPUTS>,
-    outputs: vec2<f32>,
-    force: vec2<f32>,
 }
 
 // Returns the numbers of a channel.
@@ -298,10 +301,10 @@ fn answer(task: Task, first: u32, inputs: array<f32, INPUTS>, me: ptr<function, 
     let start = task.weights + (*me).agent * task.teams + (*me).team;
     let outputs = decide(start, shape.leaders * task.teams, inputs);
     if TRACE {
-        (*me).inputs = inputs;
-        (*me).outputs = outputs;
+        trace_action(task, outputs, vec2(0.0), me);
+        trace_inputs(task, inputs, me);
     }
-    if PURSUES && own.control == CONTROLKIND_CHOOSE {
+    if shape.pursues && own.control == CONTROLKIND_CHOOSE {
         let to = chosen(first, outputs.x, me);
         obey(towards(to.x, to.y), me);
         return;
@@ -320,7 +323,7 @@ fn pull_of(class_number: u32, index: u32) -> Pull {
     return Pull((*term).inner2, (*term).outer2, (*term).scale);
 }
 
-// Returns the index of an agent's state before a step. If ALIGNS, there are two of each, which alternate as positions do.
+// Returns the index of an agent's state before a step. If rules align headings, there are two of each, which alternate as positions do.
 fn state_of(task: Task, second: bool, team: u32, agent: u32) -> u32 {
     return task.states + (select(0u, task.teams, second) + team) * shape.agents + agent;
 }
@@ -346,7 +349,7 @@ fn obey_terms(
         if range.x == range.y {
             break;
         }
-        obey_agents(task, first, ALIGNS && term.aligns != 0u, range, one, two, me, &sums);
+        obey_agents(task, first, shape.aligns && term.aligns != 0u, range, one, two, me, &sums);
     }
     add_term(one, sums[0], force);
     if pair {
@@ -368,10 +371,13 @@ fn influence_of(leader: u32, class_number: u32) -> f32 {
 fn follow(task: Task, first: u32, me: ptr<function, Agent>) {
     count_leaders(task, first, me);
     if own.control == CONTROLKIND_STILL {
+        if TRACE {
+            trace_action(task, vec2(0.0), vec2(0.0), me);
+        }
         return;
     }
     var force: SteeringForce;
-    if PURSUES && own.control == CONTROLKIND_NEAREST {
+    if shape.pursues && own.control == CONTROLKIND_NEAREST {
         let to = nearest(first, own.first_target, own.end_target, own.reach2, me);
         force = towards(to.dx, to.dy);
     } else {
@@ -380,7 +386,7 @@ fn follow(task: Task, first: u32, me: ptr<function, Agent>) {
         force = with_walls(terms, (*me).x, (*me).y);
     }
     if TRACE {
-        (*me).force = vec2(force.x, force.y);
+        trace_action(task, vec2(0.0), vec2(force.x, force.y), me);
     }
     obey(force, me);
 }
@@ -401,7 +407,7 @@ fn move_agent(first: u32, me: ptr<function, Agent>) {
     if own.control == CONTROLKIND_STILL {
         return;
     }
-    if CONFINES && own.end_near > 0u {
+    if shape.pursues && own.end_near > 0u {
         if !nearest(first, own.first_near, own.end_near, own.near2, me).found {
             return;
         }
@@ -431,25 +437,47 @@ fn class_of(agent: u32) -> u32 {
     return index;
 }
 
-fn trace(task: Task, step: u32, me: ptr<function, Agent>) {
-    let row = step * task.teams + (*me).team;
-    let moment = task.traced + (row * shape.agents + (*me).agent) * MOMENT_WORDS;
-    traced[moment] = (*me).outputs.x;
-    traced[moment + 1u] = (*me).outputs.y;
-    traced[moment + 2u] = (*me).force.x;
-    traced[moment + 3u] = (*me).force.y;
-    traced[moment + 4u] = (*me).x;
-    traced[moment + 5u] = (*me).y;
-    traced[moment + 6u] = (*me).hx;
-    traced[moment + 7u] = (*me).hy;
-    traced[moment + 8u] = (*me).speed;
-    if (*me).agent < shape.leaders {
-        let moments = (world.steps + 1u) * task.teams * shape.agents * MOMENT_WORDS;
-        let first = task.traced + moments + (row * shape.leaders + (*me).agent) * shape.inputs;
-        for (var input = 0u; input < shape.inputs; input++) {
-            traced[first + input] = (*me).inputs[input];
-        }
+// Returns the index in the trace of an agent's moment.
+fn traced_moment(task: Task, me: ptr<function, Agent>) -> u32 {
+    return task.traced + ((moment * task.teams + (*me).team) * shape.agents + (*me).agent) * MOMENT_WORDS;
+}
+
+// Traces a leader's outputs, or a follower's force.
+fn trace_action(task: Task, outputs: vec2<f32>, force: vec2<f32>, me: ptr<function, Agent>) {
+    let at = traced_moment(task, me);
+    traced[at] = outputs.x;
+    traced[at + 1u] = outputs.y;
+    traced[at + 2u] = force.x;
+    traced[at + 3u] = force.y;
+}
+
+// Traces what a leader senses.
+fn trace_inputs(task: Task, inputs: array<f32, INPUTS>, me: ptr<function, Agent>) {
+    var sensed = inputs;
+    let moments = (world.steps + 1u) * task.teams * shape.agents * MOMENT_WORDS;
+    let row = (moment * task.teams + (*me).team) * shape.leaders + (*me).agent;
+    for (var input = 0u; input < shape.inputs; input++) {
+        traced[task.traced + moments + row * shape.inputs + input] = sensed[input];
     }
+}
+
+// Traces the agent's state.
+fn trace_state(task: Task, me: ptr<function, Agent>) {
+    let at = traced_moment(task, me);
+    traced[at + 4u] = (*me).x;
+    traced[at + 5u] = (*me).y;
+    traced[at + 6u] = (*me).hx;
+    traced[at + 7u] = (*me).hy;
+    traced[at + 8u] = (*me).speed;
+}
+
+// Traces the agent at its start.
+fn trace_start(task: Task, me: ptr<function, Agent>) {
+    trace_action(task, vec2(0.0), vec2(0.0), me);
+    if (*me).agent < shape.leaders {
+        trace_inputs(task, array<f32, INPUTS>(), me);
+    }
+    trace_state(task, me);
 }
 
 // Loads the class of the agent that the thread plays next.

@@ -9,6 +9,8 @@
 //   ROLE          each class starts at a multiple of this many threads
 //   SLOTS         agents per thread, played one after another
 //   SHARED        agents of a workgroup's teams
+//   MAY_ALIGN     whether rules may align headings, which agents share through storage
+//   MAY_BE_GONE   whether POIs may be gone, which agents find together
 //   COUNTS_IN_REGISTERS
 //                 whether a follower counts the leaders it sees in registers
 //   set_shape     sets the sizes for a task
@@ -85,7 +87,7 @@ fn sense_agents(
 
 // Shares an agent's heading with those that align with it.
 fn share_heading(task: Task, second: bool, me: ptr<function, Agent>) {
-    if ALIGNS {
+    if shape.aligns {
         states[state_of(task, second, (*me).team, (*me).agent)] = current_state(me);
     }
 }
@@ -195,7 +197,7 @@ fn find_gone(task: Task, step: u32, now: u32, thread: u32) {
 
 // Reports whether a POI is gone.
 fn is_gone(task: Task, team: u32, poi: u32) -> bool {
-    return GONE && record[gone_word(task, team, poi)] != 0u;
+    return shape.gone && record[gone_word(task, team, poi)] != 0u;
 }
 
 // Counts the leaders that a follower sees. Its team's positions start at `first`.
@@ -218,7 +220,7 @@ fn begin(task: Task, me: ptr<function, Agent>) {
         record[sight(task, me, leader)] = 0u;
     }
     if TRACE {
-        trace(task, 0u, me);
+        trace_start(task, me);
     }
 }
 
@@ -264,7 +266,7 @@ fn episode(
         }
         agents[slot] = me;
     }
-    if ALIGNS {
+    if MAY_ALIGN {
         storageBarrier();
     }
     workgroupBarrier();
@@ -272,28 +274,31 @@ fn episode(
     var now = 0u;
     for (var step = task.first; step < task.end; step++) {
         let next = SHARED - now;
-        if SIGHTINGS {
+        if shape.sightings {
             record_sightings(task, step, now, thread);
         }
-        if GONE {
-            find_gone(task, step, now, thread);
+        if MAY_BE_GONE {
+            if shape.gone {
+                find_gone(task, step, now, thread);
+            }
             storageBarrier();
             workgroupBarrier();
         }
         for (var slot = 0u; slot < SLOTS; slot++) {
             var me = agents[slot];
             if me.plays {
+                moment = step + 1u;
                 act(task, now + me.team, &me);
                 positions[next + me.index] = vec2(me.x, me.y);
                 share_heading(task, next > 0u, &me);
                 if TRACE {
-                    trace(task, step + 1u, &me);
+                    trace_state(task, &me);
                 }
             }
             agents[slot] = me;
         }
         // The next step replaces headings, and which POIs are gone.
-        if ALIGNS || GONE {
+        if MAY_ALIGN || MAY_BE_GONE {
             storageBarrier();
         }
         workgroupBarrier();

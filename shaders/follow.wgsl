@@ -1,6 +1,6 @@
 // The rule of agents that do not learn: a force from other agents and walls (paper, Section 4.1, Figure 2b).
 //
-// Uses: lib/math.wgsl, motion.wgsl (rotate, limits), agent.wgsl (own, CONFINES), and from src/model: TINY.
+// Uses: lib/math.wgsl, motion.wgsl (rotate, limits), generic.wgsl (shape), agent.wgsl (own), and from src/model: TINY.
 
 // The sum over the agents that count for a term, in lattice distances, and their number.
 struct Sum {
@@ -58,7 +58,7 @@ fn walls(at: f32, near: f32, end: f32) -> vec2<f32> {
 // Adds the walls' push at a position to the force of all terms.
 fn with_walls(terms: SteeringForce, x: f32, y: f32) -> SteeringForce {
     var near = vec2(own.wall_radius);
-    if CONFINES {
+    if shape.confines {
         near = vec2(own.near_x, own.near_y);
     }
     let bounds = limits();

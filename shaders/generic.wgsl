@@ -1,16 +1,22 @@
 // The sizes and the classes of a task's world, which are constants in specialised kernels.
 //
-// Uses: lib/layout.wgsl (weights, classes), policy.wgsl, follow.wgsl, agent.wgsl (world, own, Shape, Agent).
+// Uses: lib/layout.wgsl (weights, classes), policy.wgsl, follow.wgsl, pursue.wgsl, agent.wgsl (world, own, Shape, Agent).
 //
 // The host prepends:
-//   CHOOSES        whether outputs choose a behaviour
+//   MAY_PURSUE     whether agents may move straight to others, or only near others; those of large teams do not
 //   shape_of       the shape of a class, channel_of of a channel, term_of of a term
 
 var<private> shape: Shape;
 
 fn set_shape(task: Task) {
     let agents = world.leaders + world.followers;
-    shape = Shape(world.leaders, agents, world.pois, world.words, world.class_count, world.widths[0], task.teams);
+    // Sightings come between the counts and the words of POIs.
+    let gone_words = select(0u, world.pois * task.teams, world.gone != 0u);
+    let sightings = task.status - gone_words > task.counts + world.followers * world.leaders * task.teams;
+    shape = Shape(
+        world.leaders, agents, world.pois, world.words, world.class_count, world.widths[0], task.teams,
+        world.aligns != 0u, MAY_PURSUE, true, world.gone != 0u, sightings,
+    );
 }
 
 // Returns the shape of a class.
@@ -61,34 +67,47 @@ fn same_term(a: TermShape, b: TermShape) -> bool {
 
 // Computes a leader's outputs: layer by layer, each unit's bias plus its weighted inputs in order.
 fn decide(start: u32, stride: u32, sensed: array<f32, INPUTS>) -> vec2<f32> {
-    // There is room for every layer.
-    var inputs = sensed;
+    // The values of two layers, which change places. There is room for every layer.
+    var sensed_inputs = sensed;
+    var values: array<f32, 2u * INPUTS>;
+    for (var input = 0u; input < world.widths[0]; input++) {
+        values[input] = sensed_inputs[input];
+    }
+    var last = 0u;
     var first = 0u;
     for (var layer = 0u; layer < world.layers; layer++) {
         let rows = world.widths[layer];
         let columns = world.widths[layer + 1u];
-        var units: array<f32, INPUTS>;
+        let next = INPUTS - last;
         for (var column = 0u; column < columns; column++) {
             var index = first + column;
             var sum = weight(start, stride, index + rows * columns);
             for (var row = 0u; row < rows; row++) {
-                sum += inputs[row] * weight(start, stride, index);
+                sum += values[last + row] * weight(start, stride, index);
                 index += columns;
             }
-            units[column] = activate(sum);
+            values[next + column] = activate(sum);
         }
-        inputs = units;
+        last = next;
         first += (rows + 1u) * columns;
     }
-    if PURSUES && own.control == CONTROLKIND_CHOOSE {
-        return choose_agent(inputs);
+    if shape.pursues && own.control == CONTROLKIND_CHOOSE {
+        var choices: array<f32, CHOICES>;
+        for (var index = 0u; index <= own.end_target - own.first_target; index++) {
+            choices[index] = values[last + index];
+        }
+        return choose_agent(choices);
     }
-    if CHOOSES {
+    if world.actions == ACTIONS_BEHAVIOURS {
         let pois = vec4(sensed[0], sensed[1], sensed[2], sensed[3]);
         let agents = vec4(sensed[4], sensed[5], sensed[6], sensed[7]);
-        return choose(pois, agents, array(inputs[0], inputs[1], inputs[2], inputs[3], inputs[4]));
+        var wanted: array<f32, BEHAVIOURS>;
+        for (var index = 0u; index < BEHAVIOURS; index++) {
+            wanted[index] = values[last + index];
+        }
+        return choose(pois, agents, wanted);
     }
-    return vec2(inputs[0], inputs[1]);
+    return vec2(values[last], values[last + 1u]);
 }
 
 // Returns one of a policy's weights.

@@ -1,6 +1,6 @@
 // Motion: a proportional controller, limited in turn, acceleration and speed (paper, Section 3.1).
 //
-// Uses: lib/math.wgsl, agent.wgsl (world, own, CONFINES), and from src/model: TINY, GRID, INVERSE_GRID.
+// Uses: lib/math.wgsl, generic.wgsl (shape), agent.wgsl (world, own), and from src/model: TINY, GRID, INVERSE_GRID.
 
 // Rotates a heading to the left, by the angle of this cosine and sine.
 fn rotate(hx: f32, hy: f32, cosine: f32, sine: f32) -> vec2<f32> {
@@ -34,7 +34,7 @@ fn advance(at: f32, step: f32, heading: f32, low: f32, high: f32) -> f32 {
 
 // Returns the limits of an agent's coordinates: the lower ones, then the upper ones.
 fn limits() -> vec4<f32> {
-    if CONFINES {
+    if shape.confines {
         return vec4(own.low_x, own.low_y, own.high_x, own.high_y);
     }
     return vec4(0.0, 0.0, world.map_x, world.map_y);

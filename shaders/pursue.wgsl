@@ -1,5 +1,5 @@
-// Pursuit: moving straight to an agent, the nearest of a class or the one that a policy chooses. Used only if PURSUES or
-// CONFINES.
+// Pursuit: moving straight to an agent, the nearest of a class or the one that a policy chooses. Used only if
+// `shape.pursues`.
 //
 // Uses: lib/math.wgsl, follow.wgsl, agent.wgsl (own, Agent), episode.wgsl (position_of), and from src/model: TINY.
 //

@@ -43,12 +43,13 @@ fn load_task(index: u32) -> Task {
     let task = tasks[index];
     world = worlds[task.world];
     set_shape(task);
+    moment = task.first + 1u;
     return task;
 }
 
 // Returns the grid of a class. Grids come after the last numbers of POIs.
 fn grid_of(task: Task, class_number: u32) -> Grid {
-    let at = task.pois + select(2u, 3u, GONE) * shape.pois + shape.agents + 2u * class_number;
+    let at = task.pois + select(2u, 3u, shape.gone) * shape.pois + shape.agents + 2u * class_number;
     return Grid(u32(places[at].x), u32(places[at].y), places[at + 1u].x, u32(places[at + 1u].y));
 }
 
@@ -217,7 +218,7 @@ fn obey_agents(
     }
 }
 
-// Counts the leaders that a follower sees, and records them if SIGHTINGS.
+// Counts the leaders that a follower sees, and records them if `shape.sightings`.
 fn count_leaders(task: Task, first: u32, me: ptr<function, Agent>) {
     let words = (shape.leaders + 31u) / 32u;
     let followers = shape.agents - shape.leaders;
@@ -233,7 +234,7 @@ fn count_leaders(task: Task, first: u32, me: ptr<function, Agent>) {
                 if within(other.x - (*me).x, other.y - (*me).y, influence2) {
                     let leader = u32(other.speed);
                     atomicAdd(&record[sight(task, me, leader)], 1u);
-                    if SIGHTINGS {
+                    if shape.sightings {
                         atomicOr(&record[sights + leader / 32u], 1u << (leader % 32u));
                     }
                 }
@@ -245,19 +246,19 @@ fn count_leaders(task: Task, first: u32, me: ptr<function, Agent>) {
 // Reports whether a POI is gone. Its word has the first moment at which an observer was near enough, all bits inverted, or 0.
 // A moment is needed because other workgroups already record the next one while this one senses.
 fn is_gone(task: Task, team: u32, poi: u32) -> bool {
-    return GONE && atomicLoad(&record[gone_word(task, team, poi)]) >= ~task.first;
+    return shape.gone && atomicLoad(&record[gone_word(task, team, poi)]) >= ~task.first;
 }
 
 // Stores an agent's state after `moment` steps, counts it in its cell, and records the POIs that it is at or that it makes gone.
-fn settle(task: Task, moment: u32, me: ptr<function, Agent>) {
+fn settle(task: Task, me: ptr<function, Agent>) {
     states[state_of(task, moment % 2u == 1u, 0u, (*me).agent)] = current_state(me);
     atomicAdd(&record[cell_of(task, own_class, (*me).x, (*me).y) + COME], 1u);
     if TRACE {
-        trace(task, moment, me);
+        trace_state(task, me);
     }
     for (var poi = 0u; poi < shape.pois; poi++) {
         let place = places[task.pois + poi];
-        if GONE {
+        if shape.gone {
             let gone_within = gone_within_of(task, poi);
             let counts = (u32(gone_within.y) >> own_class & 1u) != 0u;
             if counts && within(place.x - (*me).x, place.y - (*me).y, gone_within.x) {
@@ -321,7 +322,11 @@ fn enter(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(global_invocation
     if id.x < shape.agents {
         var me = agent_of(id.x);
         start(task, &me);
-        settle(task, 0u, &me);
+        moment = 0u;
+        if TRACE {
+            trace_start(task, &me);
+        }
+        settle(task, &me);
     }
     if id.x == 0u {
         // Each step adds 1.
@@ -438,7 +443,7 @@ fn learn(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_
         }
         answer(task, first, inputs, &me);
         move_agent(first, &me);
-        settle(task, task.first + 1u, &me);
+        settle(task, &me);
     }
     check_loops(task);
 }
@@ -452,7 +457,7 @@ fn obey_rule(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(global_invoca
         var me = agent_in(task, slot);
         follow(task, first, &me);
         move_agent(first, &me);
-        settle(task, task.first + 1u, &me);
+        settle(task, &me);
     }
     if id.x == 0u {
         atomicAdd(&record[task.status], 1u);

@@ -152,6 +152,7 @@ impl World {
         let leaders = classes.iter().filter(learns).map(|class| class.agents().len()).sum::<usize>();
         let starts: Vec<Vec2> = described.starts().into_iter().map(on_grid).collect();
         let agents = starts.len();
+        let aligns = classes.iter().flat_map(Class::terms).any(|term| term.shape.aligns != 0);
         let constants = Constants {
             leaders: leaders as u32,
             followers: (agents - leaders) as u32,
@@ -160,6 +161,8 @@ impl World {
             words: agents.div_ceil(32) as u32,
             class_count: classes.len() as u32,
             first_class: 0,
+            aligns: aligns.into(),
+            gone: of_each.iter().any(|group| group.gone_within > 0.0).into(),
             map: MapConstants::new(world.map, world.dt),
             policy: PolicyConstants::new(&config.widths(), policy.actions),
         };
@@ -220,7 +223,7 @@ impl World {
 
     /// Reports whether any rule aligns headings.
     pub(crate) fn aligns(&self) -> bool {
-        self.classes.iter().flat_map(Class::terms).any(|term| term.shape.aligns != 0)
+        self.constants.aligns != 0
     }
 
     /// Returns the number of agents among which each leader's policy chooses, `[leaders]`: 0 unless it chooses agents.

@@ -7,7 +7,7 @@
 @group(0) @binding(3) var<storage, read> places: array<vec2<f32>>;
 // Per task `[vectors of a policy's weights][leaders][teams]`, so that neighbouring threads load neighbouring weights.
 @group(0) @binding(4) var<storage, read> weights: array<vec4<f32>>;
-// Per task the sets `[steps][pois][words][teams]`, the counts `[followers][leaders][teams]` and, if SIGHTINGS, the
+// Per task the sets `[steps][pois][words][teams]`, the counts `[followers][leaders][teams]` and, if they are recorded, the
 // sightings `[steps][followers][words of leaders][teams]`, and a status word. Large
 // teams have their cells after that.
 @group(0) @binding(5) var<storage, read_write> record: array<RecordWord>;

@@ -185,10 +185,4 @@ impl ClassShape {
     pub(crate) fn pursues(&self) -> bool {
         matches!(self.control(), ControlKind::Nearest | ControlKind::Choose)
     }
-
-    /// Reports whether its agents cannot leave a part of the map, or move only near others.
-    #[cfg(feature = "gpu")]
-    pub(crate) fn is_confined(&self) -> bool {
-        self.boxed != 0 || self.end_near > 0
-    }
 }

@@ -25,7 +25,7 @@ use class::{Class, ClassConstants, ClassLanes, ClassShape};
 use classes::{Combine, ControlKind, Frame, Measure};
 use follow::{TermConstants, TermShape};
 use motion::{GRID, INVERSE_GRID, MapConstants, MapLanes};
-use policy::{BEHAVIOURS, PolicyConstants};
+use policy::{Actions, BEHAVIOURS, PolicyConstants};
 use sense::{ChannelConstants, ChannelShape};
 
 /// The maximum length of a map side, radius or range. Its square is far from f32's overflow.
@@ -90,6 +90,10 @@ gpu_struct! {
         pub class_count: u32,
         /// The index of its first class on a GPU.
         pub first_class: u32,
+        /// Not 0 if any rule aligns headings.
+        pub aligns: u32,
+        /// Not 0 if any POI is gone once an observer has come near.
+        pub gone: u32,
         /// The map and the length of a step.
         pub map: MapConstants,
         /// The sizes of a policy.
@@ -131,7 +135,8 @@ pub(crate) fn declarations() -> String {
         ClassConstants::wgsl(),
         Class::wgsl(),
     ];
-    [structs.concat(), Measure::wgsl(), Combine::wgsl(), Frame::wgsl(), ControlKind::wgsl(), constants].concat()
+    let enums = [Measure::wgsl(), Combine::wgsl(), Frame::wgsl(), ControlKind::wgsl(), Actions::wgsl()];
+    [structs.concat(), enums.concat(), constants].concat()
 }
 
 /// The parts' shaders.

@@ -420,6 +420,7 @@ fn vector_action(name: &str) -> Option<Action> {
         "fmac_f32" => Some(Accumulates(|[a, b, c]| f(a).mul_add(f(b), f(c)).to_bits())),
         "max_f32" => float(|[a, b, _]| f(a).max(f(b)).to_bits()),
         "min_f32" => float(|[a, b, _]| f(a).min(f(b)).to_bits()),
+        "med3_f32" => float(|[a, b, c]| f(a).min(f(b)).max(f(a).max(f(b)).min(f(c))).to_bits()),
         "floor_f32" => float(|[a, ..]| f(a).floor().to_bits()),
         // Chips may err by a unit in the last place. The compiler uses this for integer division, and corrects the
         // result.
@@ -478,6 +479,7 @@ fn scalar_action(name: &str) -> Option<Action> {
         ("not", "b32" | "b64") => scalar(|a, _| !a, NotZero),
         ("and", "b32" | "b64") => scalar(|a, b| a & b, NotZero),
         ("or", "b32" | "b64") => scalar(|a, b| a | b, NotZero),
+        ("xor", "b32" | "b64") => scalar(|a, b| a ^ b, NotZero),
         ("andn2" | "and_not1", "b32" | "b64") => scalar(|a, b| a & !b, NotZero),
         ("orn2" | "or_not1", "b32" | "b64") => scalar(|a, b| a | !b, NotZero),
         ("add", "u32") => scalar(|a, b| a + b, Carry),
@@ -488,6 +490,7 @@ fn scalar_action(name: &str) -> Option<Action> {
         ("lshl", "b32") => scalar(|a, b| a << (b & 31), NotZero),
         ("lshr", "b32") => scalar(|a, b| a >> (b & 31), NotZero),
         ("ashr", "i32") => scalar(|a, b| (a as i32 >> (b & 31)) as u32 as u64, NotZero),
+        ("lshl1_add", "u32") => scalar(|a, b| (a << 1) + b, Carry),
         ("lshl3_add", "u32") => scalar(|a, b| (a << 3) + b, Carry),
         ("min", "u32") => scalar(|a, b| a.min(b), Kept),
         ("min", "i32") => scalar(|a, b| (a as i32).min(b as i32) as u32 as u64, Kept),

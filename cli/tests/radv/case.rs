@@ -133,7 +133,7 @@ impl Case {
             (Pass::Guarded, _) => 0.33,
             // On RDNA 3, kernels use fewer registers and wait longer for memory.
             _ if self.name.starts_with("chaotic") || chip.family == "GFX1100" => 0.52,
-            _ => 0.61,
+            _ => 0.6,
         }
     }
 }

@@ -178,11 +178,7 @@ impl Wave {
         wave.vector_registers[0] = std::array::from_fn(|lane| (first + lane) as u32);
         let alive = chip.wave.min(threads - first);
         wave.set_mask(EXEC, u64::MAX >> (64 - alive));
-        // Descriptors are at address 0. The position of the only workgroup is 0 on every axis. Chips after GCN get the
-        // size of the grid, 1, in registers.
-        if !chip.gcn {
-            wave.scalar_registers[3..6].fill(1);
-        }
+        // Descriptors are at address 0. The position of the only workgroup is 0 on every axis.
         wave
     }
 

@@ -56,17 +56,17 @@ pub struct Shape {
     pub(super) workgroup: usize,
     /// Agents that a thread plays, one after another.
     pub(super) slots: usize,
-    pub(super) records: Recorded,
-    pub(super) uses: Uses,
+    /// Whether it records all quantities of every step.
+    pub(super) trace: bool,
     pub(super) sizes: Sizes,
 }
 
-/// Additional records of a kernel, besides sets and counts.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+/// Additional records of episodes, besides sets and counts.
+#[derive(Clone, Copy)]
 pub struct Recorded {
-    /// Whether it records all quantities of every step.
+    /// All quantities of every step.
     pub(super) trace: bool,
-    /// Whether it records which leaders each follower sees at each step.
+    /// The leaders that each follower sees at each step.
     pub(super) sightings: bool,
 }
 
@@ -83,36 +83,19 @@ pub enum Sizes {
     /// then takes several dispatches.
     Any { widest: usize, large: bool },
     /// Everything that the code depends on.
-    Fixed { teams: usize, leaders: u32, agents: u32, pois: u32, widths: [u32; WIDTHS], kinds: &'static [ClassKind] },
-}
-
-/// The parts of kernels that only some worlds use.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub struct Uses {
-    /// Whether the outputs of policies choose a behaviour.
-    pub(super) chooses: bool,
-    /// Whether any rule aligns headings.
-    pub(super) aligns: bool,
-    /// Whether agents of any class move straight to others.
-    pub(super) pursues: bool,
-    /// Whether agents of any class cannot leave a part of the map, or move only near others.
-    pub(super) confines: bool,
-    /// Whether any POI is gone once an observer has come near.
-    pub(super) gone: bool,
-}
-
-impl Uses {
-    fn of(world: &World) -> Uses {
-        let any = |is: fn(&ClassShape) -> bool| world.classes.iter().any(|class| is(&class.constants.shape));
-        Uses {
-            // Policies that choose agents may have fewer outputs than there are behaviours.
-            chooses: world.constants.policy.actions() == Actions::Behaviours && world.choices().contains(&0),
-            aligns: world.aligns(),
-            pursues: any(ClassShape::pursues),
-            confines: any(ClassShape::is_confined),
-            gone: !world.gone_within.is_empty(),
-        }
-    }
+    Fixed {
+        teams: usize,
+        leaders: u32,
+        agents: u32,
+        pois: u32,
+        widths: [u32; WIDTHS],
+        kinds: &'static [ClassKind],
+        /// Whether the outputs of policies choose a behaviour.
+        chooses: bool,
+        /// Whether any POI is gone once an observer has come near.
+        gone: bool,
+        sightings: bool,
+    },
 }
 
 /// The shapes of a class, its channels and its terms.
@@ -153,19 +136,19 @@ impl Shape {
     }
 
     /// Returns the kernel that plays any world with policies up to this width.
-    pub(super) fn generic(world: &World, capacity: Capacity, records: Recorded) -> (Shape, Workgroup) {
+    pub(super) fn generic(world: &World, capacity: Capacity, trace: bool) -> (Shape, Workgroup) {
         let large = is_large(world, capacity.large_from);
         let workgroup = match large {
             true => Workgroup { threads: WORKGROUPS[0], slots: 1, teams: 1 },
             false => Workgroup::generic(world, capacity.workgroup),
         };
         let widest = world.constants.policy.widest().next_power_of_two().max(LEAST_WIDTH);
-        Shape::new(world, workgroup, records, Sizes::Any { widest, large })
+        Shape::new(workgroup, trace, Sizes::Any { widest, large })
     }
 
-    fn new(world: &World, workgroup: Workgroup, records: Recorded, sizes: Sizes) -> (Shape, Workgroup) {
+    fn new(workgroup: Workgroup, trace: bool, sizes: Sizes) -> (Shape, Workgroup) {
         let Workgroup { threads, slots, .. } = workgroup;
-        (Shape { workgroup: threads, slots, records, uses: Uses::of(world), sizes }, workgroup)
+        (Shape { workgroup: threads, slots, trace, sizes }, workgroup)
     }
 
     /// Reports whether each step takes several dispatches.
@@ -176,7 +159,7 @@ impl Shape {
     /// Returns the kernel that plays worlds of these sizes only, if one is possible.
     pub(super) fn specialised(world: &World, capacity: Capacity, records: Recorded) -> Option<(Shape, Workgroup)> {
         let workgroup = Workgroup::specialised(world, capacity).filter(|_| !is_large(world, capacity.large_from))?;
-        let Constants { leaders, followers, pois, policy, .. } = world.constants;
+        let Constants { leaders, followers, pois, policy, gone, .. } = world.constants;
         let sizes = Sizes::Fixed {
             teams: workgroup.teams,
             leaders,
@@ -184,8 +167,12 @@ impl Shape {
             pois,
             widths: policy.widths,
             kinds: ClassKind::of(world),
+            // Policies that choose agents may have fewer outputs than there are behaviours.
+            chooses: policy.actions() == Actions::Behaviours && world.choices().contains(&0),
+            gone: gone != 0,
+            sightings: records.sightings,
         };
-        Some(Shape::new(world, workgroup, records, sizes))
+        Some(Shape::new(workgroup, records.trace, sizes))
     }
 }
 

@@ -3,7 +3,7 @@
 use std::collections::HashSet;
 use std::fmt::Write;
 
-use super::shape::{Capacity, ClassKind, MAX_THREADS, ROLE, Recorded, Shape, Sizes, Uses, WIDTHS, WORKGROUPS};
+use super::shape::{Capacity, ClassKind, MAX_THREADS, ROLE, Recorded, Shape, Sizes, WIDTHS, WORKGROUPS};
 use crate::backend::grid::LARGE_FROM;
 use crate::backend::{MOMENT_WORDS, VECTOR};
 use crate::config::{Config, MAX_CLASSES, MAX_SECTORS, Policy};
@@ -269,7 +269,7 @@ fn declarations() -> String {
 
 /// Returns the shader of episodes for a shape, of large teams or of others.
 fn episode(shape: Shape) -> String {
-    let Shape { workgroup, slots, records: Recorded { trace, sightings }, uses, sizes } = shape;
+    let Shape { workgroup, slots, trace, sizes } = shape;
     let (shared, in_registers, counted) = match sizes {
         // The agents of one large team, or of several small ones.
         Sizes::Any { .. } => ((workgroup * slots).min(MAX_SHARED), false, 1),
@@ -284,13 +284,8 @@ fn episode(shape: Shape) -> String {
         SLOTS = slots,
         SHARED = shared,
         TRACE = trace,
-        SIGHTINGS = sightings,
         COUNTS_IN_REGISTERS = in_registers,
         COUNTED_LEADERS = counted,
-        ALIGNS = uses.aligns,
-        PURSUES = uses.pursues,
-        CONFINES = uses.confines,
-        GONE = uses.gone,
         MAX_SECTORS,
         MAX_CLASSES,
         MOMENT_WORDS,
@@ -301,8 +296,14 @@ fn episode(shape: Shape) -> String {
         ClassConstants::copied_from("classes[class_number]")
     );
     let front = match sizes {
-        Sizes::Any { widest, .. } => [
-            gpu_constants!(INPUTS = widest, CHOICES = widest, CHOOSES = uses.chooses),
+        Sizes::Any { widest, large } => [
+            gpu_constants!(
+                INPUTS = widest,
+                CHOICES = widest,
+                MAY_ALIGN = true,
+                MAY_BE_GONE = true,
+                MAY_PURSUE = !large
+            ),
             getter("shape_of", "class_number: u32", &ClassShape::copied_from("classes[class_number]"), "ClassShape"),
             getter(
                 "channel_of",
@@ -319,15 +320,19 @@ fn episode(shape: Shape) -> String {
             include_str!("../../../shaders/generic.wgsl").into(),
         ]
         .concat(),
-        Sizes::Fixed { teams, leaders, agents, pois, widths, kinds } => {
+        Sizes::Fixed { teams, leaders, agents, pois, widths, kinds, chooses, gone, sightings } => {
             let outputs = widths.into_iter().rfind(|&width| width > 0).expect("a policy has outputs");
             let (words, classes, inputs) = (agents.div_ceil(32), kinds.len(), widths[0]);
+            let any = |is: fn(&ClassShape) -> bool| kinds.iter().any(|kind| is(&kind.shape));
+            let pursues = any(|shape| shape.pursues() || shape.end_near > 0);
+            let confines = any(|shape| shape.boxed != 0);
+            let aligns = kinds.iter().flat_map(|kind| &kind.terms).any(|term| term.aligns != 0);
             format!(
-                "{}const shape = Shape({leaders}u, {agents}u, {pois}u, {words}u, {classes}u, {inputs}u, {teams}u);\n\
-                 fn set_shape(task: Task) {{}}\n{}{}",
-                gpu_constants!(INPUTS = inputs, CHOICES = outputs),
+                "{}const shape = Shape({leaders}u, {agents}u, {pois}u, {words}u, {classes}u, {inputs}u, {teams}u, {aligns}, \
+                 {pursues}, {confines}, {gone}, {sightings});\nfn set_shape(task: Task) {{}}\n{}{}",
+                gpu_constants!(INPUTS = inputs, CHOICES = outputs, MAY_ALIGN = aligns, MAY_BE_GONE = gone),
                 straight_classes(kinds),
-                straight_policy(&widths, uses.chooses, uses.pursues)
+                straight_policy(&widths, chooses, pursues)
             )
         }
     };
@@ -443,13 +448,13 @@ pub fn shaders() -> Vec<(&'static str, String)> {
     const PLAIN: Recorded = Recorded { trace: false, sightings: false };
     const SIGHTINGS: Recorded = Recorded { sightings: true, ..PLAIN };
     const TRACE: Recorded = Recorded { trace: true, sightings: true };
-    let any = |workgroup, slots, widest, records: Recorded, large: bool| {
-        let [chooses, aligns, confines, gone] = [records.trace; 4];
-        let uses = Uses { chooses, aligns, pursues: records.trace && !large, confines, gone };
-        Shape { workgroup, slots, records, uses, sizes: Sizes::Any { widest, large } }
+    let generic = |workgroup, slots, widest, trace| {
+        Pipeline::Episode(Shape { workgroup, slots, trace, sizes: Sizes::Any { widest, large: false } })
     };
-    let generic = |workgroup, slots, widest, records| Pipeline::Episode(any(workgroup, slots, widest, records, false));
-    let swarm = |records| Pipeline::Swarm(SwarmPart::Clear, any(WORKGROUPS[0], 1, 16, records, true));
+    let swarm = |trace| {
+        let sizes = Sizes::Any { widest: 16, large: true };
+        Pipeline::Swarm(SwarmPart::Clear, Shape { workgroup: WORKGROUPS[0], slots: 1, trace, sizes })
+    };
     let specialised = |records, actions: Actions| {
         let text = include_str!("../../../configs/generally_forward.toml");
         let config = Config::parse(text, "generally_forward.toml").expect("the project's own config");
@@ -461,15 +466,15 @@ pub fn shaders() -> Vec<(&'static str, String)> {
     let all = [
         ("probe", Pipeline::Probe),
         ("ceiling", Pipeline::Ceiling),
-        ("episode", generic(64, 1, 16, PLAIN)),
-        ("episode, traced", generic(128, 1, 64, TRACE)),
-        ("episode, agents in turn", generic(256, 5, 64, PLAIN)),
+        ("episode", generic(64, 1, 16, false)),
+        ("episode, traced", generic(128, 1, 64, true)),
+        ("episode, agents in turn", generic(256, 5, 64, false)),
         ("episode, specialised", specialised(PLAIN, Actions::Direct)),
         ("episode, specialised, behaviours", specialised(PLAIN, Actions::Behaviours)),
         ("episode, specialised, with sights", specialised(SIGHTINGS, Actions::Direct)),
         ("episode, specialised, traced", specialised(TRACE, Actions::Direct)),
-        ("swarm", swarm(PLAIN)),
-        ("swarm, traced", swarm(TRACE)),
+        ("swarm", swarm(false)),
+        ("swarm, traced", swarm(true)),
         ("count", Pipeline::Count),
         ("population", Pipeline::Breed),
     ];

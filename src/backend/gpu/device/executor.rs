@@ -16,7 +16,7 @@ use crate::host::{self, Instant};
 use crate::parallel::*;
 
 /// Maximum of pipelines kept from one recording to the next, unless one needs more. A driver needs megabytes for each, and
-/// thousands of random worlds have about 450.
+/// a process may play ever new kinds of worlds with specialised kernels.
 const KEPT_PIPELINES: usize = 512;
 
 /// Bytes between host and device.

@@ -14,7 +14,7 @@ use crate::world::World;
 pub fn shader_of(world: &World, kernel: Kernel, threads: usize) -> String {
     let (capacity, records) = (Capacity::of_workgroups(threads), Recorded { trace: false, sightings: false });
     let specialised = Shape::specialised(world, capacity, records).filter(|_| kernel != Kernel::Generic);
-    let (shape, _) = specialised.unwrap_or_else(|| Shape::generic(world, capacity, records));
+    let (shape, _) = specialised.unwrap_or_else(|| Shape::generic(world, capacity, false));
     Pipeline::Episode(shape).text()
 }
 

@@ -232,7 +232,7 @@ impl<'a> GroupPlan<'a> {
         let world = group.world;
         let recorded = Recorded::of(group, trace);
         let own_kernel = Shape::specialised(world, capacity, recorded).filter(|(shape, _)| specialised.contains(shape));
-        let (shape, workgroup) = own_kernel.unwrap_or_else(|| Shape::generic(world, capacity, recorded));
+        let (shape, workgroup) = own_kernel.unwrap_or_else(|| Shape::generic(world, capacity, trace));
         let (steps_per_dispatch, iterations_per_step) = match shape.is_large() {
             true => (1, iterations_of_large(world)),
             false => (
