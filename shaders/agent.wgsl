@@ -46,8 +46,6 @@ struct Shape {
 var<private> world: Constants;
 var<private> own: ClassConstants;
 var<private> own_class: u32;
-// The steps of the episode so far, with the one that the thread plays.
-var<private> moment: u32;
 
 // What one thread plays: an agent of a team, its state, and its wanted course.
 struct Agent {
@@ -66,6 +64,10 @@ struct Agent {
     next: Steering,
     // The number of steps at which it saw each leader.
     counts: array<u32, COUNTED_LEADERS>,
+    // For the trace: a leader's inputs and outputs, or a follower's force.
+    inputs: array<f32, INPUTS>,
+    outputs: vec2<f32>,
+    force: vec2<f32>,
 }
 
 // Returns the numbers of a channel.
@@ -301,8 +303,8 @@ fn answer(task: Task, first: u32, inputs: array<f32, INPUTS>, me: ptr<function, 
     let start = task.weights + (*me).agent * task.teams + (*me).team;
     let outputs = decide(start, shape.leaders * task.teams, inputs);
     if TRACE {
-        trace_action(task, outputs, vec2(0.0), me);
-        trace_inputs(task, inputs, me);
+        (*me).inputs = inputs;
+        (*me).outputs = outputs;
     }
     if shape.pursues && own.control == CONTROLKIND_CHOOSE {
         let to = chosen(first, outputs.x, me);
@@ -323,7 +325,8 @@ fn pull_of(class_number: u32, index: u32) -> Pull {
     return Pull((*term).inner2, (*term).outer2, (*term).scale);
 }
 
-// Returns the index of an agent's state before a step. If rules align headings, there are two of each, which alternate as positions do.
+// Returns the index of an agent's state before a step. If rules align headings, there are two of each, which alternate as
+// positions do.
 fn state_of(task: Task, second: bool, team: u32, agent: u32) -> u32 {
     return task.states + (select(0u, task.teams, second) + team) * shape.agents + agent;
 }
@@ -371,9 +374,6 @@ fn influence_of(leader: u32, class_number: u32) -> f32 {
 fn follow(task: Task, first: u32, me: ptr<function, Agent>) {
     count_leaders(task, first, me);
     if own.control == CONTROLKIND_STILL {
-        if TRACE {
-            trace_action(task, vec2(0.0), vec2(0.0), me);
-        }
         return;
     }
     var force: SteeringForce;
@@ -386,7 +386,7 @@ fn follow(task: Task, first: u32, me: ptr<function, Agent>) {
         force = with_walls(terms, (*me).x, (*me).y);
     }
     if TRACE {
-        trace_action(task, vec2(0.0), vec2(force.x, force.y), me);
+        (*me).force = vec2(force.x, force.y);
     }
     obey(force, me);
 }
@@ -437,47 +437,25 @@ fn class_of(agent: u32) -> u32 {
     return index;
 }
 
-// Returns the index in the trace of an agent's moment.
-fn traced_moment(task: Task, me: ptr<function, Agent>) -> u32 {
-    return task.traced + ((moment * task.teams + (*me).team) * shape.agents + (*me).agent) * MOMENT_WORDS;
-}
-
-// Traces a leader's outputs, or a follower's force.
-fn trace_action(task: Task, outputs: vec2<f32>, force: vec2<f32>, me: ptr<function, Agent>) {
-    let at = traced_moment(task, me);
-    traced[at] = outputs.x;
-    traced[at + 1u] = outputs.y;
-    traced[at + 2u] = force.x;
-    traced[at + 3u] = force.y;
-}
-
-// Traces what a leader senses.
-fn trace_inputs(task: Task, inputs: array<f32, INPUTS>, me: ptr<function, Agent>) {
-    var sensed = inputs;
-    let moments = (world.steps + 1u) * task.teams * shape.agents * MOMENT_WORDS;
-    let row = (moment * task.teams + (*me).team) * shape.leaders + (*me).agent;
-    for (var input = 0u; input < shape.inputs; input++) {
-        traced[task.traced + moments + row * shape.inputs + input] = sensed[input];
-    }
-}
-
-// Traces the agent's state.
-fn trace_state(task: Task, me: ptr<function, Agent>) {
-    let at = traced_moment(task, me);
-    traced[at + 4u] = (*me).x;
-    traced[at + 5u] = (*me).y;
-    traced[at + 6u] = (*me).hx;
-    traced[at + 7u] = (*me).hy;
-    traced[at + 8u] = (*me).speed;
-}
-
-// Traces the agent at its start.
-fn trace_start(task: Task, me: ptr<function, Agent>) {
-    trace_action(task, vec2(0.0), vec2(0.0), me);
+fn trace(task: Task, step: u32, me: ptr<function, Agent>) {
+    let row = step * task.teams + (*me).team;
+    let moment = task.traced + (row * shape.agents + (*me).agent) * MOMENT_WORDS;
+    traced[moment] = (*me).outputs.x;
+    traced[moment + 1u] = (*me).outputs.y;
+    traced[moment + 2u] = (*me).force.x;
+    traced[moment + 3u] = (*me).force.y;
+    traced[moment + 4u] = (*me).x;
+    traced[moment + 5u] = (*me).y;
+    traced[moment + 6u] = (*me).hx;
+    traced[moment + 7u] = (*me).hy;
+    traced[moment + 8u] = (*me).speed;
     if (*me).agent < shape.leaders {
-        trace_inputs(task, array<f32, INPUTS>(), me);
+        let moments = (world.steps + 1u) * task.teams * shape.agents * MOMENT_WORDS;
+        let first = task.traced + moments + (row * shape.leaders + (*me).agent) * shape.inputs;
+        for (var input = 0u; input < shape.inputs; input++) {
+            traced[first + input] = (*me).inputs[input];
+        }
     }
-    trace_state(task, me);
 }
 
 // Loads the class of the agent that the thread plays next.

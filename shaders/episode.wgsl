@@ -10,7 +10,7 @@
 //   SLOTS         agents per thread, played one after another
 //   SHARED        agents of a workgroup's teams
 //   MAY_ALIGN     whether rules may align headings, which agents share through storage
-//   MAY_BE_GONE   whether POIs may be gone, which agents find together
+//   MAY_BE_GONE   whether POIs may be gone, which the threads of a workgroup find out together
 //   COUNTS_IN_REGISTERS
 //                 whether a follower counts the leaders it sees in registers
 //   set_shape     sets the sizes for a task
@@ -220,7 +220,7 @@ fn begin(task: Task, me: ptr<function, Agent>) {
         record[sight(task, me, leader)] = 0u;
     }
     if TRACE {
-        trace_start(task, me);
+        trace(task, 0u, me);
     }
 }
 
@@ -287,12 +287,11 @@ fn episode(
         for (var slot = 0u; slot < SLOTS; slot++) {
             var me = agents[slot];
             if me.plays {
-                moment = step + 1u;
                 act(task, now + me.team, &me);
                 positions[next + me.index] = vec2(me.x, me.y);
                 share_heading(task, next > 0u, &me);
                 if TRACE {
-                    trace_state(task, &me);
+                    trace(task, step + 1u, &me);
                 }
             }
             agents[slot] = me;

@@ -10,7 +10,7 @@ var<private> shape: Shape;
 
 fn set_shape(task: Task) {
     let agents = world.leaders + world.followers;
-    // Sightings come between the counts and the words of POIs.
+    // The record has sightings if something comes between the counts and the words of POIs.
     let gone_words = select(0u, world.pois * task.teams, world.gone != 0u);
     let sightings = task.status - gone_words > task.counts + world.followers * world.leaders * task.teams;
     shape = Shape(
@@ -67,47 +67,34 @@ fn same_term(a: TermShape, b: TermShape) -> bool {
 
 // Computes a leader's outputs: layer by layer, each unit's bias plus its weighted inputs in order.
 fn decide(start: u32, stride: u32, sensed: array<f32, INPUTS>) -> vec2<f32> {
-    // The values of two layers, which change places. There is room for every layer.
-    var sensed_inputs = sensed;
-    var values: array<f32, 2u * INPUTS>;
-    for (var input = 0u; input < world.widths[0]; input++) {
-        values[input] = sensed_inputs[input];
-    }
-    var last = 0u;
+    // There is room for every layer.
+    var inputs = sensed;
     var first = 0u;
     for (var layer = 0u; layer < world.layers; layer++) {
         let rows = world.widths[layer];
         let columns = world.widths[layer + 1u];
-        let next = INPUTS - last;
+        var units: array<f32, INPUTS>;
         for (var column = 0u; column < columns; column++) {
             var index = first + column;
             var sum = weight(start, stride, index + rows * columns);
             for (var row = 0u; row < rows; row++) {
-                sum += values[last + row] * weight(start, stride, index);
+                sum += inputs[row] * weight(start, stride, index);
                 index += columns;
             }
-            values[next + column] = activate(sum);
+            units[column] = activate(sum);
         }
-        last = next;
+        inputs = units;
         first += (rows + 1u) * columns;
     }
     if shape.pursues && own.control == CONTROLKIND_CHOOSE {
-        var choices: array<f32, CHOICES>;
-        for (var index = 0u; index <= own.end_target - own.first_target; index++) {
-            choices[index] = values[last + index];
-        }
-        return choose_agent(choices);
+        return choose_agent(inputs);
     }
     if world.actions == ACTIONS_BEHAVIOURS {
         let pois = vec4(sensed[0], sensed[1], sensed[2], sensed[3]);
         let agents = vec4(sensed[4], sensed[5], sensed[6], sensed[7]);
-        var wanted: array<f32, BEHAVIOURS>;
-        for (var index = 0u; index < BEHAVIOURS; index++) {
-            wanted[index] = values[last + index];
-        }
-        return choose(pois, agents, wanted);
+        return choose(pois, agents, array(inputs[0], inputs[1], inputs[2], inputs[3], inputs[4]));
     }
-    return vec2(values[last], values[last + 1u]);
+    return vec2(inputs[0], inputs[1]);
 }
 
 // Returns one of a policy's weights.

@@ -43,7 +43,6 @@ fn load_task(index: u32) -> Task {
     let task = tasks[index];
     world = worlds[task.world];
     set_shape(task);
-    moment = task.first + 1u;
     return task;
 }
 
@@ -250,11 +249,11 @@ fn is_gone(task: Task, team: u32, poi: u32) -> bool {
 }
 
 // Stores an agent's state after `moment` steps, counts it in its cell, and records the POIs that it is at or that it makes gone.
-fn settle(task: Task, me: ptr<function, Agent>) {
+fn settle(task: Task, moment: u32, me: ptr<function, Agent>) {
     states[state_of(task, moment % 2u == 1u, 0u, (*me).agent)] = current_state(me);
     atomicAdd(&record[cell_of(task, own_class, (*me).x, (*me).y) + COME], 1u);
     if TRACE {
-        trace_state(task, me);
+        trace(task, moment, me);
     }
     for (var poi = 0u; poi < shape.pois; poi++) {
         let place = places[task.pois + poi];
@@ -322,11 +321,7 @@ fn enter(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(global_invocation
     if id.x < shape.agents {
         var me = agent_of(id.x);
         start(task, &me);
-        moment = 0u;
-        if TRACE {
-            trace_start(task, &me);
-        }
-        settle(task, &me);
+        settle(task, 0u, &me);
     }
     if id.x == 0u {
         // Each step adds 1.
@@ -443,7 +438,7 @@ fn learn(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(local_invocation_
         }
         answer(task, first, inputs, &me);
         move_agent(first, &me);
-        settle(task, &me);
+        settle(task, task.first + 1u, &me);
     }
     check_loops(task);
 }
@@ -457,7 +452,7 @@ fn obey_rule(@builtin(workgroup_id) workgroup: vec3<u32>, @builtin(global_invoca
         var me = agent_in(task, slot);
         follow(task, first, &me);
         move_agent(first, &me);
-        settle(task, &me);
+        settle(task, task.first + 1u, &me);
     }
     if id.x == 0u {
         atomicAdd(&record[task.status], 1u);

@@ -353,7 +353,7 @@ fn opening_detects_an_edit_of_any_kernel() {
         ("count", |text| text.replace("completed[coupling - largest] += value", "completed[1] += value")),
         ("gather", |text| text.replace("vec4(tile[start], tile[start + 1u]", "vec4(tile[start + 1u], tile[start]")),
         ("breed", |text| text.replace("* breed_job.sigma", "* 1.0000001 * breed_job.sigma")),
-        ("generic kernel", |text| text.replace("sum += values[last + row]", "sum -= values[last + row]")),
+        ("generic kernel", |text| text.replace("sum += inputs[row] * weight", "sum -= inputs[row] * weight")),
     ];
     for (what, edit) in edits {
         assert!(support::edits_a_shader(edit), "an edit of {what} changes no shader");

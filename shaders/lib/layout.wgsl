@@ -7,9 +7,9 @@
 @group(0) @binding(3) var<storage, read> places: array<vec2<f32>>;
 // Per task `[vectors of a policy's weights][leaders][teams]`, so that neighbouring threads load neighbouring weights.
 @group(0) @binding(4) var<storage, read> weights: array<vec4<f32>>;
-// Per task the sets `[steps][pois][words][teams]`, the counts `[followers][leaders][teams]` and, if they are recorded, the
-// sightings `[steps][followers][words of leaders][teams]`, and a status word. Large
-// teams have their cells after that.
+// Per task the sets `[steps][pois][words][teams]`, the counts `[followers][leaders][teams]`, sightings if they are recorded,
+// `[steps][followers][words of leaders][teams]`, a word per POI and team if POIs may be gone, and a status word. Large teams
+// have their cells after that.
 @group(0) @binding(5) var<storage, read_write> record: array<RecordWord>;
 // Per task the moments `[steps + 1][teams][agents]`, and the inputs of leaders `[steps + 1][teams][leaders][inputs]`;
 // written only if TRACE.

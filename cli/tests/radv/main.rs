@@ -334,7 +334,8 @@ fn compiled_shaders_are_exact_small_and_fast() {
                     continue;
                 }
                 assert_eq!(count("Spilled VGPRs"), 0, "{context}");
-                // The kernels of large teams play any classes as well. A few scalars wait in lanes of vector registers.
+                // The kernels of large teams play any classes as well. A few scalar registers may be spilled: into lanes of
+                // vector registers, not to memory.
                 if name.starts_with("swarm, ") {
                     assert!(count("Spilled SGPRs") <= 4, "{context}: {} spilled SGPRs", count("Spilled SGPRs"));
                     continue;

@@ -271,3 +271,20 @@ impl Capacity {
         Capacity { batch: bytes, buffer: bytes, workgroup: threads, workgroup_bytes: 16 << 10, large_from: LARGE_FROM }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::sample;
+
+    /// Software drivers take seconds to compile a kernel.
+    #[test]
+    fn random_worlds_share_few_generic_kernels() {
+        let shape = |seed: u64| {
+            let world = World::new(sample::any_world(seed).validate().unwrap().at(0));
+            Shape::generic(&world, Capacity::of_workgroups(256), false).0
+        };
+        let shapes: HashSet<Shape> = (0..2000).map(shape).collect();
+        assert!((2..=20).contains(&shapes.len()), "{} kernels", shapes.len());
+    }
+}
