@@ -10,7 +10,6 @@ use glam::Vec2;
 use crate::backend::compare::{compare_breeding, compare_traces, first_difference};
 use crate::backend::{Backend, BackendError, Group};
 use crate::config::{Config, Fitness, Learning, StageConfig, ValidConfig};
-use crate::credit::RecordRequest;
 use crate::evaluate::{SCORES, SCORES_AND_DT};
 use crate::evolve::{self, TRAINING_EPISODES};
 use crate::sample;
@@ -156,28 +155,17 @@ fn compare_scores(
     Ok(first_difference(groups, &expected, &found))
 }
 
-/// Plays all groups in three batches. Each group is scored by one of [`KINDS`], which changes with each turn. Returns
-/// the first group that differs, and how.
+/// Plays all groups, each scored by one of [`KINDS`], which changes with each turn. Returns the first group that differs, and
+/// how.
 fn compare_kinds(
     groups: &[Group<'_>],
     turn: usize,
     reference: &mut dyn Backend,
     backend: &mut dyn Backend,
 ) -> Result<Option<(usize, String)>, BackendError> {
-    // A device counts a batch's records only if it can count all, so the others are separate.
-    let mut batches: [Vec<(usize, Group<'_>)>; 3] = Default::default();
-    for (index, group) in groups.iter().enumerate() {
-        let fitnesses = KINDS[(turn * groups.len() + index) % KINDS.len()];
-        let (whole, timed) = (RecordRequest(fitnesses).sights(), group.world.rule.is_timed());
-        batches[if whole { 0 } else { 1 + usize::from(timed) }].push((index, Group { fitnesses, ..*group }));
-    }
-    for batch in batches {
-        let (places, groups): (Vec<usize>, Vec<Group<'_>>) = batch.into_iter().unzip();
-        if let Some((group, difference)) = compare_scores(&groups, reference, backend)? {
-            return Ok(Some((places[group], difference)));
-        }
-    }
-    Ok(None)
+    let kind = |index: usize| KINDS[(turn * groups.len() + index) % KINDS.len()];
+    let groups = groups.iter().enumerate().map(|(index, group)| Group { fitnesses: kind(index), ..*group });
+    compare_scores(&groups.collect::<Vec<_>>(), reference, backend)
 }
 
 /// Trains the first few worlds for a few generations side by side.

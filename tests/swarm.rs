@@ -125,7 +125,8 @@ fn random_worlds_with_grids_are_equal_on_gpus() {
             class.control.target().is_none() && class.moves_near.is_none() && !each
         })
     });
-    let worlds = if support::is_long() { 200 } else { 6 };
+    let (worlds, generations) = if support::is_long() { (200, 3) } else { (6, 1) };
+    plan.generations = generations;
     plan.worlds.truncate(worlds);
     assert_eq!(plan.worlds.len(), worlds);
     check_gpus(support::adapters("random_worlds_with_grids_are_equal_on_gpus"), &plan, |gpu| gpu);

@@ -180,26 +180,31 @@ fn scores_are_the_same_from_sums_and_whole_records() {
 #[cfg(debug_assertions)]
 #[test]
 fn an_edited_sum_changes_scores() {
-    type Edit = fn(String) -> String;
+    type Edit = (usize, usize, fn(String) -> String);
+    // Beside each edit are a world and a fitness that show it.
     let edits: [Edit; 8] = [
-        |text| text.replace("size >= coupling", "size > coupling"),
-        |text| text.replace("taken > size - coupling", "taken > 0u"),
-        |text| text.replace("step < sizes.steps", "step + 1u < sizes.steps"),
-        |text| text.replace("if steps > most", "if steps >= most"),
-        |text| text.replace("& scoring[about + 2u + word]", ""),
-        |text| text.replace("max(largest, size)", "size"),
-        |text| text.replace("next * copies <= now", "next * copies < now"),
-        |text| text.replace("own = members", "own = zeroth | members"),
+        (1, 1, |text| text.replace("size >= coupling", "size > coupling")),
+        (7, 2, |text| text.replace("taken > size - coupling", "taken > 0u")),
+        (24, 4, |text| text.replace("step < sizes.steps", "step + 1u < sizes.steps")),
+        (17, 3, |text| text.replace("if steps > most", "if steps >= most")),
+        (1, 1, |text| text.replace("& scoring[about + 2u + word]", "")),
+        (2, 4, |text| text.replace("max(largest, size)", "size")),
+        (22, 4, |text| text.replace("next * copies <= now", "next * copies < now")),
+        (23, 3, |text| text.replace("own = members", "own = zeroth | members")),
     ];
-    let batch: Vec<Teams> = worlds().iter().map(|config| Teams::new(config, 37)).collect();
-    let expected: Vec<_> = (0..5).map(|first| expected(&batch, first)).collect();
+    let worlds = worlds();
     for (request, info) in support::adapters("an_edited_sum_changes_scores") {
-        for (index, edit) in edits.into_iter().enumerate() {
+        let gpu = gpu::open(request).unwrap();
+        for (index, (world, first, edit)) in edits.into_iter().enumerate() {
+            let teams = [Teams::new(&worlds[world], 37)];
+            let backend = GpuBackend::new(gpu.clone()).unwrap().with_records(COUNTED);
             // SAFETY: the edits change comparisons and shorten a loop; every index stays in bounds.
             #[expect(unsafe_code, reason = "an edited shader is compiled without bounds checks")]
-            let mut backend = unsafe { open(&request, COUNTED).edited(edit) };
-            let changed = (0..5).any(|first| scores(&mut backend, &batch, first) != expected[first]);
-            assert!(changed, "{info}: edit {index} changed no score");
+            let mut edited = unsafe { backend.edited(edit) };
+            assert!(
+                scores(&mut edited, &teams, first) != expected(&teams, first),
+                "{info}: edit {index} changed no score"
+            );
         }
     }
 }
@@ -251,7 +256,7 @@ fn a_generation_moves_less_than_50_bytes_per_team() {
         let mut backend = open(&request, COUNTED).with_residency(ResidencyPolicy::Always);
         let mut trainer = Trainer::new([config.validate().unwrap()]);
         let mut before = backend.gpu().traffic();
-        for generation in 0..=50 {
+        for generation in 0..=2 {
             let rows = trainer.advance(&mut backend).unwrap();
             let (total, played) = (backend.gpu().traffic(), backend.take_times().traffic);
             let held = (teams as u64 + 1) * 4 * 112 * 4;
@@ -267,9 +272,7 @@ fn a_generation_moves_less_than_50_bytes_per_team() {
                 per_team(played.up),
                 per_team(traffic.down)
             );
-            if [0, 50].contains(&generation) {
-                assert!(per_team(up + traffic.down) < 50.0, "{info}: generation {generation}");
-            }
+            assert!(per_team(up + traffic.down) < 50.0, "{info}: generation {generation}");
         }
     }
 }
@@ -283,6 +286,10 @@ fn nothing_is_counted_if_times_matter() {
         config.world.steps = 60;
         change(&mut config);
         vec![Teams::new(&config, 200)]
+    };
+    let by_paths = || {
+        let expanded = config(include_str!("../../configs/generally_forward.toml")).expanded().to_toml();
+        vec![Teams::new(&config(&expanded.replace("score = \"observed\"", "score = \"closeness\"")), 200)]
     };
     let cases: [(_, _, fn(&mut Config)); 4] = [
         ("default rules", true, |_| ()),
@@ -307,6 +314,16 @@ fn nothing_is_counted_if_times_matter() {
             let sights = (200 * 4 * batch[0].world.sight_words()) as u64;
             assert_eq!(downloaded(&mut backend), batch[0].whole_bytes() + sights + status(10), "{info}, {name}, Dt");
         }
+        // Groups that are copied whole, or traced for their paths, take no others along.
+        let mixed: Vec<_> = cases.iter().flat_map(|&(_, _, change)| teams_with(change)).chain(by_paths()).collect();
+        let mut backend = open(&request, COUNTED).with_kernel(Kernel::Generic);
+        let alone = mixed.iter().map(|teams| {
+            backend.play(&[teams.group(&[Fitness::D])]).unwrap();
+            downloaded(&mut backend)
+        });
+        let alone: u64 = alone.sum();
+        backend.play(&mixed.iter().map(|teams| teams.group(&[Fitness::D])).collect::<Vec<_>>()).unwrap();
+        assert_eq!(downloaded(&mut backend), alone, "{info}: as one batch");
     }
 }
 

@@ -419,16 +419,26 @@ impl Backend for GpuBackend {
     fn play(&mut self, groups: &[Group<'_>]) -> Result<Vec<GroupScores>, BackendError> {
         groups.iter().try_for_each(Group::check)?;
         let scores = ScoreTable::new(groups);
-        // Paths are read from traces.
-        let trace = groups.iter().any(|group| group.world.paths.is_some());
-        self.play_tasks(groups, trace, &|planned, words, traced| match Counting::of(&groups[planned.group]) {
-            Some(counting) if planned.task.counted != NOWHERE => {
-                counting.score(words, &planned.task, (planned.group, planned.first_team), &scores)
-            }
-            _ => each_episode(groups, planned, words, traced, |team, episode| {
-                scores.score(planned.group, team, episode);
-            }),
-        })?;
+        // A batch is counted only if all of it can be, and traced, for paths, if any of it has to be.
+        let way = |group: &Group<'_>| match group.world.paths {
+            Some(_) => 2,
+            None => usize::from(Counting::of(group).is_none()),
+        };
+        for played in 0..3 {
+            let of_way = groups.iter().enumerate().filter(|(_, group)| way(group) == played);
+            let (places, groups): (Vec<usize>, Vec<Group<'_>>) = of_way.map(|(place, &group)| (place, group)).unzip();
+            self.play_tasks(&groups, played == 2, &|planned, words, traced| {
+                let place = places[planned.group];
+                match Counting::of(&groups[planned.group]) {
+                    Some(counting) if planned.task.counted != NOWHERE => {
+                        counting.score(words, &planned.task, (place, planned.first_team), &scores)
+                    }
+                    _ => each_episode(&groups, planned, words, traced, |team, episode| {
+                        scores.score(place, team, episode)
+                    }),
+                }
+            })?;
+        }
         Ok(scores.finish())
     }
 
