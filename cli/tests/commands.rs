@@ -1,12 +1,15 @@
-//! Helpers for tests: commands, and a temporary directory in which they run.
+//! Helpers for tests: commands, a temporary directory in which they run, and training in the test's own process.
 
 use std::ffi::{OsStr, OsString};
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
+use std::sync::atomic::{AtomicBool, Ordering::SeqCst};
 use std::time::Duration;
 
 use assert_cmd::cargo::cargo_bin;
+use flotilla::backend::{BackendError, OpenBackend};
+use flotilla_app::run::{Options, RunError, Session, SessionEnd};
 use tempfile::TempDir;
 
 /// Returns the path of a file in the checkout.
@@ -169,4 +172,23 @@ impl Place {
         assert!(stderr.contains("error: ") && !stderr.contains("panicked"), "{words:?}: {stderr}");
         stderr
     }
+}
+
+/// Trains until the runs are finished, or until `stops` returns true for the generations that they play next.
+/// `fallback` may return another backend after one failed.
+pub fn train(
+    session: &mut Session,
+    mut backend: OpenBackend,
+    fallback: &mut dyn FnMut(&BackendError) -> Option<OpenBackend>,
+    stops: &mut dyn FnMut(&[usize]) -> bool,
+) -> Result<SessionEnd, RunError> {
+    let (stop, save) = (AtomicBool::new(false), AtomicBool::new(false));
+    let mut options = Options {
+        command: "",
+        stop: &stop,
+        save: &save,
+        fallback,
+        watch: &mut |now| stop.store(stops(now.generations), SeqCst),
+    };
+    session.train(&mut backend, &mut options)
 }

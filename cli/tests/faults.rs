@@ -33,95 +33,60 @@ struct Scenario {
     before: &'static [&'static str],
     /// The command that is disturbed.
     command: &'static str,
-    /// Commands that resume and keep finished work. The second runs if the first fails; it may be empty.
-    resume: [&'static str; 2],
     /// Number of faults in the default run.
     short: usize,
     /// Maximum number of disturbed calls in a long run.
     long: usize,
 }
 
+const fn scenario(
+    name: &'static str,
+    before: &'static [&'static str],
+    command: &'static str,
+    short: usize,
+) -> Scenario {
+    Scenario { name, before, command, short, long: 1000 }
+}
+
 const SCENARIOS: [Scenario; 9] = [
+    scenario("train", &[], "train small.toml --out out", 60),
+    scenario("extension", &["train small.toml --out out --generations 2"], "train small.toml --out out --resume", 50),
+    scenario("force", &["train small.toml --out out --seed 5"], "train small.toml --out out --force", 50),
+    scenario(
+        "init",
+        &["train small.toml --out first --seed 5"],
+        "train small.toml --out out --init first/policies.safetensors",
+        50,
+    ),
+    scenario("stages", &[], "train stages.toml --out out", 24),
+    scenario("sweep", &[], "sweep grid.toml --out out", 40),
+    Scenario { long: 120, ..scenario("paper", &[], "paper --trials 1 --generations 1 --out out", 8) },
     Scenario {
-        name: "train",
-        before: &[],
-        command: "train small.toml --out out",
-        resume: ["train small.toml --out out --resume", ""],
-        short: 60,
-        long: 1000,
-    },
-    Scenario {
-        name: "extension",
-        before: &["train small.toml --out out --generations 2"],
-        command: "train small.toml --out out --resume",
-        resume: ["train small.toml --out out --resume", ""],
-        short: 50,
-        long: 1000,
-    },
-    Scenario {
-        name: "force",
-        before: &["train small.toml --out out --seed 5"],
-        command: "train small.toml --out out --force",
-        // If the fault came before anything was overwritten, the directory still contains the run with seed 5.
-        resume: ["train small.toml --out out --resume", "train small.toml --out out --force"],
-        short: 50,
-        long: 1000,
-    },
-    Scenario {
-        name: "init",
-        before: &["train small.toml --out first --seed 5"],
-        command: "train small.toml --out out --init first/policies.safetensors",
-        resume: [
-            "train small.toml --out out --resume",
-            "train small.toml --out out --resume --init first/policies.safetensors",
-        ],
-        short: 50,
-        long: 1000,
-    },
-    Scenario {
-        name: "stages",
-        before: &[],
-        command: "train stages.toml --out out",
-        resume: ["train stages.toml --out out --resume", ""],
-        short: 24,
-        long: 1000,
-    },
-    Scenario {
-        name: "sweep",
-        before: &[],
-        command: "sweep grid.toml --out out",
-        resume: ["sweep grid.toml --out out --resume", ""],
-        short: 40,
-        long: 1000,
-    },
-    Scenario {
-        name: "paper",
-        before: &[],
-        command: "paper --trials 1 --generations 1 --out out",
-        resume: ["paper --trials 1 --generations 1 --out out --resume", ""],
-        short: 8,
-        long: 120,
-    },
-    Scenario {
-        name: "paper-force",
-        before: &["paper --trials 1 --generations 1 --out out --seed 5"],
-        command: "paper --trials 1 --generations 1 --out out --force",
-        resume: [
-            "paper --trials 1 --generations 1 --out out --resume",
-            "paper --trials 1 --generations 1 --out out --force",
-        ],
-        short: 6,
         long: 100,
+        ..scenario(
+            "paper-force",
+            &["paper --trials 1 --generations 1 --out out --seed 5"],
+            "paper --trials 1 --generations 1 --out out --force",
+            6,
+        )
     },
-    Scenario {
-        name: "questions",
-        before: &[],
-        command: "paper --questions=g --trials 2 --generations 1 --out out",
-        resume: ["paper --questions=g --trials 2 --generations 1 --out out --resume", ""],
-        short: 6,
-        long: 120,
-    },
+    Scenario { long: 120, ..scenario("questions", &[], "paper --questions=g --trials 2 --generations 1 --out out", 6) },
 ];
+
+impl Scenario {
+    /// Returns the command that resumes and keeps finished work. If it may be refused, also returns what to run then.
+    fn resume(&self) -> (String, Option<String>) {
+        let command = self.command;
+        if let Some(start) = command.strip_suffix(" --force") {
+            // If the fault came before anything was overwritten, the folder still contains the run with seed 5.
+            (format!("{start} --resume"), Some(command.into()))
+        } else if let Some((start, _)) = command.split_once(" --init ") {
+            (format!("{start} --resume"), Some(format!("{command} --resume")))
+        } else {
+            (format!("{} --resume", command.trim_end_matches(" --resume")), None)
+        }
+    }
+}
 
 /// The fault injected into a system call.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -321,27 +286,25 @@ fn inject(shim: &Shim, case: &Case<'_>, prepared: &Prepared) -> Option<String> {
         let ends = disturbed.status.success() || fault == Fault::Killed && disturbed.status.code().is_none();
         assert!(ends, "{context}: {:?}: {stderr}", disturbed.status);
     }
-    let [mut resume, fallback] = scenario.resume;
+    let (mut resume, fallback) = scenario.resume();
     let started = fs::read_dir(place.path().join("out")).is_ok_and(|mut entries| entries.next().is_some());
     if !started {
         // The output directory is empty, so there is nothing to resume.
         if scenario.name == "init" && disturbed.status.code().is_some() && !advises(&stderr) {
             return Some(format!("{context}: {stderr}"));
         }
-        resume = scenario.command;
+        resume = scenario.command.into();
     }
-    let resumed = output(program(place.path(), resume), &context);
+    let resumed = output(program(place.path(), &resume), &context);
     let resume_stderr = String::from_utf8_lossy(&resumed.stderr).into_owned();
     let mut refusal = None;
     if !resumed.status.success() {
         // The message must name a flag or a command that helps.
-        if resumed.status.code() != Some(1)
-            || fallback.is_empty()
-            || !resume_stderr.contains("--") && !resume_stderr.contains("resume with")
-        {
+        let advised = resume_stderr.contains("--") || resume_stderr.contains("resume with");
+        let Some(fallback) = fallback.filter(|_| resumed.status.code() == Some(1) && advised) else {
             return Some(format!("{context}: {stderr}\nthen {resume}: {:?}: {resume_stderr}", resumed.status));
-        }
-        let second = output(program(place.path(), fallback), &context);
+        };
+        let second = output(program(place.path(), &fallback), &context);
         refusal = Some(resume_stderr.clone());
         if !second.status.success() {
             return Some(format!(

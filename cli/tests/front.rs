@@ -22,7 +22,7 @@ use flotilla_app::record::disk::Disk;
 use flotilla_app::record::folder::{Start, StartFrom};
 use flotilla_app::record::policies::{self, Init, Policies};
 use flotilla_app::record::runs;
-use flotilla_app::run::{Options, Session, SessionEnd};
+use flotilla_app::run::{Session, SessionEnd};
 
 #[path = "../../app/examples/play.rs"]
 mod play;
@@ -54,11 +54,7 @@ fn run_digest_from(config: &Config, folder: &Path, init: Option<Init>) -> String
     let runs = vec![(config.clone(), folder.to_path_buf(), init)];
     let (mut session, _) = Session::open_from(runs, StartFrom::Unspecified, Start::Fresh, &Disk::default())
         .expect("the directory is empty");
-    let unset = std::sync::atomic::AtomicBool::default();
-    let ended = session.train(
-        &mut front::cpu(),
-        &mut Options { command: "", stop: &unset, save: &unset, fallback: &mut |_| None, watch: &mut |_| () },
-    );
+    let ended = support::train(&mut session, front::cpu(), &mut |_| None, &mut |_| false);
     assert_eq!(ended.expect("training succeeds"), SessionEnd::Finished);
     session.results(0).expect("the run is finished").digest.clone()
 }
@@ -233,30 +229,21 @@ fn train_gives_the_results_of_a_recorded_run() {
 
 #[test]
 fn stopped_training_equals_training_with_fewer_generations() {
-    for (seed, after) in [(3, 0), (4, 2), (5, 4), (6, 5), (7, 6)] {
-        let config = config(seed);
-        let mut calls = 0;
+    let mut staged = config(3);
+    let stage = |from| Stage { from, set: [("world.steps".to_string(), toml::Value::from(60))].into() };
+    staged.stages = vec![stage(2), stage(5)];
+    let cases = [(3, 0), (4, 2), (5, 4), (6, 5), (7, 6)].map(|(seed, after)| (config(seed), after));
+    for (config, after) in cases.into_iter().chain((0..=6).map(|after| (staged.clone(), after))) {
+        let (case, mut calls) = (format!("seed {}, after {after}", config.learning.seed), 0);
         let stopped = flotilla::train(&config, &mut Cpu::default(), |generation| {
             calls += 1;
             if generation.generation == after { Break(()) } else { Continue(()) }
         });
-        let stopped = stopped.unwrap_or_else(|error| panic!("seed {seed}: {error}"));
-        assert_eq!((stopped.config.learning.generations, calls), (6.min(after + 2), after + 1), "after {after}");
+        let stopped = stopped.unwrap_or_else(|error| panic!("{case}: {error}"));
+        let (generations, stages) = (stopped.config.learning.generations, stopped.config.stages.len());
+        assert_eq!((generations, stages, calls), (6.min(after + 2), config.stages.len(), after + 1), "{case}");
         let whole = flotilla::train(&stopped.config, &mut Cpu::default(), |_| Continue(()));
-        assert_eq!(whole.unwrap_or_else(|error| panic!("seed {seed}: {error}")), stopped, "after {after}");
-    }
-    // The same with stages.
-    let mut config = config(3);
-    let stage = |from| Stage { from, set: [("world.steps".to_string(), toml::Value::from(60))].into() };
-    config.stages = vec![stage(2), stage(5)];
-    for after in 0..=6 {
-        let stopped = flotilla::train(&config, &mut Cpu::default(), |generation| {
-            if generation.generation == after { Break(()) } else { Continue(()) }
-        });
-        let stopped = stopped.unwrap_or_else(|error| panic!("{error}"));
-        assert_eq!((stopped.config.learning.generations, stopped.config.stages.len()), (6.min(after + 2), 2));
-        let whole = flotilla::train(&stopped.config, &mut Cpu::default(), |_| Continue(()));
-        assert_eq!(whole.unwrap_or_else(|error| panic!("{error}")), stopped, "stages, after {after}");
+        assert_eq!(whole.unwrap_or_else(|error| panic!("{case}: {error}")), stopped, "{case}");
     }
 }
 

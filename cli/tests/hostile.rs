@@ -74,59 +74,16 @@ fn files() -> Files {
     }
 }
 
-/// Pieces that have a meaning in one of the formats.
-const PIECES: &[&str] = &[
-    "0",
-    "-1",
-    "1e999",
-    "-0.0",
-    "1e-40",
-    "nan",
-    "inf",
-    "18446744073709551615",
-    "9223372036854775807",
-    "99999999999999999999",
-    "4294967296",
-    "0.5",
-    "1.0000001",
-    "\"",
-    "\\u0000",
-    "\\",
-    "[",
-    "]",
-    "[[",
-    "{",
-    "}",
-    ",",
-    ":",
-    "\n",
-    "\r\n",
-    "null",
-    "true",
-    "é",
-    "\u{1f6a2}",
-    "F32",
-    "F64",
-    "F4",
-    "BOOL",
-    "shape",
-    "dtype",
-    "data_offsets",
-    "__metadata__",
-    "weights.0",
-    "weights",
-    "sha256",
-    "flotilla",
-    "[world]",
-    "leaders",
-    "=",
-    ".",
-    "#",
-    "trial,generation",
-];
+/// Pieces that have a meaning in one of the formats, separated by spaces. The first [`NUMBERS`] are numbers.
+const PIECES: &str = "0 -1 1e999 -0.0 1e-40 nan inf 18446744073709551615 9223372036854775807 99999999999999999999 \
+                      4294967296 0.5 1.0000001 \" \\u0000 \\ [ ] [[ { } , : \n \r\n null true é \u{1f6a2} F32 F64 \
+                      F4 BOOL shape dtype data_offsets __metadata__ weights.0 weights sha256 flotilla [world] \
+                      leaders = . # trial,generation";
+const NUMBERS: usize = 12;
 
 /// Returns a mutated copy of one of the seeds.
 fn mutate(random: &mut ChaCha8Rng, seeds: &[&[u8]]) -> Vec<u8> {
+    let pieces: Vec<&str> = PIECES.split(' ').collect();
     let mut bytes = seeds[random.random_range(0..seeds.len())].to_vec();
     for _ in 0..random.random_range(1..6) {
         let at = random.random_range(0..=bytes.len());
@@ -148,7 +105,7 @@ fn mutate(random: &mut ChaCha8Rng, seeds: &[&[u8]]) -> Vec<u8> {
                 bytes.splice(at..end, piece.iter().copied());
             }
             6 => {
-                let piece = PIECES[random.random_range(0..PIECES.len())];
+                let piece = pieces[random.random_range(0..pieces.len())];
                 bytes.splice(at..end, piece.bytes());
             }
             _ => {
@@ -156,7 +113,7 @@ fn mutate(random: &mut ChaCha8Rng, seeds: &[&[u8]]) -> Vec<u8> {
                 if let Some(digit) = bytes[at..].iter().position(u8::is_ascii_digit) {
                     let start = at + digit;
                     let count = bytes[start..].iter().take_while(|byte| byte.is_ascii_digit()).count();
-                    let piece = PIECES[random.random_range(0..12)];
+                    let piece = pieces[random.random_range(0..NUMBERS)];
                     bytes.splice(start..start + count, piece.bytes());
                 }
             }

@@ -65,7 +65,11 @@ fn a_killed_study_resumes_to_the_same_tables() {
     assert!(tables(&place, "whole") == whole);
     assert!(place.refused(1, &format!("{line} --out whole --resume --seed 4")).contains("holds another sweep"));
     assert!(place.refused(2, "paper --influence=nowhere").contains("3_rovers_3_uavs"));
-    assert!(place.refused(2, "paper --influence --trials 1 --out none").contains("two trials or more"));
+    for study in ["influence", "questions"] {
+        let error = place.refused(2, &format!("paper --{study} --trials 1 --out none"));
+        assert!(error.contains("--trials 1: intervals and tests take two trials or more"), "{error}");
+        assert!(!place.path("none").exists());
+    }
 }
 
 #[test]

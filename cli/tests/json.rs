@@ -16,6 +16,7 @@ fn run_json(place: &Place, words: &[&str]) -> (i32, Vec<Value>) {
     let output = place.run(&[words, &["--json"]].concat());
     let text = String::from_utf8(output.stdout).expect("JSON is UTF-8");
     assert!(text.ends_with('\n'), "{words:?} printed {text:?}");
+    assert!(!text.contains(['\u{202e}', '\u{9b}', '\u{1b}']), "{words:?} could control a terminal: {text:?}");
     let parse = |line: &str| serde_json::from_str(line).unwrap_or_else(|error| panic!("{words:?}: {error}: {line}"));
     (output.status.code().unwrap(), text.lines().map(parse).collect())
 }
@@ -38,6 +39,7 @@ fn failure(place: &Place, words: &[&str]) -> (String, String) {
     assert!(object["remedy"].is_null() || object["remedy"].as_str().is_some_and(|text| !text.is_empty()), "{object}");
     let text = |name: &str| object[name].as_str().unwrap_or_else(|| panic!("{words:?}: {object}")).to_string();
     assert!(!text("message").is_empty(), "{words:?}");
+    assert_eq!(code == 2, text("code") == "usage", "{words:?}: exit code {code}");
     (text("code"), text("message"))
 }
 
@@ -69,14 +71,15 @@ fn names_that_need_escapes_give_valid_json() {
     let compared = result(&place, &["compare", ODD_NAMES[0], ODD_NAMES[1]]);
     let folders = compared["comparisons"][0]["arms"].as_array().unwrap().iter().map(|arm| &arm["folders"][0]);
     assert_eq!(folders.collect::<Vec<_>>(), ODD_NAMES[..2].iter().collect::<Vec<_>>());
+    result(&place, &["plot", ODD_NAMES[0], ODD_NAMES[1], "--out", "\"both\".svg"]);
 }
 
 #[test]
 fn other_commands_print_json() {
     let sweep = SMALL.replace("coupling = 2\n", "") + "[grid]\n\"world.coupling\" = [1, 2]\n";
-    let place = Place::new(&[("x.toml", SMALL), ("s.toml", &sweep)]);
+    let place = Place::new(&[("x.toml", SMALL), ("s.toml", &sweep), ("\"x\".toml", SMALL)]);
     let cpu = ["--backend", "cpu"];
-    assert!(result(&place, &["check", "x.toml"])["cost"].is_object());
+    assert!(result(&place, &["check", "\"x\".toml"])["cost"].is_object());
     assert!(result(&place, &["devices"])["cpu"].is_string());
     let flags = ["--generations", "1", "--population", "8", "--paradigm", "all-leaders"];
     let with_flags = result(&place, &[&["baseline", "x.toml", "--seeds", "2"], &flags[..], &cpu].concat());
@@ -99,6 +102,11 @@ fn other_commands_print_json() {
     }
     let swept = result(&place, &[&["sweep", "s.toml", "--out", ODD_NAMES[0]][..], &cpu].concat());
     assert_eq!(swept["points"].as_array().unwrap().len(), 2);
+    // The reason why a point is missing quotes the text of its file.
+    place.write(format!("{}/points/0001/config.toml", ODD_NAMES[0]), "[world]\n\"x\u{202e}\u{9b}y\" = 1\n");
+    let (code, collected) = run_json(&place, &["sweep", "s.toml", "--out", ODD_NAMES[0], "--collect"]);
+    let missing = collected[0]["points"][1]["missing"].as_str().unwrap();
+    assert!(code == 1 && missing.contains("x\u{202e}"), "{missing:?}");
     let (code, lines) = run_json(
         &place,
         &[&["bench", "x.toml", "--rollout-only", "--teams", "4,8", "--agents", "6"][..], &cpu].concat(),

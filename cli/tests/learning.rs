@@ -61,8 +61,15 @@ fn the_tested_team_is_in_files_pictures_and_tables() {
 
     // A shorter run, extended, is the same run.
     place.good("train x.toml --generations 3 --out short --quiet --backend cpu");
-    let extended = json(&place, "train x.toml --out short --resume --quiet --json --backend cpu");
+    let error = place.refused(1, "train x.toml --generations 2 --out short --resume --backend cpu");
+    assert!(error.contains("short is a run of 3 generations, which cannot become one of 2"), "{error}");
+    let (extended, stderr) = place.good("train x.toml --out short --resume --json --backend cpu");
+    assert!(stderr.contains("resuming at generation 4"), "{stderr}");
+    let extended: Value = serde_json::from_str(&extended).unwrap();
     assert_eq!((metrics(&place, "short"), &extended["digest"]), (rows, &trained["digest"]));
+    // Generations from before and after the extension can be replayed.
+    place.good("replay short --trial 1 --generation 3 --backend cpu");
+    place.good("replay short --trial 1 --generation 5 --backend cpu");
 
     let episodes = json(&place, "replay run --team best --generation 4 --json --backend cpu");
     assert_eq!(episodes["episodes"][0]["which"], "best", "{episodes}");
@@ -70,7 +77,8 @@ fn the_tested_team_is_in_files_pictures_and_tables() {
     place.good("plot run --measure test --out test.svg");
     assert!(fs::read_to_string(place.path("test.svg")).unwrap().contains("G of the tested best team"));
     assert!(fs::read_to_string(place.path("run/curves.svg")).unwrap().contains("aria-label=\"tested best team\""));
-    assert!(!fs::read_to_string(place.path("plain/curves.svg")).unwrap().contains("tested"));
+    let curves = fs::read_to_string(place.path("plain/curves.svg")).unwrap();
+    assert!(curves.contains("champion") && !curves.contains("tested"));
     let error = place.refused(1, "plot run plain --measure test --out none.svg");
     assert!(error.contains("plain: it has no tested best team, because learning.test_episodes is 0"), "{error}");
     assert!(error.contains("--set learning.test_episodes=") && !error.contains("--resume"), "{error}");

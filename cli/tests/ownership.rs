@@ -4,19 +4,15 @@
 
 use crate::support;
 use std::fs;
-use std::io;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering::SeqCst};
 
+use crate::recovery::{Fails, reference, session, with_each_failure};
 use crate::support::{Place, SMALL};
-use flotilla::backend::cpu::Cpu;
-use flotilla::backend::{Machine, OpenBackend};
 use flotilla::config::Config;
+use flotilla::front::cpu;
 use flotilla_app::record::disk::Disk;
 use flotilla_app::record::folder::{METRICS, POLICIES, RUN, Run, Start, Status};
 use flotilla_app::record::ownership::{self, LIST};
-use flotilla_app::run::{Options, Session, SessionEnd};
 
 const SWEEP: &str = "
 [world]
@@ -544,25 +540,6 @@ mod links {
     }
 }
 
-/// Trains a run to the end. Returns the error message if the disk fails.
-fn train(config: &Config, path: &Path, start: Start, disk: Disk) -> Result<(), String> {
-    let opened = Session::open(vec![(config.clone(), path.into())], start, &disk);
-    let (mut session, _) = opened.map_err(|error| error.to_string())?;
-    if session.is_done() {
-        return Ok(());
-    }
-    let (stop, save) = (AtomicBool::new(false), AtomicBool::new(false));
-    let mut options = Options { command: "", stop: &stop, save: &save, fallback: &mut |_| None, watch: &mut |_| {} };
-    let mut backend: OpenBackend = (Box::new(Cpu::default()), Machine::default());
-    let ended = session.train(&mut backend, &mut options).map_err(|error| error.to_string())?;
-    assert_eq!(ended, SessionEnd::Finished);
-    Ok(())
-}
-
-fn digest(path: &Path) -> Option<String> {
-    Run::read(&path.join(RUN)).unwrap().digest
-}
-
 /// For each file operation of `--force`, this operation and all after it fail, as if the process were killed there. The
 /// next session, with either flag, has to end in the same results as a new run.
 #[test]
@@ -570,47 +547,29 @@ fn an_interrupted_replacement_is_completed_by_force_and_by_resume() {
     let old = Config::parse(SMALL, "small.toml").unwrap();
     let mut new = old.clone();
     (new.learning.seed, new.learning.population, new.checkpoint.generations) = (5, 6, 2);
-    let memory = || tempfile::tempdir_in("/dev/shm").or_else(|_| tempfile::tempdir()).unwrap();
-    let fresh = memory();
-    train(&new, fresh.path(), Start::Fresh, Disk::default()).unwrap();
-    let expected = digest(fresh.path());
-    let attempt = |fails: Option<usize>| {
-        let folder = memory();
-        train(&old, folder.path(), Start::Fresh, Disk::default()).unwrap();
-        fs::write(folder.path().join("notes.txt"), "mine").unwrap();
-        let count = Arc::new(AtomicUsize::new(0));
-        let counted = count.clone();
-        let disk = Disk::failing(move |_, _| match counted.fetch_add(1, SeqCst) {
-            at if fails.is_some_and(|fails| at >= fails) => Err(io::ErrorKind::StorageFull.into()),
-            _ => Ok(()),
-        });
-        let result = train(&new, folder.path(), Start::Force, disk);
-        (folder, result, count.load(SeqCst))
+    let expected = reference(&new).0.digest;
+    let train = |config: &Config, path: &Path, start| session(config, path, start, Disk::default(), cpu(), None).end;
+    let before = |path: &Path| {
+        train(&old, path, Start::Fresh).unwrap();
+        fs::write(path.join("notes.txt"), "mine").unwrap();
     };
-    let (folder, result, operations) = attempt(None);
-    assert_eq!((result, digest(folder.path())), (Ok(()), expected.clone()));
     let mut replacing = 0;
-    for at in 0..operations {
-        for start in [Start::Force, Start::Resume] {
-            let (folder, failed, _) = attempt(Some(at));
-            assert!(failed.is_err(), "operation {at}");
-            let state = Run::read(&folder.path().join(RUN)).map(|run| run.state);
-            if state.as_ref().is_ok_and(|state| *state == Status::Replacing) {
+    for start in [Start::Force, Start::Resume] {
+        with_each_failure(before, &new, Start::Force, &[Fails::FromThere], |path, outcome, _, context| {
+            assert!(outcome.end.is_err(), "{context}");
+            let state = Run::read(&path.join(RUN)).map(|run| run.state);
+            if matches!(state, Ok(Status::Replacing)) {
                 replacing += 1;
                 // A resume with another config is refused, and changes nothing.
-                train(&old, folder.path(), Start::Resume, Disk::default()).unwrap_err();
+                train(&old, path, Start::Resume).unwrap_err();
             }
-            let complete = state.is_ok_and(|state| state == Status::Done);
             // Before the first operation the old run is complete. It cannot be resumed with another config.
-            let start = if complete && Config::load(&folder.path().join("config.toml")).unwrap() == old {
-                Start::Force
-            } else {
-                start
-            };
-            let result = train(&new, folder.path(), start, Disk::default());
-            assert_eq!((result, digest(folder.path())), (Ok(()), expected.clone()), "operation {at}, {start:?}");
-            assert_eq!(fs::read(folder.path().join("notes.txt")).unwrap(), b"mine");
-        }
+            let is_old = matches!(state, Ok(Status::Done)) && Config::load(&path.join("config.toml")).unwrap() == old;
+            train(&new, path, if is_old { Start::Force } else { start }).unwrap();
+            let digest = Run::read(&path.join(RUN)).unwrap().digest;
+            assert_eq!(digest.as_deref(), Some(&*expected), "{context}, {start:?}");
+            assert_eq!(fs::read(path.join("notes.txt")).unwrap(), b"mine");
+        });
     }
     assert!(replacing > 20, "only {replacing} failures were during the replacement");
 }

@@ -8,21 +8,22 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering::SeqCst};
 
 use fearless_simd::Level;
+use flotilla::backend::Machine;
 use flotilla::backend::cpu::Cpu;
 use flotilla::backend::gpu;
 use flotilla::backend::gpu::device::{self, DeviceError, Kind};
 use flotilla::backend::gpu::episode::{GpuBackend, ResidencyPolicy};
 use flotilla::backend::{Backend, BackendError, DevicePopulation, Group, GroupScores, HELD_FROM, Trace, Weights};
-use flotilla::backend::{Machine, OpenBackend};
 use flotilla::config::{
     Config, Coupling, Elites, Fitness, Learning, Leniency, Method, Mutation, Paradigm, Parents, Sharing, Teams,
     ValidConfig,
 };
 use flotilla::evolve::{self, Breeding, Key, Purpose, UNCHANGED};
+use flotilla::front::cpu;
 use flotilla::trainer::{Row, Snapshot, SnapshotError, Trainer};
 use flotilla_app::record::disk::Disk;
-use flotilla_app::record::folder::{METRICS, Start};
-use flotilla_app::run::{Options, Session, SessionEnd};
+use flotilla_app::record::folder::{METRICS, POLICIES, RUN, Run, Start, Status};
+use flotilla_app::run::{Session, SessionEnd};
 
 fn learning() -> Learning {
     support::layout("generally_forward").learning
@@ -353,10 +354,11 @@ fn populations_too_large_for_the_device_stay_on_the_host() {
     }
 }
 
-/// A fake device that fails at its nth call, permanently or once. It holds populations in host memory.
+/// A fake device that fails at its nth call, permanently or once. If it holds populations, it does so in host memory.
 struct FakeDevice {
     cpu: Cpu,
     state: Arc<State>,
+    holds: bool,
 }
 
 struct State {
@@ -379,10 +381,10 @@ impl State {
 }
 
 impl FakeDevice {
-    /// Creates a device that fails at call `nth`, counted from 1. With 0 it never fails.
+    /// Creates a device that holds populations and fails at call `nth`, counted from 1. With 0 it never fails.
     fn failing_at(nth: usize, permanent: bool) -> FakeDevice {
         let state = State { left: AtomicUsize::new(nth), permanent, lost: AtomicBool::new(false) };
-        FakeDevice { cpu: Cpu::default(), state: Arc::new(state) }
+        FakeDevice { cpu: Cpu::default(), state: Arc::new(state), holds: true }
     }
 
     /// Returns whether the device has failed.
@@ -444,7 +446,8 @@ impl Backend for FakeDevice {
     }
 
     fn hold(&mut self, weights: &[f32], sizes: [usize; 3]) -> Result<Option<Box<dyn DevicePopulation>>, BackendError> {
-        Ok(Some(Box::new(FakePopulation { state: self.state.clone(), weights: weights.to_vec(), sizes })))
+        let held = || FakePopulation { state: self.state.clone(), weights: weights.to_vec(), sizes };
+        Ok(self.holds.then(|| Box::new(held()) as Box<dyn DevicePopulation>))
     }
 
     fn describe(&self) -> String {
@@ -502,38 +505,49 @@ fn a_run_survives_the_loss_of_its_device() {
     let run = |name: &str, start: Start, device: Option<FakeDevice>, fall_back: bool| {
         let path = folder.path().join(name);
         let (mut session, _) = Session::open(vec![(config.clone(), path.clone())], start, &Disk::default()).unwrap();
-        let (stop, save) = (AtomicBool::new(false), AtomicBool::new(false));
-        let cpu = || -> OpenBackend { (Box::new(Cpu::default()), Machine::default()) };
-        let mut options = Options {
-            command: "",
-            stop: &stop,
-            save: &save,
-            fallback: &mut |_| fall_back.then(cpu),
-            watch: &mut |_| {},
+        let (first, mut requests) = (session.generations()[0], 0);
+        let backend = device.map_or_else(cpu, |device| (Box::new(device), Machine::default()));
+        let mut fallback = |_: &BackendError| {
+            requests += 1;
+            fall_back.then(cpu)
         };
-        let mut backend = device.map_or_else(cpu, |device| (Box::new(device), Machine::default()));
-        let ended = session.train(&mut backend, &mut options).map(|outcome| {
+        let ended = support::train(&mut session, backend, &mut fallback, &mut |_| false).map(|outcome| {
             assert_eq!(outcome, SessionEnd::Finished);
             session.results(0).cloned().unwrap()
         });
         let metrics = std::fs::read_to_string(path.join(METRICS)).unwrap();
         let rows = metrics.lines().map(|line| line.rsplit_once(',').unwrap().0.to_string()).collect::<Vec<_>>();
-        (ended, rows)
+        (ended, (rows, std::fs::read(path.join(POLICIES)).ok()), first, requests)
     };
-    let (expected, rows) = run("cpu", Start::Fresh, None, false);
+    let (expected, files, ..) = run("cpu", Start::Fresh, None, false);
     let expected = expected.unwrap();
     let mut lost_populations = 0;
-    for nth in 1..20 {
-        let (ended, found) =
-            run(&format!("fall-back-{nth}"), Start::Fresh, Some(FakeDevice::failing_at(nth, true)), true);
-        assert_eq!((ended.unwrap(), &found), (expected.clone(), &rows), "call {nth}");
-        let name = format!("stop-{nth}");
-        let (ended, _) = run(&name, Start::Fresh, Some(FakeDevice::failing_at(nth, true)), false);
+    // A device that holds no populations has one call per generation, and one for the last champions.
+    let cases = (1..20).map(|nth| (nth, true)).chain((1..=config.learning.generations + 2).map(|nth| (nth, false)));
+    for (nth, holds) in cases {
+        let case = format!("call {nth}, populations on the device {holds}");
+        let device = || Some(FakeDevice { holds, ..FakeDevice::failing_at(nth, true) });
+        let (ended, found, _, requests) = run(&format!("fall-back-{nth}-{holds}"), Start::Fresh, device(), true);
+        assert_eq!((ended.unwrap(), &found, requests), (expected.clone(), &files, 1), "{case}");
+        let name = format!("stop-{nth}-{holds}");
+        let (ended, ..) = run(&name, Start::Fresh, device(), false);
         let error = flotilla_cli::Error::from(ended.unwrap_err()).to_string();
         assert!(error.contains("the device was lost") && error.contains("--resume"), "{error}");
-        lost_populations += usize::from(error.contains("the populations were lost"));
-        let (ended, found) = run(&name, Start::Resume, None, false);
-        assert_eq!((ended.unwrap(), &found), (expected.clone(), &rows), "call {nth}");
+        assert_eq!(Run::read(&folder.path().join(&name).join(RUN)).unwrap().state, Status::Stopped, "{case}");
+        let is_lost = error.contains("the populations were lost");
+        assert!(holds || !is_lost, "{case}: {error}");
+        lost_populations += usize::from(is_lost);
+        let (ended, found, first, _) = run(&name, Start::Resume, None, false);
+        assert_eq!((ended.unwrap(), &found), (expected.clone(), &files), "{case}");
+        // The host still has the populations, so no generation is played again.
+        assert!(holds || first == nth - 1, "{case}: generation {first}");
+    }
+    // A command that trains no run suggests to run it again.
+    let lost = DeviceError::Lost { adapter: "test".into(), reason: "pulled out".into() };
+    let unknown = DeviceError::UnknownAdapter { name: "test".into(), found: vec![] };
+    for (error, end) in [(lost, "; run again, or use --backend cpu"), (unknown, "; use --backend cpu")] {
+        let error = flotilla_cli::Error::from(BackendError::from(error)).to_string();
+        assert!(error.ends_with(end), "{error}");
     }
     assert!(lost_populations > 0);
 }

@@ -1,30 +1,28 @@
 //! Tests that a run stopped at any point resumes to the same bits as an uninterrupted run.
 //!
-//! Runs are stopped between generations, by failing disk operations, lost devices, kills and signals. `FLOTILLA_KILLS`
-//! sets how often the real program is killed (default: 20).
+//! Runs are stopped between generations, by failing disk operations, kills and signals. `FLOTILLA_KILLS` sets how often
+//! the real program is killed (default: 20). Lost devices are in `population.rs`.
 
 use crate::support;
 use std::fs;
 use std::io::{self, Cursor, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Output, Stdio};
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering::SeqCst};
+use std::sync::atomic::{AtomicUsize, Ordering::SeqCst};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use crate::support::tiny;
-use flotilla::backend::cpu::Cpu;
+use crate::support::{tiny, train};
 use flotilla::backend::gpu;
-use flotilla::backend::gpu::device::DeviceError;
 use flotilla::backend::gpu::episode::GpuBackend;
-use flotilla::backend::{Backend, BackendError, Group, GroupScores, Trace};
 use flotilla::backend::{Machine, OpenBackend};
 use flotilla::config::{CheckpointConfig, Config};
+use flotilla::front::cpu;
 use flotilla_app::record::checkpoint::{self, Checkpoint, CheckpointWriter};
 use flotilla_app::record::disk::{Disk, Operation};
 use flotilla_app::record::folder::{self, CONFIG, Folder, METRICS, Note, POLICIES, RUN, Run, Start, StartFrom, Status};
 use flotilla_app::record::{RecordError, metrics, policies};
-use flotilla_app::run::{Options, Results, RunError, Session, SessionEnd};
+use flotilla_app::run::{Results, RunError, Session, SessionEnd};
 use rand::{RngExt, SeedableRng, rngs::ChaCha8Rng};
 use tempfile::TempDir;
 
@@ -37,21 +35,18 @@ fn small() -> Config {
     Config::parse(&text(), "small.toml").unwrap()
 }
 
-fn cpu() -> OpenBackend {
-    (Box::new(Cpu::default()), Machine::default())
-}
-
 /// Outcome of one session. `notes` are about the folder. `start` and `reached` are the next generations at its start
 /// and at its end.
-struct Outcome {
-    end: Result<SessionEnd, RunError>,
-    results: Option<Results>,
+pub struct Outcome {
+    pub end: Result<SessionEnd, RunError>,
+    pub results: Option<Results>,
     notes: Vec<Note>,
     start: usize,
     reached: usize,
 }
 
-fn session(
+/// Trains a run until generation `stop_at` is next, or to its end.
+pub fn session(
     config: &Config,
     path: &Path,
     start: Start,
@@ -73,24 +68,6 @@ fn session(
     Outcome { end, results: session.results(0).cloned(), notes, start, reached: session.generations()[0] }
 }
 
-/// Trains until `stops` returns true or the runs are finished.
-fn train(
-    session: &mut Session,
-    mut backend: OpenBackend,
-    fallback: &mut dyn FnMut(&BackendError) -> Option<OpenBackend>,
-    stops: &mut dyn FnMut(&[usize]) -> bool,
-) -> Result<SessionEnd, RunError> {
-    let (stop, save) = (AtomicBool::new(false), AtomicBool::new(false));
-    let mut options = Options {
-        command: "",
-        stop: &stop,
-        save: &save,
-        fallback,
-        watch: &mut |now| stop.store(stops(now.generations), SeqCst),
-    };
-    session.train(&mut backend, &mut options)
-}
-
 /// Resumes a run to its end, on a disk without failures.
 fn resume(config: &Config, path: &Path) -> (Results, Outcome) {
     let outcome = session(config, path, Start::Resume, Disk::default(), cpu(), None);
@@ -109,7 +86,7 @@ fn result_files(path: &Path) -> (String, Vec<u8>) {
 }
 
 /// Trains without interruption. Returns the results and the files.
-fn reference(config: &Config) -> (Results, (String, Vec<u8>)) {
+pub fn reference(config: &Config) -> (Results, (String, Vec<u8>)) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("run");
     let outcome = session(config, &path, Start::Fresh, Disk::default(), cpu(), None);
@@ -289,20 +266,7 @@ fn names_are_flushed_once_and_after_the_last_file() {
 
 #[test]
 fn a_run_stopped_before_any_generation_resumes_to_the_same_results() {
-    let config = small();
-    let expected = reference(&config);
-    for stop_at in 1..=config.learning.generations + 2 {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("run");
-        let outcome = session(&config, &path, Start::Fresh, Disk::default(), cpu(), Some(stop_at));
-        // The last step completes the run, which leaves nothing to stop.
-        let done = stop_at == config.learning.generations + 2;
-        assert_eq!(outcome.end.unwrap(), if done { SessionEnd::Finished } else { SessionEnd::Stopped });
-        assert_eq!(outcome.reached, stop_at);
-        let (results, outcome) = resume(&config, &path);
-        assert_eq!(outcome.start, if done { 0 } else { stop_at });
-        assert_eq!((results, result_files(&path)), expected, "stopped before generation {stop_at}");
-    }
+    crate::stages::check_resumes(&small(), &[], &[]);
 }
 
 #[test]
@@ -476,46 +440,29 @@ fn a_run_with_missing_or_damaged_files_is_extended() {
     assert!(error.contains("learning.seed: 0 there, 3 here") && !error.contains("generations:"), "{error}");
 }
 
-/// Lets every disk operation of an extension fail once, alone or with all later ones. Each time, the run must resume to
-/// the same results.
+/// Lets every disk operation of an extension fail. Each time, the run must resume to the same results.
 #[test]
 fn an_extension_survives_every_failing_disk_operation() {
     let config = with_generations(&small(), 9);
     let mut short = with_generations(&config, 5);
     short.checkpoint.generations = 3;
     let expected = reference(&config);
-    let attempt = |fails: Box<dyn Fn(usize) -> bool + Send + Sync>| {
-        let folder = in_memory();
-        let path = folder.path().join("run");
-        session(&short, &path, Start::Fresh, Disk::default(), cpu(), None).end.unwrap();
-        let count = Arc::new(AtomicUsize::new(0));
-        let disk = Disk::failing({
-            let count = count.clone();
-            move |_, _| match fails(count.fetch_add(1, SeqCst)) {
-                true => Err(io::Error::from(io::ErrorKind::StorageFull)),
-                false => Ok(()),
-            }
-        });
-        let mut without_checkpoints = config.clone();
-        without_checkpoints.checkpoint.generations = 0;
-        let outcome = session(&without_checkpoints, &path, Start::Resume, disk, cpu(), None);
-        (folder, path, outcome, count.load(SeqCst))
+    let mut without_checkpoints = config.clone();
+    without_checkpoints.checkpoint.generations = 0;
+    let before = |path: &Path| {
+        session(&short, path, Start::Fresh, Disk::default(), cpu(), None).end.unwrap();
     };
-    let (_, _, outcome, operations) = attempt(Box::new(|_| false));
-    assert_eq!(outcome.results, Some(expected.0.clone()));
+    let check = |path: &Path, _: Outcome, _: Operation, context: &str| {
+        let (results, resumed) = resume(&config, path);
+        assert_eq!((results, result_files(path)), expected, "{context}");
+        assert!(resumed.notes.len() <= 1, "{context}: {:?}", resumed.notes);
+        // The run resumes from the end of the shorter run, or is already finished.
+        assert!(resumed.start >= 6 || resumed.reached == 0, "{context}: {:?}", resumed.notes);
+        assert_eq!(leftovers(path), Vec::<PathBuf>::new(), "{context}");
+    };
+    let both = [Fails::Once, Fails::FromThere];
+    let operations = with_each_failure(before, &without_checkpoints, Start::Resume, &both, check);
     assert!(operations > 20, "{operations}");
-    for at in 0..operations {
-        for and_later in [false, true] {
-            let (_folder, path, _, _) =
-                attempt(Box::new(move |operation| operation == at || and_later && operation > at));
-            let (results, resumed) = resume(&config, &path);
-            assert_eq!((results, result_files(&path)), expected, "operation {at}");
-            assert!(resumed.notes.len() <= 1, "operation {at}: {:?}", resumed.notes);
-            // The run resumes from the end of the shorter run, or is already finished.
-            assert!(resumed.start >= 6 || resumed.reached == 0, "operation {at}: {:?}", resumed.notes);
-            assert_eq!(leftovers(&path), Vec::<PathBuf>::new(), "operation {at}");
-        }
-    }
 }
 
 /// Trains runs of different lengths, sizes and progress in one session, and compares each with the same run trained
@@ -559,60 +506,33 @@ fn runs_trained_together_equal_runs_trained_alone() {
     assert!(!folder.path().join("new").exists());
 }
 
-/// Lets every disk operation of a run fail once, alone or with all later ones. A write that fails leaves its first
-/// half. Each time, the run must resume to the same results.
+/// Lets every disk operation of a run fail. Each time, the run must resume to the same results.
 #[test]
 fn a_run_survives_every_failing_disk_operation() {
     let config = small();
     let expected = reference(&config);
-    let attempt = |fails: Box<dyn Fn(usize) -> bool + Send + Sync>| {
-        let folder = in_memory();
-        let count = Arc::new(AtomicUsize::new(0));
-        let failed = Arc::new(Mutex::new(None));
-        let disk = Disk::failing({
-            let (count, failed) = (count.clone(), failed.clone());
-            move |operation, path| {
-                if fails(count.fetch_add(1, SeqCst)) {
-                    *failed.lock().unwrap() = Some((operation, path.to_path_buf()));
-                    return Err(io::Error::from(io::ErrorKind::StorageFull));
-                }
-                Ok(())
-            }
-        });
-        let path = folder.path().join("run");
-        let outcome = session(&config, &path, Start::Fresh, disk, cpu(), None);
-        let failed = failed.lock().unwrap().clone();
-        (folder, path, outcome, count.load(SeqCst), failed)
-    };
-    let (_, _, outcome, operations, _) = attempt(Box::new(|_| false));
-    assert_eq!((outcome.end.unwrap(), outcome.results), (SessionEnd::Finished, Some(expected.0.clone())));
-    assert!(operations > 14 * 5, "{operations}");
     let mut reported = Vec::new();
-    for at in 0..operations {
-        for and_later in [false, true] {
-            let (_folder, path, outcome, _, failed) =
-                attempt(Box::new(move |operation| operation == at || and_later && operation > at));
-            let (operation, file) = failed.expect("a failed operation");
-            let context = format!("operation {at}: {operation:?} {}", file.display());
-            if let Err(error) = outcome.end {
-                let error = flotilla_cli::Error::from(error).to_string();
-                assert!(error.contains("free some space, then continue with --resume"), "{context}: {error}");
-                reported.push(operation);
-            }
-            let (results, resumed) = resume(&config, &path);
-            assert_eq!((results, result_files(&path)), expected, "{context}");
-            // No file is reported as damaged. The only possible note is the generation of the resume.
-            assert!(resumed.notes.len() <= 1, "{context}: {:?}", resumed.notes);
-            // With a checkpoint per generation, at most two generations are played again.
-            assert!(
-                resumed.start + 2 >= outcome.reached || outcome.reached > 15,
-                "{context}: {} {}",
-                resumed.start,
-                outcome.reached
-            );
-            assert_eq!(leftovers(&path), Vec::<PathBuf>::new(), "{context}");
+    let check = |path: &Path, outcome: Outcome, operation: Operation, context: &str| {
+        if let Err(error) = outcome.end {
+            let error = flotilla_cli::Error::from(error).to_string();
+            assert!(error.contains("free some space, then continue with --resume"), "{context}: {error}");
+            reported.push(operation);
         }
-    }
+        let (results, resumed) = resume(&config, path);
+        assert_eq!((results, result_files(path)), expected, "{context}");
+        // No file is reported as damaged. The only possible note is the generation of the resume.
+        assert!(resumed.notes.len() <= 1, "{context}: {:?}", resumed.notes);
+        // With a checkpoint per generation, at most two generations are played again.
+        assert!(
+            resumed.start + 2 >= outcome.reached || outcome.reached > 15,
+            "{context}: {} {}",
+            resumed.start,
+            outcome.reached
+        );
+        assert_eq!(leftovers(path), Vec::<PathBuf>::new(), "{context}");
+    };
+    let operations = with_each_failure(|_| (), &config, Start::Fresh, &[Fails::Once, Fails::FromThere], check);
+    assert!(operations > 14 * 5, "{operations}");
     for operation in [
         Operation::CreateFolder,
         Operation::Create,
@@ -623,6 +543,62 @@ fn a_run_survives_every_failing_disk_operation() {
     ] {
         assert!(reported.contains(&operation), "no failure of {operation:?} was reported");
     }
+}
+
+/// How a disk fails.
+#[derive(Clone, Copy, Debug)]
+pub enum Fails {
+    /// One operation fails.
+    Once,
+    /// An operation and all later ones fail, as if the process were killed there.
+    FromThere,
+}
+
+/// Trains a run once for each of its disk operations and each way to fail, and lets that operation fail. A write that
+/// fails leaves its first half. Returns the number of operations.
+///
+/// `before` prepares a new folder each time. `check` gets the folder, the outcome, the operation that failed, and a
+/// text that describes the case.
+pub fn with_each_failure(
+    before: impl Fn(&Path),
+    config: &Config,
+    start: Start,
+    ways: &[Fails],
+    mut check: impl FnMut(&Path, Outcome, Operation, &str),
+) -> usize {
+    let attempt = |fails: Box<dyn Fn(usize) -> bool + Send + Sync>| {
+        let folder = in_memory();
+        let path = folder.path().join("run");
+        before(&path);
+        let (count, failed) = (Arc::new(AtomicUsize::new(0)), Arc::new(Mutex::new(None)));
+        let disk = Disk::failing({
+            let (count, failed) = (count.clone(), failed.clone());
+            move |operation, path| {
+                if fails(count.fetch_add(1, SeqCst)) {
+                    *failed.lock().unwrap() = Some((operation, path.to_path_buf()));
+                    return Err(io::Error::from(io::ErrorKind::StorageFull));
+                }
+                Ok(())
+            }
+        });
+        let outcome = session(config, &path, start, disk, cpu(), None);
+        let failed = failed.lock().unwrap().clone();
+        (folder, path, outcome, count.load(SeqCst), failed)
+    };
+    let (_, _, outcome, operations, _) = attempt(Box::new(|_| false));
+    assert_eq!((outcome.end.unwrap(), outcome.results), (SessionEnd::Finished, Some(reference(config).0)));
+    for at in 0..operations {
+        for &way in ways {
+            let (_folder, path, outcome, _, failed) = attempt(Box::new(move |operation| match way {
+                Fails::Once => operation == at,
+                Fails::FromThere => operation >= at,
+            }));
+            let (operation, file) = failed.expect("a failed operation");
+            let context = format!("operation {at}, {way:?}: {operation:?} {}", file.display());
+            check(&path, outcome, operation, &context);
+        }
+    }
+    operations
 }
 
 /// Creates a folder in memory, where flushes are fast, if the system has `/dev/shm`.
@@ -866,71 +842,6 @@ fn a_folder_has_one_process_at_a_time_and_one_run() {
     assert_eq!(fs::read(path.join("notes.txt")).unwrap(), b"mine");
 }
 
-/// A backend that fails after this many successful calls of `play`.
-struct Failing {
-    cpu: Cpu,
-    left: usize,
-}
-
-impl Backend for Failing {
-    fn play(&mut self, groups: &[Group<'_>]) -> Result<Vec<GroupScores>, BackendError> {
-        // A device may fail after half of its work.
-        self.cpu.play(&groups[..groups.len().div_ceil(2)])?;
-        self.left = self
-            .left
-            .checked_sub(1)
-            .ok_or(BackendError::from(DeviceError::Lost { adapter: "test".into(), reason: "pulled out".into() }))?;
-        self.cpu.play(groups)
-    }
-
-    fn trace(&mut self, group: &Group<'_>) -> Result<Trace, BackendError> {
-        self.cpu.trace(group)
-    }
-
-    fn describe(&self) -> String {
-        "a device about to be lost".into()
-    }
-}
-
-#[test]
-fn a_lost_device_does_not_change_results() {
-    let config = Config::parse(&tiny(14, "seconds = 0"), "small.toml").unwrap();
-    let expected = reference(&config);
-    for left in 0..=config.learning.generations + 1 {
-        let failing = || -> OpenBackend { (Box::new(Failing { cpu: Cpu::default(), left }), Machine::default()) };
-        let folder = tempfile::tempdir().unwrap();
-        // Without another device, the run is saved and can be resumed.
-        let path = folder.path().join("stop");
-        let outcome = session(&config, &path, Start::Fresh, Disk::default(), failing(), None);
-        let error = flotilla_cli::Error::from(outcome.end.unwrap_err()).to_string();
-        assert!(error.contains("the device was lost") && error.contains("--resume"), "{error}");
-        // A command that trains no run suggests to run it again.
-        let error = BackendError::from(DeviceError::Lost { adapter: "test".into(), reason: "pulled out".into() });
-        let error = flotilla_cli::Error::from(error).to_string();
-        assert!(error.ends_with("; run again, or use --backend cpu"), "{error}");
-        let error = BackendError::from(DeviceError::UnknownAdapter { name: "test".into(), found: vec![] });
-        let error = flotilla_cli::Error::from(error).to_string();
-        assert!(error.ends_with("; use --backend cpu"), "{error}");
-        assert_eq!(Run::read(&path.join("run.json")).unwrap().state, Status::Stopped);
-        let (results, outcome) = resume(&config, &path);
-        assert_eq!((outcome.start, results), (left, expected.0.clone()));
-        assert_eq!(result_files(&path), expected.1);
-
-        // With the CPU as replacement, the run continues.
-        let path = folder.path().join("cpu");
-        let runs = vec![(config.clone(), path.clone())];
-        let (mut session, _) = Session::open(runs, Start::Fresh, &Disk::default()).unwrap();
-        let mut requests = 0;
-        let mut fallback = |_: &_| {
-            requests += 1;
-            Some(cpu())
-        };
-        assert_eq!(train(&mut session, failing(), &mut fallback, &mut |_| false).unwrap(), SessionEnd::Finished);
-        assert_eq!(session.results(0), Some(&expected.0));
-        assert_eq!((requests, result_files(&path)), (1, expected.1.clone()));
-    }
-}
-
 #[test]
 fn a_run_can_alternate_between_cpu_and_gpu() {
     let config = small();
@@ -1028,20 +939,10 @@ fn a_killed_run_resumes_to_the_same_results() {
             let threads = (1 + random.random_range(0..3)).to_string();
             let length = lengths.last().expect("a length that remains");
             let flags = ["--resume", "--threads", &threads, "--generations", length];
-            let mut child = flotilla_train(&file, &out, &flags).spawn().unwrap();
             let moment = Instant::now() + Duration::from_micros(random.random_range(0..150_000));
-            let ended = loop {
-                match child.try_wait().unwrap() {
-                    Some(status) => break Some(status),
-                    None if killed < kills && Instant::now() >= moment => {
-                        child.kill().unwrap();
-                        child.wait().unwrap();
-                        break None;
-                    }
-                    None => std::thread::sleep(Duration::from_micros(200)),
-                }
-            };
-            let stderr = without_warnings(&read_all(child.stderr.take()));
+            let is_time = || killed < kills && Instant::now() >= moment;
+            let (ended, stderr) = run_or_kill(flotilla_train(&file, &out, &flags), is_time);
+            let stderr = without_warnings(&stderr);
             // A generation's row is written after the checkpoint before that generation. No recorded generation is
             // played again.
             if let Some((_, start)) = stderr.split_once("resuming at generation ") {
@@ -1052,19 +953,14 @@ fn a_killed_run_resumes_to_the_same_results() {
             } else {
                 assert!(recorded == 0 || !stderr.contains("generation"), "{recorded} recorded: {stderr}");
             }
-            assert!(!stderr.contains("set aside") && !stderr.contains("rewritten"), "{stderr}");
-            match ended {
-                None => {
-                    killed += 1;
-                    while_writing += usize::from(!leftovers(&out).is_empty());
+            if ended {
+                lengths.pop();
+                if lengths.is_empty() {
+                    break;
                 }
-                Some(status) => {
-                    assert_eq!(status.code(), Some(0), "{stderr}");
-                    lengths.pop();
-                    if lengths.is_empty() {
-                        break;
-                    }
-                }
+            } else {
+                killed += 1;
+                while_writing += usize::from(!leftovers(&out).is_empty());
             }
         }
         assert_eq!(result_files(&out), expected.1);
@@ -1074,36 +970,42 @@ fn a_killed_run_resumes_to_the_same_results() {
     println!("killed {killed} times, {while_writing} of them while a file was written, in {runs} runs");
 }
 
+/// Runs a command to its end, or kills it when `is_time` returns true. It must neither fail nor report damaged files.
+/// Returns whether it ended by itself, and its standard error.
+fn run_or_kill(mut command: Command, mut is_time: impl FnMut() -> bool) -> (bool, String) {
+    let mut child = command.spawn().unwrap();
+    let ended = loop {
+        match child.try_wait().unwrap() {
+            Some(status) => break Some(status),
+            None if is_time() => {
+                child.kill().unwrap();
+                child.wait().unwrap();
+                break None;
+            }
+            None => std::thread::sleep(Duration::from_micros(200)),
+        }
+    };
+    let mut stderr = String::new();
+    child.stderr.unwrap().read_to_string(&mut stderr).unwrap();
+    assert!(!stderr.contains("set aside") && !stderr.contains("rewritten"), "{stderr}");
+    assert!(ended.is_none_or(|status| status.success()), "{ended:?}: {stderr}");
+    (ended.is_some(), stderr)
+}
+
 /// Kills and resumes a run up to `kills` times, then lets it finish. Returns the number of kills.
 fn finish_under_kills(file: &Path, out: &Path, flags: &[&str], kills: usize) -> usize {
-    let mut random = ChaCha8Rng::seed_from_u64(2);
-    let mut killed = 0;
+    let (mut random, mut killed) = (ChaCha8Rng::seed_from_u64(2), 0);
     loop {
-        let mut child = flotilla_train(file, out, &[&["--resume"], flags].concat()).spawn().unwrap();
-        let before = generations_recorded(out);
-        let start = Instant::now();
+        let (before, start) = (generations_recorded(out), Instant::now());
         // Every kill waits for some progress, or 20 seconds, so that the run finishes eventually.
-        let ended = loop {
+        let is_time = || {
             let progressed = generations_recorded(out) > before + random.random_range(0..9);
-            match child.try_wait().unwrap() {
-                Some(status) => break Some(status),
-                None if killed < kills && (progressed || start.elapsed() > Duration::from_secs(20)) => {
-                    child.kill().unwrap();
-                    child.wait().unwrap();
-                    break None;
-                }
-                None => std::thread::sleep(Duration::from_micros(200)),
-            }
+            killed < kills && (progressed || start.elapsed() > Duration::from_secs(20))
         };
-        let stderr = read_all(child.stderr.take());
-        assert!(!stderr.contains("set aside") && !stderr.contains("rewritten"), "{stderr}");
-        match ended {
-            None => killed += 1,
-            Some(status) => {
-                assert_eq!(status.code(), Some(0), "{stderr}");
-                return killed;
-            }
+        if run_or_kill(flotilla_train(file, out, &[&["--resume"], flags].concat()), is_time).0 {
+            return killed;
         }
+        killed += 1;
     }
 }
 
@@ -1142,12 +1044,6 @@ fn a_killed_run_with_init_resumes_to_the_same_results() {
     let digest = |path: &Path| Run::read(&path.join("run.json")).unwrap().digest;
     assert_eq!(digest(&out), digest(&uninterrupted));
     assert_ne!(digest(&out), Some(reference(&Config::parse(HEAVY, "heavy.toml").unwrap()).0.digest));
-}
-
-fn read_all(pipe: Option<impl Read>) -> String {
-    let mut text = String::new();
-    pipe.unwrap().read_to_string(&mut text).unwrap();
-    text
 }
 
 /// Waits until a condition is true, for at most 60 seconds.

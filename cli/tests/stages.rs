@@ -4,13 +4,12 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, Ordering::Relaxed};
 
-use crate::support::SMALL;
+use crate::support::{self, SMALL};
 use assert_cmd::cargo::cargo_bin_cmd;
-use flotilla::backend::Machine;
 use flotilla::backend::cpu::Cpu;
 use flotilla::config::{Config, Sharing};
+use flotilla::front;
 use flotilla::trainer::{Row, Trainer};
 use flotilla::verify;
 use flotilla_app::record::digests::Verification;
@@ -19,7 +18,7 @@ use flotilla_app::record::folder::{Folder, METRICS, POLICIES, RUN, Run, Start, S
 use flotilla_app::record::metrics::Lines;
 use flotilla_app::record::policies::{self, Init, read_init};
 use flotilla_app::report::replay::{Which, replay};
-use flotilla_app::run::{Options, Results, RunError, Session, SessionEnd};
+use flotilla_app::run::{Results, RunError, Session, SessionEnd};
 use tempfile::TempDir;
 
 const STAGES: &str = "
@@ -161,15 +160,7 @@ fn errors_in_stages_name_their_line() {
 
 /// Trains until `stops` returns true for the next generation, or to the end.
 fn train_until(session: &mut Session, stops: impl Fn(usize) -> bool) -> Result<SessionEnd, RunError> {
-    let (stop, save) = (AtomicBool::new(stops(0)), AtomicBool::new(false));
-    let mut options = Options {
-        command: "",
-        stop: &stop,
-        save: &save,
-        fallback: &mut |_| None,
-        watch: &mut |progress| stop.store(stops(progress.generations[0]), Relaxed),
-    };
-    session.train(&mut (Box::new(Cpu::default()), Machine::default()), &mut options)
+    support::train(session, front::cpu(), &mut |_| None, &mut |next| stops(next[0]))
 }
 
 /// Opens a run and trains it until generation `until` is next, or to the end. Returns the results of a finished run.
@@ -203,6 +194,49 @@ fn train_shorter(config: &Config, path: &Path, init: Option<Init>, until: usize,
     last
 }
 
+/// Trains a run without a stop, stops it before each generation, and extends runs of the given lengths to its length.
+/// The results must be the same, and the given generations must replay. Returns the folder, with the run in `whole`.
+pub fn check_resumes(config: &Config, lengths: &[usize], replayed: &[usize]) -> TempDir {
+    let place = tempfile::tempdir().unwrap();
+    let path = |name: &str, number: usize| place.path().join(format!("{name}-{number}"));
+    let open = |config: &Config, path: &Path, start: Start| {
+        Session::open(vec![(config.clone(), path.into())], start, &Disk::default()).unwrap().0
+    };
+    let whole = place.path().join("whole");
+    let expected = train(config, &whole, None, Start::Fresh, 99).unwrap();
+    // The last step completes the run, which leaves nothing to stop.
+    let done = config.learning.generations + 2;
+    let resumes = |path: &Path, next: usize| {
+        let mut session = open(config, path, Start::Resume);
+        assert_eq!((session.generations(), session.is_done()), (&[next][..], next == done), "{}", path.display());
+        assert_eq!(train_until(&mut session, |_| false).unwrap(), SessionEnd::Finished);
+        assert_eq!(session.results(0), expected.as_ref(), "{}", path.display());
+        assert_eq!((rows(path), policy_bytes(path)), (rows(&whole), policy_bytes(&whole)), "{}", path.display());
+    };
+    for until in 1..=done {
+        let path = path("stopped", until);
+        let mut session = open(config, &path, Start::Fresh);
+        let end = if until == done { SessionEnd::Finished } else { SessionEnd::Stopped };
+        assert_eq!(train_until(&mut session, |next| next >= until).unwrap(), end, "{until}");
+        assert_eq!(session.generations(), [until]);
+        drop(session);
+        resumes(&path, until);
+    }
+    for &generations in lengths {
+        let path = path("extended", generations);
+        let mut short = config.clone();
+        short.learning.generations = generations;
+        assert!(train(&short, &path, None, Start::Fresh, 99).unwrap().is_some());
+        resumes(&path, generations + 1);
+    }
+    // The best team and the champions of each generation can be replayed.
+    for which in [Which::Best, Which::Champion].into_iter().filter(|_| !replayed.is_empty()) {
+        let again = replay(&whole, 1, replayed, which, Verification::Required, &mut Cpu::default(), &mut |_| true);
+        assert_eq!(again.unwrap_or_else(|error| panic!("{which:?}: {error}")).len(), replayed.len());
+    }
+    place
+}
+
 /// Reads all files below a folder, except locks.
 fn read_files(path: &Path) -> Vec<(PathBuf, Vec<u8>)> {
     let mut files = Vec::new();
@@ -231,9 +265,9 @@ fn policy_bytes(path: &Path) -> Vec<u8> {
 
 #[test]
 fn a_staged_run_resumes_to_the_same_results() {
-    let place = tempfile::tempdir().unwrap();
-    let (config, whole) = (staged(), place.path().join("whole"));
-    let expected = train(&config, &whole, None, Start::Fresh, 99).unwrap().unwrap();
+    let config = staged();
+    let place = check_resumes(&config, &[], &[]);
+    let whole = place.path().join("whole");
     let (metrics, valid) = (rows(&whole), config.validate().unwrap());
     assert_eq!(metrics[0], ["trial", "generation", "best_g", "mean_g", "champion_g", "stage"]);
     for row in &metrics[1..] {
@@ -244,13 +278,6 @@ fn a_staged_run_resumes_to_the_same_results() {
     train(&Config { stages: vec![], ..config.clone() }, &plain, None, Start::Fresh, 99).unwrap();
     let without: Vec<_> = rows(&plain).iter().map(|row| row.to_vec()).collect();
     assert!((1..7).all(|row| metrics[row][..5] == without[row][..5]) && metrics[7][..5] != without[7][..5]);
-    for until in 1..=7 {
-        let path = place.path().join(format!("stopped-{until}"));
-        let stopped = train(&config, &path, None, Start::Fresh, until).unwrap();
-        assert_eq!(stopped, None, "{until}");
-        assert_eq!(train(&config, &path, None, Start::Resume, 99).unwrap().as_ref(), Some(&expected), "{until}");
-        assert_eq!((rows(&path), policy_bytes(&path)), (metrics.clone(), policy_bytes(&whole)), "{until}");
-    }
     // A run cannot be resumed with other stages.
     let mut other = config.clone();
     other.stages[1].from = 5;
@@ -261,25 +288,12 @@ fn a_staged_run_resumes_to_the_same_results() {
 /// Stages change the number of partners.
 #[test]
 fn a_run_with_several_partners_resumes_to_the_same_results() {
-    let place = tempfile::tempdir().unwrap();
     let text = SMALL.replace("population = 8", "population = 8\npartners = 3\nleniency = 'max'");
     let stages = "[[stages]]\nfrom = 3\nset = { learning.partners = 1 }\n\
                   [[stages]]\nfrom = 5\nset = { learning.partners = 2, learning.leniency = 'mean' }\n";
     let config = config(&[&text, stages].concat());
+    let place = check_resumes(&config, &[], &[0, 2, 3, 5, 6]);
     let whole = place.path().join("whole");
-    let expected = train(&config, &whole, None, Start::Fresh, 99).unwrap().unwrap();
-    for until in 1..=7 {
-        let path = place.path().join(format!("stopped-{until}"));
-        assert_eq!(train(&config, &path, None, Start::Fresh, until).unwrap(), None, "{until}");
-        assert_eq!(train(&config, &path, None, Start::Resume, 99).unwrap().as_ref(), Some(&expected), "{until}");
-        assert_eq!((rows(&path), policy_bytes(&path)), (rows(&whole), policy_bytes(&whole)), "{until}");
-    }
-    // The best team and the champions of each generation can be replayed.
-    for which in [Which::Best, Which::Champion] {
-        let again =
-            replay(&whole, 1, &[0, 2, 3, 5, 6], which, Verification::Required, &mut Cpu::default(), &mut |_| true);
-        assert_eq!(again.unwrap_or_else(|error| panic!("{which:?}: {error}")).len(), 5);
-    }
     // Team 23 is the last of three rounds of 8 policies, and generation 3 has a single round.
     let team = |generation| {
         let mut backend = Cpu::default();
@@ -293,46 +307,17 @@ fn a_run_with_several_partners_resumes_to_the_same_results() {
 #[test]
 fn a_run_with_a_hall_of_fame_resumes_to_the_same_results() {
     const FAR: &str = "pois = [[10, 12], [20, 13]]\ncoupling = 1\nsteps = 20";
-    let place = tempfile::tempdir().unwrap();
     let small = SMALL.replace("pois = [[10, 9], [20, 9]]\ncoupling = 2\nsteps = 9", FAR);
     let small = small.replace("population = 8", "population = 8\nhall_of_fame = 3");
     let stage = "[[stages]]\nfrom = 3\nset = { learning.partners = 2, world.coupling = 2 }\n";
     let config = config(&[&small, stage].concat());
-    let whole = place.path().join("whole");
-    let expected = train(&config, &whole, None, Start::Fresh, 99).unwrap().unwrap();
-    let plain = Config { stages: vec![], ..config.clone() };
-    let longer = place.path().join("longer");
-    train(&plain, &longer, None, Start::Fresh, 99).unwrap();
-    let mut without = config.clone();
+    let place = check_resumes(&config, &[], &[0, 2, 3, 6]);
+    check_resumes(&Config { stages: vec![], ..config.clone() }, &[0, 1, 3, 5], &[]);
+    let [whole, path] = ["whole", "without"].map(|name| place.path().join(name));
+    let mut without = config;
     without.learning.hall_of_fame = 0;
-    let without_path = place.path().join("without");
-    train(&without, &without_path, None, Start::Fresh, 99).unwrap();
-    assert!(policy_bytes(&without_path) != policy_bytes(&whole), "the hall of fame changed nothing");
-    for until in 1..=7 {
-        let path = place.path().join("stopped");
-        assert_eq!(train(&config, &path, None, Start::Force, until).unwrap(), None, "{until}");
-        assert_eq!(train(&config, &path, None, Start::Resume, 99).unwrap().as_ref(), Some(&expected), "{until}");
-        assert_eq!((rows(&path), policy_bytes(&path)), (rows(&whole), policy_bytes(&whole)), "{until}");
-    }
-    for generations in [0, 1, 3, 5] {
-        let extended = place.path().join("extended");
-        let mut short = plain.clone();
-        short.learning.generations = generations;
-        train(&short, &extended, None, Start::Force, 99).unwrap();
-        let (mut session, _) =
-            Session::open(vec![(plain.clone(), extended.clone())], Start::Resume, &Disk::default()).unwrap();
-        assert_eq!(session.generations(), [generations + 1], "the finished generations are trained again");
-        assert!(train_until(&mut session, |_| false).unwrap() == SessionEnd::Finished);
-        assert_eq!(
-            (rows(&extended), policy_bytes(&extended)),
-            (rows(&longer), policy_bytes(&longer)),
-            "from {generations} on"
-        );
-    }
-    for which in [Which::Best, Which::Champion] {
-        let again = replay(&whole, 1, &[0, 2, 3, 6], which, Verification::Required, &mut Cpu::default(), &mut |_| true);
-        assert_eq!(again.unwrap_or_else(|error| panic!("{which:?}: {error}")).len(), 4);
-    }
+    train(&without, &path, None, Start::Fresh, 99).unwrap();
+    assert!(policy_bytes(&path) != policy_bytes(&whole), "the hall of fame changed nothing");
 }
 
 /// Checkpoints include the mean and the standard deviations of the search. A stage changes its step size. A finished
@@ -340,79 +325,33 @@ fn a_run_with_a_hall_of_fame_resumes_to_the_same_results() {
 #[test]
 fn evolution_strategies_resume_to_the_same_results() {
     const FAR: &str = "pois = [[10, 12], [20, 13]]\ncoupling = 1\nsteps = 20";
-    let place = tempfile::tempdir().unwrap();
     let stage = "[[stages]]\nfrom = 3\nset = { learning.search_step = 2.0, world.coupling = 2 }\n";
     for method in ["openai-es", "snes"] {
         let method = format!("population = 9\nmethod = '{method}'\nfitness = 'G'");
         // The POIs are far enough away that policies differ in how many they reach.
         let small = SMALL.replace("pois = [[10, 9], [20, 9]]\ncoupling = 2\nsteps = 9", FAR);
         let config = config(&[&small.replace("population = 8", &method), stage].concat());
+        let place = check_resumes(&config, &[], &[0, 2, 3, 6]);
+        check_resumes(&Config { stages: vec![], ..config.clone() }, &[0, 1, 3, 5], &[]);
         let whole = place.path().join("whole");
-        let expected = train(&config, &whole, None, Start::Force, 99).unwrap().unwrap();
         let varied = rows(&whole)[1..].iter().filter(|row| row[2] != row[3]).count();
         assert!(varied > 10, "{method}: teams differ in only {varied} rows, so the search hardly moves");
-        for until in 1..=7 {
-            let path = place.path().join("stopped");
-            assert_eq!(train(&config, &path, None, Start::Force, until).unwrap(), None, "{until}");
-            assert_eq!(train(&config, &path, None, Start::Resume, 99).unwrap().as_ref(), Some(&expected), "{until}");
-            assert_eq!((rows(&path), policy_bytes(&path)), (rows(&whole), policy_bytes(&whole)), "{until}");
-        }
-        let plain = Config { stages: vec![], ..config.clone() };
-        let longer = place.path().join("longer");
-        let expected = train(&plain, &longer, None, Start::Force, 99).unwrap().unwrap();
-        for generations in [0, 1, 3, 5] {
-            let extended = place.path().join("extended");
-            let mut short = plain.clone();
-            short.learning.generations = generations;
-            assert!(train(&short, &extended, None, Start::Force, 99).unwrap().is_some());
-            let (mut session, _) =
-                Session::open(vec![(plain.clone(), extended.clone())], Start::Resume, &Disk::default()).unwrap();
-            assert_eq!(session.generations(), [generations + 1], "the finished generations are trained again");
-            assert!(train_until(&mut session, |_| false).unwrap() == SessionEnd::Finished);
-            assert_eq!(session.results(0), Some(&expected), "from {generations} on");
-            assert_eq!(
-                (rows(&extended), policy_bytes(&extended)),
-                (rows(&longer), policy_bytes(&longer)),
-                "from {generations} on"
-            );
-        }
-        for which in [Which::Best, Which::Champion] {
-            let again =
-                replay(&whole, 1, &[0, 2, 3, 6], which, Verification::Required, &mut Cpu::default(), &mut |_| true);
-            assert_eq!(again.unwrap_or_else(|error| panic!("{which:?}: {error}")).len(), 4);
-        }
         // A search that starts from given policies resumes, too.
         let init = || Some(read_init(&whole.join(POLICIES), &config).unwrap());
         let [warm, again] = ["warm", "again"].map(|name| place.path().join(name));
-        train(&config, &warm, init(), Start::Force, 99).unwrap();
-        train(&config, &again, init(), Start::Force, 2).unwrap();
+        train(&config, &warm, init(), Start::Fresh, 99).unwrap();
+        train(&config, &again, init(), Start::Fresh, 2).unwrap();
         train(&config, &again, init(), Start::Resume, 99).unwrap();
         assert_eq!((rows(&again), policy_bytes(&again)), (rows(&warm), policy_bytes(&warm)));
         assert!(policy_bytes(&warm) != policy_bytes(&whole));
-        fs::remove_dir_all(place.path()).unwrap();
-        fs::create_dir(place.path()).unwrap();
     }
 }
 
 /// Policies after the last generation are bred with the settings of its stage.
 #[test]
 fn a_finished_run_is_extended_with_the_settings_of_its_last_stage() {
-    let place = tempfile::tempdir().unwrap();
     let stage = "[[stages]]\nfrom = 3\nset = { learning.mutation = 'additive', learning.mutation_probability = 0.9 }\n";
-    let config = config(&[SMALL, stage].concat());
-    let (whole, extended) = (place.path().join("whole"), place.path().join("extended"));
-    let expected = train(&config, &whole, None, Start::Fresh, 99).unwrap();
-    for generations in [3, 5] {
-        let mut short = config.clone();
-        short.learning.generations = generations;
-        assert!(train(&short, &extended, None, Start::Force, 99).unwrap().is_some());
-        assert_eq!(train(&config, &extended, None, Start::Resume, 99).unwrap(), expected, "from {generations} on");
-        assert_eq!(
-            (rows(&extended), policy_bytes(&extended)),
-            (rows(&whole), policy_bytes(&whole)),
-            "from {generations} on"
-        );
-    }
+    check_resumes(&config(&[SMALL, stage].concat()), &[3, 5], &[]);
 }
 
 #[test]
@@ -698,7 +637,7 @@ fn every_command_supports_stages() {
     assert!(stderr.contains("note: the stage from generation 4 on is never played"), "{stderr}");
     good("train staged.toml --generations 3 --out short --resume");
     good("train short/config.toml --out short --resume --generations 4");
-    good("train staged.toml --out short --resume");
+    assert!(good("train staged.toml --out short --resume").starts_with("Trained 3 trials"));
     assert!(policy_bytes(&folder.join("short")) == policy_bytes(&folder.join("run")));
     // The same with sweeps, whose points tell what a stage overrides.
     let grid = "[grid]\n'world.coupling' = [1, 2]\n";

@@ -168,14 +168,6 @@ fn a_run_is_overwritten_only_with_force() {
 }
 
 #[test]
-fn adapter_is_refused_with_the_cpu() {
-    let place = place();
-    let output = place.run("train small.toml --backend cpu --adapter Voodoo");
-    assert_eq!(output.status.code(), Some(2));
-    assert!(!place.path("runs").exists());
-}
-
-#[test]
 fn the_first_team_of_a_rollout_is_the_trials_champion() {
     let place = place();
     place.good("train small.toml --out run --generations 9 --quiet");
@@ -285,34 +277,11 @@ fn rollout_reads_files_of_other_programs_and_refuses_invalid_ones() {
         assert!(error.contains("bad.safetensors: it is cut short"), "{error}");
     }
     fs::write(place.path("bad.safetensors"), "not tensors at all").unwrap();
-    assert!(place.refused(1, &line("bad")).contains("it is not a safetensors file"));
+    let error = place.refused(1, &line("bad"));
+    assert!(error.contains("it is not a safetensors file") && !error.contains("1048576"), "{error}");
     assert!(place.refused(1, &line("missing")).contains("missing.safetensors: cannot be read"));
     place.refused(1, "rollout small.toml --policies good.safetensors --scores no/such/folder.csv");
     assert_eq!(place.run("rollout small.toml").status.code(), Some(2));
-}
-
-#[test]
-fn a_finished_run_is_extended() {
-    let place = place();
-    place.good("train small.toml --out whole --generations 11 --quiet");
-    place.good("train small.toml --out run --quiet");
-    let error = place.refused(1, "train small.toml --out run --resume --generations 5");
-    assert!(error.contains("run is a run of 6 generations, which cannot become one of 5"), "{error}");
-    let (summary, stderr) = place.good("train small.toml --out run --resume --generations 11");
-    assert!(stderr.contains("resuming at generation 7"), "{stderr}");
-    assert!(summary.starts_with("Trained 3 trials"), "{summary}");
-    for name in ["policies.safetensors", "config.toml"] {
-        assert!(fs::read(place.path("run").join(name)).unwrap() == fs::read(place.path("whole").join(name)).unwrap());
-    }
-    let metrics_without_time = |name: &str| -> Vec<String> {
-        place.read(name).lines().map(|line| line.rsplit_once(',').unwrap().0.to_string()).collect()
-    };
-    assert_eq!(metrics_without_time("run/metrics.csv"), metrics_without_time("whole/metrics.csv"));
-    let digest = |name: &str| serde_json::from_str::<serde_json::Value>(&place.read(name)).unwrap()["digest"].clone();
-    assert_eq!(digest("run/run.json"), digest("whole/run.json"));
-    // Generations from before and after the extension can be replayed.
-    place.good("replay run --trial 1 --generation 6");
-    place.good("replay run --trial 1 --generation 9");
 }
 
 #[cfg(unix)]
@@ -702,45 +671,6 @@ fn errors_repeat_large_numbers_as_typed() {
     }
     place.good("train small.toml --seed 9223372036854775807 --generations 0 --quiet");
     assert!(place.read("runs/small/config.toml").contains("seed = 9223372036854775807"));
-}
-
-/// Tests that `--json` prints valid JSON for any names and file contents. Characters that could control a terminal must
-/// be escaped.
-#[test]
-fn json_output_is_valid_for_any_names_and_file_contents() {
-    let place = place();
-    place.write("a \"b\".toml", SMALL);
-    place.write("sweep.toml", SMALL.to_string() + "[grid]\n\"learning.seed\" = [1, 2]\n");
-    let json = |arguments: &[&str], code: i32| {
-        let output = place.command().args(arguments).output().unwrap();
-        let text = String::from_utf8(output.stdout).unwrap();
-        let stderr = String::from_utf8_lossy(&output.stderr);
-        assert_eq!(output.status.code(), Some(code), "{arguments:?}: {stderr}");
-        assert!(!text.contains(['\u{202e}', '\u{9b}', '\u{1b}']), "{arguments:?}: {text}");
-        serde_json::from_str::<serde_json::Value>(&text)
-            .unwrap_or_else(|error| panic!("{arguments:?}: {error}: {text}"))
-    };
-    let cpu = ["--backend", "cpu", "--json"];
-    let config = "a \"b\".toml";
-    json(&["check", config, "--json"], 0);
-    assert_eq!(
-        json(&[&["train", config, "--out", "run \"1\"", "--quiet"][..], &cpu].concat(), 0)["folder"],
-        "run \"1\""
-    );
-    json(&[&["train", config, "--out", "two", "--seed", "3", "--quiet"][..], &cpu].concat(), 0);
-    json(&["plot", "run \"1\"", "two", "--out", "curves \"\".svg", "--json"], 0);
-    json(&["compare", "run \"1\"", "two", "--json"], 0);
-    json(&[&["replay", "run \"1\""][..], &cpu].concat(), 0);
-    let policies = "run \"1\"/policies.safetensors";
-    json(&[&["rollout", config, "--policies", policies, "--quiet"][..], &cpu].concat(), 0);
-    json(&[&["bench", "--rollout-only", "--teams", "2"][..], &cpu].concat(), 0);
-    json(&[&["sweep", "sweep.toml", "--out", "a \"sweep\"", "--quiet"][..], &cpu].concat(), 0);
-    // The reason why a point is missing quotes the text of its file.
-    let point = "a \"sweep\"/points/0001/config.toml";
-    place.write(point, "[world]\n\"x\u{202e}\u{9b}y\" = 1\n");
-    let summary = json(&["sweep", "sweep.toml", "--out", "a \"sweep\"", "--collect", "--json"], 1);
-    let missing = summary["points"][1]["missing"].as_str().unwrap();
-    assert!(missing.contains("x\u{202e}"), "{missing:?}");
 }
 
 /// Files in memory, like those that the browser page puts into its archive.

@@ -18,12 +18,10 @@ use flotilla::evaluate::Starts;
 use flotilla::statistics::{self, Average, Estimate};
 use flotilla_app::choice::Work;
 use flotilla_app::ops::{BackendSource, Context, Error, check_memory};
-use flotilla_app::record::digests::Verification;
 use flotilla_app::record::disk::Disk;
 use flotilla_app::record::folder::{self, ARMS};
 use flotilla_app::record::{RecordError, ownership};
 use flotilla_app::report::grid::{Dots, Interval};
-use flotilla_app::report::runs;
 use flotilla_app::report::scene::Format;
 
 /// The names of the layouts: the paper's, and the first with a coupling that takes two groups.
@@ -208,18 +206,11 @@ fn products() -> impl Iterator<Item = String> {
 
 /// Reads a finished run, and plays its champions from held-out starts.
 fn measure(cell: &mut Cell, disk: &Disk, folder: &Path, backend: &mut dyn Backend) -> Result<(), Error> {
-    let Cell { config, measured, .. } = cell;
-    let trials = config.learning.trials;
-    let [champion, mean, held_out] = measured;
-    (*champion, *mean) = (vec![0.0; trials], vec![0.0; trials]);
-    runs::metrics(disk.at(folder), config, Verification::Required, |row| {
-        if row.generation == config.learning.generations {
-            (champion[row.trial], mean[row.trial]) = (row.champion_g, row.mean_g);
-        }
-    })?;
+    let config = &cell.config;
+    let [champion, mean] = tasks::last_g(config, disk, folder, |row| row.mean_g)?;
     let (episodes, jitter) = HELD_OUT;
     let starts = Starts::Drawn { episodes, seed: config.learning.seed, jitter, poi_jitter: 0.0 };
-    *held_out = tasks::play_champions(config, disk, folder, &starts, backend)?;
+    cell.measured = [champion, mean, tasks::play_champions(config, disk, folder, &starts, backend)?];
     Ok(())
 }
 

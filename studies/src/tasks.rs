@@ -15,6 +15,7 @@ use flotilla::backend::{Backend, OpenBackend};
 use flotilla::baseline::NAMES;
 use flotilla::config::{Config, ConfigError, Fitness, Learning, Override, Problem, ValidConfig};
 use flotilla::evaluate::Starts;
+use flotilla::trainer::Row;
 use flotilla::world::World;
 use flotilla_app::choice::Work;
 use flotilla_app::ops::{BackendSource, ConfigText, Context, Error, Event, baseline, check_memory, with_remedy};
@@ -283,18 +284,27 @@ pub(crate) fn train(
 
 /// Reads a finished run. If starts or POIs move, its champions play held-out episodes.
 fn measure(config: &Config, disk: &Disk, folder: &Path, backend: &mut dyn Backend) -> Result<Trained, Error> {
-    let learning = &config.learning;
-    let (population, fitness, none) = (learning.population, learning.fitness, vec![0.0; learning.trials]);
-    let mut trained = Trained { population, fitness, champion_g: none.clone(), best_g: none };
+    let [mut champion_g, best_g] = last_g(config, disk, folder, |row| row.best_g)?;
+    if moves(config) {
+        champion_g = play_champions(config, disk, folder, &held_out(config), backend)?;
+    }
+    Ok(Trained { population: config.learning.population, fitness: config.learning.fitness, champion_g, best_g })
+}
+
+/// Returns G of every trial's champion in the last generation of a finished run, and another G of the same row.
+pub(crate) fn last_g(
+    config: &Config,
+    disk: &Disk,
+    folder: &Path,
+    other: fn(&Row) -> f64,
+) -> Result<[Vec<f64>; 2], Error> {
+    let mut found = [vec![0.0; config.learning.trials], vec![0.0; config.learning.trials]];
     runs::metrics(disk.at(folder), config, Verification::Required, |row| {
-        if row.generation == learning.generations {
-            (trained.champion_g[row.trial], trained.best_g[row.trial]) = (row.champion_g, row.best_g);
+        if row.generation == config.learning.generations {
+            (found[0][row.trial], found[1][row.trial]) = (row.champion_g, other(row));
         }
     })?;
-    if moves(config) {
-        trained.champion_g = play_champions(config, disk, folder, &held_out(config), backend)?;
-    }
-    Ok(trained)
+    Ok(found)
 }
 
 /// Returns G of every trial's champion in a finished run, over all starts.
