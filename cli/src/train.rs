@@ -4,10 +4,10 @@ use std::fmt::Write;
 use std::path::PathBuf;
 
 use super::recovery::{Checkpoints, quoted};
-use super::{ConfigArgs, Error, ExistingResults, Printed, RunOptions, console};
+use super::{ConfigArgs, Error, ExistingResults, Printed, RunOptions, console, with_remedy};
 use flotilla::escape::PathExt;
 use flotilla_app::ops::train::{self, Extremes, TrainOutcome, TrainRequest};
-use flotilla_app::record::folder::{CONFIG, METRICS, POLICIES, RUN};
+use flotilla_app::record::folder::{self, CONFIG, METRICS, POLICIES, RUN, Start};
 use flotilla_app::record::ownership::CURVES;
 use flotilla_app::report::map::{counted, weighted};
 use flotilla_app::report::runs::TeamKind;
@@ -37,6 +37,14 @@ pub struct Args {
 pub fn run(args: Args) -> Result<(), Error> {
     let Args { config, run, out, existing, init, printed, checkpoints } = args;
     let (name, start) = (config.name(), existing.start());
+    // Without its folder, the run in `runs/config` would be meant.
+    if let (None, Start::Resume | Start::Force, Some(run)) = (&out, start, folder::owner(&config.file.path)) {
+        let text = format!("{} is the config of the run in {}", config.file.path.escaped(), run.escaped());
+        return Err(Error::Usage(with_remedy(
+            text,
+            format!("name that folder with --out {}, or another", quoted(&run)),
+        )));
+    }
     let request = TrainRequest { config: config.text(checkpoints.list())?, name, out, start, init };
     let found = console::run(&run, printed.quiet, |backends, context| train::run(&request, backends, context))?;
     printed.summary(&found, report)
@@ -60,7 +68,10 @@ fn report(found: &TrainOutcome) -> String {
             "Trained {} of {} teams, {}, in {} ({:.1} generations/s) on {on}",
             counted(found.trials, "trial"),
             found.teams,
-            counted(found.generations, "generation"),
+            match found.generations - found.trained_generations.min(found.generations) {
+                0 => counted(found.generations, "generation"),
+                before => format!("{} after generation {before}", counted(found.trained_generations, "generation")),
+            },
             time(found.seconds),
             found.trained_generations as f64 / found.seconds.max(1e-9),
         ),
@@ -117,7 +128,7 @@ Files in {}:
 Next:
   flotilla replay {replayed} --trial {best}
   flotilla replay {replayed} --trial {best} --out {film}
-  flotilla rollout {replayed} --scores scores.csv
+  flotilla rollout {replayed} --trial {best} --scores scores.csv
 ",
         folder.escaped(),
         CONFIG,

@@ -502,6 +502,8 @@ fn wrong_usage_exits_with_code_2() {
         &["check", "configs/chaotic.toml", "--paradigm", "leaders"],
         &["check", "configs/chaotic.toml", "another.toml"],
         &["verify", "configs/chaotic.toml", "--worlds", "3"],
+        &["sweep", "configs/sweeps/coupling.toml", "--shards", "4"],
+        &["sweep", "configs/sweeps/coupling.toml", "--gpus", "2"],
         &[],
     ] {
         let output = flotilla(args);

@@ -81,6 +81,10 @@ fn outputs_do_not_replace_inputs_or_files_of_a_run() {
         );
     }
     assert!(place.refused(2, "sweep grid.toml --out o --slurm=grid.toml").contains("is read from"));
+    for flag in ["--scores", "--trace"] {
+        let stderr = place.refused(2, &[&rollout[..], &[flag, "grid.toml"]].concat());
+        assert!(stderr.contains("grid.toml: this file has neither scores nor a trace; move it away"), "{stderr}");
+    }
     for (name, content) in before {
         assert_eq!(fs::read(place.path(name)).unwrap(), content, "{name}");
     }
@@ -303,6 +307,38 @@ fn commands_name_the_right_command_for_sweeps_and_configs() {
             && stderr.lines().count() == 1,
         "{stderr}"
     );
+}
+
+/// Without `--out`, it would continue or overwrite `runs/config`.
+#[test]
+fn the_config_of_a_run_continues_it_only_with_its_folder() {
+    let place = with_run();
+    for flag in ["--resume", "--force"] {
+        let stderr = place.refused(2, &["train", "run/config.toml", flag]);
+        assert!(stderr.contains("is the config of the run in run; name that folder with --out run"), "{stderr}");
+    }
+    place.good("train run/config.toml --resume --out run --quiet");
+    let stderr = place.refused(1, "train small.toml --out run --resume --population 9");
+    assert!(
+        stderr.contains("resume it as it was started with `flotilla train run/config.toml --out run --resume`"),
+        "{stderr}"
+    );
+}
+
+#[test]
+fn a_rollout_says_whose_policies_it_plays() {
+    let place = with_run();
+    let note = "note: this plays trial 0 of";
+    for (flags, noted, trial) in
+        [("", true, "0"), ("--trial 1", false, "1"), ("--policies run/policies.safetensors", false, "null")]
+    {
+        let (stdout, stderr) = place.good(&format!("rollout run --json {flags}"));
+        assert_eq!(stderr.contains(note), noted, "{flags}: {stderr}");
+        assert!(
+            stdout.contains(&format!("\"trial\":{trial}")) || stdout.contains(&format!("\"trial\": {trial}")),
+            "{stdout}"
+        );
+    }
 }
 
 #[test]

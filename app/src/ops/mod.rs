@@ -245,7 +245,10 @@ impl ConfigText {
         config.learning.generations = config.stages.iter().fold(generations, |last, stage| last.max(stage.from));
         let valid = config.validate()?;
         let Some((_, of_stage)) = valid.stages().get(stage) else {
-            let stages = numbered(valid.stages().len(), "stage");
+            let stages = match valid.stages().len() {
+                1 => "no [[stages]]".into(),
+                count => numbered(count, "stage"),
+            };
             return Err(Error::Usage(format!("--stage {stage}: the config has {stages}").into()));
         };
         let mut config = Config { stages: vec![], ..Config::clone(of_stage) };

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
-use super::output::Destination;
+use super::output::{self, Destination};
 use super::{Context, Error, escaped, with_remedy};
 use crate::record::RecordError;
 use crate::record::digests::Verification;
@@ -54,6 +54,7 @@ pub fn run(request: &PlotRequest, context: Context<'_>) -> Result<PlotOutcome, E
     };
     let out = place.path();
     let kind = kind_of(out)?;
+    output::check(&[("--out", request.out.as_deref())], &[])?;
     let scene = runs::figure(runs, request.measure, request.band, verification)?.scene();
     place.check()?;
     place.write(&content(&scene, kind, out)?)?;

@@ -1,6 +1,7 @@
 //! Plays teams of policies from a file, and scores every leader.
 
-use std::io::{self, Write};
+use std::fs::File;
+use std::io::{self, Read, Write};
 use std::ops::ControlFlow::{Break, Continue};
 use std::path::{Path, PathBuf};
 
@@ -10,7 +11,7 @@ use super::{BackendSource, ConfigText, Context, Error, ProcessorInfo, output, sw
 use crate::choice::Work;
 use crate::import;
 use crate::record::digests::{Digests, Verification};
-use crate::record::{folder, policies, tensors};
+use crate::record::{RecordError, folder, policies, tensors};
 use crate::report::map;
 use crate::report::runs::ReadError;
 use crate::run::RunError;
@@ -26,6 +27,8 @@ use flotilla::model::sense::{ChannelConstants, ChannelShape};
 use flotilla::parallel;
 use flotilla::world::{OUTPUTS, World};
 
+/// The first column of scores and traces.
+const TEAM: &str = "team,";
 /// Columns of a trace. Only agents that learn fill the others: the inputs and outputs of their policies.
 const STATES: &str = "team,step,agent,role,x,y,heading_x,heading_y,speed";
 /// The inputs of one class that senses POIs and agents by quadrants.
@@ -80,6 +83,8 @@ pub struct RolloutOutcome {
     /// Leaders per team.
     pub leaders: usize,
     pub pois: usize,
+    /// The trial whose policies play, if it is known.
+    pub trial: Option<usize>,
     /// Episodes per team.
     pub episodes: usize,
     /// Random seed of held-out starts.
@@ -160,9 +165,27 @@ pub fn run(
     };
     let outputs = [("--scores", request.scores.as_deref()), ("--trace", request.trace.as_deref())];
     output::check(&outputs, &[&config_path, &policies])?;
+    for (flag, path) in outputs {
+        let Some(path) = path.filter(|path| path.is_file()) else { continue };
+        let mut start = vec![];
+        let read = File::open(path).and_then(|file| file.take(TEAM.len() as u64).read_to_end(&mut start));
+        read.map_err(RecordError::read(path))?;
+        if !start.is_empty() && start != TEAM.as_bytes() {
+            return Err(Error::Usage(with_remedy(
+                format!("{flag} {}: this file has neither scores nor a trace", path.escaped()),
+                "move it away, or name another to write",
+            )));
+        }
+    }
     let (text, name) = (import::read_file(&config_path)?, config::name(&config_path));
     let config = ConfigText { text, name, set: request.set.clone() }.in_stage(request.stage, context)?;
     let starts = request.starts(&config)?;
+    // A run's file has the policies of all trials.
+    let trial = request.trial.or(request.policies.is_none().then_some(0));
+    if request.trial.is_none() && trial.is_some() && config.learning.trials > 1 {
+        let trials = config.learning.trials;
+        context.note(format_args!("note: this plays trial 0 of {trials}; --trial N plays another"));
+    }
     verify(&config_path, &policies, request.unverified)?;
     let policies = policies::read(&policies, &config, request.trial)?;
     let world = World::new(&config.validate()?);
@@ -202,6 +225,7 @@ pub fn run(
         teams: evaluation.observed.len(),
         leaders: evaluation.leaders,
         pois: evaluation.pois,
+        trial,
         episodes: evaluation.episodes,
         seed,
         start_jitter,

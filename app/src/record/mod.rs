@@ -165,14 +165,12 @@ impl RecordError {
 
     /// Returns the error for a run that cannot be resumed with the given config. `differences` has a line for each key.
     fn config_differs(path: &Path, differences: &[String]) -> RecordError {
-        let (path, differences) = (path.escaped(), differences.join("\n"));
+        let (command, path, differences) = (command_to_resume(path, &[]), path.escaped(), differences.join("\n"));
         RecordError::refused(
             format!(
                 "{path} is a run of another config, so it cannot continue with this one; what differs:\n{differences}"
             ),
-            format!(
-                "resume with the config and the flags it was started with ({path}/{CONFIG} has both), or choose another --out"
-            ),
+            format!("resume it as it was started with `{command}`, or choose another --out"),
         )
     }
 
