@@ -64,7 +64,7 @@
 //! | add a measure of senses | the files of the worked example in `CONTRIBUTING.md` |
 //! | add a key of classes or POIs | `model/classes.rs`, `config/classes/read.rs`; what kernels read of it in `model/class.rs` or `world.rs` |
 //! | add a fitness | `config/learning.rs`, `credit/` (`mod.rs`, `replay.rs`; `record.rs` for what it needs, `fast.rs` and `lanes.rs` for speed); then show it, because Python offers every fitness |
-//! | test a new word of a key | `cli/tests/model.rs` or `tests/credit.rs`, a line in `cli/tests/cli.rs` or, of classes, `tests/classes.rs`, a case in `tests/golden/cases.rs`; for a fitness `KINDS` in `verify.rs` and `tests/evolve.rs` |
+//! | test a new word of a key | `cli/tests/model.rs` or `tests/credit.rs`, a line in `tests/data/refusals/keys.txt` or, of classes, `tests/data/refusals/classes.txt`, a case in `tests/golden/cases.txt`; for a fitness `KINDS` in `verify.rs` and `tests/evolve.rs` |
 //! | show a fitness beside the others | `evaluate.rs`, `front/play.rs`, `app/src/ops/rollout.rs`, `app/src/report/replay/page.rs`, `python/src/play.rs`, `python/flotilla/_play.py`, `web/page/`, `docs/explain/credits.md` |
 //! | add a place that holds populations | a backend with `Backend::hold` and a `DevicePopulation`, such as `FakeDevice` in `cli/tests/population.rs` |
 //! | add a kind of value in configs | `reader/request.rs`, `reader/allowed.rs` |

@@ -4,6 +4,7 @@
 
 use std::path::Path;
 
+use crate::support::{GOOD, table, with_line};
 use flotilla::config::{
     Actions, CheckpointConfig, Config, ConfigError, Coupling, CreditConfig, Density, Elites, Fitness, Follow, Heading,
     Initial, Learning, LedBy, Leniency, MAX_EPISODES, MAX_GENERATIONS, MAX_HALL_OF_FAME, MAX_HIDDEN_LAYERS,
@@ -549,58 +550,44 @@ fn counts_at_their_limits_are_valid() {
     }
 }
 
+/// Each message has the line, the key, the value found and the allowed values.
+#[test]
+fn wrong_values_are_reported_with_line_and_range() {
+    let message = |text: String| Config::parse(&text, "x.toml").expect_err(&text).to_string();
+    for [line, text, expected] in table(include_str!("data/refusals/keys.txt"), 104) {
+        let found = message(with_line(line.parse().unwrap(), &text));
+        assert_eq!(found.lines().next(), Some(&*format!("x.toml:{line}: {expected}")), "{text}");
+    }
+    let many = |count: usize| format!("[{}]", vec!["[1, 1]"; count].join(", "));
+    for (line, key, count, allowed) in
+        [(3, "leaders", 1025, "1 to 1024"), (5, "pois", 257, "1 to 256"), (4, "followers", 1026, "0 to 1023")]
+    {
+        let problem = format!("found a list of {count}, allowed a list of {allowed} positions [x, y]");
+        let found = message(with_line(line, &format!("{key} = {}", many(count))));
+        assert_eq!(found.lines().next(), Some(&*format!("x.toml:{line}: world.{key}: {problem}")));
+    }
+    let crowd =
+        GOOD.replace("[[12, 2], [8, 2], [22, 2], [18, 2]]", &many(1023)).replace("[[10, 5], [20, 5]]", &many(5));
+    let agents = "found 1028 agents with the leaders, allowed 1 to 1024";
+    assert_eq!(message(crowd), format!("x.toml:4: world.followers: {agents}"));
+    for (key, problem) in [
+        ("hall_of_fame = 3", "hall_of_fame: found 3 with a single leader, allowed 0: it has no partners"),
+        ("partners = 2", "partners: found 2 with a single leader, allowed 1: it has no partners"),
+        ("teams = 'sorted'", "teams: found \"sorted\" with a single leader, allowed \"random\": it has no partners"),
+    ] {
+        let single = GOOD.replace("[[10, 5], [20, 5]]", "[[10, 5]]") + key + "\n";
+        assert_eq!(message(single), format!("x.toml:24: learning.{problem}"));
+    }
+}
+
 /// Errors in observers, windows and order name the line and the index in the list.
 #[test]
 fn impossible_rules_are_refused_with_their_line_and_index() {
     let world = |rest: &str| {
         format!("[world]\nleaders = [[1, 2], [2, 2]]\nfollowers = [[1, 1]]\npois = [[3, 4], [5, 6], [7, 8]]\n{rest}")
     };
-    for (rest, expected) in [
-        ("after = [[], [0]]", "5: world.after: found a list of 2, allowed a list of 3 lists of POIs, or none"),
-        ("after = [[], [3], []]", "5: world.after[1][0]: found 3, allowed 0 to 2 (the last POI)"),
-        ("after = [[], [-1], []]", "5: world.after[1][0]: found -1, allowed 0 to 2 (the last POI)"),
-        (
-            "after = [[], 0, []]",
-            "5: world.after[1]: found 0, allowed a list of 0 to 3 numbers, each 0 to 2 (the last POI)",
-        ),
-        ("after = [\n[],\n[0, 1],\n[]]", "7: world.after[1]: found the POI itself, allowed others"),
-        (
-            "after = [\n[],\n[0, 2],\n[0, 1]]",
-            "7: world.after[1]: found POI 1 after POI 2 after POI 1, which can never begin",
-        ),
-        (
-            "after = [[1], [2], [0]]",
-            "5: world.after[0]: found POI 0 after POI 1 after POI 2 after POI 0, which can never begin",
-        ),
-        // POI 0 depends on the cycle but is not in it, so it is not reported.
-        ("after = [[1], [2], [1]]", "5: world.after[1]: found POI 1 after POI 2 after POI 1, which can never begin"),
-        ("windows = [[1, 2]]", "5: world.windows: found a list of 1, allowed a list of 3 pairs [first, last], or none"),
-        ("windows = [[1, 2], [0, 3], [1, 9]]", "5: world.windows[1][0]: found 0, allowed 1 to 25 (world.steps)"),
-        ("windows = [[1, 2], [1, 3],\n[1, 26]]", "6: world.windows[2][1]: found 26, allowed 1 to 25 (world.steps)"),
-        (
-            "windows = [[1, 2], [1, 3],\n[9, 3]]",
-            "6: world.windows[2]: found the steps from 9 to 3, allowed the earlier one first",
-        ),
-        (
-            "windows = [[1, 2, 3], [1, 3], [1, 3]]",
-            "5: world.windows[0]: found a list of 3, allowed a list of 2 numbers",
-        ),
-        ("windows = 3", "5: world.windows: found 3, allowed a list of 3 pairs [first, last], or none"),
-        ("observers = 'nobody'", "5: world.observers: found 'nobody', allowed \"all\" or \"leaders\" or \"followers\""),
-        (
-            "observers = 'followers'\ncoupling = 2",
-            "6: world.coupling: found 2, allowed 1 (the number of followers, because only they observe)",
-        ),
-        (
-            "observers = 'leaders'\ncoupling = [1, 2, 3]",
-            "6: world.coupling[2]: found 3, allowed 1 to 2 (the number of leaders, because only they observe)",
-        ),
-        (
-            "observers = 'followers'\n[learning]\nparadigm = 'all-leaders'",
-            "5: world.observers: found \"followers\", but all agents lead, so nobody would observe",
-        ),
-    ] {
-        let error = Config::parse(&world(rest), "rules.toml").expect_err(rest).to_string();
+    for [rest, expected] in table(include_str!("data/refusals/rules.txt"), 18) {
+        let error = Config::parse(&world(&rest), "rules.toml").expect_err(&rest).to_string();
         assert!(error.starts_with(&format!("rules.toml:{expected}")) && !error.contains('\n'), "{rest}: {error}");
     }
     let without_followers = "[world]\nleaders = [[1, 2]]\npois = [[3, 4]]\nobservers = 'followers'";

@@ -1,38 +1,11 @@
 //! Tests the command line: exit codes, messages, and the streams that they are printed to.
 
-use crate::support;
+use crate::support::{self, GOOD, table, with_line};
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Output;
 
 use tempfile::TempDir;
-
-/// A valid config with two leaders, four followers and two POIs. Tests replace lines of it by their number.
-const GOOD: &str = "\
-[world]
-map = [50, 40]
-leaders = [[10, 5], [20, 5]]
-followers = [[12, 2], [8, 2], [22, 2], [18, 2]]
-pois = [[10, 15], [20, 15]]
-coupling = 3
-steps = 25
-dt = 0.2
-heading = 1.5
-speed = 0
-[motion]
-min_speed = 0
-max_speed = 3
-[follow]
-attraction_radius = 5
-repulsion_radius = 1
-[sense]
-poi_range = inf
-density = 'linear'
-[policy]
-hidden = [10]
-[learning]
-population = 50
-";
 
 fn flotilla(args: &[&str]) -> Output {
     support::flotilla().args(args).output().unwrap()
@@ -63,11 +36,6 @@ fn error_message(output: Output) -> String {
     let error = error.strip_prefix("error: ").expect(&error).trim_end();
     let name = |line: &str| line.find("x.toml").map_or(line.to_string(), |at| line[at..].to_string());
     error.lines().map(name).collect::<Vec<_>>().join("\n")
-}
-
-/// Returns [`GOOD`] with one line replaced, numbered from 1.
-fn with_line(number: usize, line: &str) -> String {
-    GOOD.lines().enumerate().map(|(at, old)| if at + 1 == number { line } else { old }).collect::<Vec<_>>().join("\n")
 }
 
 #[test]
@@ -140,243 +108,12 @@ fn another_language_is_one_problem() {
     }
 }
 
-/// Each message has the line, the key, the value found and the allowed values.
+/// The program prints the messages of the engine, which `tests/config.rs` checks for every line of the table.
 #[test]
 fn wrong_values_are_reported_with_line_and_range() {
-    let many = |count: usize| format!("[{}]", vec!["[1, 1]"; count].join(", "));
-    let agents = "found 1028 agents with the leaders, allowed 1 to 1024";
-    let leaders = format!("leaders = {}", many(1025));
-    let pois = format!("pois = {}", many(257));
-    let followers = format!("followers = {}", many(1022 + 4));
-    for (line, text, expected) in [
-        // unknown keys and sections
-        (13, "max_sped = 3", "motion.max_sped: unknown key, did you mean `motion.max_speed`?"),
-        (10, "max_speed = 3", "world.max_speed: unknown key, did you mean `motion.max_speed`?"),
-        (21, "hiden = [10]", "policy.hiden: unknown key, did you mean `policy.hidden`?"),
-        (21, "qwertz = 1", "policy.qwertz: unknown key; [policy] has actions, hidden"),
-        (20, "[polcy]", "polcy: unknown section, did you mean `policy`?"),
-        // wrong types
-        (8, "dt = 'fast'", "world.dt: found 'fast', allowed a number, 0.0001 to 10"),
-        (8, "dt = true", "world.dt: found true, allowed a number, 0.0001 to 10"),
-        (8, "dt = [1]", "world.dt: found a list of 1, allowed a number, 0.0001 to 10"),
-        (8, "dt = {}", "world.dt: found a table, allowed a number, 0.0001 to 10"),
-        (8, "dt = 1979-05-27", "world.dt: found 1979-05-27, allowed a number, 0.0001 to 10"),
-        (7, "steps = 2.5", "world.steps: found 2.5, allowed a whole number, 1 to 10000"),
-        (2, "map = 50", "world.map: found 50, allowed a list of 2 numbers"),
-        (2, "map = [50 60]", "found `50 60`, allowed numbers with a comma between them"),
-        (2, "map = [50]", "world.map: found a list of 1, allowed a list of 2 numbers"),
-        (3, "leaders = [[1, 2], 3]", "world.leaders[1]: found 3, allowed a list of 2 numbers"),
-        (3, "leaders = [[1, 2, 3]]", "world.leaders[0]: found a list of 3, allowed a list of 2 numbers"),
-        (3, "leaders = [[1, 'a']]", "world.leaders[0][1]: found 'a', allowed a number, 0 to 40 (the map)"),
-        (19, "density = 3", "sense.density: found 3, allowed \"linear\" or \"inverse\" or \"mean\""),
-        (19, "density = 'flat'", "sense.density: found 'flat', allowed \"linear\" or \"inverse\" or \"mean\""),
-        (23, "fitness = 'x'", "learning.fitness: found 'x', allowed \"G\" or \"D\" or \"Df\" or \"D++\" or \"Dt\""),
-        (
-            23,
-            "fitness = 'df'",
-            "learning.fitness: found 'df', allowed \"G\" or \"D\" or \"Df\" or \"D++\" or \"Dt\"; did you mean \"Df\"?",
-        ),
-        (
-            23,
-            "paradigm = 'all-leader'",
-            "learning.paradigm: found 'all-leader', allowed \"leader-follower\" or \"all-leaders\"; did you mean \"all-leaders\"?",
-        ),
-        (
-            23,
-            "elites = 0.1",
-            "learning.elites: found 0.1, allowed a whole number, 0 to 50 (learning.population), or a percentage such as \"10%\"",
-        ),
-        (23, "mutation = ''", "learning.mutation: found '', allowed \"scaled\" or \"additive\""),
-        (23, "paradigm = 'x'", "learning.paradigm: found 'x', allowed \"leader-follower\" or \"all-leaders\""),
-        // NaN and infinity
-        (8, "dt = nan", "world.dt: found nan, allowed 0.0001 to 10"),
-        (8, "dt = inf", "world.dt: found inf, allowed 0.0001 to 10"),
-        (2, "map = [50, inf]", "world.map[1]: found inf, allowed 1 to 10000"),
-        (9, "heading = -inf", "world.heading: found -inf, allowed -1000 to 1000"),
-        (18, "poi_range = nan", "sense.poi_range: found nan, allowed 0 to 10000 or inf (unlimited)"),
-        (18, "poi_range = -inf", "sense.poi_range: found -inf, allowed 0 to 10000 or inf (unlimited)"),
-        (18, "agent_range = -1", "sense.agent_range: found -1, allowed 0 to 10000 or inf (unlimited)"),
-        (18, "agent_range = 1e-3", "sense.agent_range: found 1e-3, allowed 0 or 0.01 to 10000 or inf (unlimited)"),
-        // one heading, one per leader, or one per agent
-        (
-            9,
-            "heading = [1, 2, 3]",
-            "world.heading: found a list of 3, allowed one number or a list of 2 (one per leader) or 6 (one per agent)",
-        ),
-        (
-            9,
-            "heading = []",
-            "world.heading: found a list of 0, allowed one number or a list of 2 (one per leader) or 6 (one per agent)",
-        ),
-        (9, "heading = [1, 'a']", "world.heading[1]: found 'a', allowed a number, -1000 to 1000"),
-        // out of range
-        (8, "dt = 0", "world.dt: found 0, allowed 0.0001 to 10"),
-        (8, "dt = -0.2", "world.dt: found -0.2, allowed 0.0001 to 10"),
-        (8, "dt = 99999999999999999999", "world.dt: found 99999999999999999999, allowed 0.0001 to 10"),
-        (2, "map = [0, 40]", "world.map[0]: found 0, allowed 1 to 10000"),
-        (7, "steps = 0", "world.steps: found 0, allowed 1 to 10000"),
-        (7, "steps = 10_001", "world.steps: found 10_001, allowed 1 to 10000"),
-        (7, "observation_radius = 0", "world.observation_radius: found 0, allowed 0.01 to 10000"),
-        (10, "speed = 4", "world.speed: found 4, allowed 0 to 3 (motion.min_speed to motion.max_speed)"),
-        (12, "min_speed = 4", "motion.min_speed: found 4, allowed 0 to 3 (motion.max_speed)"),
-        (13, "max_speed = 1e4", "motion.max_speed: found 1e4, allowed 0 to 1000"),
-        (13, "max_speed = 1e-40", "motion.max_speed: found 1e-40, allowed 0 or 0.000001 to 1000"),
-        (13, "max_acceleration = -1", "motion.max_acceleration: found -1, allowed 0 to 1000"),
-        (13, "max_turn_rate = -1", "motion.max_turn_rate: found -1, allowed 0 to 1000"),
-        (15, "attraction_radius = 0", "follow.attraction_radius: found 0, allowed 0.01 to 10000"),
-        (16, "repulsion_radius = 6", "follow.repulsion_radius: found 6, allowed 0.01 to 5 (follow.attraction_radius)"),
-        (16, "attraction_gain = -1", "follow.attraction_gain: found -1, allowed 0 to 1000"),
-        (16, "repulsion_gain = 1e9", "follow.repulsion_gain: found 1e9, allowed 0 to 1000"),
-        (16, "wall_gain = -1", "follow.wall_gain: found -1, allowed 0 to 1000"),
-        (23, "population = 1", "learning.population: found 1, allowed 2 to 1048576"),
-        (23, "population = 1048577", "learning.population: found 1048577, allowed 2 to 1048576"),
-        (23, "elites = 51", "learning.elites: found 51, allowed 0 to 50 (learning.population)"),
-        (
-            23,
-            "elites = \"0%\"",
-            "learning.elites: found \"0%\", allowed 0 to 50 (learning.population), or above \"0%\", up to \"100%\"",
-        ),
-        (
-            23,
-            "elites = \"ten\"",
-            "learning.elites: found \"ten\", allowed 0 to 50 (learning.population), or above \"0%\", up to \"100%\"",
-        ),
-        (
-            23,
-            "parents = \"elites\"\nelites = 0",
-            "learning.parents: found \"elites\" with learning.elites = 0, allowed with 1 or more",
-        ),
-        (23, "partners = 17", "learning.partners: found 17, allowed 1 to 16"),
-        (
-            23,
-            "partners = 3\nsharing = \"all\"",
-            "learning.partners: found 3 with learning.sharing = \"all\", allowed 1: a team has a single policy",
-        ),
-        (
-            23,
-            "partners = 2\nsharing = \"group\"\ngroups = [[0, 1]]",
-            "learning.partners: found 2 with learning.sharing = \"group\", allowed 1: a team has a single policy",
-        ),
-        (23, "groups = [[0, 1]]", "learning.groups: found with learning.sharing = \"none\", allowed with \"group\""),
-        (
-            23,
-            "groups = [[0, 1], [1]]\nsharing = \"group\"",
-            "learning.groups[1]: found learner 1 again, allowed in one group",
-        ),
-        (
-            23,
-            "groups = [[1]]\nsharing = \"group\"",
-            "learning.groups[0]: found no learner 0, allowed every learner in one group",
-        ),
-        (
-            23,
-            "groups = [[0, 2]]\nsharing = \"group\"",
-            "learning.groups[0][1]: found 2, allowed 0 to 1 (the last learner)",
-        ),
-        (
-            23,
-            "partners = 2\npopulation = 600000",
-            "learning.partners: found 2, which makes 1200000 teams per generation, allowed 1048576",
-        ),
-        (23, "hall_of_fame = 1001", "learning.hall_of_fame: found 1001, allowed 0 to 1000"),
-        (
-            23,
-            "hall_of_fame = 3\nsharing = \"all\"",
-            "learning.hall_of_fame: found 3 with learning.sharing = \"all\", allowed 0: a team has a single policy",
-        ),
-        (
-            23,
-            "hall_of_fame = 3\nmethod = \"snes\"",
-            "learning.hall_of_fame: found 3, allowed 0 unless learning.method is \"tournament\"",
-        ),
-        (
-            23,
-            "hall_of_fame = 3\npopulation = 400000",
-            "learning.hall_of_fame: found 3, which makes 1200000 teams per generation, allowed 1048576",
-        ),
-        (
-            23,
-            "teams = \"sorted\"\nsharing = \"all\"",
-            "learning.teams: found \"sorted\" with learning.sharing = \"all\", allowed \"random\": a team has a single policy",
-        ),
-        (
-            23,
-            "teams = \"softmax\"\nmethod = \"snes\"",
-            "learning.teams: found \"softmax\", allowed \"random\" unless learning.method is \"tournament\"",
-        ),
-        (
-            23,
-            "team_elites = 2\npartners = 3",
-            "learning.team_elites: found 2 with learning.partners = 3, allowed 0: a policy plays in several teams",
-        ),
-        (
-            23,
-            "team_g_elites = 1\nhall_of_fame = 4",
-            "learning.team_g_elites: found 1 with learning.hall_of_fame = 4, allowed 0: a policy plays in several teams",
-        ),
-        (
-            23,
-            "team_elites = 40\nteam_g_elites = 10",
-            "learning.team_elites: found 1 elites, 40 team_elites and 10 team_g_elites, allowed 50 together: learning.population",
-        ),
-        (23, "team_elites = 51", "learning.team_elites: found 51, allowed 0 to 50 (learning.population)"),
-        (23, "temperature = 0", "learning.temperature: found 0, allowed 0.000001 to 1000000"),
-        (23, "initial = \"zero\"", "learning.initial: found \"zero\", allowed \"normal\" or \"uniform\""),
-        (23, "initial_scale = 0", "learning.initial_scale: found 0, allowed 0.000001 to 1000"),
-        (23, "test_episodes = 1001", "learning.test_episodes: found 1001, allowed 0 to 1000"),
-        (23, "leniency = \"min\"", "learning.leniency: found \"min\", allowed \"mean\" or \"max\""),
-        (23, "generations = -1", "learning.generations: found -1, allowed 0 to 1000000"),
-        (23, "trials = 0", "learning.trials: found 0, allowed 1 to 4096"),
-        (23, "episodes_per_team = 0", "learning.episodes_per_team: found 0, allowed 1 to 1000"),
-        (23, "start_jitter = -1", "learning.start_jitter: found -1, allowed 0 to 10000"),
-        (23, "mutation_sigma = -1", "learning.mutation_sigma: found -1, allowed 0 to 100"),
-        (23, "mutation_probability = 1.5", "learning.mutation_probability: found 1.5, allowed 0 to 1"),
-        (23, "seed = -1", "learning.seed: found -1, allowed 0 to 9223372036854775807"),
-        (
-            23,
-            "seed = 18446744073709551615",
-            "learning.seed: found 18446744073709551615, allowed 0 to 9223372036854775807",
-        ),
-        // positions, coupling and sizes
-        (3, "leaders = [[10, 41]]", "world.leaders[0][1]: found 41, allowed 0 to 40 (the map)"),
-        (4, "followers = [[51, 4]]", "world.followers[0][0]: found 51, allowed 0 to 50 (the map)"),
-        (5, "pois = [[1, 1], [1, -1]]", "world.pois[1][1]: found -1, allowed 0 to 40 (the map)"),
-        (3, "leaders = []", "world.leaders: found a list of 0, allowed a list of 1 to 1024 positions [x, y]"),
-        (5, "pois = []", "world.pois: found a list of 0, allowed a list of 1 to 256 positions [x, y]"),
-        (3, &leaders, "world.leaders: found a list of 1025, allowed a list of 1 to 1024 positions [x, y]"),
-        (5, &pois, "world.pois: found a list of 257, allowed a list of 1 to 256 positions [x, y]"),
-        (4, &followers, "world.followers: found a list of 1026, allowed a list of 0 to 1023 positions [x, y]"),
-        (6, "coupling = 9", "world.coupling: found 9, allowed 1 to 6 (the number of agents)"),
-        (6, "coupling = 0", "world.coupling: found 0, allowed 1 to 6 (the number of agents)"),
-        (6, "coupling = [3, 7]", "world.coupling[1]: found 7, allowed 1 to 6 (the number of agents)"),
-        (
-            6,
-            "coupling = [3]",
-            "world.coupling: found a list of 1, allowed a list of 2 numbers, each 1 to 6 (the number of agents)",
-        ),
-        (
-            21,
-            "hidden = [9, 9, 9, 9]",
-            "policy.hidden: found a list of 4, allowed a list of 0 to 3 numbers, each 1 to 64",
-        ),
-        (21, "hidden = [65]", "policy.hidden[0]: found 65, allowed 1 to 64"),
-        (21, "hidden = [10, 0]", "policy.hidden[1]: found 0, allowed 1 to 64"),
-        (21, "hidden = 10", "policy.hidden: found 10, allowed a list of 0 to 3 numbers, each 1 to 64"),
-    ] {
-        let expected = format!("x.toml:{line}: {expected}");
-        let found = failure_message(check(with_line(line, text), &[]));
-        assert_eq!(found.lines().next(), Some(expected.as_str()), "{text}");
-    }
-    let crowd =
-        GOOD.replace("[[12, 2], [8, 2], [22, 2], [18, 2]]", &many(1023)).replace("[[10, 5], [20, 5]]", &many(5));
-    assert_eq!(failure_message(check(crowd, &[])), format!("x.toml:4: world.followers: {agents}"));
-    for (key, problem) in [
-        ("hall_of_fame = 3", "hall_of_fame: found 3 with a single leader, allowed 0: it has no partners"),
-        ("partners = 2", "partners: found 2 with a single leader, allowed 1: it has no partners"),
-        ("teams = 'sorted'", "teams: found \"sorted\" with a single leader, allowed \"random\": it has no partners"),
-    ] {
-        let single = GOOD.replace("[[10, 5], [20, 5]]", "[[10, 5]]") + key + "\n";
-        assert_eq!(failure_message(check(single, &[])), format!("x.toml:24: learning.{problem}"));
+    for [line, text, expected] in table(include_str!("../../tests/data/refusals/keys.txt"), 104).iter().step_by(10) {
+        let found = failure_message(check(with_line(line.parse().unwrap(), text), &[]));
+        assert_eq!(found.lines().next(), Some(&*format!("x.toml:{line}: {expected}")), "{text}");
     }
 }
 

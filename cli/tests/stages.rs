@@ -5,7 +5,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use crate::support::{self, SMALL};
+use crate::support::{self, SMALL, table};
 use assert_cmd::cargo::cargo_bin_cmd;
 use flotilla::backend::cpu::Cpu;
 use flotilla::config::{Config, Sharing};
@@ -99,50 +99,9 @@ fn the_first_teams_of_a_stage_depend_on_what_was_observed_before_it() {
 fn errors_in_stages_name_their_line() {
     let lines = SMALL.lines().count();
     let stage = |from: &str, set: &str| format!("[[stages]]\nfrom = {from}\nset = {{ {set} }}\n");
-    let cases = [
-        (
-            stage("0", "'world.copling' = 1"),
-            3,
-            "stages[0].set.world.copling: unknown key, did you mean `world.coupling`?",
-        ),
-        (stage("0", "'world.coupling' = 9"), 3, "stages[0].set.world.coupling: found 9, allowed"),
-        (
-            stage("0", "'learning.population' = 9"),
-            3,
-            "stages[0].set.learning.population: this key cannot change between stages",
-        ),
-        (
-            stage("0", "'learning.hall_of_fame' = 2"),
-            3,
-            "stages[0].set.learning.hall_of_fame: this key cannot change between stages",
-        ),
-        (
-            stage("0", "'learning.elites' = '50%'"),
-            3,
-            "stages[0].set.learning.elites: this key cannot change between stages",
-        ),
-        (
-            stage("0", "'learning.parents' = 'elites'"),
-            3,
-            "stages[0].set.learning.parents: this key cannot change between stages",
-        ),
-        (stage("0", "'policy.hidden' = [3]"), 3, "stages[0].set.policy.hidden: this key cannot change between stages"),
-        (
-            stage("0", "'checkpoint.seconds' = 3"),
-            3,
-            "stages[0].set.checkpoint.seconds: this key cannot change between stages",
-        ),
-        (stage("0", "'world.leaders' = [[1, 1]]"), 3, "stages[0].set.world.leaders: 1 leaders learn in this stage, 2"),
-        (stage("1000001", ""), 2, "stages[0].from: found 1000001, allowed a whole number, 0 to 1000000"),
-        (stage("-1", ""), 2, "stages[0].from: found -1, allowed a whole number, 0 to 1000000"),
-        (stage("3", "") + &stage("3", ""), 5, "stages[1].from: found 3, allowed a whole number, 4 to 1000000, after"),
-        ("[[stages]]\nset = {}\n".into(), 1, "stages[0]: missing `from`"),
-        (stage("1", "").replace("set", "sett"), 3, "stages[0].sett: unknown key; a stage has from, set"),
-        ("[[stages]]\nfrom = 1\nset = 3\n".into(), 3, "stages[0].set: allowed a table"),
-    ];
-    for (text, line, message) in cases {
+    for [text, line, message] in table(include_str!("refusals/stages.txt"), 15) {
         let found = error_lines(&[SMALL, &text].concat());
-        let expected = format!("test.toml:{}: {message}", lines + line);
+        let expected = format!("test.toml:{}: {message}", lines + line.parse::<usize>().unwrap());
         assert!(found.len() == 1 && found[0].starts_with(&expected), "{text}: {found:?} is not {expected}");
     }
     assert!(error_lines(&["stages = 3\n", SMALL].concat())[0].starts_with("test.toml:1: stages: allowed a list"));

@@ -217,31 +217,9 @@ fn flags_count_as_if_they_were_in_the_file() {
 #[test]
 fn errors_in_sweeps_name_the_line() {
     let error_of = |grid: &str| parse_error(&SMALL.replace("\"world.coupling\" = [1, 3]", grid));
-    for (grid, expected) in [
-        (
-            "\"world.copling\" = [1, 3]",
-            "x.toml:13: grid.\"world.copling\"[0]: unknown key, did you mean `world.coupling`?",
-        ),
-        ("\"world.coupling\" = []", "x.toml:13: grid.\"world.coupling\": found no values"),
-        ("\"world.coupling\" = 3", "x.toml:13: grid.\"world.coupling\": found 3, allowed a list of values: [3]"),
-        ("\"world.coupling\" = [1, 2, 1]", "x.toml:13: grid.\"world.coupling\": found 1 twice, at [0] and at [2]"),
-        ("\"world.coupling\" = [1, \"many\"]", "grid.\"world.coupling\"[1]: found \"many\", allowed"),
-        ("groups = [0, 2.5]", "x.toml:13: grid.groups: found 0, allowed whole numbers 1 to 256"),
-        ("groups = [0, 2.5]", "x.toml:13: grid.groups: found 2.5, allowed whole numbers 1 to 256"),
-        ("followers_per_leader = [65]", "grid.followers_per_leader: found 65, allowed whole numbers 0 to 64"),
-        ("followers_per_leader = [2]", "it lays out world.leaders, which is given too"),
-        (
-            "\"world.coupling\" = [1, 3]\nworld.coupling = [2]",
-            "x.toml:14: grid.\"world.coupling\": given twice; leave one of them out",
-        ),
-        ("world.coupling = [2]\n\"world.coupling\" = [1, 3]", "x.toml:14: grid.\"world.coupling\": given twice"),
-        ("skip_impossible = 1", "grid.skip_impossible: found 1, allowed true or false"),
-        ("\"world.dt\" = [nan]", "grid.\"world.dt\"[0]: found nan"),
-        ("\"world.dt\" = [0.2", "array"),
-        ("\"checkpoint.folder\" = ['/']", "grid.\"checkpoint.folder\"[0]: unknown key"),
-    ] {
-        let error = error_of(grid);
-        assert!(error.contains(expected), "{grid}: {error}");
+    for [grid, expected] in support::table(include_str!("refusals/grid.txt"), 15) {
+        let error = error_of(&grid);
+        assert!(error.contains(&expected), "{grid}: {error}");
     }
     let without = SMALL.split("[grid]").next().unwrap();
     assert!(parse_error(without).contains("missing, a sweep has a section [grid]"));
@@ -343,32 +321,9 @@ fn keys_that_set_the_same_are_refused() {
 #[test]
 fn errors_in_varied_keys_name_the_line() {
     let error_of = |keys: &str| parse_error(&varied().replace("world.coupling = [1, 7]", keys));
-    for (keys, expected) in [
-        (
-            "\"learning.fitness\" = [\"D\"]",
-            "x.toml:17: vary.\"learning.fitness\": grid.\"learning.fitness\" sets the same",
-        ),
-        (
-            "\"world.coupling\" = [1, 3]",
-            "x.toml:17: vary.\"world.coupling\"[1]: found 3, which is the file's own value",
-        ),
-        ("\"motion.max_speed\" = [3]", "vary.\"motion.max_speed\"[0]: found 3, which is the file's own value"),
-        ("\"world.coupling\" = []", "x.toml:17: vary.\"world.coupling\": found no values"),
-        ("\"world.coupling\" = 1", "x.toml:17: vary.\"world.coupling\": found 1, allowed a list of values: [1]"),
-        (
-            "\"world.copling\" = [1]",
-            "x.toml:17: vary.\"world.copling\"[0]: unknown key, did you mean `world.coupling`?",
-        ),
-        ("\"world.coupling\" = [1, 1]", "x.toml:17: vary.\"world.coupling\": found 1 twice"),
-        (
-            "\"world.coupling\" = [1, 7]",
-            "vary.\"world.coupling\"[1]: found 7, allowed 1 to 6 (the number of agents); at 2",
-        ),
-        ("followers_per_leader = [3]", "x.toml:17: vary.followers_per_leader: not allowed in [vary]"),
-        ("skip_impossible = true", "x.toml:17: vary.skip_impossible: found true, allowed a list of values"),
-    ] {
-        let error = error_of(keys);
-        assert!(error.contains(expected), "{keys}: {error}");
+    for [keys, expected] in support::table(include_str!("refusals/vary.txt"), 10) {
+        let error = error_of(&keys);
+        assert!(error.contains(&expected), "{keys}: {error}");
     }
     let base = SMALL.split("[grid]").next().unwrap();
     assert!(parse_error(&format!("{base}[vary]\n")).contains("x.toml:12: vary: it has no key"));

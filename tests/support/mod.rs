@@ -43,6 +43,52 @@ pub fn tiny(generations: usize, checkpoint: &str) -> String {
     format!("{}[checkpoint]\n{checkpoint}\n", TINY.replace("generations = 4", &format!("generations = {generations}")))
 }
 
+/// A valid config with two leaders, four followers and two POIs. Tests replace lines of it by their number.
+pub const GOOD: &str = "\
+[world]
+map = [50, 40]
+leaders = [[10, 5], [20, 5]]
+followers = [[12, 2], [8, 2], [22, 2], [18, 2]]
+pois = [[10, 15], [20, 15]]
+coupling = 3
+steps = 25
+dt = 0.2
+heading = 1.5
+speed = 0
+[motion]
+min_speed = 0
+max_speed = 3
+[follow]
+attraction_radius = 5
+repulsion_radius = 1
+[sense]
+poi_range = inf
+density = 'linear'
+[policy]
+hidden = [10]
+[learning]
+population = 50
+";
+
+/// Returns [`GOOD`] with one line replaced, numbered from 1.
+pub fn with_line(number: usize, line: &str) -> String {
+    GOOD.lines().enumerate().map(|(at, old)| if at + 1 == number { line } else { old }).collect::<Vec<_>>().join("\n")
+}
+
+/// Returns the rows of a table: one per line, with columns separated by ` => ` and line breaks written as `\n`. Lines
+/// that start with `#` are comments.
+///
+/// Panics if a row has another number of columns, or if there are fewer than `least` rows.
+pub fn table<const N: usize>(text: &str, least: usize) -> Vec<[String; N]> {
+    let row = |line: &str| {
+        let columns: Vec<String> = line.split(" => ").map(|column| column.replace("\\n", "\n")).collect();
+        <[String; N]>::try_from(columns).unwrap_or_else(|_| panic!("not {N} columns: {line}"))
+    };
+    let rows: Vec<_> = text.lines().filter(|line| !line.starts_with('#')).map(row).collect();
+    assert!(rows.len() >= least, "only {} rows", rows.len());
+    rows
+}
+
 /// Loads a config of the directory `configs/` by its name.
 pub fn layout(name: &str) -> Config {
     let path = format!("{}/configs/{name}.toml", crate::ROOT);
