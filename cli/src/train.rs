@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use super::recovery::{Checkpoints, quoted};
 use super::{ConfigArgs, Error, ExistingResults, Printed, RunOptions, console, with_remedy};
 use flotilla::escape::PathExt;
+use flotilla::file;
 use flotilla_app::ops::train::{self, Extremes, TrainOutcome, TrainRequest};
 use flotilla_app::record::folder::{self, CONFIG, METRICS, POLICIES, RUN, Start};
 use flotilla_app::record::ownership::CURVES;
@@ -38,11 +39,12 @@ pub fn run(args: Args) -> Result<(), Error> {
     let Args { config, run, out, existing, init, printed, checkpoints } = args;
     let (name, start) = (config.name(), existing.start());
     // Without its folder, the run in `runs/config` would be meant.
-    if let (None, Start::Resume | Start::Force, Some(run)) = (&out, start, folder::owner(&config.file.path)) {
+    if let (None, Start::Resume | Start::Force, Some(_)) = (&out, start, folder::owner(&config.file.path)) {
+        let run = file::folder(&config.file.path);
         let text = format!("{} is the config of the run in {}", config.file.path.escaped(), run.escaped());
         return Err(Error::Usage(with_remedy(
             text,
-            format!("name that folder with --out {}, or another", quoted(&run)),
+            format!("name that folder with --out {}, or another", quoted(run)),
         )));
     }
     let request = TrainRequest { config: config.text(checkpoints.list())?, name, out, start, init };

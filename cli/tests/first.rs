@@ -273,11 +273,12 @@ fn commands_in_the_summary_work_for_the_best_champion() {
 #[test]
 fn rollout_accepts_a_run_directory() {
     let place = small();
-    let from_directory = place.good("rollout run --json --quiet").0;
-    let from_files = place.good("rollout run/config.toml --policies run/policies.safetensors --json --quiet").0;
+    let from_directory = place.good("rollout run --trial 0 --json --quiet").0;
+    let from_files =
+        place.good("rollout run/config.toml --policies run/policies.safetensors --trial 0 --json --quiet").0;
     assert_eq!(from_directory, from_files);
     assert!(place.refused(2, "rollout small.toml").contains("--policies: a config file needs a file of policies"));
-    assert!(place.refused(2, "rollout run --stage 1").contains("--stage 1: the config has 1 stage, 0\n"));
+    assert!(place.refused(2, "rollout run --stage 1").contains("--stage 1: the config has no [[stages]]\n"));
 }
 
 #[test]
