@@ -312,9 +312,7 @@ fn climb(
     backend: &mut dyn Backend,
 ) -> Result<(), BackendError> {
     let (mut observed, mut rounds) = (Vec::new(), Vec::new());
-    for setting in &mut *playing {
-        setting.draw_round(generation, first);
-    }
+    playing.par_iter_mut().for_each(|setting| setting.draw_round(generation, first));
     for setting in &*playing {
         let teams = setting.round_size(first);
         let climbing = setting.trials.iter().filter_map(|trial| Some((trial, trial.climbers.as_ref()?)));
@@ -436,14 +434,14 @@ impl Setting {
     fn draw_round(&mut self, generation: usize, first: usize) {
         // Other starts make other results, so the best team plays again.
         let (count, again) = (self.round_size(first), generation > 0 && first == 0 && self.moves());
-        for Trial { index, climbers, weights, .. } in self.trials.iter_mut().filter(|_| count > 0) {
+        self.trials.par_iter_mut().filter(|_| count > 0).for_each(|Trial { index, climbers, weights, .. }| {
             if let Some(Climbers { segments, networks }) = climbers {
                 for climber in [segments, &mut *networks] {
                     climber.draw(&self.config.learning, *index, generation, (first, count), again);
                 }
                 by_population(networks, self.world.parameters(), weights);
             }
-        }
+        });
     }
 
     /// Returns the round of a trial's teams whose policies are written.
