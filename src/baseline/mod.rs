@@ -176,8 +176,10 @@ struct Setting {
 /// One trial's teams of the current generation, and the results of its earlier generations.
 struct Trial {
     index: usize,
-    /// `[populations][teams][parameters]`
+    /// The policies of constant and random teams, `[populations][teams][parameters]`.
     weights: Vec<f32>,
+    /// The policies of the teams that climb, in the same shape.
+    climbing: Vec<f32>,
     /// `[episodes][agents]`, with POIs if they move.
     starts: Vec<Vec<Vec2>>,
     /// Summed worth of the POIs observed in all episodes of the current generation: by the constants that play, then by each kind of
@@ -252,7 +254,8 @@ impl Baselines {
             let mut rounds = Vec::new();
             for setting in &playing {
                 let teams = setting.teams(generation).min(first + DRAWN_TOGETHER).saturating_sub(first);
-                rounds.extend(setting.trials.iter().filter(|_| teams > 0).map(|trial| setting.round(trial, teams)));
+                let trials = setting.trials.iter().filter(|_| teams > 0);
+                rounds.extend(trials.map(|trial| setting.round(trial, &trial.weights, teams)));
             }
             let mut observed = play(&rounds, |groups| backend.play(groups))?.into_iter();
             for setting in &mut playing {
@@ -318,7 +321,7 @@ fn climb(
         let climbing = setting.trials.iter().filter_map(|trial| Some((trial, trial.climbers.as_ref()?)));
         let climbing: Vec<_> = climbing.filter(|_| teams > 0).collect();
         let first = rounds.len();
-        rounds.extend(climbing.iter().map(|(trial, _)| setting.round(trial, teams)));
+        rounds.extend(climbing.iter().map(|(trial, _)| setting.round(trial, &trial.climbing, teams)));
         let open_loop: Vec<_> = climbing.iter().flat_map(|(_, climbers)| climbers.segments.teams()).collect();
         observed.extend(play_segments(&rounds[first..], &open_loop)?);
     }
@@ -399,6 +402,7 @@ impl Setting {
         let trial = |index| Trial {
             index,
             weights: vec![],
+            climbing: vec![],
             starts: vec![vec![]; episodes_per_team],
             observed: Vec::with_capacity(constants.len() + RANDOM.len() * config.learning.team_count()),
             last_constants: vec![],
@@ -434,19 +438,19 @@ impl Setting {
     fn draw_round(&mut self, generation: usize, first: usize) {
         // Other starts make other results, so the best team plays again.
         let (count, again) = (self.round_size(first), generation > 0 && first == 0 && self.moves());
-        self.trials.par_iter_mut().filter(|_| count > 0).for_each(|Trial { index, climbers, weights, .. }| {
+        self.trials.par_iter_mut().filter(|_| count > 0).for_each(|Trial { index, climbers, climbing, .. }| {
             if let Some(Climbers { segments, networks }) = climbers {
                 for climber in [segments, &mut *networks] {
                     climber.draw(&self.config.learning, *index, generation, (first, count), again);
                 }
-                by_population(networks, self.world.parameters(), weights);
+                by_population(networks, self.world.parameters(), climbing);
             }
         });
     }
 
-    /// Returns the round of a trial's teams whose policies are written.
-    fn round<'a>(&'a self, trial: &'a Trial, teams: usize) -> Round<'a> {
-        Round { world: &self.world, teams, weights: &trial.weights, starts: &trial.starts }
+    /// Returns a round of a trial's teams.
+    fn round<'a>(&'a self, trial: &'a Trial, weights: &'a [f32], teams: usize) -> Round<'a> {
+        Round { world: &self.world, teams, weights, starts: &trial.starts }
     }
 
     /// Returns the team at a place among a generation's teams.
@@ -479,7 +483,6 @@ impl Setting {
     /// Writes teams' policies, `[populations][teams][parameters]`.
     fn write_policies(&self, trial: &Trial, teams: &[Team], weights: &mut Vec<f32>) {
         let (level, parameters) = (Level::new(), self.world.parameters());
-        weights.clear();
         weights.resize(self.config.populations() * teams.len() * parameters, 0.0);
         weights.par_chunks_exact_mut(parameters).enumerate().for_each(|(place, policy)| {
             self.write_policy(level, trial, teams[place % teams.len()], place / teams.len(), policy);
