@@ -314,17 +314,17 @@ fn climb(
     first: usize,
     backend: &mut dyn Backend,
 ) -> Result<(), BackendError> {
-    let (mut observed, mut rounds) = (Vec::new(), Vec::new());
+    let (mut open_loop, mut rounds) = (Vec::new(), Vec::new());
     playing.par_iter_mut().for_each(|setting| setting.draw_round(generation, first));
     for setting in &*playing {
         let teams = setting.round_size(first);
         let climbing = setting.trials.iter().filter_map(|trial| Some((trial, trial.climbers.as_ref()?)));
-        let climbing: Vec<_> = climbing.filter(|_| teams > 0).collect();
-        let first = rounds.len();
-        rounds.extend(climbing.iter().map(|(trial, _)| setting.round(trial, &trial.climbing, teams)));
-        let open_loop: Vec<_> = climbing.iter().flat_map(|(_, climbers)| climbers.segments.teams()).collect();
-        observed.extend(play_segments(&rounds[first..], &open_loop)?);
+        for (trial, climbers) in climbing.filter(|_| teams > 0) {
+            rounds.push(setting.round(trial, &trial.climbing, teams));
+            open_loop.push(&climbers.segments.teams[..]);
+        }
     }
+    let observed = play_segments(&rounds, &open_loop)?;
     let networks = play(&rounds, |groups| backend.play(groups))?;
     let climbers = playing.iter_mut().filter(|setting| setting.round_size(first) > 0);
     let climbers = climbers.flat_map(|setting| &mut setting.trials).filter_map(|trial| trial.climbers.as_mut());
@@ -345,13 +345,13 @@ struct Round<'a> {
     starts: &'a [Vec<Vec2>],
 }
 
-/// Plays open-loop teams, `[rounds][teams]`, in place of those of some rounds of one size in one world. Returns what
-/// [`play`] does.
+/// Plays open-loop teams, `[rounds][teams][numbers]`, in place of those of some rounds. Returns what [`play`] does.
 fn play_segments(rounds: &[Round<'_>], open_loop: &[&[f32]]) -> Result<Vec<Vec<u64>>, BackendError> {
-    let Some(&Round { world, teams, starts, .. }) = rounds.first() else { return Ok(vec![]) };
-    let actions = |index: usize, leader, step| {
-        let team = index / (starts.len() * teams) * teams + index % teams;
-        segment_action(world, open_loop[team], leader, step)
+    let of_rounds = rounds.iter().zip(open_loop);
+    let of_group: Vec<_> = of_rounds.flat_map(|of| std::iter::repeat_n(of, of.0.starts.len())).collect();
+    let actions = |(group, team): (usize, usize), leader, step| {
+        let (Round { world, teams, .. }, numbers) = of_group[group];
+        segment_action(world, &numbers[numbers.len() / teams * team..], leader, step)
     };
     play(rounds, |groups| Cpu::default().play_with(groups, Some(&actions)))
 }
