@@ -108,11 +108,9 @@ impl Positions<'_> {
     /// Returns a vector of an agent's row: its x and y.
     #[inline(always)]
     fn at<S: Simd>(&self, simd: S, agent: usize, first: usize) -> [S::f32s; 2] {
-        let start = first * self.stride + agent * self.agent_stride;
-        [0, self.axis_stride].map(
-            #[inline(always)]
-            |axis| S::u32s::from_slice(simd, &self.words[start + axis..][..S::f32s::LEN]).bitcast(),
-        )
+        let x = &self.words[first * self.stride + agent * self.agent_stride..];
+        let [x, y] = [&x[..S::f32s::LEN], &x[self.axis_stride..][..S::f32s::LEN]];
+        [S::u32s::from_slice(simd, x).bitcast(), S::u32s::from_slice(simd, y).bitcast()]
     }
 }
 
