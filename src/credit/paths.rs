@@ -3,7 +3,7 @@
 use fearless_simd::{Simd, prelude::*};
 
 use super::assignment::{first_most, lead};
-use super::{Paths, each_bit, fill_with_zeros, share, stepping_stone};
+use super::{Paths, Strided, each_bit, fill_with_zeros, share, stepping_stone};
 use crate::config::{Fitness, Score, When};
 use crate::kernels::math::within;
 use crate::kernels::{larger, select, smaller, splat};
@@ -269,8 +269,7 @@ impl PathCredit {
         let place = |moment: usize, agent: usize, word: usize| {
             (word * agents + agent / teams) * row + moment * teams + agent % teams
         };
-        let sights = &self.sights;
-        lead(|place| sights[place], &mut self.led, [moments, agents * teams, leaders], world.led, place);
+        lead(&Strided::contiguous(&self.sights), &mut self.led, [moments, agents * teams, leaders], world.led, place);
         for (place, led) in self.led.chunks_exact(row).enumerate() {
             let (word, agent) = (place / agents, place % agents);
             for bit in each_bit(led[..moments * teams].iter().fold(0, |ever, led| ever | led)) {
