@@ -34,7 +34,7 @@ pub(crate) struct PathCredit {
     /// Agents that are ever near the POI and count there, `[observers]`.
     observers: Vec<usize>,
     /// Their squared distance at each moment, infinite unless it is near and the moment counts, and then the vector of its
-    /// smallest distances if [`Scored::is_closest_ever`], `[observers][width + lanes]`.
+    /// smallest distances if [`Scored::is_closest_ever`], `[observers][width + lanes]`. It has room for all agents.
     near: Vec<f32>,
     /// The beginning of each vector in which an observer is near. Empty if [`Scored::is_closest_ever`].
     vectors: Vec<usize>,
@@ -349,21 +349,20 @@ impl PathCredit {
     #[inline(always)]
     fn find_observers<S: Simd>(&mut self, simd: S, scored: &Scored<'_>, poi: usize) {
         let &Scored { ref positions, teams, world, rule, .. } = scored;
-        let (agents, width) = (world.agents(), self.width);
+        let (agents, width, row) = (world.agents(), self.width, self.width + S::f32s::LEN);
         // A window of all steps includes the start, if that counts. POIs without one have it if others have windows.
         let window = world.rule.window(poi).filter(|&window| window != [1, world.constants.steps]);
         let [first, last] = window.map_or([0, world.steps()], |window| window.map(|step| step as usize));
         let first = first.max(usize::from(!rule.start_counts));
         self.observers.clear();
-        self.near.clear();
+        // Not cleared, because all that is read is written first.
+        self.near.resize(agents * row, 0.0);
         let (poi_x, poi_y) = self.pois[poi * 2 * S::f32s::LEN..][..2 * S::f32s::LEN].split_at(S::f32s::LEN);
         let (poi_x, poi_y) = (S::f32s::from_slice(simd, poi_x), S::f32s::from_slice(simd, poi_y));
         let (radius2, infinity) = (splat(simd, world.radii2[poi]), splat(simd, f32::INFINITY));
         let is_closest_ever = scored.is_closest_ever(poi);
         for agent in (0..agents).filter(|&agent| world.rule.counts_at(poi, agent)) {
-            let start = self.near.len();
-            self.near.resize(start + width + S::f32s::LEN, 0.0);
-            let (near, smallest) = self.near[start..].split_at_mut(width);
+            let (near, smallest) = self.near[self.observers.len() * row..][..row].split_at_mut(width);
             let mut ever = S::u32s::splat(simd, 0);
             for (vector, near) in near.chunks_exact_mut(S::f32s::LEN).enumerate() {
                 let [x, y] = positions.at(simd, agent, vector * S::f32s::LEN);
@@ -383,8 +382,6 @@ impl PathCredit {
                     closest.store_slice(smallest);
                 }
                 self.observers.push(agent);
-            } else {
-                self.near.truncate(start);
             }
         }
         self.vectors.clear();
@@ -393,7 +390,7 @@ impl PathCredit {
         }
         for first in (0..width).step_by(S::f32s::LEN) {
             let mut is_anyone_near = false;
-            for near in self.near.chunks_exact(width + S::f32s::LEN) {
+            for near in self.near.chunks_exact(row).take(self.observers.len()) {
                 let near = S::f32s::from_slice(simd, &near[first..][..S::f32s::LEN]);
                 is_anyone_near |= near.simd_lt(infinity).any_true();
             }
