@@ -65,7 +65,7 @@ pub(super) struct Climber {
     /// Summed worth of the POIs that it observes in the episodes of its last generation.
     pub(super) observed: u64,
     /// The teams of this round, `[teams][numbers]`.
-    teams: Vec<f32>,
+    pub(super) teams: Vec<f32>,
 }
 
 impl Climber {
@@ -114,7 +114,7 @@ impl Climber {
     }
 
     /// Returns the teams of this round.
-    pub(super) fn teams(&self) -> impl Iterator<Item = &[f32]> {
+    fn teams(&self) -> impl Iterator<Item = &[f32]> {
         let (parts, size, _) = self.genome.shape();
         self.teams.chunks_exact(parts * size)
     }

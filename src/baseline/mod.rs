@@ -176,8 +176,10 @@ struct Setting {
 /// One trial's teams of the current generation, and the results of its earlier generations.
 struct Trial {
     index: usize,
-    /// `[populations][teams][parameters]`
+    /// The policies of constant and random teams, `[populations][teams][parameters]`.
     weights: Vec<f32>,
+    /// The policies of the teams that climb, in the same shape.
+    climbing: Vec<f32>,
     /// `[episodes][agents]`, with POIs if they move.
     starts: Vec<Vec<Vec2>>,
     /// Summed worth of the POIs observed in all episodes of the current generation: by the constants that play, then by each kind of
@@ -252,7 +254,8 @@ impl Baselines {
             let mut rounds = Vec::new();
             for setting in &playing {
                 let teams = setting.teams(generation).min(first + DRAWN_TOGETHER).saturating_sub(first);
-                rounds.extend(setting.trials.iter().filter(|_| teams > 0).map(|trial| setting.round(trial, teams)));
+                let trials = setting.trials.iter().filter(|_| teams > 0);
+                rounds.extend(trials.map(|trial| setting.round(trial, &trial.weights, teams)));
             }
             let mut observed = play(&rounds, |groups| backend.play(groups))?.into_iter();
             for setting in &mut playing {
@@ -311,19 +314,17 @@ fn climb(
     first: usize,
     backend: &mut dyn Backend,
 ) -> Result<(), BackendError> {
-    let (mut observed, mut rounds) = (Vec::new(), Vec::new());
-    for setting in &mut *playing {
-        setting.draw_round(generation, first);
-    }
+    let (mut open_loop, mut rounds) = (Vec::new(), Vec::new());
+    playing.par_iter_mut().for_each(|setting| setting.draw_round(generation, first));
     for setting in &*playing {
         let teams = setting.round_size(first);
         let climbing = setting.trials.iter().filter_map(|trial| Some((trial, trial.climbers.as_ref()?)));
-        let climbing: Vec<_> = climbing.filter(|_| teams > 0).collect();
-        let first = rounds.len();
-        rounds.extend(climbing.iter().map(|(trial, _)| setting.round(trial, teams)));
-        let open_loop: Vec<_> = climbing.iter().flat_map(|(_, climbers)| climbers.segments.teams()).collect();
-        observed.extend(play_segments(&rounds[first..], &open_loop)?);
+        for (trial, climbers) in climbing.filter(|_| teams > 0) {
+            rounds.push(setting.round(trial, &trial.climbing, teams));
+            open_loop.push(&climbers.segments.teams[..]);
+        }
     }
+    let observed = play_segments(&rounds, &open_loop)?;
     let networks = play(&rounds, |groups| backend.play(groups))?;
     let climbers = playing.iter_mut().filter(|setting| setting.round_size(first) > 0);
     let climbers = climbers.flat_map(|setting| &mut setting.trials).filter_map(|trial| trial.climbers.as_mut());
@@ -344,13 +345,13 @@ struct Round<'a> {
     starts: &'a [Vec<Vec2>],
 }
 
-/// Plays open-loop teams, `[rounds][teams]`, in place of those of some rounds of one size in one world. Returns what
-/// [`play`] does.
+/// Plays open-loop teams, `[rounds][teams][numbers]`, in place of those of some rounds. Returns what [`play`] does.
 fn play_segments(rounds: &[Round<'_>], open_loop: &[&[f32]]) -> Result<Vec<Vec<u64>>, BackendError> {
-    let Some(&Round { world, teams, starts, .. }) = rounds.first() else { return Ok(vec![]) };
-    let actions = |index: usize, leader, step| {
-        let team = index / (starts.len() * teams) * teams + index % teams;
-        segment_action(world, open_loop[team], leader, step)
+    let of_rounds = rounds.iter().zip(open_loop);
+    let of_group: Vec<_> = of_rounds.flat_map(|of| std::iter::repeat_n(of, of.0.starts.len())).collect();
+    let actions = |(group, team): (usize, usize), leader, step| {
+        let (Round { world, teams, .. }, numbers) = of_group[group];
+        segment_action(world, &numbers[numbers.len() / teams * team..], leader, step)
     };
     play(rounds, |groups| Cpu::default().play_with(groups, Some(&actions)))
 }
@@ -401,6 +402,7 @@ impl Setting {
         let trial = |index| Trial {
             index,
             weights: vec![],
+            climbing: vec![],
             starts: vec![vec![]; episodes_per_team],
             observed: Vec::with_capacity(constants.len() + RANDOM.len() * config.learning.team_count()),
             last_constants: vec![],
@@ -436,19 +438,19 @@ impl Setting {
     fn draw_round(&mut self, generation: usize, first: usize) {
         // Other starts make other results, so the best team plays again.
         let (count, again) = (self.round_size(first), generation > 0 && first == 0 && self.moves());
-        for Trial { index, climbers, weights, .. } in self.trials.iter_mut().filter(|_| count > 0) {
+        self.trials.par_iter_mut().filter(|_| count > 0).for_each(|Trial { index, climbers, climbing, .. }| {
             if let Some(Climbers { segments, networks }) = climbers {
                 for climber in [segments, &mut *networks] {
                     climber.draw(&self.config.learning, *index, generation, (first, count), again);
                 }
-                by_population(networks, self.world.parameters(), weights);
+                by_population(networks, self.world.parameters(), climbing);
             }
-        }
+        });
     }
 
-    /// Returns the round of a trial's teams whose policies are written.
-    fn round<'a>(&'a self, trial: &'a Trial, teams: usize) -> Round<'a> {
-        Round { world: &self.world, teams, weights: &trial.weights, starts: &trial.starts }
+    /// Returns a round of a trial's teams.
+    fn round<'a>(&'a self, trial: &'a Trial, weights: &'a [f32], teams: usize) -> Round<'a> {
+        Round { world: &self.world, teams, weights, starts: &trial.starts }
     }
 
     /// Returns the team at a place among a generation's teams.
@@ -465,7 +467,6 @@ impl Setting {
         match team {
             Team::Constant(index) => constant_policy(&self.constants[index][population], policy),
             Team::Random(kind, generation, slot) => {
-                let population = if kind == Purpose::SharedBaseline { 0 } else { population };
                 let key = Key::new(self.config.learning.seed, trial.index, kind).at(generation, population, slot);
                 match kind {
                     Purpose::ConstantActions => random_action(key, outputs(&self.config), policy),
@@ -481,10 +482,19 @@ impl Setting {
     /// Writes teams' policies, `[populations][teams][parameters]`.
     fn write_policies(&self, trial: &Trial, teams: &[Team], weights: &mut Vec<f32>) {
         let (level, parameters) = (Level::new(), self.world.parameters());
-        weights.clear();
         weights.resize(self.config.populations() * teams.len() * parameters, 0.0);
+        let (shared, weights) = weights.split_at_mut(teams.len() * parameters);
+        shared.par_chunks_exact_mut(parameters).zip(teams).for_each(|(policy, &team)| {
+            self.write_policy(level, trial, team, 0, policy);
+        });
         weights.par_chunks_exact_mut(parameters).enumerate().for_each(|(place, policy)| {
-            self.write_policy(level, trial, teams[place % teams.len()], place / teams.len(), policy);
+            let (population, index) = (place / teams.len() + 1, place % teams.len());
+            match teams[index] {
+                Team::Random(Purpose::SharedBaseline, ..) => {
+                    policy.copy_from_slice(&shared[index * parameters..][..parameters]);
+                }
+                team => self.write_policy(level, trial, team, population, policy),
+            }
         });
     }
 

@@ -43,28 +43,32 @@ pub fn find_leading(sights: &Strided<'_>, world: &World, led: &mut Vec<u32>) {
     fill_with_zeros(led, sights.len());
     let place = |step: usize, follower: usize, word: usize| (step * followers + follower) * words + word;
     let steps = sights.len() / (followers * words).max(1);
-    lead(|place| sights.get(place), led, [steps, followers, leaders], world.led, place);
+    lead(sights, led, [steps, followers, leaders], world.led, place);
 }
 
 /// Computes [`find_leading`] in any layout. The numbers are of steps, of followers or other agents that are led, and of
-/// leaders. `place` returns where `seen` and `led` have a word of leaders, by step and follower.
+/// leaders. `place` returns where `sights` and `led` have a word of leaders, by step and follower.
 pub(super) fn lead(
-    seen: impl Fn(usize) -> u32,
+    sights: &Strided<'_>,
     led: &mut [u32],
     [steps, followers, leaders]: [usize; 3],
     Led { within, by }: Led,
     place: impl Fn(usize, usize, usize) -> usize,
 ) {
-    let (words, seen_at, place) = (leaders.div_ceil(32), &seen, &place);
+    let (words, place) = (leaders.div_ceil(32), &place);
     if within == 1 && words == 1 {
-        return led.iter_mut().enumerate().for_each(|(place, led)| *led = choose(by, seen_at(place), leaders));
+        return match sights.stride {
+            // Without strides this is compiled to vector instructions.
+            1 => choose(by, leaders, led.iter_mut().zip(sights.words.iter().copied())),
+            _ => choose(by, leaders, led.iter_mut().zip(sights.iter())),
+        };
     }
     let mut counts = vec![0u32; leaders];
     for follower in 0..followers {
         counts.fill(0);
         for step in 0..steps {
             let seen = |step: usize| {
-                let of_word = move |word| (word, seen_at(place(step, follower, word)));
+                let of_word = move |word| (word, sights.get(place(step, follower, word)));
                 (0..words).map(of_word).flat_map(|(word, seen)| each_bit(seen).map(move |bit| word * 32 + bit))
             };
             seen(step).for_each(|leader| counts[leader] += 1);
@@ -89,14 +93,17 @@ pub(super) fn lead(
     }
 }
 
-/// Returns who leads, of up to 32 leaders that were seen at the one step that counts.
-fn choose(by: LedBy, seen: u32, leaders: usize) -> u32 {
+/// Writes who leads, of up to 32 leaders that were seen at the one step that counts.
+fn choose<'a>(by: LedBy, leaders: usize, words: impl Iterator<Item = (&'a mut u32, u32)>) {
     match by {
-        LedBy::AnySeen => seen,
-        LedBy::MostSeen | LedBy::First => seen & seen.wrapping_neg(),
-        LedBy::Alone if seen.count_ones() == 1 => seen,
-        LedBy::Anyone if seen != 0 => u32::MAX >> (32 - leaders),
-        LedBy::Alone | LedBy::Anyone => 0,
+        LedBy::AnySeen => words.for_each(|(led, seen)| *led = seen),
+        LedBy::MostSeen | LedBy::First => words.for_each(|(led, seen)| *led = seen & seen.wrapping_neg()),
+        // A word of at most one bit is 0 without its lowest bit.
+        LedBy::Alone => words.for_each(|(led, seen)| *led = if seen & seen.wrapping_sub(1) == 0 { seen } else { 0 }),
+        LedBy::Anyone => {
+            let all = u32::MAX >> (32 - leaders);
+            words.for_each(|(led, seen)| *led = if seen != 0 { all } else { 0 });
+        }
     }
 }
 

@@ -3,7 +3,7 @@
 use fearless_simd::{Simd, prelude::*};
 
 use super::assignment::{first_most, lead};
-use super::{Paths, each_bit, fill_with_zeros, share, stepping_stone};
+use super::{Paths, Strided, each_bit, fill_with_zeros, share, stepping_stone};
 use crate::config::{Fitness, Score, When};
 use crate::kernels::math::within;
 use crate::kernels::{larger, select, smaller, splat};
@@ -33,9 +33,10 @@ pub(crate) struct PathCredit {
     ever_taken: Vec<u32>,
     /// Agents that are ever near the POI and count there, `[observers]`.
     observers: Vec<usize>,
-    /// Their squared distance at each moment, infinite unless it is near and the moment counts, `[observers][width]`.
+    /// Their squared distance at each moment, infinite unless it is near and the moment counts, and then the vector of its
+    /// smallest distances if [`Scored::is_closest_ever`], `[observers][width + lanes]`. It has room for all agents.
     near: Vec<f32>,
-    /// The beginning of each vector in which an observer is near.
+    /// The beginning of each vector in which an observer is near. Empty if [`Scored::is_closest_ever`].
     vectors: Vec<usize>,
     /// The observers of the team whose worth is computed.
     counted: Vec<Counted>,
@@ -96,6 +97,13 @@ struct Scored<'a> {
     fitness: Fitness,
 }
 
+impl Scored<'_> {
+    /// Reports whether the worth of a POI depends only on the smallest distance of any observer at any moment.
+    fn is_closest_ever(&self, poi: usize) -> bool {
+        self.rule.scores[poi] == (Score::Closeness, When::Ever) && self.world.coupling[poi] == 1
+    }
+}
+
 /// Positions of every agent and moment, f32 as bits. The strides are those of a row's elements, of agents and of axes.
 struct Positions<'a> {
     words: &'a [u32],
@@ -108,11 +116,9 @@ impl Positions<'_> {
     /// Returns a vector of an agent's row: its x and y.
     #[inline(always)]
     fn at<S: Simd>(&self, simd: S, agent: usize, first: usize) -> [S::f32s; 2] {
-        let start = first * self.stride + agent * self.agent_stride;
-        [0, self.axis_stride].map(
-            #[inline(always)]
-            |axis| S::u32s::from_slice(simd, &self.words[start + axis..][..S::f32s::LEN]).bitcast(),
-        )
+        let x = &self.words[first * self.stride + agent * self.agent_stride..];
+        let [x, y] = [&x[..S::f32s::LEN], &x[self.axis_stride..][..S::f32s::LEN]];
+        [S::u32s::from_slice(simd, x).bitcast(), S::u32s::from_slice(simd, y).bitcast()]
     }
 }
 
@@ -271,8 +277,7 @@ impl PathCredit {
         let place = |moment: usize, agent: usize, word: usize| {
             (word * agents + agent / teams) * row + moment * teams + agent % teams
         };
-        let sights = &self.sights;
-        lead(|place| sights[place], &mut self.led, [moments, agents * teams, leaders], world.led, place);
+        lead(&Strided::contiguous(&self.sights), &mut self.led, [moments, agents * teams, leaders], world.led, place);
         for (place, led) in self.led.chunks_exact(row).enumerate() {
             let (word, agent) = (place / agents, place % agents);
             for bit in each_bit(led[..moments * teams].iter().fold(0, |ever, led| ever | led)) {
@@ -344,21 +349,22 @@ impl PathCredit {
     #[inline(always)]
     fn find_observers<S: Simd>(&mut self, simd: S, scored: &Scored<'_>, poi: usize) {
         let &Scored { ref positions, teams, world, rule, .. } = scored;
-        let (agents, width) = (world.agents(), self.width);
+        let (agents, width, row) = (world.agents(), self.width, self.width + S::f32s::LEN);
         // A window of all steps includes the start, if that counts. POIs without one have it if others have windows.
         let window = world.rule.window(poi).filter(|&window| window != [1, world.constants.steps]);
         let [first, last] = window.map_or([0, world.steps()], |window| window.map(|step| step as usize));
         let first = first.max(usize::from(!rule.start_counts));
         self.observers.clear();
-        self.near.clear();
+        // Not cleared, because all that is read is written first.
+        self.near.resize(agents * row, 0.0);
         let (poi_x, poi_y) = self.pois[poi * 2 * S::f32s::LEN..][..2 * S::f32s::LEN].split_at(S::f32s::LEN);
         let (poi_x, poi_y) = (S::f32s::from_slice(simd, poi_x), S::f32s::from_slice(simd, poi_y));
         let (radius2, infinity) = (splat(simd, world.radii2[poi]), splat(simd, f32::INFINITY));
+        let is_closest_ever = scored.is_closest_ever(poi);
         for agent in (0..agents).filter(|&agent| world.rule.counts_at(poi, agent)) {
-            let start = self.near.len();
-            self.near.resize(start + width, 0.0);
+            let (near, smallest) = self.near[self.observers.len() * row..][..row].split_at_mut(width);
             let mut ever = S::u32s::splat(simd, 0);
-            for (vector, near) in self.near[start..].chunks_exact_mut(S::f32s::LEN).enumerate() {
+            for (vector, near) in near.chunks_exact_mut(S::f32s::LEN).enumerate() {
                 let [x, y] = positions.at(simd, agent, vector * S::f32s::LEN);
                 let (dx, dy) = (x - poi_x, y - poi_y);
                 let is_near = observes::<S>(radius2, dx, dy);
@@ -366,18 +372,25 @@ impl PathCredit {
                 ever |= is_near.to_vector().bitcast::<S::u32s>();
             }
             if ever.simd_gt(0).any_true() {
-                let near = &mut self.near[start..];
                 near[..first * teams].fill(f32::INFINITY);
                 near[(last + 1) * teams..].fill(f32::INFINITY);
+                if is_closest_ever {
+                    let mut closest = infinity;
+                    for near in near.chunks_exact(S::f32s::LEN) {
+                        closest = smaller::<S>(S::f32s::from_slice(simd, near), closest);
+                    }
+                    closest.store_slice(smallest);
+                }
                 self.observers.push(agent);
-            } else {
-                self.near.truncate(start);
             }
         }
         self.vectors.clear();
+        if is_closest_ever {
+            return;
+        }
         for first in (0..width).step_by(S::f32s::LEN) {
             let mut is_anyone_near = false;
-            for near in self.near.chunks_exact(width) {
+            for near in self.near.chunks_exact(row).take(self.observers.len()) {
                 let near = S::f32s::from_slice(simd, &near[first..][..S::f32s::LEN]);
                 is_anyone_near |= near.simd_lt(infinity).any_true();
             }
@@ -392,7 +405,7 @@ impl PathCredit {
         let (world, agents) = (scored.world, scored.world.agents());
         self.counted.clear();
         for (index, &agent) in self.observers.iter().enumerate() {
-            let mut counted = Counted { near: index * self.width, times: 1, led: None };
+            let mut counted = Counted { near: index * (self.width + S::f32s::LEN), times: 1, led: None };
             match change {
                 Change::Without(leader) => {
                     let of_leader = &self.ever_taken[leader * world.constants.words as usize..];
@@ -430,7 +443,10 @@ impl PathCredit {
             Change::Without(leader) => 1 << (leader % 32),
             _ => 0,
         };
-        let mut best = splat(simd, f32::INFINITY);
+        let mut best = match scored.is_closest_ever(poi) {
+            true => self.closest_ever(simd, bit),
+            false => splat(simd, f32::INFINITY),
+        };
         fill_with_zeros(&mut self.sums, teams);
         for index in 0..self.vectors.len() {
             let first = self.vectors[index];
@@ -440,7 +456,6 @@ impl PathCredit {
             }
             let squared = match (score, coupling) {
                 (Score::Observed, _) => self.observed_at::<S>(simd, coupling as u32, first, bit),
-                (Score::Closeness, 1) => self.closest::<S>(simd, first, bit),
                 (Score::Closeness, _) => self.close::<S>(simd, coupling, first, bit),
             };
             match when {
@@ -488,12 +503,23 @@ impl PathCredit {
         select::<S>(infinity, splat(simd, 1.0), count.simd_ge(coupling))
     }
 
-    /// Returns the square of max(d, 1) for the distance d of the nearest observer.
+    /// Returns the square of max(d, 1) for the smallest distance d of any observer at any moment.
     #[inline(always)]
-    fn closest<S: Simd>(&self, simd: S, first: usize, bit: u32) -> S::f32s {
-        let mut closest = splat(simd, f32::INFINITY);
+    fn closest_ever<S: Simd>(&self, simd: S, bit: u32) -> S::f32s {
+        let infinity = splat(simd, f32::INFINITY);
+        let mut closest = infinity;
         for counted in &self.counted {
-            closest = smaller::<S>(self.near(simd, counted, first, bit), closest);
+            // Unless it depends on the moment whether it is taken out, its smallest distance is known.
+            let Some([row, 1]) = counted.led else {
+                closest = smaller::<S>(self.near(simd, counted, self.width, bit), closest);
+                continue;
+            };
+            let near = self.near[counted.near..][..self.width].chunks_exact(S::f32s::LEN);
+            for (near, led) in near.zip(self.led[row..].chunks_exact(S::f32s::LEN)) {
+                let stays = (S::u32s::from_slice(simd, led) & S::u32s::splat(simd, bit)).simd_eq(0);
+                let near = select::<S>(infinity, S::f32s::from_slice(simd, near), stays);
+                closest = smaller::<S>(near, closest);
+            }
         }
         larger::<S>(closest, splat(simd, 1.0))
     }

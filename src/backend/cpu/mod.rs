@@ -112,12 +112,11 @@ pub fn level_name(level: Level) -> &'static str {
     "scalar"
 }
 
-/// The actions of a team's leader at a step, each in -1..1. Teams are counted over all groups.
-pub(crate) type Actions<'a> = dyn Fn(usize, usize, usize) -> [f32; OUTPUTS] + Sync + 'a;
+/// Returns the actions of a leader at a step, each in -1..1. The team is given by its group's index and its index there.
+pub(crate) type Actions<'a> = dyn Fn((usize, usize), usize, usize) -> [f32; OUTPUTS] + Sync + 'a;
 
 impl Cpu {
-    /// Plays groups as [`Backend::play`] does, with `actions` in place of those of policies if they are given. All groups are
-    /// then of one world.
+    /// Plays groups as [`Backend::play`] does, with `actions` in place of those of policies if they are given.
     ///
     /// # Errors
     /// A group is inconsistent.
@@ -223,7 +222,9 @@ impl<S: Simd, T: Together<S>> Observer<S, T> for Playing<'_> {
             let (index, first) = T::outputs_at(leader);
             let outputs = &mut teams.outputs()[index];
             for (lane, team) in (first..).zip(self.playing.clone()) {
-                outputs.iter_mut().zip(actions(team, leader, step)).for_each(|(to, action)| to[lane] = action);
+                let (group, team) = self.batch.locate(team);
+                let actions = actions((self.batch.first + group, team), leader, step);
+                outputs.iter_mut().zip(actions).for_each(|(to, action)| to[lane] = action);
             }
         }
     }
@@ -323,7 +324,7 @@ mod tests {
         let mut observed = 0;
         for (seed, world) in worlds {
             const TEAMS: usize = 3;
-            let action = |team: usize, leader: usize, step: usize| {
+            let action = |(_, team): (usize, usize), leader: usize, step: usize| {
                 let angle = (team * 7 + leader * 3) as f32 + step as f32 * 0.1;
                 [libm::sinf(angle) * 0.3, libm::cosf(angle * 0.7)]
             };
@@ -333,7 +334,7 @@ mod tests {
             let mut stepper = Stepper::new(world.clone(), TEAMS, Recording::SetsAndSights).unwrap();
             for step in 0..world.steps() {
                 let leaders = (0..TEAMS).flat_map(|team| (0..world.leaders()).map(move |leader| (team, leader)));
-                let actions: Vec<f32> = leaders.flat_map(|(team, leader)| action(team, leader, step)).collect();
+                let actions: Vec<f32> = leaders.flat_map(|(team, leader)| action((0, team), leader, step)).collect();
                 stepper.step(&actions).unwrap();
             }
             for large_from in [grid::LARGE_FROM, 0] {
