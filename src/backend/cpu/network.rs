@@ -19,7 +19,7 @@ pub(super) struct Network<S: Simd> {
     /// `[leaders][parameters]`, layer by layer. Units that are computed together (see [`together`]) form a block: one
     /// row per input, then the biases.
     weights: Vec<S::f32s>,
-    /// The index in `weights` of each weight of a policy. Empty if they have the same order, as in the paper's network.
+    /// The index in `weights` of each weight of a policy.
     slots: Vec<usize>,
     /// The units of a layer and of the next, `[leaders][units]`.
     hidden: [Vec<S::f32s>; 2],
@@ -44,9 +44,6 @@ impl<S: Simd> Network<S> {
             }
             first += rows * columns;
         }
-        if slots.iter().copied().eq(0..parameters) {
-            slots.clear();
-        }
         Network {
             simd,
             choices,
@@ -61,33 +58,18 @@ impl<S: Simd> Network<S> {
     /// Loads the policy of each leader and lane.
     #[inline(always)]
     pub(super) fn load_policies<'a>(&mut self, policy: impl Fn(usize, usize) -> &'a [f32]) {
-        let Network { simd, weights, slots, constants, .. } = self;
-        for (leader, weights) in weights.chunks_exact_mut(constants.parameters as usize).enumerate() {
+        let Network { simd, weights, slots, .. } = self;
+        for (leader, weights) in weights.chunks_exact_mut(slots.len()).enumerate() {
             // Four lanes at a time, the width of the narrowest vector.
             for lane in (0..S::f32s::LEN).step_by(4) {
-                let rows = [
-                    policy(leader, lane),
-                    policy(leader, lane + 1),
-                    policy(leader, lane + 2),
-                    policy(leader, lane + 3),
-                ];
-                if slots.is_empty() {
-                    let mut weights = weights.iter_mut();
-                    transpose_rows(
-                        *simd,
-                        rows,
-                        #[inline(always)]
-                        |_, lanes| {
-                            if let Some(weight) = weights.next() {
-                                weight.as_mut_slice()[lane..lane + 4].copy_from_slice(lanes);
-                            }
-                        },
-                    );
-                    continue;
-                }
                 transpose_rows(
                     *simd,
-                    rows,
+                    [
+                        policy(leader, lane),
+                        policy(leader, lane + 1),
+                        policy(leader, lane + 2),
+                        policy(leader, lane + 3),
+                    ],
                     #[inline(always)]
                     |parameter, lanes| {
                         weights[slots[parameter]].as_mut_slice()[lane..lane + 4].copy_from_slice(lanes);
