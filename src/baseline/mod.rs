@@ -467,6 +467,7 @@ impl Setting {
         match team {
             Team::Constant(index) => constant_policy(&self.constants[index][population], policy),
             Team::Random(kind, generation, slot) => {
+                let population = if kind == Purpose::SharedBaseline { 0 } else { population };
                 let key = Key::new(self.config.learning.seed, trial.index, kind).at(generation, population, slot);
                 match kind {
                     Purpose::ConstantActions => random_action(key, outputs(&self.config), policy),
@@ -483,18 +484,8 @@ impl Setting {
     fn write_policies(&self, trial: &Trial, teams: &[Team], weights: &mut Vec<f32>) {
         let (level, parameters) = (Level::new(), self.world.parameters());
         weights.resize(self.config.populations() * teams.len() * parameters, 0.0);
-        let (shared, weights) = weights.split_at_mut(teams.len() * parameters);
-        shared.par_chunks_exact_mut(parameters).zip(teams).for_each(|(policy, &team)| {
-            self.write_policy(level, trial, team, 0, policy);
-        });
         weights.par_chunks_exact_mut(parameters).enumerate().for_each(|(place, policy)| {
-            let (population, index) = (place / teams.len() + 1, place % teams.len());
-            match teams[index] {
-                Team::Random(Purpose::SharedBaseline, ..) => {
-                    policy.copy_from_slice(&shared[index * parameters..][..parameters]);
-                }
-                team => self.write_policy(level, trial, team, population, policy),
-            }
+            self.write_policy(level, trial, teams[place % teams.len()], place / teams.len(), policy);
         });
     }
 
