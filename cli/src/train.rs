@@ -85,11 +85,16 @@ fn report(found: &TrainOutcome) -> String {
     let what = what + &weighted;
     let pois = pois_of_all.unwrap_or(1);
     let mut text = format!("{trained}.\n\n{what}: mean over trials (lowest to highest trial)\n");
-    let last = format!("generation {}", found.generations);
+    // Rows of different stages are of different tasks.
+    let (mut first, mut last) = (String::from("start"), format!("generation {}", found.generations));
+    if let Some(stage) = found.last_stage {
+        first += ", stage 0";
+        let _ = write!(last, ", stage {stage}");
+    }
     let known = TeamKind::ALL.into_iter().filter(|score| ends.last.iter().all(|row| score.of(row).is_some()));
     let known: Vec<TeamKind> = known.collect();
     let mut table = vec![[""].into_iter().chain(known.iter().map(|score| score.name())).map(String::from).collect()];
-    let rows = [("start", &ends.first), (&*last, &ends.last)];
+    let rows = [(&*first, &ends.first), (&*last, &ends.last)];
     // A run without generations after the start has one row.
     let shown = if found.generations == 0 { 1 } else { rows.len() };
     for (name, rows) in rows.into_iter().take(shown) {

@@ -534,7 +534,8 @@ fn every_command_supports_stages() {
         assert_eq!(code, Some(0), "{line}: {stderr}");
         stdout
     };
-    good("train staged.toml --out run");
+    let report = good("train staged.toml --out run");
+    assert!(report.contains("\n  start, stage 0  ") && report.contains("\n  generation 6, stage 2  "), "{report}");
     // Generations of all stages can be replayed.
     for generation in [1, 2, 3, 4, 6] {
         good(&format!("replay run --generation {generation} --out replay.html"));

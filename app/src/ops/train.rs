@@ -86,6 +86,9 @@ pub struct TrainOutcome {
     /// See [`Config::weighted_by`].
     #[serde(skip)]
     pub weighted_by: Option<&'static str>,
+    /// The stage of the last generation, if there are several.
+    #[serde(skip)]
+    pub last_stage: Option<usize>,
     /// The processor in words, or `None` if the run was finished before.
     #[serde(skip)]
     pub trained_on: Option<String>,
@@ -231,6 +234,7 @@ pub fn run(
         rows: results.rows.clone(),
         teams: config.max_teams() - 1,
         weighted_by: valid.weighted_by(),
+        last_stage: (valid.stages().len() > 1).then(|| valid.stage_of(learning.generations)),
         trained_on: (!was_done).then_some(on),
         folder,
     })

@@ -12,7 +12,7 @@ use flotilla_app::ops::{Context, Error, Event};
 use flotilla_app::record::digests::Verification;
 use flotilla_app::record::disk::Disk;
 use flotilla_app::record::folder::{ARMS, Folder, Start, StartFrom};
-use flotilla_app::report::runs;
+use flotilla_app::report::{map::counted, runs};
 use flotilla_app::run::{self, Session, SessionEnd, Twin};
 
 /// The experiments of a paper and their folders. Experiments with the same training are trained once. The first of them
@@ -78,7 +78,8 @@ impl Experiments {
         let learning = &self.all[0].config.learning;
         let (count, different, trials) = (self.all.len(), self.configs.len(), learning.trials);
         context.message(format_args!(
-            "training {count} experiments, {different} of them different, of {trials} trials each on {on}, into {}",
+            "training {count} experiments, {different} of them different, of {} each on {on}, into {}",
+            counted(trials, "trial"),
             out.escaped()
         ));
         let names = self.all.iter().map(|experiment| (experiment.name(), Some(experiment.pois()))).collect();
