@@ -43,7 +43,7 @@ pub struct Args {
     #[arg(long)]
     skip_impossible: bool,
     /// Print the points with their costs and shards, and train none
-    #[arg(long, group = "shards of")]
+    #[arg(long, group = "planned")]
     list: bool,
     /// Memory for the points that train together, in GiB [default: half of the free memory]
     #[arg(long, value_name = "GIB", value_parser = positive)]
@@ -62,10 +62,10 @@ pub struct Args {
     #[arg(long, conflicts_with_all = ["shard", "resume", "force", "list", "slurm"], help_heading = SCALE_OUT)]
     collect: bool,
     /// Write the batch script of a Slurm job array to standard output, or to =FILE
-    #[arg(long, value_name = "FILE", num_args = 0..=1, require_equals = true, conflicts_with_all = ["shard", "force", "list"], group = "shards of", help_heading = SCALE_OUT)]
+    #[arg(long, value_name = "FILE", num_args = 0..=1, require_equals = true, conflicts_with_all = ["shard", "force", "list"], group = "planned", help_heading = SCALE_OUT)]
     slurm: Option<Option<PathBuf>>,
     /// Number of tasks of the job array, or of shards that --list shows
-    #[arg(long, value_name = "N", default_value_t = 1, requires = "shards of", value_parser = shard_count, help_heading = SCALE_OUT)]
+    #[arg(long, value_name = "N", default_value_t = 1, requires = "planned", value_parser = shard_count, help_heading = SCALE_OUT)]
     shards: usize,
     /// Time limit of a task of the job array
     #[arg(long, value_name = "HH:MM:SS", default_value = "01:00:00", requires = "slurm", value_parser = time_limit, help_heading = SCALE_OUT)]

@@ -587,6 +587,7 @@ pub fn with_each_failure(
     };
     let (_, _, outcome, operations, _) = attempt(Box::new(|_| false));
     assert_eq!((outcome.end.unwrap(), outcome.results), (SessionEnd::Finished, Some(reference(config).0)));
+    let mut unreached = 0;
     for at in 0..operations {
         for &way in ways {
             let (_folder, path, outcome, _, failed) = attempt(Box::new(move |operation| match way {
@@ -596,12 +597,14 @@ pub fn with_each_failure(
             // On a busy machine, the attempt that was counted may have had more operations.
             let Some((operation, file)) = failed else {
                 assert_eq!(outcome.end.unwrap(), SessionEnd::Finished, "operation {at} of {operations}");
+                unreached += 1;
                 continue;
             };
             let context = format!("operation {at}, {way:?}: {operation:?} {}", file.display());
             check(&path, outcome, operation, &context);
         }
     }
+    assert!(unreached * 10 < operations, "{unreached} of {operations} operations did not fail");
     operations
 }
 

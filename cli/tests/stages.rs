@@ -597,7 +597,8 @@ fn every_command_supports_stages() {
     assert!(stderr.contains("note: the stage from generation 4 on is never played"), "{stderr}");
     good("train staged.toml --generations 3 --out short --resume");
     good("train short/config.toml --out short --resume --generations 4");
-    assert!(good("train staged.toml --out short --resume").starts_with("Trained 3 trials"));
+    let report = good("train staged.toml --out short --resume");
+    assert!(report.starts_with("Trained 3 trials of 8 teams, 2 generations after generation 4, in "), "{report}");
     assert!(policy_bytes(&folder.join("short")) == policy_bytes(&folder.join("run")));
     // The same with sweeps, whose points tell what a stage overrides.
     let grid = "[grid]\n'world.coupling' = [1, 2]\n";

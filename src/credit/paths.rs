@@ -122,6 +122,13 @@ impl Positions<'_> {
     }
 }
 
+/// Returns a vector of squared distances, infinite where a leader's bit is set.
+#[inline(always)]
+fn unless_led<S: Simd>(simd: S, near: &[f32], led: &[u32], bit: u32) -> S::f32s {
+    let stays = (S::u32s::from_slice(simd, led) & S::u32s::splat(simd, bit)).simd_eq(0);
+    select::<S>(splat(simd, f32::INFINITY), S::f32s::from_slice(simd, near), stays)
+}
+
 impl PathCredit {
     /// Scores every learner of one team by `fitness` into `scores`, `[leaders]`, and returns what the POIs are worth that
     /// the team observed.
@@ -485,11 +492,11 @@ impl PathCredit {
     /// whom it is taken out.
     #[inline(always)]
     fn near<S: Simd>(&self, simd: S, counted: &Counted, first: usize, bit: u32) -> S::f32s {
-        let near = S::f32s::from_slice(simd, &self.near[counted.near + first..][..S::f32s::LEN]);
-        let Some([row, stride]) = counted.led else { return near };
-        let led = S::u32s::from_slice(simd, &self.led[row + first * stride..][..S::f32s::LEN]);
-        let stays = (led & S::u32s::splat(simd, bit)).simd_eq(0);
-        select::<S>(splat(simd, f32::INFINITY), near, stays)
+        let near = &self.near[counted.near + first..][..S::f32s::LEN];
+        match counted.led {
+            None => S::f32s::from_slice(simd, near),
+            Some([row, stride]) => unless_led(simd, near, &self.led[row + first * stride..][..S::f32s::LEN], bit),
+        }
     }
 
     /// Returns 1 at moments with enough observers, else infinity.
@@ -506,19 +513,16 @@ impl PathCredit {
     /// Returns the square of max(d, 1) for the smallest distance d of any observer at any moment.
     #[inline(always)]
     fn closest_ever<S: Simd>(&self, simd: S, bit: u32) -> S::f32s {
-        let infinity = splat(simd, f32::INFINITY);
-        let mut closest = infinity;
+        let mut closest = splat(simd, f32::INFINITY);
         for counted in &self.counted {
-            // Unless it depends on the moment whether it is taken out, its smallest distance is known.
+            // Its smallest distance is known, unless it depends on the moment whether it is taken out.
             let Some([row, 1]) = counted.led else {
                 closest = smaller::<S>(self.near(simd, counted, self.width, bit), closest);
                 continue;
             };
             let near = self.near[counted.near..][..self.width].chunks_exact(S::f32s::LEN);
             for (near, led) in near.zip(self.led[row..].chunks_exact(S::f32s::LEN)) {
-                let stays = (S::u32s::from_slice(simd, led) & S::u32s::splat(simd, bit)).simd_eq(0);
-                let near = select::<S>(infinity, S::f32s::from_slice(simd, near), stays);
-                closest = smaller::<S>(near, closest);
+                closest = smaller::<S>(unless_led(simd, near, led, bit), closest);
             }
         }
         larger::<S>(closest, splat(simd, 1.0))

@@ -27,8 +27,8 @@ use flotilla::model::sense::{ChannelConstants, ChannelShape};
 use flotilla::parallel;
 use flotilla::world::{OUTPUTS, World};
 
-/// The first column of scores and traces.
-const TEAM: &str = "team,";
+/// The first columns of scores.
+const SCORES: &str = "team,leader,g,d,df,dpp,dt";
 /// Columns of a trace. Only agents that learn fill the others: the inputs and outputs of their policies.
 const STATES: &str = "team,step,agent,role,x,y,heading_x,heading_y,speed";
 /// The inputs of one class that senses POIs and agents by quadrants.
@@ -168,9 +168,9 @@ pub fn run(
     for (flag, path) in outputs {
         let Some(path) = path.filter(|path| path.is_file()) else { continue };
         let mut start = vec![];
-        let read = File::open(path).and_then(|file| file.take(TEAM.len() as u64).read_to_end(&mut start));
+        let read = File::open(path).and_then(|file| file.take(STATES.len() as u64).read_to_end(&mut start));
         read.map_err(RecordError::read(path))?;
-        if !start.is_empty() && start != TEAM.as_bytes() {
+        if !start.is_empty() && ![SCORES, STATES].iter().any(|columns| start.starts_with(columns.as_bytes())) {
             return Err(Error::Usage(with_remedy(
                 format!("{flag} {}: this file has neither scores nor a trace", path.escaped()),
                 "move it away, or name another to write",
@@ -264,7 +264,7 @@ pub fn counted(teams: usize, episodes: usize) -> String {
 fn write_scores(file: &mut dyn Write, evaluation: &Evaluation) -> io::Result<()> {
     let Evaluation { episodes, leaders, observed, .. } = evaluation;
     let several = if *episodes > 1 { ",episodes,pois,pois_deviation,pois_low,pois_high" } else { "" };
-    writeln!(file, "team,leader,g,d,df,dpp,dt{several}")?;
+    writeln!(file, "{SCORES}{several}")?;
     for team in 0..observed.len() {
         let several = match evaluation.team(team) {
             Spread { mean, deviation: Some(deviation), interval: Some([low, high]) } => {

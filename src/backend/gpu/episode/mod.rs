@@ -419,14 +419,16 @@ impl Backend for GpuBackend {
     fn play(&mut self, groups: &[Group<'_>]) -> Result<Vec<GroupScores>, BackendError> {
         groups.iter().try_for_each(Group::check)?;
         let scores = ScoreTable::new(groups);
-        // A batch is counted only if all of it can be, and traced, for paths, if any of it has to be.
-        let way = |group: &Group<'_>| match group.world.paths {
+        // What a group is scored from: 0 sums, 1 its whole record, 2 a trace, for its paths. Each has batches of its own,
+        // because a batch is copied as the group in it that needs most.
+        let source = |group: &Group<'_>| match group.world.paths {
             Some(_) => 2,
             None => usize::from(Counting::of(group).is_none()),
         };
         for played in 0..3 {
-            let of_way = groups.iter().enumerate().filter(|(_, group)| way(group) == played);
-            let (places, groups): (Vec<usize>, Vec<Group<'_>>) = of_way.map(|(place, &group)| (place, group)).unzip();
+            let of_source = groups.iter().enumerate().filter(|(_, group)| source(group) == played);
+            let (places, groups): (Vec<usize>, Vec<Group<'_>>) =
+                of_source.map(|(place, &group)| (place, group)).unzip();
             self.play_tasks(&groups, played == 2, &|planned, words, traced| {
                 let place = places[planned.group];
                 match Counting::of(&groups[planned.group]) {
