@@ -46,11 +46,12 @@ pub fn run(args: Args) -> Result<(), Error> {
     let Cost {
         agents, learners, travel, teams, team_steps, agent_steps, parameters, policy_bytes, record_bytes, ..
     } = cost;
+    let learn = if learners == 1 { "learns" } else { "learn" };
     let Cost { host_bytes, checkpoint_bytes, gpu_host_bytes, adapter_bytes, .. } = cost;
     print(&format!(
         "{}
 # A run of this plays {teams} teams, champions included:
-#   agents per team         {agents}, of which {learners} learn
+#   agents per team         {agents}, of which {learners} {learn}
 #   distance per episode    at most {travel:.1} units per agent
 #   team-steps              {team_steps}
 #   agent-steps             {agent_steps}

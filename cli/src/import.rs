@@ -20,7 +20,7 @@ pub struct Args {
     force: bool,
 }
 
-/// Prints or writes the config, and lists the keys that are not translated on standard error.
+/// Prints or writes the config, and lists the keys without an exact equivalent on standard error.
 pub fn run(args: Args) -> Result<(), Error> {
     let Args { file, out, force } = args;
     output::check(&[("--out", out.as_deref())], &[&file])?;
@@ -42,7 +42,7 @@ pub fn run(args: Args) -> Result<(), Error> {
     }
     found.skipped.iter().for_each(say);
     if !found.skipped.is_empty() {
-        say(format_args!("keys not translated: {}; the config has them as comments", found.skipped.len()));
+        say(format_args!("keys without an exact equivalent: {}; the config has them as comments", found.skipped.len()));
     }
     Ok(())
 }

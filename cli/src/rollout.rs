@@ -92,14 +92,16 @@ fn in_words(found: &RolloutOutcome) -> String {
             best.team
         );
     }
-    let from = match (found.start_jitter, found.poi_jitter, found.seed) {
-        (Some(0.0), Some(0.0), Some(seed)) => format!(", starts drawn anew (seed {seed})"),
-        (Some(jitter), Some(0.0), Some(seed)) => format!(", starts moved by up to {jitter} (seed {seed})"),
-        (Some(jitter), Some(poi_jitter), Some(seed)) => {
-            format!(", starts moved by up to {jitter}, POIs by up to {poi_jitter} (seed {seed})")
-        }
-        _ => String::new(),
-    };
+    let drawn = found.is_drawn.then(|| "places drawn anew".into());
+    let moved =
+        [("starts", found.start_jitter), ("POIs", found.poi_jitter)].into_iter().filter_map(|(what, jitter)| {
+            let jitter = jitter.filter(|&jitter| jitter > 0.0)?;
+            Some(format!("{what} moved by up to {jitter}"))
+        });
+    let mut from = drawn.into_iter().chain(moved).map(|part: String| format!(", {part}")).collect::<String>();
+    if let Some(seed) = found.seed {
+        from += &format!(" (seed {seed})");
+    }
     let names = ["team 0".into(), format!("best (team {})", best.team), "mean of all teams".into()];
     let mut text = format!(
         "{counted}{from}. POIs observed, of {pois}{weighted}:\n  {:<20}{:>6}{:>22}   95 % interval of the mean\n",

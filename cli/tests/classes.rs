@@ -70,7 +70,7 @@ fn check_prints_a_config_in_full_and_nothing_else() {
     let seeded = place.good("check --expand chaotic.toml --seed 7").0;
     assert!(seeded.contains("seed = 7\n"));
     let refused = place.refused(2, "check full.toml --set world.coupling=2");
-    assert!(refused.contains("`flotilla check --expand` writes it from the other keys"), "{refused}");
+    assert!(refused.contains("--set world.coupling: a config with [[pois]] has no such key"), "{refused}");
     let staged = format!("{chaotic}[[stages]]\nfrom = 3\nset = {{ \"world.coupling\" = 3 }}\n");
     std::fs::write(place.path("staged.toml"), staged).unwrap();
     let (full, noted) = place.good("check --expand staged.toml");
@@ -352,11 +352,20 @@ fn a_credit_that_is_always_0_is_noted() {
     }
     assert!(!notes("check herd.toml --fitness Df").contains("equals D"));
     let own = herd.replace("leads = \"sheep\"", "leads = \"sheep\"\nfitness = \"G\"");
+    place.write("unused.toml", own.replace("[learning]\nfitness = \"G\"", "[learning]\nfitness = \"D\""));
+    place.write("grid.toml", format!("{own}[grid]\n\"learning.fitness\" = [\"D\", \"Df\"]\n"));
     place.write("own.toml", own);
     let unused = "learning.fitness = \"D\" has no effect: every class that learns has its own";
-    assert!(notes("check own.toml --fitness D").contains(unused));
-    for line in ["check own.toml --fitness G", "check own.toml", "check herd.toml --fitness G"] {
+    assert!(notes("check unused.toml").contains(unused));
+    for line in ["check own.toml", "check herd.toml --fitness G"] {
         assert!(!notes(line).contains("has no effect"), "{line}");
+    }
+    // Also the default, and what classes have, would train the same again.
+    for line in
+        ["check own.toml --fitness D", "check own.toml --fitness Df", "train own.toml --fitness G", "sweep grid.toml"]
+    {
+        let error = place.refused(2, line);
+        assert!(error.contains("no effect, because every class that learns has its own"), "{line}: {error}");
     }
 }
 

@@ -115,13 +115,15 @@ fn pictures_are_labelled_with_the_team_they_show() {
         (stdout, place.read("r.svg"))
     };
     let (stdout, svg) = picture("--trial 2 --team champion --generation 3");
-    let observed =
-        format!("observed {:.2} of 2 POIs (mean of 2 episodes), as in metrics", 2.0 * metric(&place, 3, 4)[2]);
+    let observed = format!(
+        "observed {:.2} of 2 POIs (mean of 2 episodes, of which the first is shown), as in metrics",
+        2.0 * metric(&place, 3, 4)[2]
+    );
     assert!(stdout.starts_with(&format!("Champion of trial 2, generation 3: {observed}")), "{stdout}");
-    assert!(has_label(&svg, "Champion") && has_label(&svg, "trial 2, generation 3"), "{svg}");
+    assert!(has_label(&svg, "Champion") && has_label(&svg, "trial 2, generation 3, first of 2 episodes"), "{svg}");
     let (stdout, svg) = picture("--trial 1 --team 5");
     assert!(stdout.starts_with("Team number 5 of trial 1, generation 4: observed "), "{stdout}");
-    assert!(has_label(&svg, "Team number 5") && has_label(&svg, "trial 1, generation 4"));
+    assert!(has_label(&svg, "Team number 5") && has_label(&svg, "trial 1, generation 4, first of 2 episodes"));
     // Axis labels, the number of agents needed, and the step at which a POI was observed.
     assert!(has_label(&svg, "x, map units") && has_label(&svg, "y, map units"));
     let (_, svg) = picture("--trial best --team champion");

@@ -160,6 +160,12 @@ fn rovers_and_uavs_become_classes() {
     let fitness = |name: &str| Some(name.to_string());
     let expected = [("rover", "D"), ("rover_2", "G"), ("uav", "Dt"), ("uav_2", "D")];
     assert_eq!(classes, expected.map(|(name, of)| (name, fitness(of))));
+    // Classes have no fitness of their own if all rewards are equal. Then --fitness can change it.
+    let equal = ["reward_type: Difference", "reward_type: IndirectDifference"]
+        .iter()
+        .fold(INFLUENCE.to_string(), |text, reward| text.replace(reward, "reward_type: Global"));
+    let (equal, ..) = import(&equal);
+    assert!(equal.learning.fitness.to_string() == "G" && equal.agents.iter().all(|class| class.fitness.is_none()));
     let pois: Vec<_> = config.pois.iter().map(|group| (&*group.name, group.radius, group.value)).collect();
     // A rover observes within the smaller radius, or within the capture radius.
     assert_eq!(pois, [("rover", 3.0, 2.0), ("hidden-A", 8.0, 1.0)]);
@@ -167,13 +173,13 @@ fn rovers_and_uavs_become_classes() {
     // Kept teams have slots of the population.
     assert_eq!((learning.population, learning.generations, learning.trials, learning.seed), (22, 7, 6, 9));
     assert_eq!((learning.team_elites, learning.episodes_per_team, learning.mutation_sigma), (2, 3, 0.2));
-    // One line per key that is lost, each with its place, and none for keys that are translated.
+    // One line per key without an exact equivalent, each with its place, and none for the others.
     for place in [
         "disappear_bool = true: there, it disappears only for rovers with a SmartLidar",
         "n_individual_elites = 4: there, tournaments compare the team's G, and each elite is listed twice",
         "team_formation.type = \"softmax_teams\": there, a mutated policy has fitness 0",
-        "config.yaml:8: not translated: env.agents.rovers[0].reward_type = \"Difference\": credit.add_g is one for all",
-        "config.yaml:53: not translated: ccea.network.uav_max_velocity = 1.5: there, the first UAV has",
+        "config.yaml:8: no exact equivalent: env.agents.rovers[0].reward_type = \"Difference\": credit.add_g is one for all",
+        "config.yaml:53: no exact equivalent: ccea.network.uav_max_velocity = 1.5: there, the first UAV has",
         "ccea.weight_initialization.lower_bound = -0.5",
         "processing.num_threads = 3",
         "novelty = 1: unknown",
@@ -181,9 +187,12 @@ fn rovers_and_uavs_become_classes() {
         assert!(listed.contains(place), "{place}\n{listed}");
     }
     assert!(!["needs_uav_to_move", "sensor", "mutation.mean"].iter().any(|key| listed.contains(key)), "{listed}");
-    let lines = listed.lines().filter(|line| line.contains(": not translated: ")).count();
-    assert_eq!(lines, text.matches("# not translated: ").count());
-    assert!(listed.ends_with(&format!("keys not translated: {lines}; the config has them as comments\n")), "{listed}");
+    let lines = listed.lines().filter(|line| line.contains(": no exact equivalent: ")).count();
+    assert_eq!(lines, text.matches("# no exact equivalent: ").count());
+    assert!(
+        listed.ends_with(&format!("keys without an exact equivalent: {lines}; the config has them as comments\n")),
+        "{listed}"
+    );
 }
 
 fn line_of(text: &str, part: &str) -> usize {
@@ -473,7 +482,7 @@ fn bad_input_is_refused_with_its_line() {
     let unknown: String = (0..60_000).map(|key| format!("key{key}: 1\n")).collect();
     place.write("long.yaml", format!("leader_positions: [[2, 3]]\npoi_positions: [[8, 9]]\n{unknown}"));
     let (_, listed) = place.good("import long.yaml --out long.toml");
-    assert!(listed.ends_with("keys not translated: 60000; the config has them as comments\n"));
+    assert!(listed.ends_with("keys without an exact equivalent: 60000; the config has them as comments\n"));
     let mut bomb = String::from("env: &a0 [x, x, x, x, x, x, x, x, x]\n");
     (1..30).for_each(|i| bomb += &format!("b{i}: &a{i} [*a{0}, *a{0}, *a{0}, *a{0}, *a{0}, *a{0}]\n", i - 1));
     for (text, message) in [
@@ -497,7 +506,10 @@ fn bad_input_is_refused_with_its_line() {
     }
     place.write("good.yaml", "leader_positions: [[2, 3]]\npoi_positions: [[8, 9]]\n\"k\\nmap = 1\": \"v\\u0007\"\n");
     let (text, listed) = place.good("import good.yaml");
-    assert!(text.contains("# not translated: k\\nmap = 1 = ") && listed.contains("k\\nmap = 1 = "), "{text}{listed}");
+    assert!(
+        text.contains("# no exact equivalent: k\\nmap = 1 = ") && listed.contains("k\\nmap = 1 = "),
+        "{text}{listed}"
+    );
     place.good("import good.yaml --out x.toml");
     assert!(place.refused(1, "import good.yaml --out x.toml").contains("--force"));
     place.good("import good.yaml --out x.toml --force");

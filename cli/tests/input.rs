@@ -418,7 +418,10 @@ fn replay_prints_the_number_of_observed_pois() {
     fs::write(place.path("mean.toml"), config + "episodes_per_team = 3\nstart_jitter = 2.0\n").unwrap();
     place.good("train mean.toml --out mean --quiet");
     let (stdout, _) = place.good("replay mean --out r.svg");
-    assert!(stdout.contains(" of 9 POIs (mean of 3 episodes)") && !stdout.contains("3333"), "{stdout}");
+    assert!(
+        stdout.contains(" of 9 POIs (mean of 3 episodes, of which the first is shown)") && !stdout.contains("3333"),
+        "{stdout}"
+    );
 }
 
 #[test]

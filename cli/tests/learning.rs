@@ -102,7 +102,13 @@ fn the_tested_team_is_in_files_pictures_and_tables() {
     }
     let error = place.refused(2, "sweep sweep.toml --out other --measure test --backend cpu");
     assert!(error.contains("--measure test: point 0000: it has no tested best team"), "{error}");
-    place.good("sweep tested.toml --out measured --measure test --quiet --backend cpu");
+    let measured = json(&place, "sweep tested.toml --out measured --measure test --quiet --json --backend cpu");
+    assert_eq!([&swept["measure"], &measured["measure"]], ["champion", "test"]);
+    // The folder of a run is no config, but has one.
+    for (line, config) in [("train run", "run/config.toml"), ("sweep measured --collect", "measured/sweep.toml")] {
+        let error = place.refused(1, line);
+        assert!(error.contains(&format!("it is a directory; name its config, {config}")), "{error}");
+    }
 }
 
 /// Rovers and POIs that are drawn from regions.

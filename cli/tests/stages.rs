@@ -567,9 +567,12 @@ fn every_command_supports_stages() {
     let jitters = ["", " --poi-jitter 3.0"].map(|flag| {
         let line = "rollout staged.toml --policies run/policies.safetensors --json --episodes 2 --stage 2";
         let found: serde_json::Value = serde_json::from_str(&good(&format!("{line}{flag}"))).unwrap();
+        assert_eq!(found["stage"], 2);
         (found["pois"].as_u64(), found["poi_jitter"].as_f64())
     });
     assert_eq!(jitters, [(Some(3), Some(1.0)), (Some(3), Some(3.0))]);
+    let held_out = good("rollout staged.toml --policies run/policies.safetensors --episodes 2 --stage 2");
+    assert!(held_out.contains("2 episodes each, POIs moved by up to 1 (seed 0)."), "{held_out}");
     good("rollout staged.toml --policies run/policies.safetensors --set learning.generations=3 --stage 2");
     let (_, text, stderr) = run(&folder, "baseline staged.toml --seeds 1 --episodes 1");
     assert!(text.contains("of 2") && stderr.contains("note: this plays in the world before any stage"), "{stderr}");

@@ -475,6 +475,17 @@ fn resolve<'a>(
         }),
     };
     let (stages, configs): (Vec<_>, Vec<_>) = resolved.map_err(invalid)?.into_iter().unzip();
+    if configs.iter().all(valid::learn_by_own_fitness) {
+        let unused = overrides.iter().filter(|set| set.key == "learning.fitness").map(|set| Problem {
+            line: None,
+            key: set.name.clone(),
+            message: "no effect, because every class that learns has its own; set agents.NAME.fitness instead".into(),
+        });
+        let unused: Vec<Problem> = unused.collect();
+        if !unused.is_empty() {
+            return Err(invalid(unused));
+        }
+    }
     for set in &overrides {
         let path = stages::path_of(&set.key, &own);
         let sets = |key: &String| {

@@ -190,6 +190,12 @@ fn without_credit(config: &Config, classes: &Classes) -> Vec<String> {
     always_0.into_iter().chain(note).collect()
 }
 
+/// Reports whether every class that learns has its own fitness, so that `learning.fitness` has no effect.
+pub(super) fn learn_by_own_fitness(config: &Config) -> bool {
+    let learning = || config.agents.iter().filter(|class| class.learns());
+    learning().next().is_some() && learning().all(|class| class.fitness.is_some())
+}
+
 /// Returns a note for a fitness that no class learns by, because each has its own.
 fn unused_fitness(config: &Config, classes: &Classes) -> Option<String> {
     let fitness = config.learning.fitness;

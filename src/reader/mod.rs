@@ -423,10 +423,15 @@ impl<'a> Reader<'a> {
         let entry = entry?;
         match self.replaced.iter().find(|(replaced, _)| self.scope.is_none() && includes(replaced, key)) {
             Some((_, list)) => {
-                let message = format!(
-                    "found in a config with [[{list}]], which replaces this key: remove one of the two; without \
-                     [[{list}]], `flotilla check --expand` writes it from the other keys"
-                );
+                let message = match entry.outside {
+                    true => {
+                        format!("a config with [[{list}]] has no such key; set keys of its tables: {list}.NAME.KEY")
+                    }
+                    false => format!(
+                        "found in a config with [[{list}]], which replaces this key: remove one of the two; without \
+                         [[{list}]], `flotilla check --expand` writes it from the other keys"
+                    ),
+                };
                 self.report(entry.place(), &entry.name, message);
                 None
             }
@@ -705,6 +710,9 @@ fn syntax_problem(error: &Error, text: &str) -> String {
     // A missing comma is the usual mistake in a list of positions. The parser takes it for a word without quotes.
     let is_numbers = |at: &str| at.contains(' ') && at.split(' ').all(|word| word.parse::<f64>().is_ok());
     match at {
+        Some(list @ ("agents" | "pois" | "stages")) if message == "duplicate key" => {
+            format!("found a further section [{list}], allowed tables [[{list}]]")
+        }
         Some(at) if is_numbers(at) => format!("found `{}`, allowed numbers with a comma between them", shorten(at)),
         Some(at) => format!("{message} (at `{}`)", shorten(at)),
         None => message,

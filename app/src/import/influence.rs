@@ -243,6 +243,10 @@ pub(super) fn translate(root: &At<'_>) -> Result<Vec<Section>, Problem> {
     // One rule, and one choice to add G, are for all agents. UAVs have rovers to lead.
     let led_by = credits[rovers..].iter().chain(&credits).find_map(|credit| credit.led_by);
     let adds_g = credits.iter().any(|credit| credit.adds_g);
+    // One fitness of all is not written per class, so that `--fitness` and sweeps can change it.
+    let learns = |credit: &&Credit| !credit.fitness.is_empty();
+    let shared = credits.iter().find(learns).map(|credit| credit.fitness);
+    let shared = shared.filter(|fitness| credits.iter().filter(learns).all(|credit| credit.fitness == *fitness));
     let mut agents = Vec::new();
     for (i, ((kind, at), credit)) in all().zip(credits).enumerate() {
         let max_speed = root.need(&format!("ccea.network.{kind}_max_velocity"))?;
@@ -253,7 +257,9 @@ pub(super) fn translate(root: &At<'_>) -> Result<Vec<Section>, Problem> {
             agent.section.skip(&radius, "here, POIs count within the largest one for all rovers");
         }
         if agent.learns {
-            agent.section.put("fitness", quoted(credit.fitness), &at.need("reward_type")?);
+            if shared.is_none() {
+                agent.section.put("fitness", quoted(credit.fitness), &at.need("reward_type")?);
+            }
             if credit.led_by.is_some() && credit.led_by != led_by {
                 agent
                     .section
@@ -292,6 +298,9 @@ pub(super) fn translate(root: &At<'_>) -> Result<Vec<Section>, Problem> {
     }
     if let Some(teams) = root.get("ccea.team_formation.type").filter(|teams| !teams.shown().contains("random")) {
         learning.skip(&teams, "there, a mutated policy has fitness 0 when teams form, and here its parent's");
+    }
+    if let Some(fitness) = shared {
+        learning.set("fitness", quoted(fitness), "the agents' reward_type");
     }
     learning.set("mutation", quoted("additive"), "as in the program");
     learning.set("initial", quoted("uniform"), "as in the program");

@@ -14,9 +14,10 @@ use std::path::Path;
 
 use serde::Serialize;
 
+use crate::record::folder::{CONFIG, SWEEP};
 use crate::shell;
 use flotilla::config::{self, Config, ConfigError, Problem};
-use flotilla::escape;
+use flotilla::escape::{self, PathExt};
 use table::Section;
 use yaml::At;
 
@@ -30,7 +31,7 @@ mod yaml;
 pub struct Imported {
     /// The config, with comments.
     pub text: String,
-    /// The keys that are not translated, each with its file, line and reason.
+    /// The keys without an exact equivalent, each with its file, line and reason.
     pub skipped: Vec<String>,
 }
 
@@ -97,8 +98,12 @@ pub fn translate(text: &str, name: &str) -> Result<Imported, ConfigError> {
 /// Reads the text of a config or sweep file as [`config::read_file`] does, and refuses YAML.
 ///
 /// # Errors
-/// The file cannot be read, or is YAML.
+/// The file cannot be read, or is YAML. For the folder of a run or a sweep, the error names its config.
 pub fn read_file(path: &Path) -> Result<String, ConfigError> {
+    if let Some(file) = [CONFIG, SWEEP].map(|name| path.join(name)).iter().find(|file| file.is_file()) {
+        let reason = format!("it is a directory; name its config, {}", file.escaped());
+        return Err(ConfigError::Unreadable { name: config::name(path), reason, is_missing: false });
+    }
     let text = config::read_file(path)?;
     if text.parse::<toml::Table>().is_err() && is_yaml(&text, path) {
         let file = if config::is_standard_input(path) { path.into() } else { shell::argument(path) };

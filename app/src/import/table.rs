@@ -27,7 +27,7 @@ pub(super) enum To {
 /// A key of the authors' program, as a dotted path, and what becomes of it and all keys below it.
 pub(super) type Row = (&'static str, To);
 
-/// A line of a config. One without `text` is a comment about a key that is not translated.
+/// A line of a config. One without `text` is a comment about a key without an exact equivalent.
 pub(super) struct Line {
     pub text: String,
     /// The line of the YAML file, 0 if none.
@@ -73,10 +73,10 @@ impl Section {
         }
     }
 
-    /// Adds comments about a key that is not translated, and about all keys below it.
+    /// Adds comments about a key without an exact equivalent, and about all keys below it.
     pub fn skip(&mut self, at: &At<'_>, why: &str) {
         for at in at.leaves() {
-            self.add(String::new(), Some(&at), format!("not translated: {} = {}: {why}", at.path, at.shown()));
+            self.add(String::new(), Some(&at), format!("no exact equivalent: {} = {}: {why}", at.path, at.shown()));
         }
     }
 

@@ -105,9 +105,7 @@ pub fn run(args: &CompareRequest, context: Context<'_>) -> Result<CompareOutcome
     }
     // For several runs, the notes so far report different layouts or copies. Then pairing is no useful advice.
     let alike = args.folders.len() == 1 || reported == 0;
-    // Fewer pairs never give a p-value below 0.05.
-    const ENOUGH_PAIRS: usize = 6;
-    let enough = |arms: &[Cohort]| comparison::paired(arms) && arms[0].trials.len() >= ENOUGH_PAIRS;
+    let enough = |arms: &[Cohort]| comparison::paired(arms) && arms[0].trials.len() >= comparison::ENOUGH_PAIRS;
     if !args.paired && alike && groups.iter().all(|(_, arms)| enough(arms)) {
         notes.push("these arms have the same seeds, so their trials are pairs: --paired compares pair by pair".into());
     }
@@ -204,7 +202,7 @@ fn of_sweep(out: &Path, args: &CompareRequest, notes: &mut Vec<String>) -> Resul
     let sweep = Sweep::load(&out.join(SWEEP), &[], false)?;
     let by = match (&args.by, sweep.axes.len()) {
         (Some(name), _) => sweep.axis(name).ok_or_else(|| {
-            Error::Usage(format!("--by {name}: not an axis of the sweep; it has {}", sweep.keys()).into())
+            Error::Usage(format!("--by {name}: names no single axis of the sweep; it has {}", sweep.keys()).into())
         })?,
         (None, 1) => 0,
         (None, _) => {

@@ -322,7 +322,11 @@ fn described(config: &Config, played: &Replayed) -> String {
         played.name(),
         played.place(),
         team_g * pois as f64,
-        if *episodes > 1 { format!(" (mean of {episodes} episodes)") } else { String::new() },
+        if *episodes > 1 {
+            format!(" (mean of {episodes} episodes, of which the first is shown)")
+        } else {
+            String::new()
+        },
         if matches!(which, Which::Number(_)) { "" } else { ", as in metrics.csv" },
     )
 }

@@ -85,6 +85,8 @@ pub struct RolloutOutcome {
     pub pois: usize,
     /// The trial whose policies play, if it is known.
     pub trial: Option<usize>,
+    /// The config's stage, if it is not the world before any stage.
+    pub stage: Option<usize>,
     /// Episodes per team.
     pub episodes: usize,
     /// Random seed of held-out starts.
@@ -104,6 +106,9 @@ pub struct RolloutOutcome {
     /// See [`Config::weighted_by`].
     #[serde(skip)]
     pub weighted_by: Option<&'static str>,
+    /// Whether starts or POIs are drawn from regions.
+    #[serde(skip)]
+    pub is_drawn: bool,
     #[serde(flatten)]
     pub processor: ProcessorInfo,
 }
@@ -226,6 +231,7 @@ pub fn run(
         leaders: evaluation.leaders,
         pois: evaluation.pois,
         trial,
+        stage: request.stage,
         episodes: evaluation.episodes,
         seed,
         start_jitter,
@@ -235,6 +241,7 @@ pub fn run(
         mean: evaluation.mean(),
         unverified: request.unverified,
         weighted_by: config.weighted_by(),
+        is_drawn: config.draws_starts(),
         processor: ProcessorInfo::of(machine, &backend.describe()),
     })
 }

@@ -127,6 +127,8 @@ pub struct SweepOutcome {
     pub sweep: String,
     /// The G whose first generation is reported.
     pub reach: f64,
+    /// The team whose G is to reach it, and is in pictures.
+    pub measure: TeamKind,
     /// Whether files were read that differ from their digests.
     pub unverified: bool,
     pub points: Vec<PointOutcome>,
@@ -184,7 +186,7 @@ pub fn check_measure(sweep: &Sweep, measure: TeamKind) -> Result<(), Error> {
 pub fn picture_axes(sweep: &Sweep, names: &[String]) -> Result<Vec<usize>, Error> {
     let find = |name: &String| {
         sweep.axis(name).ok_or_else(|| {
-            Error::Usage(format!("--axes: {name} is not an axis of the grid; it has {}", sweep.keys()).into())
+            Error::Usage(format!("--axes: {name} names no single axis of the grid; it has {}", sweep.keys()).into())
         })
     };
     if !names.is_empty() && sweep.axes.iter().any(|axis| axis.varied) {
@@ -493,7 +495,7 @@ fn write_results(
 ) -> Result<SweepOutcome, Error> {
     let out = place.path();
     let options = &request.results;
-    let &ResultOptions { every, reach, unverified, .. } = options;
+    let &ResultOptions { every, reach, measure, unverified, .. } = options;
     let folders: Vec<PathBuf> = sweep.points.iter().map(|point| results::point_folder(out, point)).collect();
     let outcomes = results::write(sweep, place, options, disk)?;
     let (pictures, note) = pictures::draw(sweep, &outcomes, options, axes, out, disk)?;
@@ -538,6 +540,7 @@ fn write_results(
         folder: out.escaped(),
         sweep: sweep.name.clone(),
         reach,
+        measure,
         unverified,
         points: sweep.points.iter().zip(&outcomes).zip(&folders).map(point).collect(),
         files: Files {

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
+use super::comparison::ENOUGH_PAIRS;
 use super::curves::{Band, Curve, Figure, Panel};
 use super::map::counted;
 use crate::record::digests::{Digests, UNVERIFIED, Verification};
@@ -193,14 +194,15 @@ fn figure_of_runs(
     }
 }
 
-/// Reports whether trials of several runs form pairs, because all runs have the same seed and number of trials.
+/// Reports whether trials of several runs form enough pairs to compare them, because all runs have the same seed and number
+/// of trials.
 ///
 /// Paired trials share their starts and all random numbers. If sizes agree, they also share their first populations.
 pub fn paired(folders: &[PathBuf], verification: Verification) -> Result<bool, ReadError> {
     let trials =
         |folder: &PathBuf| config(folder, verification).map(|Config { learning, .. }| (learning.seed, learning.trials));
     let trials = folders.iter().map(trials).collect::<Result<Vec<_>, ReadError>>()?;
-    Ok(trials.len() > 1 && trials.iter().all(|other| *other == trials[0]))
+    Ok(trials.len() > 1 && trials[0].1 >= ENOUGH_PAIRS && trials.iter().all(|other| *other == trials[0]))
 }
 
 /// Most config keys in the label of a run. More are not read.

@@ -162,7 +162,8 @@ impl Folder {
                 Err(error @ RecordError::Damaged { .. }) => error.to_string(),
                 Err(error) => return Err(error),
             };
-            notes.push(Note::damage(format!("{reason}; set aside, and the one before is used")));
+            let next = if kept.len() > 1 { "the one before is tried" } else { "there is no other" };
+            notes.push(Note::damage(format!("{reason}; set aside, and {next}")));
             let damaged = checkpoint::quarantine_path(&path);
             self.disk.rename(&path, &damaged).map_err(RecordError::write(&damaged))?;
             kept.pop();

@@ -127,7 +127,11 @@ impl<'a> Screen<'a> {
             let by_now = played.observed.iter().flatten().filter(|&&observed| observed <= step).count();
             let steps = played.world.steps();
             scene.bold([left, 4.0], played.name(), 3.2, Anchor::Start, BLACK);
-            scene.text([left, 7.6], played.place(), 2.6, Anchor::Start, FAINT);
+            let first = match played.episodes {
+                1 => String::new(),
+                episodes => format!(", first of {episodes} episodes"),
+            };
+            scene.text([left, 7.6], played.place() + &first, 2.6, Anchor::Start, FAINT);
             let g = match self.weighted && step == steps {
                 true => format!("   G = {:.2}", played.scores.g),
                 false => String::new(),
