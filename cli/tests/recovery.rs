@@ -75,23 +75,13 @@ fn resume(config: &Config, path: &Path) -> (Results, Outcome) {
     (outcome.results.clone().unwrap(), outcome)
 }
 
-/// Returns the metrics without the column of seconds, and the policies.
-fn result_files(path: &Path) -> (String, Vec<u8>) {
-    let metrics = fs::read_to_string(path.join(METRICS)).unwrap();
-    let shared = |line: &str| {
-        let fields = line.split(',').enumerate().filter(|&(at, _)| at != 5).map(|(_, field)| field);
-        fields.collect::<Vec<_>>().join(",") + "\n"
-    };
-    (metrics.lines().map(shared).collect(), fs::read(path.join(POLICIES)).unwrap())
-}
-
 /// Trains without interruption. Returns the results and the files.
-pub fn reference(config: &Config) -> (Results, (String, Vec<u8>)) {
+pub fn reference(config: &Config) -> (Results, (Vec<Vec<String>>, Vec<u8>)) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("run");
     let outcome = session(config, &path, Start::Fresh, Disk::default(), cpu(), None);
     assert!(matches!(outcome.end, Ok(SessionEnd::Finished)), "{:?}", outcome.end);
-    (outcome.results.unwrap(), result_files(&path))
+    (outcome.results.unwrap(), support::results(&path))
 }
 
 #[test]
@@ -175,21 +165,6 @@ fn one_slow_write_does_not_stop_timed_checkpoints() {
     }
 }
 
-/// Returns the names and contents of the files in a folder.
-#[cfg(unix)]
-fn contents(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
-    let mut files = Vec::new();
-    for entry in fs::read_dir(folder).unwrap() {
-        let path = entry.unwrap().path();
-        match path.is_dir() {
-            true => files.extend(contents(&path)),
-            false => files.push((path.clone(), fs::read(path).unwrap())),
-        }
-    }
-    files.sort();
-    files
-}
-
 #[test]
 #[cfg(unix)]
 fn a_copy_of_hard_links_is_not_changed_and_not_locked() {
@@ -206,12 +181,12 @@ fn a_copy_of_hard_links_is_not_changed_and_not_locked() {
     // A list of pictures, to which lines are added.
     fs::write(path.join(".flotilla.sha256"), "0  x\n").unwrap();
     link(&path, &copy);
-    let before = contents(&copy);
+    let before = support::files(&copy);
     let disk = Disk::default().within(&path).unwrap();
     disk.extend(&path.join(".flotilla.sha256"), b"1  y\n").unwrap();
     let (results, _) = resume(&small(), &path);
     assert_eq!(results, reference(&small()).0);
-    assert_eq!(contents(&copy), before);
+    assert_eq!(support::files(&copy), before);
     // Both can be used at the same time.
     let open = |path: &Path| Folder::open(path, Start::Resume, &small(), StartFrom::Random, Disk::default());
     let (_run, _copy) = (open(&path).unwrap(), open(&copy).unwrap());
@@ -291,7 +266,7 @@ fn a_finished_run_is_not_trained_again() {
         bytes[at] ^= 1;
         fs::write(path.join(name), bytes).unwrap();
         let (results, _) = resume(&config, &path);
-        assert_eq!((results, result_files(&path)), expected, "{name}");
+        assert_eq!((results, support::results(&path)), expected, "{name}");
     }
 }
 
@@ -355,7 +330,7 @@ fn a_run_extended_from_any_length_has_the_same_results() {
             session(&short, &path, Start::Fresh, Disk::default(), cpu(), None).end.unwrap();
             let (results, outcome) = resume(&config, &path);
             assert_eq!(outcome.start, length + 1, "{:?}", outcome.notes);
-            assert_eq!((results, result_files(&path)), expected, "from {length} generations");
+            assert_eq!((results, support::results(&path)), expected, "from {length} generations");
             assert_eq!(fs::read_to_string(path.join("config.toml")).unwrap(), config.to_toml());
             // The extended run is finished.
             assert_eq!(resume(&config, &path).1.reached, 0);
@@ -379,7 +354,7 @@ fn a_run_with_missing_or_damaged_files_is_extended() {
     let resumes = |path: &Path, start: usize| {
         let (results, outcome) = resume(&config, path);
         assert_eq!(outcome.start, start, "{:?}", outcome.notes);
-        assert_eq!((results, result_files(path)), expected);
+        assert_eq!((results, support::results(path)), expected);
     };
     // Runs of earlier versions have no checkpoint of their end.
     let (_folder, path, [_, end]) = run();
@@ -401,7 +376,7 @@ fn a_run_with_missing_or_damaged_files_is_extended() {
         }
         let (results, outcome) = resume(&config, &path);
         assert_eq!((outcome.start, outcome.notes.len()), (7, 1), "{damage}: {:?}", outcome.notes);
-        assert_eq!((results, result_files(&path)), expected);
+        assert_eq!((results, support::results(&path)), expected);
     }
     // The policies cannot be read for now: a folder has the file's name.
     let (_folder, path, _) = run();
@@ -428,11 +403,11 @@ fn a_run_with_missing_or_damaged_files_is_extended() {
 
     // A run cannot become shorter. The refusal changes no file.
     let (_folder, path, _) = run();
-    let before = result_files(&path);
+    let before = support::results(&path);
     let outcome = session(&with_generations(&config, 6), &path, Start::Resume, Disk::default(), cpu(), None);
     let error = outcome.end.unwrap_err().to_string();
     assert!(error.contains("is a run of 7 generations, which cannot become one of 6"), "{error}");
-    assert_eq!(result_files(&path), before);
+    assert_eq!(support::results(&path), before);
     // An extension cannot change other keys.
     let mut changed = config.clone();
     changed.learning.seed = 3;
@@ -454,7 +429,7 @@ fn an_extension_survives_every_failing_disk_operation() {
     };
     let check = |path: &Path, _: Outcome, _: Operation, context: &str| {
         let (results, resumed) = resume(&config, path);
-        assert_eq!((results, result_files(path)), expected, "{context}");
+        assert_eq!((results, support::results(path)), expected, "{context}");
         assert!(resumed.notes.len() <= 1, "{context}: {:?}", resumed.notes);
         // The run resumes from the end of the shorter run, or is already finished.
         assert!(resumed.start >= 6 || resumed.reached == 0, "{context}: {:?}", resumed.notes);
@@ -494,7 +469,7 @@ fn runs_trained_together_equal_runs_trained_alone() {
     assert_eq!((done.unwrap(), session.generations()), (SessionEnd::Finished, &[16, 7, 11, 16][..]));
     for (run, expected) in expected.iter().enumerate() {
         assert_eq!(
-            (session.results(run), result_files(&path(run))),
+            (session.results(run), support::results(&path(run))),
             (Some(&expected.0), expected.1.clone()),
             "run {run}"
         );
@@ -519,7 +494,7 @@ fn a_run_survives_every_failing_disk_operation() {
             reported.push(operation);
         }
         let (results, resumed) = resume(&config, path);
-        assert_eq!((results, result_files(path)), expected, "{context}");
+        assert_eq!((results, support::results(path)), expected, "{context}");
         // No file is reported as damaged. The only possible note is the generation of the resume.
         assert!(resumed.notes.len() <= 1, "{context}: {:?}", resumed.notes);
         // With a checkpoint per generation, at most two generations are played again.
@@ -717,7 +692,7 @@ fn a_damaged_checkpoint_is_reported_and_the_previous_one_is_used() {
     fs::write(path.join(METRICS), &metrics).unwrap();
     let (results, outcome) = resume(&config, &path);
     assert_eq!((outcome.start, outcome.notes.len()), (0, 3), "{:?}", outcome.notes);
-    assert_eq!((results, result_files(&path)), expected);
+    assert_eq!((results, support::results(&path)), expected);
 }
 
 #[test]
@@ -733,7 +708,7 @@ fn a_checkpoint_of_another_run_is_set_aside_and_the_previous_one_is_used() {
     let note = outcome.notes[0].to_string();
     assert!(note.contains("000000009.safetensors: it is of another run"), "{note}");
     assert_eq!(outcome.start, 8, "{:?}", outcome.notes);
-    assert_eq!((results, result_files(&path)), expected);
+    assert_eq!((results, support::results(&path)), expected);
 }
 
 /// A file of which one read fails, after `left` others.
@@ -789,7 +764,7 @@ fn a_run_with_cut_metrics_resumes_before_the_cut() {
         fs::write(path.join(METRICS), &metrics[..metrics.len() - cut]).unwrap();
         let (results, outcome) = resume(&config, &path);
         assert_eq!(outcome.start, start, "{:?}", outcome.notes);
-        assert_eq!((results, result_files(&path)), expected);
+        assert_eq!((results, support::results(&path)), expected);
     }
 }
 
@@ -866,7 +841,7 @@ fn a_run_can_alternate_between_cpu_and_gpu() {
         }
         let outcome = session(&config, &path, Start::Resume, Disk::default(), gpu(), None);
         assert_eq!((outcome.end.unwrap(), outcome.results), (SessionEnd::Finished, Some(expected.0.clone())), "{info}");
-        assert_eq!(result_files(&path), expected.1, "{info}");
+        assert_eq!(support::results(&path), expected.1, "{info}");
     }
 }
 
@@ -970,7 +945,7 @@ fn a_killed_run_resumes_to_the_same_results() {
                 while_writing += usize::from(!leftovers(&out).is_empty());
             }
         }
-        assert_eq!(result_files(&out), expected.1);
+        assert_eq!(support::results(&out), expected.1);
         assert_eq!(Run::read(&out.join("run.json")).unwrap().digest, Some(expected.0.digest.clone()));
         fs::remove_dir_all(out).unwrap();
     }
@@ -1028,7 +1003,7 @@ fn a_run_killed_around_changes_of_stage_resumes_to_the_same_results() {
     let (file, out) = (config_file(folder.path(), &text), folder.path().join("run"));
     let killed = finish_under_kills(&file, &out, &[], 8);
     assert!(killed >= 4, "killed {killed} times");
-    assert_eq!(result_files(&out), expected.1);
+    assert_eq!(support::results(&out), expected.1);
     assert_eq!(Run::read(&out.join("run.json")).unwrap().digest, Some(expected.0.digest));
 }
 
@@ -1047,7 +1022,7 @@ fn a_killed_run_with_init_resumes_to_the_same_results() {
     run(&uninterrupted, &init);
     let killed = finish_under_kills(&file, &out, &init, 5);
     assert!(killed >= 3, "killed {killed} times");
-    assert_eq!(result_files(&out), result_files(&uninterrupted));
+    assert_eq!(support::results(&out), support::results(&uninterrupted));
     let digest = |path: &Path| Run::read(&path.join("run.json")).unwrap().digest;
     assert_eq!(digest(&out), digest(&uninterrupted));
     assert_ne!(digest(&out), Some(reference(&Config::parse(HEAVY, "heavy.toml").unwrap()).0.digest));
@@ -1178,7 +1153,7 @@ fn a_refused_paper_is_unchanged() {
     for arm in [&arms[0], &arms[arms.len() - 1]] {
         let config = Config::load(&arm.join(CONFIG)).unwrap();
         let lock = Folder::open(arm, Start::Resume, &config, StartFrom::Unspecified, Disk::default()).unwrap();
-        let results = || arms.iter().map(|arm| result_files(arm)).collect::<Vec<_>>();
+        let results = || arms.iter().map(|arm| support::results(arm)).collect::<Vec<_>>();
         let results_before = results();
         for flags in
             [&["--generations", "1", "--force", "--seed", "1"], &["--generations", "2", "--resume", "--seed", "0"]]
@@ -1286,7 +1261,7 @@ mod unix {
             assert_eq!(resumed.status.code(), Some(0), "{}", stderr(&resumed));
             assert!(stderr(&resumed).contains("resuming at generation"), "{}", stderr(&resumed));
             assert!(String::from_utf8_lossy(&resumed.stdout).contains(&expected.0.digest));
-            assert_eq!(result_files(&out), expected.1);
+            assert_eq!(support::results(&out), expected.1);
         }
     }
 
@@ -1361,7 +1336,7 @@ mod unix {
         assert!(stderr(&refused).contains(".safetensors: cannot be written"), "{}", stderr(&refused));
         let resumed = flotilla_train(&file, &out, &["--resume"]).output().unwrap();
         assert_eq!(resumed.status.code(), Some(0), "{}", stderr(&resumed));
-        assert_eq!(result_files(&out), expected.1);
+        assert_eq!(support::results(&out), expected.1);
     }
 
     #[test]
