@@ -6,7 +6,7 @@ use std::fs;
 use std::ops::ControlFlow::Continue;
 use std::path::{Path, PathBuf};
 
-use crate::support::{Place, SMALL};
+use crate::support::{self, Place, SMALL};
 use flotilla::trainer::Row;
 use flotilla::{Config, front};
 use flotilla_app::ops;
@@ -334,8 +334,7 @@ fn the_json_summary_agrees_with_the_files() {
             assert_eq!(score("highest"), values.iter().copied().fold(0.0, f64::max));
         }
     }
-    let (resumed, _) = place.good("train small.toml --out run --json --resume");
-    let resumed: serde_json::Value = serde_json::from_str(&resumed).unwrap();
+    let resumed = place.json("train small.toml --out run --json --resume");
     assert_eq!((&resumed["digest"], &resumed["trained_generations"]), (&summary["digest"], &0.into()));
 }
 
@@ -494,8 +493,7 @@ fn a_rollout_of_one_episode_has_no_columns_of_statistics() {
     let moved = place.read("trace.csv");
     place.good("rollout small.toml --policies run/policies.safetensors --trace trace.csv");
     assert_ne!(place.read("trace.csv"), moved, "--episodes 1 also moves the starts");
-    let (json, _) = place.good("rollout small.toml --policies run/policies.safetensors --json");
-    let json: serde_json::Value = serde_json::from_str(&json).unwrap();
+    let json = place.json("rollout small.toml --policies run/policies.safetensors --json");
     assert_eq!((&json["episodes"], &json["backend"]), (&1.into(), &"cpu".into()));
     for absent in [&json["seed"], &json["start_jitter"], &json["adapter"], &json["best"]["standard_deviation"]] {
         assert!(absent.is_null(), "{json}");
@@ -643,11 +641,10 @@ fn notes_on_a_config_are_printed() {
                 [learning]\ntrials = 1\ngenerations = 0\n";
     place.write("noted.toml", text);
     for command in ["check noted.toml --json", "train noted.toml --json --quiet"] {
-        let output = place.command().args(command.split(' ')).output().unwrap();
-        let stderr = String::from_utf8(output.stderr).unwrap();
+        let (stdout, stderr) = place.good(command);
         assert!(stderr.contains("note: world.coupling is not set: 2 is used"), "{command}: {stderr}");
         assert!(stderr.contains("note: motion.max_speed times world.dt is 3.00e-3 units"), "{command}: {stderr}");
-        let json: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+        let json: serde_json::Value = serde_json::from_str(&stdout).unwrap();
         assert_eq!(json["notes"].as_array().unwrap().len(), 2, "{json}");
     }
     let (_, stderr) = place.good("train small.toml --out plain --quiet");
@@ -689,29 +686,20 @@ fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
         value.get_mut("__metadata__").into_iter().for_each(drop);
         value.to_string().into_bytes()
     }
-    let mut contents = BTreeMap::new();
-    let mut folders = vec![folder.to_path_buf()];
-    while let Some(next) = folders.pop() {
-        for path in fs::read_dir(next).unwrap().map(|entry| entry.unwrap().path()) {
-            if path.is_dir() {
-                folders.push(path);
-                continue;
+    let mut contents = support::files(folder);
+    for (path, bytes) in &mut contents {
+        match path.file_name().unwrap().to_str().unwrap() {
+            "metrics.csv" => {
+                let rows = support::metrics_without_seconds(&folder.join(path.parent().unwrap()));
+                *bytes = format!("{rows:?}").into_bytes();
             }
-            let bytes = fs::read(&path).unwrap();
-            let content = match path.file_name().unwrap().to_str().unwrap() {
-                "metrics.csv" => {
-                    let text = String::from_utf8(bytes).unwrap();
-                    text.lines().map(|line| line.rsplit_once(',').unwrap().0).collect::<Vec<_>>().join("\n").into()
-                }
-                "run.json" => without(&bytes, &["started", "updated", "seconds", "command", "name"]),
-                name if name.ends_with(".safetensors") && name != "policies.safetensors" => {
-                    let length = u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
-                    let times = ["seconds", "metrics_bytes", "metrics_sha256", "checksum", "sha256"];
-                    [without(&bytes[8..8 + length], &times), bytes[8 + length..].to_vec()].concat()
-                }
-                _ => bytes,
-            };
-            contents.insert(path.strip_prefix(folder).unwrap().to_path_buf(), content);
+            "run.json" => *bytes = without(bytes, &["started", "updated", "seconds", "command", "name"]),
+            name if name.ends_with(".safetensors") && name != "policies.safetensors" => {
+                let length = u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
+                let times = ["seconds", "metrics_bytes", "metrics_sha256", "checksum", "sha256"];
+                *bytes = [without(&bytes[8..8 + length], &times), bytes[8 + length..].to_vec()].concat();
+            }
+            _ => {}
         }
     }
     contents
@@ -781,12 +769,10 @@ fn compare_files(method: &str) {
         }
         assert!(actual.is_empty(), "{folder}: {:?}", actual.keys());
     }
-    let uninterrupted = place.good(&format!("train small.toml --out straight --generations 16 --json {set}")).0;
-    let uninterrupted: serde_json::Value = serde_json::from_str(&uninterrupted).unwrap();
+    let uninterrupted = place.json(&format!("train small.toml --out straight --generations 16 --json {set}"));
     for folder in ["theirs", "saved", "archived"] {
-        let summary =
-            place.good(&format!("train {folder}/config.toml --out {folder} --resume --generations 16 --json")).0;
-        let summary: serde_json::Value = serde_json::from_str(&summary).unwrap();
+        let line = format!("train {folder}/config.toml --out {folder} --resume --generations 16 --json");
+        let summary = place.json(&line);
         // Only the 10 new generations are trained.
         assert_eq!(
             (&summary["digest"], &summary["trained_generations"]),
