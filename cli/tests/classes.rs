@@ -63,7 +63,7 @@ fn check_prints_a_config_in_full_and_nothing_else() {
         assert_eq!(full, short.expanded().to_toml());
         assert_eq!(Config::parse(&full, "full.toml").unwrap().classes(), short.classes());
         // In full already, it is printed as it is.
-        std::fs::write(place.path("full.toml"), &full).unwrap();
+        place.write("full.toml", &full);
         assert_eq!(place.good("check --expand full.toml").0, full);
     }
     assert!(place.read("full.toml").contains("groups = [[0, 4, 5, 6, 7], [1, "));
@@ -72,7 +72,7 @@ fn check_prints_a_config_in_full_and_nothing_else() {
     let refused = place.refused(2, "check full.toml --set world.coupling=2");
     assert!(refused.contains("`flotilla check --expand` writes it from the other keys"), "{refused}");
     let staged = format!("{chaotic}[[stages]]\nfrom = 3\nset = {{ \"world.coupling\" = 3 }}\n");
-    std::fs::write(place.path("staged.toml"), staged).unwrap();
+    place.write("staged.toml", staged);
     let (full, noted) = place.good("check --expand staged.toml");
     assert!(full.contains("[[agents]]") && !full.contains("[[pois]]"), "{full}");
     assert!(noted.contains("[[pois]] is not written, because a stage sets a key that it would replace"), "{noted}");

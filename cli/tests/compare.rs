@@ -277,7 +277,7 @@ fn invalid_comparisons_fail_with_a_clear_error() {
     run(&place, "one", &[GENERATIONS, FITNESS_G], &slices(&rising_to(&[0.5])));
     run(&place, "torn", &[GENERATIONS, FITNESS_G], &[&[0.5, 0.5], &[]]);
     fs::create_dir(place.path("paper")).unwrap();
-    fs::write(place.path("paper/paper.toml"), "seed = 0\n").unwrap();
+    place.write("paper/paper.toml", "seed = 0\n");
     assert_fails(&place, "compare a", 2, &["a is one run", "another"]);
     assert_fails(&place, "compare a b ./a", 2, &["./a is named twice"]);
     assert_fails(&place, "compare a one", 1, &["one trial", "--trials"]);
@@ -310,7 +310,7 @@ generations = 2
 #[test]
 fn a_sweep_is_compared_along_an_axis_and_seeds_add_trials() {
     let place = Place::new(&[]);
-    fs::write(place.path("x.toml"), format!("{WORLD}{SWEEP}")).unwrap();
+    place.write("x.toml", format!("{WORLD}{SWEEP}"));
     place.good("sweep x.toml --out s --backend cpu --quiet");
     assert_fails(&place, "compare s", 2, &["several axes", "--by", "world.coupling, learning.fitness, learning.seed"]);
     assert_fails(&place, "compare s --by steps", 2, &["--by steps: ", "world.coupling, learning.fitness"]);
@@ -363,7 +363,7 @@ fn a_varied_key_is_compared_with_the_files_own_value() {
     let text = "[learning]\npopulation = 8\ntrials = 2\ngenerations = 1\n\
                 [grid]\n\"learning.fitness\" = [\"G\", \"Df\"]\n\
                 [vary]\n\"motion.max_speed\" = [2.0, 5.0]\n\"world.steps\" = [8]\n";
-    fs::write(place.path("x.toml"), format!("{WORLD}{text}")).unwrap();
+    place.write("x.toml", format!("{WORLD}{text}"));
     place.good("sweep x.toml --out s --backend cpu --quiet");
     let report = json(&place, "compare s --by max_speed");
     let names = |comparison: &Value| {
@@ -428,7 +428,7 @@ fn different_layouts_print_a_note_and_are_not_paired() {
     }
     // The long form is the same layout.
     let (long, _) = place.good("check here/config.toml --expand");
-    std::fs::write(place.path("long.toml"), long).unwrap();
+    place.write("long.toml", long);
     place.good("train long.toml --backend cpu --out long");
     assert!(!place.good("compare here long").1.contains("layouts"));
 }

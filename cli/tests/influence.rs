@@ -53,7 +53,7 @@ fn a_killed_study_resumes_to_the_same_tables() {
     assert!(tables(&place, "killed") == whole, "killed {kills} times");
 
     // The tables are those of the sweep, and of a comparison of its runs.
-    assert_eq!(fs::read(place.path("whole/rover_uav/points.csv")).unwrap(), whole["rover_uav.csv"]);
+    assert_eq!(place.bytes("whole/rover_uav/points.csv"), whole["rover_uav.csv"]);
     let points: Vec<String> = (0..7).map(|point| format!("whole/rover_uav/points/{point:04}")).collect();
     let (compared, _) = place.good(&format!("compare {} --paired --csv", points.join(" ")));
     let lines = String::from_utf8_lossy(&whole["rover_uav_pairs.csv"]).into_owned();

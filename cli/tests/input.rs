@@ -59,7 +59,7 @@ fn outputs_do_not_replace_inputs_or_files_of_a_run() {
     let place = with_run();
     std::os::unix::fs::symlink("run/metrics.csv", place.path("link.csv")).unwrap();
     let before: Vec<_> = ["run/policies.safetensors", "run/metrics.csv", "run/config.toml", "small.toml", "grid.toml"]
-        .map(|name| (name, fs::read(place.path(name)).unwrap()))
+        .map(|name| (name, place.bytes(name)))
         .into();
     let rollout = ["rollout", "small.toml", "--policies", "run/policies.safetensors"];
     for (flags, why) in [
@@ -86,7 +86,7 @@ fn outputs_do_not_replace_inputs_or_files_of_a_run() {
         assert!(stderr.contains("grid.toml: this file has neither scores nor a trace; move it away"), "{stderr}");
     }
     for (name, content) in before {
-        assert_eq!(fs::read(place.path(name)).unwrap(), content, "{name}");
+        assert_eq!(place.bytes(name), content, "{name}");
     }
     // Other file names in a run's folder are allowed, and so are devices.
     let null = &device(&place, "null", "3")[..];
@@ -145,7 +145,7 @@ fn outputs_are_complete_or_absent_and_devices_are_not_replaced() {
     assert!(scores.starts_with("team,leader,g,d,df,dpp,dt\n0,0,"), "{scores}");
     // If writing fails halfway, the previous file remains.
     let before = "team,step,agent,role,x,y,heading_x,heading_y,speed,before";
-    fs::write(place.path("trace.csv"), before).unwrap();
+    place.write("trace.csv", before);
     let names = place.names();
     let output = place
         .shell("ulimit -f 1; exec flotilla rollout small.toml --policies run/policies.safetensors --trace trace.csv");
@@ -214,10 +214,7 @@ fn a_limit_on_file_sizes_is_reported_and_the_run_can_be_resumed() {
     assert_eq!(stderr.lines().count(), 1, "{stderr}");
     place.good("train small.toml --out run --resume --quiet");
     place.good("train small.toml --out unlimited --quiet");
-    assert_eq!(
-        fs::read(place.path("run/policies.safetensors")).unwrap(),
-        fs::read(place.path("unlimited/policies.safetensors")).unwrap()
-    );
+    assert_eq!(place.bytes("run/policies.safetensors"), place.bytes("unlimited/policies.safetensors"));
 }
 
 #[test]
@@ -339,12 +336,12 @@ fn a_rollout_says_whose_policies_it_plays() {
 fn a_sweep_folder_is_not_a_run() {
     let place = place();
     place.good("sweep grid.toml --out sweep --quiet");
-    let picture = fs::read(place.path("sweep/curves.svg")).unwrap();
+    let picture = place.bytes("sweep/curves.svg");
     for flags in [&[][..], &["--force"], &["--resume"]] {
         let stderr = place.refused(1, &[&["train", "small.toml", "--out", "sweep"], flags].concat());
         assert!(stderr.contains("sweep holds a sweep, not a run"), "{stderr}");
     }
-    assert_eq!(fs::read(place.path("sweep/curves.svg")).unwrap(), picture);
+    assert_eq!(place.bytes("sweep/curves.svg"), picture);
     place.fails(1, "plot sweep", &["name one of the runs in it, as sweep/points/0000"]);
     let stderr = place.refused(1, "replay sweep");
     let first = "sweep holds a sweep; name one of its points:\n  sweep/points/0000  world.coupling = 1, ";
@@ -355,11 +352,11 @@ fn a_sweep_folder_is_not_a_run() {
 #[test]
 fn missing_and_damaged_files_of_a_finished_run_are_restored() {
     let place = with_run();
-    let config = fs::read(place.path("run/config.toml")).unwrap();
-    fs::write(place.path("run/config.toml"), "x = 1").unwrap();
+    let config = place.bytes("run/config.toml");
+    place.write("run/config.toml", "x = 1");
     fs::remove_file(place.path("run/curves.svg")).unwrap();
     place.good("train small.toml --out run --resume --quiet");
-    assert_eq!(fs::read(place.path("run/config.toml")).unwrap(), config);
+    assert_eq!(place.bytes("run/config.toml"), config);
     assert!(place.path("run/curves.svg").exists());
     place.good("replay run");
 }
@@ -369,7 +366,7 @@ fn outputs_are_validated_before_any_work_is_done() {
     let place = with_run();
     fs::copy(place.path("small.toml"), place.path("small.svg")).unwrap();
     place.fails(2, "check small.svg --out small.svg", &["is read from"]);
-    assert_eq!(fs::read(place.path("small.svg")).unwrap(), fs::read(place.path("small.toml")).unwrap());
+    assert_eq!(place.bytes("small.svg"), place.bytes("small.toml"));
 }
 
 #[test]
@@ -406,12 +403,12 @@ fn replay_prints_the_number_of_observed_pois() {
     let nine: Vec<_> = (1..=9).map(|at| format!("[{}, 9]", 5 * at)).collect();
     let config =
         TINY.replace("[[10, 9], [20, 9]]", &format!("[{}]", nine.join(", "))).replace("coupling = 2", "coupling = 1");
-    fs::write(place.path("nine.toml"), &config).unwrap();
+    place.write("nine.toml", &config);
     place.good("train nine.toml --out nine --quiet");
     let (stdout, _) = place.good("replay nine --out r.svg");
     let count = stdout.split(": observed ").nth(1).and_then(|rest| rest.split(' ').next()).unwrap();
     assert!(count.parse::<u32>().is_ok_and(|count| (1..=9).contains(&count)), "{stdout}");
-    fs::write(place.path("mean.toml"), config + "episodes_per_team = 3\nstart_jitter = 2.0\n").unwrap();
+    place.write("mean.toml", config + "episodes_per_team = 3\nstart_jitter = 2.0\n");
     place.good("train mean.toml --out mean --quiet");
     let (stdout, _) = place.good("replay mean --out r.svg");
     assert!(stdout.contains(" of 9 POIs (mean of 3 episodes)") && !stdout.contains("3333"), "{stdout}");
@@ -507,7 +504,7 @@ fn files_cannot_print_terminal_control_characters() {
         ("[learning]\nfitness = \"\\u001b[31mG\\nx\"\n", 1),
         ("[world]\nleaders = \u{1b}[31m\n", 1),
     ] {
-        fs::write(place.path("bad.toml"), text).unwrap();
+        place.write("bad.toml", text);
         let stderr = place.refused(code, &["check", "bad.toml"]);
         assert!(!stderr.contains('\u{1b}') && !stderr.contains('\u{7}'), "{stderr:?}");
         assert!(stderr.lines().skip(1).all(|line| line.starts_with("bad.toml:")), "{stderr:?}");
@@ -518,14 +515,14 @@ fn files_cannot_print_terminal_control_characters() {
         "\"learning.fitness\" = [\"x\\ny\", \"x\\ny\"]",
         "\"learning.fitness\" = \"x\\ny\"",
     ] {
-        fs::write(place.path("bad.toml"), format!("{TINY}[grid]\n{grid}\n")).unwrap();
+        place.write("bad.toml", format!("{TINY}[grid]\n{grid}\n"));
         let stderr = place.refused(1, "sweep bad.toml");
         assert!(!stderr.contains('\u{1b}') && stderr.lines().count() == 1, "{stderr:?}");
     }
     // A tensor's name has an escape sequence.
     let header = "{\"w\\u001b[31m\\nx\":{\"dtype\":\"F32\",\"shape\":[1],\"data_offsets\":[0,4]}}";
     let bytes = [&(header.len() as u64).to_le_bytes()[..], header.as_bytes(), &[0; 4]].concat();
-    fs::write(place.path("w.safetensors"), bytes).unwrap();
+    place.write("w.safetensors", bytes);
     let stderr = place.refused(1, "rollout small.toml --policies w.safetensors");
     assert!(!stderr.contains('\u{1b}') && stderr.lines().count() == 1, "{stderr:?}");
 }
@@ -565,7 +562,7 @@ fn a_wrong_value_of_a_flag_exits_with_code_2() {
         place.refused(2, words);
     }
     // A wrong file exits with code 1, also together with a wrong flag.
-    fs::write(place.path("wrong.toml"), TINY.replace("steps = 8", "steps = 0")).unwrap();
+    place.write("wrong.toml", TINY.replace("steps = 8", "steps = 0"));
     place.refused(1, "check wrong.toml");
     place.refused(1, "check wrong.toml --seed -1");
     place.refused(1, "check missing.toml --seed -1");

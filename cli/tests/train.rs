@@ -77,7 +77,7 @@ fn train_writes_a_complete_folder() {
     }
 
     // The policies are readable with the safetensors crate.
-    let bytes = fs::read(place.path("runs/small/policies.safetensors")).unwrap();
+    let bytes = place.bytes("runs/small/policies.safetensors");
     let (_, header) = SafeTensors::read_metadata(&bytes).unwrap();
     assert_eq!(header.metadata().as_ref().unwrap()["layers"], "8,5,2");
     let tensors = SafeTensors::deserialize(&bytes).unwrap();
@@ -99,7 +99,7 @@ fn train_writes_a_complete_folder() {
 
     // The resolved config reproduces the run, also with another number of threads.
     place.prints("train runs/small/config.toml --out again --threads 1", &[run["digest"].as_str().unwrap()]);
-    assert_eq!(fs::read(place.path("again/policies.safetensors")).unwrap(), bytes);
+    assert_eq!(place.bytes("again/policies.safetensors"), bytes);
     assert_eq!(place.read("again/config.toml"), place.read("runs/small/config.toml"));
 }
 
@@ -266,12 +266,12 @@ fn rollout_reads_files_of_other_programs_and_refuses_invalid_ones() {
     // The file must have policies for every leader.
     place.fails(1, &(line("good") + " --paradigm all-leaders"), &["needs F32 [5, "]);
 
-    let complete = fs::read(place.path("good.safetensors")).unwrap();
+    let complete = place.bytes("good.safetensors");
     for length in [0, 7, 8, 40, complete.len() - 1] {
-        fs::write(place.path("bad.safetensors"), &complete[..length]).unwrap();
+        place.write("bad.safetensors", &complete[..length]);
         place.fails(1, &line("bad"), &["bad.safetensors: it is cut short"]);
     }
-    fs::write(place.path("bad.safetensors"), "not tensors at all").unwrap();
+    place.write("bad.safetensors", "not tensors at all");
     let error = place.refused(1, &line("bad"));
     assert!(error.contains("it is not a safetensors file") && !error.contains("1048576"), "{error}");
     place.fails(1, &line("missing"), &["missing.safetensors: cannot be read"]);
@@ -473,7 +473,7 @@ fn held_out_episodes_are_summarised_by_mean_deviation_and_interval() {
         let moved = SMALL
             .replace("[[10, 5], [20, 5]]", &format!("{:?}", &start[..2]))
             .replace("[[12, 2], [22, 2], [30, 2]]", &format!("{:?}", &start[2..]));
-        fs::write(place.path("moved.toml"), moved).unwrap();
+        place.write("moved.toml", moved);
         place.good("rollout moved.toml --policies run/policies.safetensors --scores one.csv");
         for (sums, row) in sums.iter_mut().zip(self::rows(&place.read("one.csv")).1) {
             sums.iter_mut().zip(&row[2..]).for_each(|(sum, text)| *sum += text.parse::<f32>().unwrap() as f64);
@@ -517,7 +517,7 @@ fn rollout_refuses_flags_without_effect() {
     place.fails(2, &format!("{line} --episodes 2 --start-jitter -1"), &["--start-jitter: found -1"]);
     place.good(&format!("{line} --episodes 1"));
     // If the config has a start jitter, no flag is needed.
-    fs::write(place.path("small.toml"), SMALL.to_string() + "start_jitter = 1.5\n").unwrap();
+    place.write("small.toml", SMALL.to_string() + "start_jitter = 1.5\n");
     place.prints(&format!("{line} --episodes 3"), &["starts moved by up to 1.5 (seed 0)"]);
 }
 
@@ -532,7 +532,7 @@ fn a_trace_has_the_inputs_and_outputs_of_leaders() {
          pois_back_right,pois_front_right,pois_front_left,pois_back_left,\
          agents_back_right,agents_front_right,agents_front_left,agents_back_left,turn_output,speed_output"
     );
-    let bytes = fs::read(place.path("run/policies.safetensors")).unwrap();
+    let bytes = place.bytes("run/policies.safetensors");
     let file = SafeTensors::deserialize(&bytes).unwrap();
     let tensor = file.tensor("weights.0").unwrap();
     let weights: Vec<f64> =
