@@ -205,6 +205,15 @@ impl Place {
         containing(self.refused(code, &words), parts, &words)
     }
 
+    /// Runs a script with `bash`, which must end with this exit code. Its standard error must contain all of `parts`, and
+    /// is returned.
+    pub fn script(&self, code: i32, script: &str, parts: &[&str]) -> String {
+        let output = self.shell(script);
+        let stderr = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(code), "{script}: {:?}: {stderr}", output.status);
+        containing(stderr, parts, &[script.into()])
+    }
+
     /// Runs a command that [`Self::good`] accepts. Returns the JSON value on its standard output.
     pub fn json(&self, words: impl Words) -> Value {
         serde_json::from_str(&self.good(words).0).unwrap()

@@ -136,7 +136,7 @@ fn film_formats_print_commands_that_make_them() {
     let commands: Vec<&str> = stderr.lines().filter_map(|line| line.strip_prefix("  ")).collect();
     let [pictures, film] = commands[..] else { panic!("{stderr}") };
     assert!(film.starts_with("ffmpeg -framerate 10 -i champ-%04d.png ") && film.ends_with(" champ.mp4"), "{film}");
-    assert!(place.shell(pictures).status.success(), "{pictures}");
+    place.script(0, pictures, &[]);
     assert!(place.path("champ-0000.png").exists(), "{pictures}: {:?}", place.names());
     for out in ["-o champ.mp4", "--out=champ.mp4", "-ochamp.mp4"] {
         place.fails(2, &format!("replay run {out}"), &["champ-%04d.png --backend cpu\n"]);
@@ -255,10 +255,10 @@ fn commands_in_the_summary_work_for_the_best_champion() {
         "{text}"
     );
     let film = text.lines().find(|line| line.contains("champion.gif")).unwrap().trim();
-    assert!(place.shell(film).status.success(), "{film}");
+    place.script(0, film, &[]);
     assert!(place.path("run/champion.gif").exists(), "{film}");
     let scores = text.lines().find(|line| line.contains("flotilla rollout")).unwrap().trim();
-    assert!(place.shell(scores).status.success(), "{scores}");
+    place.script(0, scores, &[]);
 }
 
 #[test]

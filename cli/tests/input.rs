@@ -120,10 +120,7 @@ fn help_that_cannot_be_printed_is_an_error() {
         return support::skip("help_that_cannot_be_printed_is_an_error", "this system has no full device");
     }
     for command in ["--help", "--version", "train --help", "help train", "completions bash", "man", "init"] {
-        let output = place.shell(&format!("flotilla {command} > {full}"));
-        let stderr = String::from_utf8(output.stderr).unwrap();
-        assert_eq!(output.status.code(), Some(1), "{command}: {stderr}");
-        assert!(stderr.contains("standard output cannot be written"), "{command}: {stderr}");
+        place.script(1, &format!("flotilla {command} > {full}"), &["standard output cannot be written"]);
     }
 }
 
@@ -147,11 +144,8 @@ fn outputs_are_complete_or_absent_and_devices_are_not_replaced() {
     let before = "team,step,agent,role,x,y,heading_x,heading_y,speed,before";
     place.write("trace.csv", before);
     let names = place.names();
-    let output = place
-        .shell("ulimit -f 1; exec flotilla rollout small.toml --policies run/policies.safetensors --trace trace.csv");
-    let stderr = String::from_utf8(output.stderr).unwrap();
-    assert_eq!(output.status.code(), Some(1), "{:?} {stderr}", output.status);
-    assert!(stderr.contains("trace.csv: cannot be written") && stderr.contains("ulimit -f"), "{stderr}");
+    let script = format!("ulimit -f 1; exec flotilla {} --trace trace.csv", rollout.join(" "));
+    place.script(1, &script, &["trace.csv: cannot be written", "ulimit -f"]);
     assert_eq!(place.read("trace.csv"), before);
     assert_eq!(place.names(), names);
     // A link is followed, not replaced.
@@ -204,13 +198,8 @@ fn an_interrupted_trace_leaves_no_file() {
 #[test]
 fn a_limit_on_file_sizes_is_reported_and_the_run_can_be_resumed() {
     let place = place();
-    let output = place.shell("ulimit -f 1; exec flotilla train small.toml --out run --quiet");
-    let stderr = String::from_utf8(output.stderr).unwrap();
-    assert_eq!(output.status.code(), Some(1), "{:?} {stderr}", output.status);
-    assert!(
-        stderr.contains("cannot be written") && stderr.contains("ulimit -f") && stderr.contains("--resume"),
-        "{stderr}"
-    );
+    let script = "ulimit -f 1; exec flotilla train small.toml --out run --quiet";
+    let stderr = place.script(1, script, &["cannot be written", "ulimit -f", "--resume"]);
     assert_eq!(stderr.lines().count(), 1, "{stderr}");
     place.good("train small.toml --out run --resume --quiet");
     place.good("train small.toml --out unlimited --quiet");
@@ -249,10 +238,8 @@ fn commands_do_not_wait_for_input_from_pipes_and_devices() {
         assert!(matches!(output.status.code(), Some(0 | 1)), "{:?}", output.status);
     }
     // Standard input and pipes that the shell opens are read.
-    let output = place.shell("flotilla check /dev/stdin < small.toml && flotilla check <(cat small.toml)");
-    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
-    let output = place.shell("cat small.toml | flotilla check /dev/stdin");
-    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+    place.script(0, "flotilla check /dev/stdin < small.toml && flotilla check <(cat small.toml)", &[]);
+    place.script(0, "cat small.toml | flotilla check /dev/stdin", &[]);
 }
 
 /// A reader may open the pipe later and still gets everything. Until then, a message says what the program waits for.
@@ -483,8 +470,7 @@ fn special_characters_in_names_are_escaped_in_every_output() {
         "1",
         "--slurm=job.sh",
     ]);
-    let output = place.shell("SLURM_ARRAY_TASK_ID=1 bash job.sh");
-    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+    place.script(0, "SLURM_ARRAY_TASK_ID=1 bash job.sh", &[]);
     assert!(!place.path("x").exists() && !place.path("y").exists());
     place.good(&["sweep", &*sweep, "--out", &format!("sweep {special}"), "--collect"]);
     let mut table = csv::Reader::from_path(place.path(format!("sweep {special}")).join("results.csv")).unwrap();
@@ -643,10 +629,7 @@ fn a_training_works_with_fewer_threads_than_requested() {
             // The limit counts all processes of a user. Only `nobody` (65534) is assumed to have no others.
             let started = if root { started } else { "of" };
             let run = |command: &str| {
-                let output = place.shell(&format!("exec {user} prlimit --nproc={limit} ./flotilla {command}"));
-                let stderr = String::from_utf8(output.stderr).unwrap();
-                assert_eq!(output.status.code(), Some(0), "{limit}, {command}: {stderr}");
-                stderr
+                place.script(0, &format!("exec {user} prlimit --nproc={limit} ./flotilla {command}"), &[])
             };
             let stderr = run(&format!(
                 "train small.toml --backend cpu --threads 5 --quiet --out run{limit} --checkpoint-generations 1"
