@@ -32,7 +32,7 @@ trials = 1
 led_within = 4
 ";
 
-/// Creates a folder with the config, and with a run of it in `run`.
+/// Creates a folder with the config [`RELAY`], and with a run of it in `run`.
 fn trained() -> Place {
     let place = Place::new(&[("relay.toml", RELAY)]).on_cpu().slow();
     place.good("train relay.toml --out run --quiet");

@@ -51,7 +51,7 @@ fn place(sweep: &str) -> Place {
     Place::new(&[("x.toml", sweep)]).on_cpu().slow()
 }
 
-/// Creates the same with a sweep over so many seeds.
+/// Creates a folder with a sweep over this many seeds.
 fn place_of_seeds(points: usize) -> Place {
     let seeds: Vec<usize> = (0..points).collect();
     place(&format!("{}[grid]\n\"learning.seed\" = {seeds:?}\n", support::TINY))

@@ -95,7 +95,7 @@ fn invalid_scripts_are_refused_before_training() {
 /// Between these marks, the page has what the test below prints.
 const MARKS: [&str; 2] = ["<!-- what comes out: cargo test tasks:: -->\n", "<!-- so far -->\n"];
 
-/// Runs a command that prints a table, and fails with exit code 1 because of what it found. Returns its output.
+/// Runs a command that must fail with exit code 1 and this message. It may print a table before. Returns its output.
 fn finds(place: &Place, line: &str, message: &str) -> Output {
     let output = place.run(line);
     let error = String::from_utf8_lossy(&output.stderr);
