@@ -4,6 +4,7 @@
 //! Statistical tests use seeded draws. Counts and means must be within five standard deviations of their expected
 //! values.
 
+use crate::golden::cases;
 use crate::support;
 use std::collections::HashSet;
 use std::f64::consts::TAU;
@@ -13,8 +14,8 @@ use fearless_simd::Level;
 use flotilla::backend::cpu::{Cpu, level_name};
 use flotilla::backend::{Backend, Group};
 use flotilla::config::{
-    Actions, Choice, Config, Elites, Fitness, Initial, Learning, Leniency, Method, Mutation, Paradigm, Parents,
-    Sharing, Teams, ValidConfig, own_populations,
+    Choice, Config, Elites, Fitness, Learning, Leniency, Method, Mutation, Parents, Sharing, Teams, ValidConfig,
+    own_populations,
 };
 use flotilla::credit::Credit;
 use flotilla::evaluate::Starts;
@@ -43,7 +44,6 @@ const PURPOSES: [Purpose; 12] = [
     Purpose::HallOfFame,
 ];
 const GENERALLY_FORWARD: &str = "generally_forward";
-const STRICTLY_FORWARD: &str = "strictly_forward";
 const CHAOTIC: &str = "chaotic";
 
 fn config(layout: &str, change: impl FnOnce(&mut Config)) -> Config {
@@ -795,224 +795,15 @@ fn policies_are_equal_on_all_instruction_sets() {
     }
 }
 
-/// Returns the world of a layout with these `[learning]` and `[[stages]]` sections.
-fn staged(layout: &str, rest: &str) -> Config {
-    let path = format!("{}/configs/{layout}.toml", env!("CARGO_MANIFEST_DIR"));
-    let text = std::fs::read_to_string(path).unwrap();
-    let world = text.split("[learning]").next().unwrap();
-    Config::parse(&format!("{world}\n{rest}"), "staged").unwrap_or_else(|error| panic!("{error}"))
-}
-
-/// Returns small experiments of every kind, with different numbers of generations.
+/// Returns the experiments of `data/experiments.txt`.
 fn experiments() -> Vec<Config> {
-    let small = |config: &mut Config, population, generations, trials| {
-        let Learning { population: p, generations: g, trials: t, .. } = &mut config.learning;
-        (*p, *g, *t) = (population, generations, trials);
+    let experiment = |line: &str| {
+        let [layout, sizes, changes] = line.split(" | ").collect::<Vec<_>>()[..] else { panic!("{line}") };
+        let keys = ["population", "generations", "trials"];
+        let sizes = keys.iter().zip(sizes.split(' ')).map(|(key, size)| format!("learning.{key} = {size}; "));
+        cases::config(layout, &[&(sizes.collect::<String>() + changes)])
     };
-    vec![
-        config(GENERALLY_FORWARD, |config| {
-            small(config, 12, 5, 3);
-            config.learning.elites = 3.into();
-        }),
-        config(CHAOTIC, |config| {
-            small(config, 9, 3, 2);
-            (config.learning.start_jitter, config.learning.episodes_per_team) = (0.75, 3);
-            (config.learning.mutation, config.learning.mutation_sigma) = (Mutation::Additive, 0.5);
-            (config.learning.fitness, config.learning.elites, config.learning.seed) = (Fitness::Dpp, 0.into(), 1 << 40);
-        }),
-        config(STRICTLY_FORWARD, |config| {
-            small(config, 17, 4, 1);
-            (config.learning.paradigm, config.learning.fitness) = (Paradigm::AllLeaders, Fitness::D);
-            config.world.coupling = flotilla::config::Coupling::Each(vec![1, 2]);
-        }),
-        config(STRICTLY_FORWARD, |config| {
-            small(config, 2, 0, 1);
-            config.learning.fitness = Fitness::G;
-        }),
-        config(CHAOTIC, |config| {
-            small(config, 10, 3, 1);
-            (config.learning.fitness, config.credit.led_within) = (Fitness::Dt, 5);
-            config.world.windows = vec![[1, 50], [10, 30], [1, 20], [1, 50]];
-        }),
-        config(GENERALLY_FORWARD, |config| {
-            small(config, 6, 2, 1);
-            config.learning.elites = 6.into();
-        }),
-        config(CHAOTIC, |config| {
-            small(config, 18, 4, 2);
-            (config.learning.elites, config.learning.parents) = (Elites::Percentage(25.0), Parents::Elites);
-            config.sense.gain = 8.0;
-        }),
-        config(GENERALLY_FORWARD, |config| {
-            small(config, 10, 4, 2);
-            (config.learning.partners, config.learning.fitness) = (3, Fitness::D);
-            config.world.coupling = flotilla::config::Coupling::Same(2);
-        }),
-        config(CHAOTIC, |config| {
-            small(config, 8, 3, 1);
-            (config.learning.partners, config.learning.leniency) = (2, Leniency::Max);
-            (config.learning.start_jitter, config.learning.episodes_per_team) = (0.5, 2);
-        }),
-        config(GENERALLY_FORWARD, |config| {
-            small(config, 8, 6, 2);
-            (config.learning.hall_of_fame, config.learning.fitness) = (3, Fitness::D);
-            config.world.coupling = flotilla::config::Coupling::Same(2);
-        }),
-        config(STRICTLY_FORWARD, |config| {
-            small(config, 7, 5, 1);
-            (config.learning.hall_of_fame, config.learning.paradigm) = (9, Paradigm::AllLeaders);
-            (config.learning.partners, config.learning.leniency) = (2, Leniency::Max);
-            (config.learning.start_jitter, config.learning.episodes_per_team) = (0.5, 2);
-            config.world.coupling = flotilla::config::Coupling::Same(1);
-        }),
-        config(GENERALLY_FORWARD, |config| {
-            small(config, 11, 4, 2);
-            (config.learning.sharing, config.learning.fitness) = (Sharing::Shared, Fitness::D);
-            (config.learning.start_jitter, config.learning.episodes_per_team) = (0.5, 2);
-        }),
-        config(STRICTLY_FORWARD, |config| {
-            small(config, 13, 5, 1);
-            (config.learning.sharing, config.learning.paradigm) = (Sharing::Shared, Paradigm::AllLeaders);
-            config.policy.actions = Actions::Behaviours;
-            (config.learning.poi_jitter, config.learning.episodes_per_team) = (3.0, 3);
-            config.world.coupling = flotilla::config::Coupling::Same(2);
-        }),
-        config(GENERALLY_FORWARD, |config| {
-            small(config, 9, 5, 2);
-            (config.learning.sharing, config.learning.paradigm) = (Sharing::Group, Paradigm::AllLeaders);
-            (config.learning.hall_of_fame, config.learning.fitness) = (2, Fitness::D);
-            (config.learning.start_jitter, config.learning.episodes_per_team) = (0.5, 2);
-            config.world.coupling = flotilla::config::Coupling::Same(2);
-        }),
-        config(CHAOTIC, |config| {
-            small(config, 9, 4, 1);
-            (config.learning.sharing, config.learning.groups) = (Sharing::Group, vec![vec![3, 1], vec![0, 2]]);
-            (config.learning.partners, config.learning.leniency) = (2, Leniency::Max);
-            config.world.coupling = flotilla::config::Coupling::Same(2);
-        }),
-        config(GENERALLY_FORWARD, |config| {
-            small(config, 9, 5, 2);
-            (config.learning.method, config.learning.fitness) = (Method::OpenAiEs, Fitness::D);
-            config.world.coupling = flotilla::config::Coupling::Same(2);
-        }),
-        config(CHAOTIC, |config| {
-            small(config, 12, 4, 2);
-            (config.learning.method, config.learning.search_sigma) = (Method::Snes, 0.6);
-            (config.learning.partners, config.learning.episodes_per_team) = (2, 2);
-            (config.learning.start_jitter, config.world.coupling) = (0.5, flotilla::config::Coupling::Same(2));
-        }),
-        config(STRICTLY_FORWARD, |config| {
-            small(config, 10, 0, 1);
-            (config.learning.method, config.learning.sharing) = (Method::Snes, Sharing::Shared);
-        }),
-        config(GENERALLY_FORWARD, |config| {
-            small(config, 12, 5, 2);
-            (config.learning.teams, config.learning.temperature) = (Teams::Softmax, 0.3);
-            (config.learning.start_jitter, config.learning.test_episodes) = (0.5, 3);
-            (config.learning.initial, config.learning.initial_scale) = (Initial::Uniform, 2.0);
-            config.world.coupling = flotilla::config::Coupling::Same(2);
-        }),
-        config(CHAOTIC, |config| {
-            small(config, 14, 6, 2);
-            (config.learning.teams, config.learning.fitness) = (Teams::Sorted, Fitness::D);
-            (config.learning.elites, config.learning.team_elites, config.learning.team_g_elites) = (2.into(), 3, 2);
-            config.world.coupling = flotilla::config::Coupling::Same(2);
-        }),
-        config(GENERALLY_FORWARD, |config| {
-            small(config, 10, 6, 1);
-            (config.learning.sharing, config.learning.paradigm) = (Sharing::Group, Paradigm::AllLeaders);
-            (config.learning.elites, config.learning.team_elites) = (0.into(), 2);
-            (config.learning.poi_jitter, config.learning.test_episodes) = (2.0, 2);
-            config.world.coupling = flotilla::config::Coupling::Same(2);
-        }),
-        // Teams are formed by the fitness in an earlier stage.
-        staged(
-            STRICTLY_FORWARD,
-            "[learning]
-population = 10
-generations = 6
-trials = 2
-team_g_elites = 2
-initial_scale = 0.5
-[[stages]]
-from = 2
-set = { 'learning.teams' = 'sorted', 'world.coupling' = 1, 'world.pois' = [[10, 12], [40, 20], [20, 9]] }
-[[stages]]
-from = 4
-set = { 'learning.teams' = 'softmax' }
-",
-        ),
-        staged(
-            GENERALLY_FORWARD,
-            "[learning]
-population = 12
-generations = 7
-trials = 2
-fitness = 'D'
-[[stages]]
-from = 2
-set = { 'world.coupling' = 1, 'world.steps' = 12, 'learning.episodes_per_team' = 3, 'learning.start_jitter' = 0.5 }
-[[stages]]
-from = 3
-set = { 'world.pois' = [[10, 12], [40, 20]], 'learning.fitness' = 'D++', 'learning.mutation' = 'additive' }
-[[stages]]
-from = 6
-set = { 'learning.poi_jitter' = 2.0, 'learning.episodes_per_team' = 2 }
-",
-        ),
-        // Leniency ends early, as in Panait, Luke and Wiegand (2006), and the number of partners changes.
-        staged(
-            STRICTLY_FORWARD,
-            "[learning]
-population = 10
-generations = 6
-trials = 2
-fitness = 'G'
-partners = 2
-leniency = 'max'
-[[stages]]
-from = 2
-set = { 'learning.partners' = 4 }
-[[stages]]
-from = 3
-set = { 'learning.partners' = 1, 'world.coupling' = 2 }
-[[stages]]
-from = 5
-set = { 'learning.partners' = 3, 'learning.leniency' = 'mean', 'learning.fitness' = 'D' }
-",
-        ),
-        // Past champions play in later stages than their own.
-        staged(
-            GENERALLY_FORWARD,
-            "[learning]
-population = 6
-generations = 6
-trials = 2
-hall_of_fame = 2
-[[stages]]
-from = 3
-set = { 'world.coupling' = 2, 'learning.partners' = 2, 'learning.fitness' = 'D++' }
-[[stages]]
-from = 5
-set = { 'learning.leniency' = 'max', 'world.pois' = [[10, 12], [40, 20]] }
-",
-        ),
-        // The first stage begins at generation 0, the last at the last generation.
-        staged(
-            STRICTLY_FORWARD,
-            "[learning]
-population = 9
-generations = 4
-trials = 1
-[[stages]]
-from = 0
-set = { world.coupling = 1 }
-[[stages]]
-from = 4
-set = { world.coupling = [1, 2], motion.max_speed = 5.0 }
-",
-        ),
-    ]
+    include_str!("data/experiments.txt").lines().filter(|line| !line.starts_with('#')).map(experiment).collect()
 }
 
 /// Trains all experiments together. Returns the rows and policies of each.

@@ -18,7 +18,7 @@ use flotilla::world::World;
 use sha2::{Digest, Sha256};
 
 #[path = "golden/cases.rs"]
-mod cases;
+pub mod cases;
 
 use cases::{CASES, CONFIGS, Case};
 

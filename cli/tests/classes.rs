@@ -59,11 +59,11 @@ fn check_prints_a_config_in_full_and_nothing_else() {
     let place = Place::new(&[("chaotic.toml", &chaotic), ("grouped.toml", &grouped)]);
     for name in ["chaotic.toml", "grouped.toml"] {
         let short = Config::load(&place.path(name)).unwrap();
-        let (full, _) = place.good(&*format!("check --expand {name}"));
+        let (full, _) = place.good(&format!("check --expand {name}"));
         assert_eq!(full, short.expanded().to_toml());
         assert_eq!(Config::parse(&full, "full.toml").unwrap().classes(), short.classes());
         // In full already, it is printed as it is.
-        std::fs::write(place.path("full.toml"), &full).unwrap();
+        place.write("full.toml", &full);
         assert_eq!(place.good("check --expand full.toml").0, full);
     }
     assert!(place.read("full.toml").contains("groups = [[0, 4, 5, 6, 7], [1, "));
@@ -72,7 +72,7 @@ fn check_prints_a_config_in_full_and_nothing_else() {
     let refused = place.refused(2, "check full.toml --set world.coupling=2");
     assert!(refused.contains("--set world.coupling: a config with [[pois]] has no such key"), "{refused}");
     let staged = format!("{chaotic}[[stages]]\nfrom = 3\nset = {{ \"world.coupling\" = 3 }}\n");
-    std::fs::write(place.path("staged.toml"), staged).unwrap();
+    place.write("staged.toml", staged);
     let (full, noted) = place.good("check --expand staged.toml");
     assert!(full.contains("[[agents]]") && !full.contains("[[pois]]"), "{full}");
     assert!(noted.contains("[[pois]] is not written, because a stage sets a key that it would replace"), "{noted}");
@@ -122,8 +122,7 @@ fn a_stage_that_weighs_pois_is_told() {
     let alike = HERD.replace("value = 2\n", "").replace("value = 0.5\n", "");
     let stage = "[[stages]]\nfrom = 1\nset = { pois.far.value = 7.5 }\n";
     let place = Place::new(&[("herd.toml", &(alike + stage))]);
-    let (report, _) = place.good("train herd.toml --out run");
-    assert!(report.contains("weighted by value"), "{report}");
+    place.prints("train herd.toml --out run", &["weighted by value"]);
     assert!(place.read("run/curves.svg").contains("G (weighted share of POIs)"));
 }
 
@@ -138,8 +137,7 @@ learning = { population = 4, generations = 1, trials = 1 }
 ";
     let place = Place::new(&[("start.toml", text)]).on_cpu();
     place.good("train start.toml --out run --quiet");
-    let (said, _) = place.good("replay run --out start.svg");
-    assert!(said.contains("1 of 1"), "{said}");
+    place.prints("replay run --out start.svg", &["1 of 1"]);
     let picture = place.read("start.svg");
     assert!(picture.contains("1 of 1 POIs observed") && picture.contains("at step 0"), "{picture}");
     place.good("replay run --out start.html");
@@ -179,18 +177,16 @@ senses = [{ of = 'pois' }]
         ("free.toml", &choosers.replace("control = 'choose:post'\n", "")),
         ("both.toml", &choosers.replacen("[[agents]]", &format!("{walker}[[agents]]"), 1)),
     ]);
-    let found = |command: &str| -> serde_json::Value { serde_json::from_str(&place.good(command).0).unwrap() };
     let pois = |constants: &serde_json::Value| -> Vec<_> {
         constants.as_array().unwrap().iter().map(|constant| constant["pois"].as_f64().unwrap()).collect()
     };
-    let alone = found("baseline choose.toml --seeds 1 --json --backend cpu");
+    let alone = place.json("baseline choose.toml --seeds 1 --json --backend cpu");
     let constants = &alone["constants"];
     assert_eq!(pois(constants), [0.0, 1.0, 0.0, 0.0, 0.0]);
     assert!(constants[4]["choice"] == 4 && constants[4]["speed"].is_null(), "{constants}");
     assert_eq!(alone["chosen"], serde_json::json!([1]));
-    let (text, _) = place.good("baseline choose.toml --seeds 1");
-    assert!(text.contains("A team with the constant choice 1 observes every POI."), "{text}");
-    let both = found("baseline both.toml --seeds 1 --json --backend cpu");
+    place.prints("baseline choose.toml --seeds 1", &["A team with the constant choice 1 observes every POI."]);
+    let both = place.json("baseline both.toml --seeds 1 --json --backend cpu");
     let constants = &both["constants"];
     assert_eq!((pois(constants).len(), &pois(constants)[..7]), (20, &[0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0][..]));
     assert!(constants[19]["speed"] == 1.0 && constants[6]["choice"] == 6, "{constants}");
@@ -201,7 +197,7 @@ senses = [{ of = 'pois' }]
     // A policy may have fewer weights than there are behaviours.
     let set = "--set policy.hidden=[] --set policy.actions=behaviours --set agents.post.at=[[10,10]] \
                --set agents.scout.senses=[{of='pois',sectors=1}]";
-    let found = found(&format!("baseline choose.toml --seeds 1 --json --backend cpu {set}"));
+    let found = place.json(&format!("baseline choose.toml --seeds 1 --json --backend cpu {set}"));
     assert_eq!(found["constant"]["mean"].as_f64(), Some(1.0));
 }
 
@@ -227,7 +223,7 @@ fn g_weighs_pois_by_value_in_metrics_replays_and_rollouts() {
     assert!(best.iter().any(|g| *g > 4.0 / 9.0), "{metrics}");
     // A replay is compared with the metrics.
     for generation in 0..=2 {
-        place.good(&*format!("replay run --team best --generation {generation} --out best.svg"));
+        place.good(&format!("replay run --team best --generation {generation} --out best.svg"));
     }
     let (text, _) = place.good("rollout run --scores scores.csv");
     let most = place.read("scores.csv").lines().skip(1).map(g).fold(0.0, f64::max);
@@ -265,9 +261,9 @@ fn a_poi_that_counts_at_the_end_is_observed_only_then() {
     let ever = PASSING.replace("when = \"end\"", "when = \"ever\"");
     let place = Place::new(&[("end.toml", PASSING), ("ever.toml", &ever)]);
     for (when, observed) in [("end", 0), ("ever", 1)] {
-        let (_, warned) = place.good(&*format!("train {when}.toml --out {when}"));
+        let (_, warned) = place.good(&format!("train {when}.toml --out {when}"));
         assert_eq!(warned.contains("only the last step counts"), observed == 0, "{warned}");
-        let (text, _) = place.good(&*format!("replay {when} --out {when}.svg"));
+        let (text, _) = place.good(&format!("replay {when} --out {when}.svg"));
         assert!(text.contains(&format!("observed {observed} of 1 POIs, as in metrics.csv")), "{text}");
         let picture = place.read(format!("{when}.svg"));
         assert!(picture.contains(&format!("POIs observed: {observed} of 1")), "{picture}");
@@ -283,8 +279,7 @@ fn a_closeness_that_rounds_to_0_is_not_called_unobserved() {
          coupling = 8\nradius = 60\nscore = \"closeness\"\n[learning]\npopulation = 4\ngenerations = 1\ntrials = 1\n"
     );
     let place = Place::new(&[("far.toml", &text)]);
-    let (_, stderr) = place.good("train far.toml --out far");
-    assert!(stderr.contains("warning: no team scored in any generation"), "{stderr}");
+    let stderr = place.notes("train far.toml --out far", &["warning: no team scored in any generation"]);
     assert!(!stderr.contains("no team observed any POI"), "{stderr}");
 }
 
@@ -387,7 +382,7 @@ fn fitness_by_led_agents_that_nobody_leads_is_noted() {
     let close = [&close[..sheep], "count = 400\nin = { disc = [25, 20, 5] }", &close[end..]].concat();
     place.write("close.toml", close.replace("after = \"gate\"", ""));
     let cubic = "D++ by closeness takes a time that grows with the cube of the coupling, which is 300 here";
-    assert!(place.good("check close.toml --fitness D++").1.contains(cubic));
+    place.notes("check close.toml --fitness D++", &[cubic]);
     assert!(!place.good("check close.toml --fitness D").1.contains(cubic));
     // Dt takes out the sheep that another class leads, if anyone may lead them.
     let bird = "[[agents]]\nname = \"bird\"\nat = [[1, 1]]\nsenses = [{ of = \"sheep\" }]\nleads = \"sheep\"\nobserves = false\n[[agents]]";
@@ -402,14 +397,12 @@ fn fitness_by_led_agents_that_nobody_leads_is_noted() {
         "rocks.toml",
         herd.replace("[[pois]]", "[[pois]]\nobservers = \"rock\"").replacen("[[pois]]", &format!("{rock}[[pois]]"), 1),
     );
-    assert!(place.good("check rocks.toml --fitness Df").1.contains(&format!("note: Df of every dog is {always_0}")));
-    let (_, notes) = place.good("check counting.toml --fitness Df");
-    assert!(notes.contains("note: Df equals D here, because no class has `leads`"), "{notes}");
+    place.notes("check rocks.toml --fitness Df", &[&format!("note: Df of every dog is {always_0}")]);
+    place.notes("check counting.toml --fitness Df", &["note: Df equals D here, because no class has `leads`"]);
     // Runs that differ in nothing but the name of their fitness.
     for fitness in ["D", "Df"] {
         let run = "--generations 1 --trials 2 --population 4";
         place.good(&format!("train counting.toml --fitness {fitness} {run} --out {fitness}"));
     }
-    let (_, notes) = place.good("compare D Df");
-    assert!(notes.contains("note: Df has the digest of D: their settings differ, and their results do not"), "{notes}");
+    place.notes("compare D Df", &["note: Df has the digest of D: their settings differ, and their results do not"]);
 }

@@ -1,41 +1,35 @@
 //! Tests the command line: exit codes, messages, and the streams that they are printed to.
 
-use crate::support::{self, GOOD, table, with_line};
+use crate::support::{self, GOOD, Place, Words, table, with_line};
 use std::fs;
-use std::path::{Path, PathBuf};
 use std::process::Output;
 
-use tempfile::TempDir;
+use serde_json::Value;
 
-fn flotilla(args: &[&str]) -> Output {
-    support::flotilla().args(args).output().unwrap()
-}
-
-fn write_config(text: impl AsRef<[u8]>) -> (TempDir, PathBuf) {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("x.toml");
-    fs::write(&path, text).unwrap();
-    (folder, path)
+/// Runs the program at the root of the checkout.
+fn flotilla(words: impl Words) -> Output {
+    support::flotilla().args(words.words()).output().unwrap()
 }
 
 fn check(text: impl AsRef<[u8]>, flags: &[&str]) -> Output {
-    let (_folder, path) = write_config(text);
-    flotilla(&[&["check", path.to_str().unwrap()], flags].concat())
+    let place = Place::new(&[]);
+    place.write("x.toml", text);
+    place.run(&[&["check", "x.toml"], flags].concat())
 }
 
-/// Returns the error message of a command that failed with exit code 1, without the folder's name.
-fn failure_message(output: Output) -> String {
-    assert_eq!(output.status.code(), Some(1), "{}", String::from_utf8_lossy(&output.stderr));
-    error_message(output)
-}
-
-/// Returns the error message of a command, without the folder's name. Checks that standard output is empty.
-fn error_message(output: Output) -> String {
+/// Checks that a command failed with this exit code and printed nothing to standard output. Returns its error message,
+/// of which each line begins at the name of the config if it has that.
+fn error_message(code: i32, output: Output) -> String {
     let error = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(code), "{error}");
     assert!(output.stdout.is_empty(), "{}", String::from_utf8_lossy(&output.stdout));
     let error = error.strip_prefix("error: ").expect(&error).trim_end();
     let name = |line: &str| line.find("x.toml").map_or(line.to_string(), |at| line[at..].to_string());
     error.lines().map(name).collect::<Vec<_>>().join("\n")
+}
+
+fn failure_message(output: Output) -> String {
+    error_message(1, output)
 }
 
 #[test]
@@ -75,10 +69,10 @@ fn a_heading_in_degrees_causes_a_note() {
 #[test]
 fn json_is_one_object_with_config_and_cost() {
     let output = check(GOOD, &["--json", "--paradigm", "all-leaders", "--fitness", "D++", "--seed", "7"]);
-    let json: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    let json: Value = serde_json::from_slice(&output.stdout).unwrap();
     assert_eq!(json["config"]["learning"]["fitness"], "D++");
     assert_eq!(json["config"]["learning"]["seed"], 7);
-    assert_eq!(json["config"]["sense"]["poi_range"], serde_json::Value::Null);
+    assert_eq!(json["config"]["sense"]["poi_range"], Value::Null);
     assert_eq!((json["cost"]["learners"].as_u64(), json["cost"]["agents"].as_u64()), (Some(6), Some(6)));
     assert_eq!(json["cost"]["team_steps"], 643_875);
 }
@@ -178,21 +172,20 @@ fn toml_syntax_errors_name_their_line() {
 
 #[test]
 fn unreadable_config_files_are_refused() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = |name: &str| folder.path().join(name).to_str().unwrap().to_string();
-    let assert_refused = |path: &str, reason: &str| {
-        let found = failure_message(flotilla(&["check", path]));
-        assert!(found.contains(reason) && found.contains("x.toml"), "{found}");
-    };
-    assert_refused(&path("x.toml"), "cannot be read: ");
-    fs::create_dir(path("dir-x.toml")).unwrap();
-    assert_refused(&path("dir-x.toml"), "it is a directory; name a config file in it");
-    fs::write(path("latin-x.toml"), b"[world]\n# caf\xe9\n").unwrap();
-    assert_refused(&path("latin-x.toml"), "line 2 is not UTF-8 text");
+    let place = Place::new(&[]);
+    fs::create_dir(place.path("dir-x.toml")).unwrap();
+    place.write("latin-x.toml", b"[world]\n# caf\xe9\n");
     // 100 MB of zeros, refused before most of it is read.
-    let big = path("big-x.toml");
-    fs::File::create(Path::new(&big)).unwrap().set_len(100_000_000).unwrap();
-    assert_refused(&big, "larger than 1048576 bytes");
+    fs::File::create(place.path("big-x.toml")).unwrap().set_len(100_000_000).unwrap();
+    for (name, reason) in [
+        ("x.toml", "cannot be read: "),
+        ("dir-x.toml", "it is a directory; name a config file in it"),
+        ("latin-x.toml", "line 2 is not UTF-8 text"),
+        ("big-x.toml", "larger than 1048576 bytes"),
+    ] {
+        let found = failure_message(place.run(&["check", name]));
+        assert!(found.contains(reason) && found.contains("x.toml"), "{found}");
+    }
 }
 
 #[test]
@@ -205,12 +198,9 @@ fn overrides_out_of_range_name_the_flag() {
         (["--generations", "1e3"], "--generations: found 1000.0, allowed a whole number, 0 to 1000000"),
         (["--seed", "-1"], &format!("--seed: found -1, {whole}")),
     ] {
-        let output = check(GOOD, &flags);
-        assert_eq!(output.status.code(), Some(2), "an out-of-range flag is wrong usage");
-        assert_eq!(error_message(output), expected);
+        assert_eq!(error_message(2, check(GOOD, &flags)), expected);
     }
-    let not_a_number = check(GOOD, &["--trials", "five"]);
-    let message = error_message(not_a_number);
+    let message = error_message(2, check(GOOD, &["--trials", "five"]));
     assert!(message.starts_with("invalid value 'five' for '--trials <N>': allowed a number\n"), "{message}");
     // A negative number is parsed as the value of a flag, not as another flag.
     for (line, flag) in [
@@ -218,9 +208,7 @@ fn overrides_out_of_range_name_the_flag() {
         ("replay x --step -2", "--step <N>"),
         ("sweep x --shards -1", "--shards <N>"),
     ] {
-        let output = flotilla(&line.split(' ').collect::<Vec<_>>());
-        assert_eq!(output.status.code(), Some(2), "{line}");
-        let message = error_message(output);
+        let message = error_message(2, flotilla(line));
         assert!(message.contains(&format!("for '{flag}': allowed")) && !message.contains("tip:"), "{line}: {message}");
     }
     // A flag replaces an invalid value of the file.
@@ -229,23 +217,23 @@ fn overrides_out_of_range_name_the_flag() {
 
 #[test]
 fn wrong_usage_exits_with_code_2() {
-    for args in [
-        &["check"][..],
-        &["chekc", "configs/chaotic.toml"],
-        &["check", "configs/chaotic.toml", "--sed", "1"],
-        &["check", "configs/chaotic.toml", "--seed"],
-        &["check", "configs/chaotic.toml", "--seed", "many"],
-        &["check", "configs/chaotic.toml", "--fitness", "E"],
-        &["check", "configs/chaotic.toml", "--paradigm", "leaders"],
-        &["check", "configs/chaotic.toml", "another.toml"],
-        &["verify", "configs/chaotic.toml", "--worlds", "3"],
-        &["sweep", "configs/sweeps/coupling.toml", "--shards", "4"],
-        &["sweep", "configs/sweeps/coupling.toml", "--gpus", "2"],
-        &[],
+    for line in [
+        "check",
+        "chekc configs/chaotic.toml",
+        "check configs/chaotic.toml --sed 1",
+        "check configs/chaotic.toml --seed",
+        "check configs/chaotic.toml --seed many",
+        "check configs/chaotic.toml --fitness E",
+        "check configs/chaotic.toml --paradigm leaders",
+        "check configs/chaotic.toml another.toml",
+        "verify configs/chaotic.toml --worlds 3",
+        "sweep configs/sweeps/coupling.toml --shards 4",
+        "sweep configs/sweeps/coupling.toml --gpus 2",
+        "",
     ] {
-        let output = flotilla(args);
-        assert_eq!(output.status.code(), Some(2), "{args:?}");
-        assert!(output.stdout.is_empty() && !output.stderr.is_empty(), "{args:?}");
+        let output = flotilla(line);
+        assert_eq!(output.status.code(), Some(2), "{line}");
+        assert!(output.stdout.is_empty() && !output.stderr.is_empty(), "{line}");
     }
     // All commands report wrong numbers in the same form.
     for (line, allowed) in [
@@ -263,19 +251,16 @@ fn wrong_usage_exits_with_code_2() {
         ("baseline x.toml --seeds 0", "a whole number from 1 to 4096"),
         ("train x.toml --trials far", "a number"),
     ] {
-        let output = flotilla(&line.split(' ').collect::<Vec<_>>());
-        assert_eq!(output.status.code(), Some(2), "{line}");
-        let (message, value) = (error_message(output), line.rsplit([' ', ',']).next().unwrap());
+        let (message, value) = (error_message(2, flotilla(line)), line.rsplit([' ', ',']).next().unwrap());
         assert!(message.contains(&format!(": allowed {allowed}\n")) && message.contains(value), "{line}: {message}");
     }
-    let output = flotilla(&["bench", "--backend", "cpu", "--agents", "1024"]);
-    assert_eq!(output.status.code(), Some(2));
-    assert!(error_message(output).contains("341 leaders and 683 followers"));
+    let message = error_message(2, flotilla("bench --backend cpu --agents 1024"));
+    assert!(message.contains("341 leaders and 683 followers"), "{message}");
     // Suggested commands are quoted, so that they can be pasted into a shell.
     let message = failure_message(flotilla(&["plot", "no run; here"]));
     assert!(message.ends_with("`flotilla train CONFIG --out 'no run; here'` makes a run there"), "{message}");
-    assert_eq!(flotilla(&["--help"]).status.code(), Some(0));
-    assert_eq!(flotilla(&["--version"]).status.code(), Some(0));
+    assert_eq!(flotilla("--help").status.code(), Some(0));
+    assert_eq!(flotilla("--version").status.code(), Some(0));
 }
 
 #[test]
@@ -289,8 +274,8 @@ fn a_closed_standard_output_is_not_an_error() {
 }
 
 /// Returns the JSON objects that `bench --json` prints, one per line.
-fn bench_json(flags: &[&str]) -> Vec<serde_json::Value> {
-    let output = flotilla(&[&["bench", "--backend", "cpu", "--json"], flags].concat());
+fn bench_json(flags: &str) -> Vec<Value> {
+    let output = flotilla(&format!("bench --backend cpu --json {flags}"));
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let text = String::from_utf8(output.stdout).unwrap();
     text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
@@ -298,7 +283,7 @@ fn bench_json(flags: &[&str]) -> Vec<serde_json::Value> {
 
 #[test]
 fn bench_json_has_plausible_values() {
-    let objects = bench_json(&["--teams", "20"]);
+    let objects = bench_json("--teams 20");
     let [object] = &objects[..] else { panic!("one combination gives {} objects", objects.len()) };
     assert_eq!(object["backend"], "cpu");
     assert!(object["adapter"].is_null());
@@ -319,7 +304,7 @@ fn bench_json_has_plausible_values() {
 
 #[test]
 fn bench_measures_every_combination() {
-    let objects = bench_json(&["--teams", "2,3", "--steps", "1,2", "--agents", "3,7", "--rollout-only"]);
+    let objects = bench_json("--teams 2,3 --steps 1,2 --agents 3,7 --rollout-only");
     let found: Vec<_> =
         objects.iter().map(|o| ["agents", "steps", "teams"].map(|key| o[key].as_u64().unwrap())).collect();
     let expected: Vec<_> = [3, 7]
@@ -335,7 +320,7 @@ fn bench_measures_every_combination() {
 
 #[test]
 fn bench_profile_reports_the_parts_of_a_generation() {
-    let [object] = &bench_json(&["--teams", "50", "--profile"])[..] else { panic!("one combination gives one object") };
+    let [object] = &bench_json("--teams 50 --profile")[..] else { panic!("one combination gives one object") };
     let profile = object["profile"].as_object().unwrap();
     let parts =
         ["rollout_and_scores_ms", "teams_and_starts_ms", "fitness_and_champions_ms", "selection_and_mutation_ms"];
@@ -348,7 +333,7 @@ fn bench_profile_reports_the_parts_of_a_generation() {
 #[test]
 fn bench_plays_trained_teams() {
     let mean_g = |generations: &str| {
-        let flags = ["--teams", "50", "--trained", generations, "--rollout-only"];
+        let flags = format!("--teams 50 --trained {generations} --rollout-only");
         bench_json(&flags)[0]["mean_g"].as_f64().unwrap()
     };
     let (random, trained) = (mean_g("0"), mean_g("30"));
@@ -365,25 +350,24 @@ fn bench_plays_the_first_stage() {
         stage(1, "[[20, 25], [1, 25]]"),
     ]
     .concat();
-    let (_folder, path) = write_config(text);
-    let path = path.to_str().unwrap();
-    assert_eq!(bench_json(&[path, "--teams", "50", "--steps", "10", "--rollout-only"]).len(), 1);
-    let short = flotilla(&["bench", "--backend", "cpu", path, "--steps", "9", "--teams", "50"]);
+    let place = Place::new(&[("x.toml", &text)]).on_cpu().slow();
+    let measured = place.good("bench x.toml --json --teams 50 --steps 10 --rollout-only").0;
+    assert_eq!(measured.lines().map(|line| serde_json::from_str::<Value>(line).unwrap()).count(), 1);
+    let short = place.run("bench x.toml --steps 9 --teams 50");
     let error = String::from_utf8_lossy(&short.stderr);
     assert!(short.status.code().is_some_and(|code| (1..=2).contains(&code)) && error.contains("windows"), "{error}");
 }
 
 #[test]
 fn an_unknown_flag_named_like_a_config_key_suggests_set() {
-    let stderr = |arguments: &[&str]| String::from_utf8(flotilla(arguments).stderr).unwrap();
-    assert!(stderr(&["train", "x.toml", "--steps", "50"]).contains("'--set world.steps=VALUE'"));
-    assert!(stderr(&["check", "x.toml", "--start-jitter=2"]).contains("'--set learning.start_jitter=VALUE'"));
+    let stderr = |line: &str| String::from_utf8(flotilla(line).stderr).unwrap();
+    assert!(stderr("train x.toml --steps 50").contains("'--set world.steps=VALUE'"));
+    assert!(stderr("check x.toml --start-jitter=2").contains("'--set learning.start_jitter=VALUE'"));
     // No suggestion if the command has no --set or does not use the key, or if the config has no such key.
-    assert!(!stderr(&["rollout", "run", "--generations", "3"]).contains("VALUE"));
-    assert!(!stderr(&["plot", "run", "--steps", "50"]).contains("--set"));
-    assert!(!stderr(&["train", "x.toml", "--colour", "red"]).contains("VALUE"));
-    let (_folder, path) = write_config(include_str!("../../configs/chaotic.toml"));
-    let ambiguous = stderr(&["check", path.to_str().unwrap(), "--set", "generations=3"]);
+    assert!(!stderr("rollout run --generations 3").contains("VALUE"));
+    assert!(!stderr("plot run --steps 50").contains("--set"));
+    assert!(!stderr("train x.toml --colour red").contains("VALUE"));
+    let ambiguous = stderr("check configs/chaotic.toml --set generations=3");
     assert!(
         ambiguous.contains("`learning.generations`") && ambiguous.contains("`checkpoint.generations`"),
         "{ambiguous}"
@@ -392,7 +376,7 @@ fn an_unknown_flag_named_like_a_config_key_suggests_set() {
 
 #[test]
 fn help_lists_every_command_once_in_a_group() {
-    let help = String::from_utf8(flotilla(&["help"]).stdout).unwrap();
+    let help = String::from_utf8(flotilla("help").stdout).unwrap();
     let mut group = "";
     let mut found = Vec::new();
     for line in help.lines() {

@@ -128,9 +128,7 @@ fn a_clock_beyond_the_year_9999_is_tolerated() {
             return result;
         }",
     );
-    let output =
-        place.shell("LD_PRELOAD=$PWD/preload.so exec flotilla train small.toml --out run --backend cpu --quiet");
-    assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+    place.script(0, "LD_PRELOAD=$PWD/preload.so exec flotilla train small.toml --out run --backend cpu --quiet", &[]);
     assert!(place.read("run/run.json").contains("9999-12-31T23:59:59Z"));
 }
 
@@ -149,9 +147,7 @@ fn bench_rejects_a_clock_that_does_not_advance() {
     );
     // The limit counts processor time, so that a busy machine does not matter.
     let script = "ulimit -t 60; LD_PRELOAD=$PWD/preload.so exec flotilla bench --backend cpu --threads 1 --teams 2";
-    let output = place.shell(script);
-    let text = stderr(&output);
-    assert!(output.status.code() == Some(1) && text.contains("clock does not advance"), "{:?} {text}", output.status);
+    place.script(1, script, &["clock does not advance"]);
 }
 
 #[test]
@@ -164,9 +160,8 @@ fn a_file_system_without_locks_causes_a_warning() {
     );
     for command in ["train small.toml --out run", "sweep grid.toml --out sweep", "train small.toml --out run --resume"]
     {
-        let output = place.shell(&format!("LD_PRELOAD=$PWD/preload.so exec flotilla {command} --backend cpu --quiet"));
-        let text = stderr(&output);
-        assert_eq!(output.status.code(), Some(0), "{command}: {text}");
+        let script = format!("LD_PRELOAD=$PWD/preload.so exec flotilla {command} --backend cpu --quiet");
+        let text = place.script(0, &script, &[]);
         assert_eq!(text.matches("this file system has no locks").count(), 1, "{command}: {text}");
     }
 }
@@ -250,8 +245,7 @@ fn errors_about_missing_files_suggest_a_remedy() {
         ("rollout small.toml --policies missing.safetensors", "check the path"),
         ("train small.toml --init missing.safetensors", "check the path"),
     ] {
-        let text = place.refused(1, command);
-        assert!(text.contains("missing.") && text.contains("cannot be read: ") && text.contains(remedy), "{text}");
+        place.fails(1, command, &["missing.", "cannot be read: ", remedy]);
     }
 }
 
@@ -287,9 +281,7 @@ fn the_longest_configs_are_rejected_within_seconds() {
     for (name, text) in texts {
         let place = Place::new(&[("x.toml", &text)]);
         // The limit counts processor time, so that a busy machine does not matter.
-        let output = place.shell("ulimit -t 20; exec flotilla check x.toml");
-        let lines = stderr(&output).lines().count();
-        assert_eq!(output.status.code(), Some(1), "{name}: {:?}", output.status);
+        let lines = place.script(1, "ulimit -t 20; exec flotilla check x.toml", &[]).lines().count();
         assert!(lines <= 52, "{name}: {lines} lines");
     }
 }

@@ -31,18 +31,15 @@ fn run(place: &Place, name: &str, keys: &[(&str, &str)], trials: &[&[f64]]) {
 }
 
 fn json(place: &Place, line: &str) -> Value {
-    serde_json::from_str(&place.good(&format!("{line} --json")).0).unwrap()
+    place.json(&format!("{line} --json"))
 }
 
 /// Runs a command that must fail with this code. Its error must contain these words.
 fn assert_fails(place: &Place, line: &str, code: i32, words: &[&str]) {
-    let stderr = place.refused(code, line);
-    for word in words {
-        let error = stderr.lines().position(|line| line.starts_with("error: ")).expect("no line starts with `error: `");
-        // Only notes may come before the error.
-        assert!(stderr.lines().take(error).all(|line| line.starts_with("note: ")), "{line}: {stderr}");
-        assert!(stderr.contains(word), "{line}: {stderr}");
-    }
+    let stderr = place.fails(code, line, words);
+    let error = stderr.lines().position(|line| line.starts_with("error: ")).expect("no line starts with `error: `");
+    // Only notes may come before the error.
+    assert!(stderr.lines().take(error).all(|line| line.starts_with("note: ")), "{line}: {stderr}");
 }
 
 fn number(value: &Value) -> f64 {
@@ -144,8 +141,7 @@ fn paired_trials_print_a_note_and_are_compared_with_paired() {
     let with_sixth = |ends: [f64; 5], sixth: f64| rising_to(&[&ends[..], &[sixth]].concat());
     run(&place, "df6", &[GENERATIONS], &slices(&with_sixth(df_ends, 0.5)));
     run(&place, "g6", &[GENERATIONS, FITNESS_G], &slices(&with_sixth(g_ends, 0.25)));
-    let (_, stderr) = place.good("compare df6 g6");
-    assert!(stderr.contains("note: these arms have the same seeds") && stderr.contains("--paired"), "{stderr}");
+    place.notes("compare df6 g6", &["note: these arms have the same seeds", "--paired"]);
     let (text, stderr) = place.good("compare df g --paired");
     assert!(stderr.is_empty() && text.contains("Wilcoxon's signed-rank test"), "{stderr}{text}");
     let report = json(&place, "compare df g --paired");
@@ -281,7 +277,7 @@ fn invalid_comparisons_fail_with_a_clear_error() {
     run(&place, "one", &[GENERATIONS, FITNESS_G], &slices(&rising_to(&[0.5])));
     run(&place, "torn", &[GENERATIONS, FITNESS_G], &[&[0.5, 0.5], &[]]);
     fs::create_dir(place.path("paper")).unwrap();
-    fs::write(place.path("paper/paper.toml"), "seed = 0\n").unwrap();
+    place.write("paper/paper.toml", "seed = 0\n");
     assert_fails(&place, "compare a", 2, &["a is one run", "another"]);
     assert_fails(&place, "compare a b ./a", 2, &["./a is named twice"]);
     assert_fails(&place, "compare a one", 1, &["one trial", "--trials"]);
@@ -314,7 +310,7 @@ generations = 2
 #[test]
 fn a_sweep_is_compared_along_an_axis_and_seeds_add_trials() {
     let place = Place::new(&[]);
-    fs::write(place.path("x.toml"), format!("{WORLD}{SWEEP}")).unwrap();
+    place.write("x.toml", format!("{WORLD}{SWEEP}"));
     place.good("sweep x.toml --out s --backend cpu --quiet");
     assert_fails(&place, "compare s", 2, &["several axes", "--by", "world.coupling, learning.fitness, learning.seed"]);
     assert_fails(&place, "compare s --by steps", 2, &["--by steps: ", "world.coupling, learning.fitness"]);
@@ -346,8 +342,7 @@ fn a_sweep_is_compared_along_an_axis_and_seeds_add_trials() {
     // A process that is killed early leaves no config.
     fs::remove_file(place.path("s/points/0002/config.toml")).unwrap();
     fs::remove_dir_all(place.path("s/points/0003")).unwrap();
-    let (_, stderr) = place.good("compare s --by fitness");
-    assert!(stderr.contains("note: s/points/0006 was not run, and is left out: world.coupling = 2"), "{stderr}");
+    place.notes("compare s --by fitness", &["note: s/points/0006 was not run, and is left out: world.coupling = 2"]);
     let report = json(&place, "compare s --by fitness");
     assert_eq!(report["comparisons"].as_array().unwrap().len(), 1);
     assert_eq!(report["comparisons"][0]["arms"][1]["trials"], 3);
@@ -368,7 +363,7 @@ fn a_varied_key_is_compared_with_the_files_own_value() {
     let text = "[learning]\npopulation = 8\ntrials = 2\ngenerations = 1\n\
                 [grid]\n\"learning.fitness\" = [\"G\", \"Df\"]\n\
                 [vary]\n\"motion.max_speed\" = [2.0, 5.0]\n\"world.steps\" = [8]\n";
-    fs::write(place.path("x.toml"), format!("{WORLD}{text}")).unwrap();
+    place.write("x.toml", format!("{WORLD}{text}"));
     place.good("sweep x.toml --out s --backend cpu --quiet");
     let report = json(&place, "compare s --by max_speed");
     let names = |comparison: &Value| {
@@ -433,7 +428,7 @@ fn different_layouts_print_a_note_and_are_not_paired() {
     }
     // The long form is the same layout.
     let (long, _) = place.good("check here/config.toml --expand");
-    std::fs::write(place.path("long.toml"), long).unwrap();
+    place.write("long.toml", long);
     place.good("train long.toml --backend cpu --out long");
     assert!(!place.good("compare here long").1.contains("layouts"));
 }
@@ -453,12 +448,11 @@ fn keys_of_classes_are_compared_one_by_one() {
     place.good(&format!("{train} --out fast --set agents.rover.motion.max_speed=9"));
     assert!(!place.good("compare G fast").1.contains("layouts"));
     place.good(&format!("{train} --out turned --set agents.rover.heading=45"));
-    assert!(place.good("compare G turned").1.contains("the arms play in different layouts: agents differ"));
+    place.notes("compare G turned", &["the arms play in different layouts: agents differ"]);
     // A key that only one run sets names both, in any order.
     place.good(&format!("{train} --out plain --seed 1"));
     for arms in ["plain G", "G plain"] {
-        let (text, _) = place.good(&format!("compare {arms}"));
-        assert!(text.contains("drone.fitness G, seed 0") && text.contains("drone.fitness -, seed 1"), "{text}");
+        place.prints(&format!("compare {arms}"), &["drone.fitness G, seed 0", "drone.fitness -, seed 1"]);
     }
 }
 

@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::Path;
 
-use crate::support::{Place, tiny};
+use crate::support::{Place, files, tiny};
 use serde_json::Value;
 
 fn place() -> Place {
@@ -46,8 +46,7 @@ fn every_reader_detects_edited_metrics() {
         assert!(output.contains("--resume` ") || output.contains("--resume`,"), "{command}: {output}");
         assert!(output.contains("--unverified"), "{command}: {output}");
     }
-    let stderr = place.refused(1, "replay run");
-    assert!(stderr.contains("run/metrics.csv: it has changed since the run wrote it"), "{stderr}");
+    place.fails(1, "replay run", &["run/metrics.csv: it has changed since the run wrote it"]);
     let output = output_of(&place, 1, "compare swept");
     assert!(output.contains("swept/points/0001/metrics.csv: it has changed since the run wrote it"), "{output}");
     let output = output_of(&place, 1, "sweep grid.toml --out swept --collect");
@@ -96,11 +95,9 @@ fn replay_rollout_and_resume_detect_an_edited_config() {
     let place = place();
     edit(&place, "run/config.toml", &[("coupling = 2", "coupling = 1"), ("coupling = [2, 2]", "coupling = [1, 1]")]);
     for command in ["replay run", ROLLOUT] {
-        let stderr = place.refused(1, command);
-        assert!(stderr.contains("run/config.toml: it has changed since the run wrote it"), "{command}: {stderr}");
+        place.fails(1, command, &["run/config.toml: it has changed since the run wrote it"]);
     }
-    let stdout = place.good(&format!("{ROLLOUT} --unverified")).0;
-    assert!(stdout.contains("Unverified"), "{stdout}");
+    place.prints(&format!("{ROLLOUT} --unverified"), &["Unverified"]);
     assert_eq!(json(&place.good(&format!("{ROLLOUT} --unverified --json")).0)["unverified"], true);
     // A run does not resume with another config.
     let before = files(&place.path("run"));
@@ -120,8 +117,7 @@ fn a_replay_of_unverified_files_is_marked() {
     record["files"]["metrics.csv"] = "0".repeat(64).into();
     place.write("run/run.json", record.to_string());
     place.refused(1, "replay run");
-    let (stdout, _) = place.good("replay run --unverified");
-    assert!(stdout.contains("Unverified"), "{stdout}");
+    place.prints("replay run --unverified", &["Unverified"]);
     assert!(place.read("run/replay.html").contains("(unverified)"));
     place.good("replay run --unverified --out still.svg");
     assert!(place.read("still.svg").contains("Unverified: files were not compared"));
@@ -133,8 +129,7 @@ fn rollout_detects_policies_of_another_run() {
     let place = place();
     place.good("train small.toml --out other --seed 3");
     fs::copy(place.path("other/policies.safetensors"), place.path("run/policies.safetensors")).unwrap();
-    let stderr = place.refused(1, ROLLOUT);
-    assert!(stderr.contains("run/policies.safetensors: it has changed since the run wrote it"), "{stderr}");
+    place.fails(1, ROLLOUT, &["run/policies.safetensors: it has changed since the run wrote it"]);
     place.good(&format!("{ROLLOUT} --unverified"));
     // The user's own configs and policies have no digests to compare with.
     fs::copy(place.path("other/policies.safetensors"), place.path("mine.safetensors")).unwrap();
@@ -149,11 +144,13 @@ fn a_finished_run_without_digests_is_damaged() {
     let fields = record.as_object_mut().unwrap();
     assert!(fields.remove("files").is_some() && fields.remove("origin").is_some());
     place.write("run/run.json", record.to_string());
-    let stderr = place.refused(1, "plot run");
-    assert!(stderr.contains("run.json: not the record of a run"), "{stderr}");
-    assert!(
-        stderr.contains("restore it, or make it again with `flotilla train run/config.toml --out run --resume`"),
-        "{stderr}"
+    place.fails(
+        1,
+        "plot run",
+        &[
+            "run.json: not the record of a run",
+            "restore it, or make it again with `flotilla train run/config.toml --out run --resume`",
+        ],
     );
     place.good("plot run --unverified");
     place.good("train small.toml --out run --resume");
@@ -168,20 +165,6 @@ fn unfinished_runs_are_not_verified() {
     place.write("run/run.json", text.replace("\"done\"", "\"running\""));
     edit_metrics(&place, "run/metrics.csv");
     output_of(&place, 0, "plot run");
-}
-
-/// Returns every file below a directory, with its content.
-fn files(folder: &Path) -> Vec<(String, Vec<u8>)> {
-    let mut contents = Vec::new();
-    for entry in fs::read_dir(folder).unwrap() {
-        let path = entry.unwrap().path();
-        match path.is_dir() {
-            true => contents.extend(files(&path)),
-            false => contents.push((path.display().to_string(), fs::read(&path).unwrap())),
-        }
-    }
-    contents.sort();
-    contents
 }
 
 /// Marks a tensor file as written in a newer format, and corrects its checksum.
@@ -233,13 +216,11 @@ fn files_of_a_newer_version_are_not_changed() {
     let text = place.read("run/run.json");
     place.write("run/run.json", text.replace("\"done\"", "\"paused\"").replace(flotilla::VERSION, "8.1.0"));
     let before = files(&place.path("run"));
-    let stderr = place.refused(1, "train small.toml --out run --resume");
-    assert!(stderr.contains("run.json: it was written by flotilla 8.1.0"), "{stderr}");
+    place.fails(1, "train small.toml --out run --resume", &["run.json: it was written by flotilla 8.1.0"]);
     assert_eq!(files(&place.path("run")), before);
     // The same text of this version is damaged.
     place.write("run/run.json", text.replace("\"done\"", "\"paused\""));
-    let stderr = place.refused(1, "plot run");
-    assert!(stderr.contains("run.json: not the record of a run"), "{stderr}");
+    place.fails(1, "plot run", &["run.json: not the record of a run"]);
 }
 
 #[test]

@@ -19,6 +19,7 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 use std::time::{Duration, Instant};
 
+use flotilla_app::record::folder::METRICS;
 use tempfile::TempDir;
 
 const STAGES: &str = "[[stages]]\nfrom = 2\nset = { 'world.coupling' = 1 }\n";
@@ -116,7 +117,7 @@ struct Case<'a> {
 /// The directory that a scenario starts from, with the results and the calls of an undisturbed run.
 struct Prepared {
     before: TempDir,
-    expected: BTreeMap<String, Vec<u8>>,
+    expected: BTreeMap<PathBuf, Vec<u8>>,
     calls: usize,
 }
 
@@ -200,50 +201,21 @@ fn succeed(folder: &Path, words: &str, context: &str) {
     assert_eq!(output.status.code(), Some(0), "{context}: {words}: {stderr}");
 }
 
-fn copy(from: &Path, to: &Path) {
-    fs::create_dir_all(to).unwrap();
-    for entry in fs::read_dir(from).unwrap() {
-        let entry = entry.unwrap();
-        let to = to.join(entry.file_name());
-        match entry.file_type().unwrap().is_dir() {
-            true => copy(&entry.path(), &to),
-            false => drop(fs::copy(entry.path(), to).unwrap()),
-        }
-    }
-}
-
 /// Reads the results: every file except those that record time and place.
 ///
 /// `metrics.csv` is read without its seconds.
-fn outcome(folder: &Path) -> BTreeMap<String, Vec<u8>> {
-    let mut results = BTreeMap::new();
-    let mut folders = vec![folder.to_path_buf()];
-    while let Some(next) = folders.pop() {
-        for entry in fs::read_dir(&next).unwrap() {
-            let path = entry.unwrap().path();
-            if path.is_dir() {
-                folders.push(path);
-                continue;
-            }
-            let name = path.strip_prefix(folder).unwrap().display().to_string();
-            let file = path.file_name().unwrap().to_string_lossy().into_owned();
-            // Checkpoints depend on how often they are saved. Killed writers leave temporary files.
-            let irrelevant = file.starts_with('.') || file.ends_with(".tmp") || name.contains("checkpoints/");
-            if irrelevant || ["run.json", "summary.json"].contains(&&*file) {
-                continue;
-            }
-            let bytes = fs::read(&path).unwrap();
-            if file == "metrics.csv" {
-                let text = String::from_utf8(bytes).unwrap();
-                let kept = |line: &str| {
-                    let fields = line.split(',').enumerate().filter(|&(column, _)| column != 5).map(|(_, field)| field);
-                    fields.collect::<Vec<_>>().join(",") + "\n"
-                };
-                results.insert(name, text.lines().map(kept).collect::<String>().into_bytes());
-            } else {
-                results.insert(name, bytes);
-            }
-        }
+fn outcome(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
+    let mut results = support::files(folder);
+    results.retain(|path, _| {
+        let name = path.file_name().unwrap().to_string_lossy();
+        // Checkpoints depend on how often they are saved. Killed writers leave temporary files.
+        let irrelevant =
+            name.starts_with('.') || name.ends_with(".tmp") || path.iter().any(|part| part == "checkpoints");
+        !irrelevant && !["run.json", "summary.json"].contains(&&*name)
+    });
+    for (path, bytes) in results.iter_mut().filter(|(path, _)| path.ends_with(METRICS)) {
+        let rows = support::metrics_without_seconds(&folder.join(path.parent().unwrap()));
+        *bytes = format!("{rows:?}").into_bytes();
     }
     results
 }
@@ -257,7 +229,7 @@ fn prepare(shim: &Shim, scenario: &Scenario) -> Prepared {
     }
     scenario.before.iter().for_each(|words| succeed(before.path(), words, scenario.name));
     let undisturbed = folder();
-    copy(before.path(), undisturbed.path());
+    support::copy(before.path(), undisturbed.path());
     let count = undisturbed.path().join("calls");
     let counted = shim.disturb(program(undisturbed.path(), scenario.command), 0, Fault::Full, Some(&count));
     let stderr = output(counted, scenario.name);
@@ -277,7 +249,7 @@ fn inject(shim: &Shim, case: &Case<'_>, prepared: &Prepared) -> Option<String> {
     let Case { scenario, call, fault } = *case;
     let context = format!("{}, call {call} of {}, {fault:?}", scenario.name, prepared.calls);
     let place = folder();
-    copy(prepared.before.path(), place.path());
+    support::copy(prepared.before.path(), place.path());
     let disturbed = output(shim.disturb(program(place.path(), scenario.command), call, fault, None), &context);
     let stderr = String::from_utf8_lossy(&disturbed.stderr).into_owned();
     if disturbed.status.code() == Some(1) {
@@ -314,7 +286,7 @@ fn inject(shim: &Shim, case: &Case<'_>, prepared: &Prepared) -> Option<String> {
         }
     }
     let results = outcome(&place.path().join("out"));
-    let differ = |name: &&String| results.get(*name) != prepared.expected.get(*name);
+    let differ = |name: &&PathBuf| results.get(*name) != prepared.expected.get(*name);
     let mut names: Vec<_> = results.keys().chain(prepared.expected.keys()).filter(differ).cloned().collect();
     names.sort();
     names.dedup();

@@ -34,10 +34,6 @@ fn metric(place: &Place, generation: usize, column: usize) -> Vec<f64> {
     rows.filter(|row| row[1] == generation.to_string()).map(|row| row[column].parse().unwrap()).collect()
 }
 
-fn json(place: &Place, line: &str) -> serde_json::Value {
-    serde_json::from_str(&place.good(line).0).unwrap()
-}
-
 #[test]
 fn only_a_numbered_name_makes_a_film() {
     let place = small();
@@ -63,7 +59,7 @@ fn replays_have_the_scores_in_the_metrics() {
         let [best, champion] = [2, 4].map(|column| metric(&place, generation, column));
         for trial in 0..4 {
             let line = format!("replay run --json --trial {trial} --generation {generation} -o r.svg --team ");
-            let episode = |team: &str| json(&place, &(line.clone() + team))["episodes"][0].clone();
+            let episode = |team: &str| place.json(&(line.clone() + team))["episodes"][0].clone();
             let replay = episode("champion");
             assert_eq!((&replay["champion_g"], &replay["which"]), (&champion[trial].into(), &"champion".into()));
             let replay = episode("best");
@@ -74,9 +70,9 @@ fn replays_have_the_scores_in_the_metrics() {
     }
     // Without checkpoints, training is repeated, with the same result.
     let line = "replay run --json --trial 1 --team champion -o r.svg";
-    let from_checkpoints = json(&place, line);
+    let from_checkpoints = place.json(line);
     fs::remove_dir_all(place.path("run/checkpoints")).unwrap();
-    assert_eq!(json(&place, line), from_checkpoints);
+    assert_eq!(place.json(line), from_checkpoints);
 }
 
 #[test]
@@ -90,16 +86,14 @@ fn replay_finds_the_best_and_worst_trial() {
                     format!("replay run --json --trial {choice} --team {team} --generation {generation} -o r.svg");
                 let expected_g = g.iter().copied().reduce(extreme).unwrap();
                 let first = g.iter().position(|&g| g == expected_g).unwrap();
-                assert_eq!(json(&place, &line)["episodes"][0]["trial"], first, "{line}: {g:?}");
+                assert_eq!(place.json(&line)["episodes"][0]["trial"], first, "{line}: {g:?}");
             }
         }
     }
     let [champions, best] = [4, 2].map(|column| metric(&place, 4, column));
     assert!(champions.iter().any(|&g| g != champions[0]) && champions != best, "{champions:?}: all trials are equal");
-    let stderr = place.refused(2, "replay run --trial first");
-    assert!(stderr.contains("allowed best, worst or a whole number, from 0"), "{stderr}");
-    let stderr = place.refused(2, "replay run --team 12");
-    assert!(stderr.contains("no team 12: a generation has 12 teams, 0 to 11"), "{stderr}");
+    place.fails(2, "replay run --trial first", &["allowed best, worst or a whole number, from 0"]);
+    place.fails(2, "replay run --team 12", &["no team 12: a generation has 12 teams, 0 to 11"]);
 }
 
 /// Whether a picture contains this label.
@@ -144,11 +138,10 @@ fn film_formats_print_commands_that_make_them() {
     let commands: Vec<&str> = stderr.lines().filter_map(|line| line.strip_prefix("  ")).collect();
     let [pictures, film] = commands[..] else { panic!("{stderr}") };
     assert!(film.starts_with("ffmpeg -framerate 10 -i champ-%04d.png ") && film.ends_with(" champ.mp4"), "{film}");
-    assert!(place.shell(pictures).status.success(), "{pictures}");
+    place.script(0, pictures, &[]);
     assert!(place.path("champ-0000.png").exists(), "{pictures}: {:?}", place.names());
     for out in ["-o champ.mp4", "--out=champ.mp4", "-ochamp.mp4"] {
-        let stderr = place.refused(2, &format!("replay run {out}"));
-        assert!(stderr.contains("champ-%04d.png --backend cpu\n"), "{stderr}");
+        place.fails(2, &format!("replay run {out}"), &["champ-%04d.png --backend cpu\n"]);
     }
 }
 
@@ -158,7 +151,7 @@ fn quiet_prints_the_summary_only_if_asked() {
     for line in ["train small.toml --out again --quiet", "replay run --quiet"] {
         assert_eq!(place.good(line), (String::new(), String::new()), "{line}");
     }
-    let trained = json(&place, "train small.toml --out third --quiet --json");
+    let trained = place.json("train small.toml --out third --quiet --json");
     assert_eq!((&trained["pois"], trained["poi_value"].as_f64()), (&2.into(), Some(2.0)));
 }
 
@@ -184,7 +177,7 @@ fn unreachable_pois_print_warnings_before_and_after_training() {
     let (text, stderr) = place.good("check far.toml");
     assert!(stderr.contains(warning) && stderr.contains("set world.steps to at least 4"), "{stderr}");
     assert!(text.contains("#   distance per episode    at most 14.4 units per agent\n"), "{text}");
-    let cost = json(&place, "check near.toml --json")["cost"].clone();
+    let cost = place.json("check near.toml --json")["cost"].clone();
     assert!((17.4..17.5).contains(&cost["travel"].as_f64().unwrap()), "{cost}");
     assert_eq!(place.good("check near.toml").1, "");
     for line in ["train far.toml --out far --backend cpu --quiet", "train far.toml --out again --backend cpu --seed 3"]
@@ -194,17 +187,15 @@ fn unreachable_pois_print_warnings_before_and_after_training() {
         assert!(stderr.contains("warning: no team observed any POI in any generation"), "{stderr}");
         assert!(stderr.contains("world.steps") && stderr.contains("a smaller coupling"), "{stderr}");
     }
-    let (_, stderr) = place.good("compare far again");
-    assert!(stderr.contains("no team of these runs scored in any generation"), "{stderr}");
+    place.notes("compare far again", &["no team of these runs scored in any generation"]);
     let (_, stderr) = place.good("train near.toml --out near --backend cpu");
     assert!(!stderr.contains("warning"), "{stderr}");
     assert!(!place.good("compare near far").1.contains("no team of these runs"));
     let text = FAR.to_string() + "[grid]\n'world.steps' = [20, 60]\n";
     place.write("grid.toml", text);
-    let (_, stderr) = place.good("sweep grid.toml --out grid --backend cpu --quiet");
-    assert!(
-        stderr.contains("units in 20 steps") && stderr.contains("; at 1 of 2 points, the first world.steps = 20"),
-        "{stderr}"
+    place.notes(
+        "sweep grid.toml --out grid --backend cpu --quiet",
+        &["units in 20 steps", "; at 1 of 2 points, the first world.steps = 20"],
     );
 }
 
@@ -266,10 +257,10 @@ fn commands_in_the_summary_work_for_the_best_champion() {
         "{text}"
     );
     let film = text.lines().find(|line| line.contains("champion.gif")).unwrap().trim();
-    assert!(place.shell(film).status.success(), "{film}");
+    place.script(0, film, &[]);
     assert!(place.path("run/champion.gif").exists(), "{film}");
     let scores = text.lines().find(|line| line.contains("flotilla rollout")).unwrap().trim();
-    assert!(place.shell(scores).status.success(), "{scores}");
+    place.script(0, scores, &[]);
 }
 
 #[test]
@@ -279,8 +270,8 @@ fn rollout_accepts_a_run_directory() {
     let from_files =
         place.good("rollout run/config.toml --policies run/policies.safetensors --trial 0 --json --quiet").0;
     assert_eq!(from_directory, from_files);
-    assert!(place.refused(2, "rollout small.toml").contains("--policies: a config file needs a file of policies"));
-    assert!(place.refused(2, "rollout run --stage 1").contains("--stage 1: the config has no [[stages]]\n"));
+    place.fails(2, "rollout small.toml", &["--policies: a config file needs a file of policies"]);
+    place.fails(2, "rollout run --stage 1", &["--stage 1: the config has no [[stages]]\n"]);
 }
 
 #[test]
@@ -312,15 +303,13 @@ fn init_layouts_have_the_requested_size_and_reachable_pois() {
     }
     let stderr = place.refused(2, "init chaotic --groups 3");
     assert!(stderr.contains("--groups: the layout chaotic is the paper's; use it with ring, row or grid"), "{stderr}");
-    let stderr = place.refused(2, "init ring --groups 600 --followers 1 --pois 5");
-    assert!(stderr.contains("these are 1200 agents, allowed 1 to 1024"), "{stderr}");
-    assert!(place.refused(2, "init row --pois 0").contains("--pois 0: allowed 1 to 256"));
+    place.fails(2, "init ring --groups 600 --followers 1 --pois 5", &["these are 1200 agents, allowed 1 to 1024"]);
+    place.fails(2, "init row --pois 0", &["--pois 0: allowed 1 to 256"]);
     place.good("init row --coupling 8 --out eight.toml");
     let text = place.read("eight.toml");
     assert!(text.contains("\ncoupling = 8\n") && text.contains("when 8 agents are within"), "{text}");
     for (flags, wrong) in [("--coupling 0", "0: allowed 1 to 16"), ("--groups 2 --coupling 9", "9: allowed 1 to 8")] {
-        let stderr = place.refused(2, &*format!("init row {flags}"));
-        assert!(stderr.contains(&format!("--coupling {wrong}, the number of agents")), "{stderr}");
+        place.fails(2, &format!("init row {flags}"), &[&format!("--coupling {wrong}, the number of agents")]);
     }
 }
 
@@ -337,16 +326,15 @@ fn teams_learn_in_the_ring_layout() {
 #[test]
 fn keys_are_set_from_the_command_line() {
     let place = Place::new(&[("small.toml", SMALL)]);
-    let world = |flags: &str| json(&place, &format!("check small.toml --json {flags}"))["config"].clone();
+    let world = |flags: &str| place.json(&format!("check small.toml --json {flags}"))["config"].clone();
     let config = world("--set world.steps=44 --set learning.fitness=G --set policy.hidden=[4,5]");
     assert_eq!((&config["world"]["steps"], &config["learning"]["fitness"]), (&44.into(), &"G".into()));
     assert_eq!(config["policy"]["hidden"], serde_json::json!([4, 5]));
     assert_eq!(world("--fitness df")["learning"]["fitness"], "Df");
     let stderr = place.refused(2, "check small.toml --set world.stps=3");
     assert!(stderr.contains("--set world.stps: unknown key, did you mean `world.steps`?"), "{stderr}");
-    let stderr = place.refused(2, "check small.toml --set world.steps=0");
-    assert!(stderr.contains("--set world.steps: found 0, allowed 1 to 10000"), "{stderr}");
-    assert!(place.refused(2, "check small.toml --set steps").contains("allowed KEY=VALUE, as world.steps=60"));
+    place.fails(2, "check small.toml --set world.steps=0", &["--set world.steps: found 0, allowed 1 to 10000"]);
+    place.fails(2, "check small.toml --set steps", &["allowed KEY=VALUE, as world.steps=60"]);
 }
 
 #[test]

@@ -53,18 +53,18 @@ fn a_killed_study_resumes_to_the_same_tables() {
     assert!(tables(&place, "killed") == whole, "killed {kills} times");
 
     // The tables are those of the sweep, and of a comparison of its runs.
-    assert_eq!(fs::read(place.path("whole/rover_uav/points.csv")).unwrap(), whole["rover_uav.csv"]);
+    assert_eq!(place.bytes("whole/rover_uav/points.csv"), whole["rover_uav.csv"]);
     let points: Vec<String> = (0..7).map(|point| format!("whole/rover_uav/points/{point:04}")).collect();
     let (compared, _) = place.good(&format!("compare {} --paired --csv", points.join(" ")));
     let lines = String::from_utf8_lossy(&whole["rover_uav_pairs.csv"]).into_owned();
     assert!(lines.lines().all(|line| compared.lines().any(|other| other == line)), "{lines}\n{compared}");
 
-    assert!(place.refused(1, &format!("{line} --out whole")).contains("--resume"));
+    place.fails(1, &format!("{line} --out whole"), &["--resume"]);
     let other = line.replace("rover_uav,3_rovers_1_uav", "3_rovers_3_uavs");
-    assert!(place.refused(1, &format!("{other} --out whole")).contains("whole holds rover_uav.csv already"));
+    place.fails(1, &format!("{other} --out whole"), &["whole holds rover_uav.csv already"]);
     assert!(tables(&place, "whole") == whole);
-    assert!(place.refused(1, &format!("{line} --out whole --resume --seed 4")).contains("holds another sweep"));
-    assert!(place.refused(2, "paper --influence=nowhere").contains("3_rovers_3_uavs"));
+    place.fails(1, &format!("{line} --out whole --resume --seed 4"), &["holds another sweep"]);
+    place.fails(2, "paper --influence=nowhere", &["3_rovers_3_uavs"]);
     for study in ["influence", "questions"] {
         let error = place.refused(2, &format!("paper --{study} --trials 1 --out none"));
         assert!(error.contains("--trials 1: intervals and tests take two trials or more"), "{error}");

@@ -10,7 +10,7 @@ use std::fs;
 use std::os::unix::ffi::OsStrExt;
 use std::process::{Command, Stdio};
 
-use crate::support::{Place, TINY};
+use crate::support::{Place, TINY, page_data};
 
 const SWEEP: &str = "[grid]\n\"world.coupling\" = [1, 2]\n\"learning.fitness\" = [\"G\", \"Df\"]\n";
 
@@ -59,7 +59,7 @@ fn outputs_do_not_replace_inputs_or_files_of_a_run() {
     let place = with_run();
     std::os::unix::fs::symlink("run/metrics.csv", place.path("link.csv")).unwrap();
     let before: Vec<_> = ["run/policies.safetensors", "run/metrics.csv", "run/config.toml", "small.toml", "grid.toml"]
-        .map(|name| (name, fs::read(place.path(name)).unwrap()))
+        .map(|name| (name, place.bytes(name)))
         .into();
     let rollout = ["rollout", "small.toml", "--policies", "run/policies.safetensors"];
     for (flags, why) in [
@@ -80,13 +80,13 @@ fn outputs_do_not_replace_inputs_or_files_of_a_run() {
             "{stderr}"
         );
     }
-    assert!(place.refused(2, "sweep grid.toml --out o --slurm=grid.toml").contains("is read from"));
+    place.fails(2, "sweep grid.toml --out o --slurm=grid.toml", &["is read from"]);
     for flag in ["--scores", "--trace"] {
         let stderr = place.refused(2, &[&rollout[..], &[flag, "grid.toml"]].concat());
         assert!(stderr.contains("grid.toml: this file has neither scores nor a trace; move it away"), "{stderr}");
     }
     for (name, content) in before {
-        assert_eq!(fs::read(place.path(name)).unwrap(), content, "{name}");
+        assert_eq!(place.bytes(name), content, "{name}");
     }
     // Other file names in a run's folder are allowed, and so are devices.
     let null = &device(&place, "null", "3")[..];
@@ -120,10 +120,7 @@ fn help_that_cannot_be_printed_is_an_error() {
         return support::skip("help_that_cannot_be_printed_is_an_error", "this system has no full device");
     }
     for command in ["--help", "--version", "train --help", "help train", "completions bash", "man", "init"] {
-        let output = place.shell(&format!("flotilla {command} > {full}"));
-        let stderr = String::from_utf8(output.stderr).unwrap();
-        assert_eq!(output.status.code(), Some(1), "{command}: {stderr}");
-        assert!(stderr.contains("standard output cannot be written"), "{command}: {stderr}");
+        place.script(1, &format!("flotilla {command} > {full}"), &["standard output cannot be written"]);
     }
 }
 
@@ -145,13 +142,10 @@ fn outputs_are_complete_or_absent_and_devices_are_not_replaced() {
     assert!(scores.starts_with("team,leader,g,d,df,dpp,dt\n0,0,"), "{scores}");
     // If writing fails halfway, the previous file remains.
     let before = "team,step,agent,role,x,y,heading_x,heading_y,speed,before";
-    fs::write(place.path("trace.csv"), before).unwrap();
+    place.write("trace.csv", before);
     let names = place.names();
-    let output = place
-        .shell("ulimit -f 1; exec flotilla rollout small.toml --policies run/policies.safetensors --trace trace.csv");
-    let stderr = String::from_utf8(output.stderr).unwrap();
-    assert_eq!(output.status.code(), Some(1), "{:?} {stderr}", output.status);
-    assert!(stderr.contains("trace.csv: cannot be written") && stderr.contains("ulimit -f"), "{stderr}");
+    let script = format!("ulimit -f 1; exec flotilla {} --trace trace.csv", rollout.join(" "));
+    place.script(1, &script, &["trace.csv: cannot be written", "ulimit -f"]);
     assert_eq!(place.read("trace.csv"), before);
     assert_eq!(place.names(), names);
     // A link is followed, not replaced.
@@ -204,20 +198,12 @@ fn an_interrupted_trace_leaves_no_file() {
 #[test]
 fn a_limit_on_file_sizes_is_reported_and_the_run_can_be_resumed() {
     let place = place();
-    let output = place.shell("ulimit -f 1; exec flotilla train small.toml --out run --quiet");
-    let stderr = String::from_utf8(output.stderr).unwrap();
-    assert_eq!(output.status.code(), Some(1), "{:?} {stderr}", output.status);
-    assert!(
-        stderr.contains("cannot be written") && stderr.contains("ulimit -f") && stderr.contains("--resume"),
-        "{stderr}"
-    );
+    let script = "ulimit -f 1; exec flotilla train small.toml --out run --quiet";
+    let stderr = place.script(1, script, &["cannot be written", "ulimit -f", "--resume"]);
     assert_eq!(stderr.lines().count(), 1, "{stderr}");
     place.good("train small.toml --out run --resume --quiet");
     place.good("train small.toml --out unlimited --quiet");
-    assert_eq!(
-        fs::read(place.path("run/policies.safetensors")).unwrap(),
-        fs::read(place.path("unlimited/policies.safetensors")).unwrap()
-    );
+    assert_eq!(place.bytes("run/policies.safetensors"), place.bytes("unlimited/policies.safetensors"));
 }
 
 #[test]
@@ -234,8 +220,7 @@ fn commands_do_not_wait_for_input_from_pipes_and_devices() {
         &["check", "/dev/zero"],
         &["rollout", "small.toml", "--policies", "/dev/zero"],
     ] {
-        let stderr = place.refused(1, command);
-        assert!(stderr.contains("it is a pipe or a device, not a file"), "{stderr}");
+        place.fails(1, command, &["it is a pipe or a device, not a file"]);
     }
     for command in ["train small.toml", "sweep grid.toml", "paper --trials 1 --generations 1"] {
         let stderr = place.refused(1, &format!("{command} --backend cpu --out pipe"));
@@ -253,10 +238,8 @@ fn commands_do_not_wait_for_input_from_pipes_and_devices() {
         assert!(matches!(output.status.code(), Some(0 | 1)), "{:?}", output.status);
     }
     // Standard input and pipes that the shell opens are read.
-    let output = place.shell("flotilla check /dev/stdin < small.toml && flotilla check <(cat small.toml)");
-    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
-    let output = place.shell("cat small.toml | flotilla check /dev/stdin");
-    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+    place.script(0, "flotilla check /dev/stdin < small.toml && flotilla check <(cat small.toml)", &[]);
+    place.script(0, "cat small.toml | flotilla check /dev/stdin", &[]);
 }
 
 /// A reader may open the pipe later and still gets everything. Until then, a message says what the program waits for.
@@ -279,17 +262,15 @@ fn an_output_pipe_without_a_reader_is_waited_for_with_a_message() {
 fn a_finished_run_with_an_unreadable_file_is_not_trained_again() {
     let place = with_run();
     // Another training would change the column of seconds.
-    let metrics = |place: &Place| fs::read_to_string(place.path("run/metrics.csv")).unwrap();
-    let before = metrics(&place);
+    let before = place.read("run/metrics.csv");
     for name in ["run.json", "policies.safetensors", "metrics.csv"] {
         let (path, away) = (place.path("run").join(name), place.path("away"));
         fs::rename(&path, &away).unwrap();
         assert!(Command::new("mkfifo").arg(&path).status().unwrap().success());
-        let stderr = place.refused(1, "train small.toml --out run --resume --quiet");
-        assert!(stderr.contains(name) && stderr.contains("cannot be read"), "{stderr}");
+        place.fails(1, "train small.toml --out run --resume --quiet", &[name, "cannot be read"]);
         fs::rename(&away, &path).unwrap();
         place.good("train small.toml --out run --resume --quiet");
-        assert!(metrics(&place) == before, "{name}: the run was trained again");
+        assert!(place.read("run/metrics.csv") == before, "{name}: the run was trained again");
     }
 }
 
@@ -297,8 +278,7 @@ fn a_finished_run_with_an_unreadable_file_is_not_trained_again() {
 fn commands_name_the_right_command_for_sweeps_and_configs() {
     let place = place();
     for command in ["check", "train", "verify"] {
-        let stderr = place.refused(1, &[command, "grid.toml"]);
-        assert!(stderr.contains("grid.toml:13: grid: ") && stderr.contains("`flotilla sweep`"), "{stderr}");
+        let stderr = place.fails(1, &[command, "grid.toml"], &["grid.toml:13: grid: ", "`flotilla sweep`"]);
         assert_eq!(stderr.lines().count(), 1, "{stderr}");
     }
     let stderr = place.refused(1, "sweep small.toml");
@@ -343,13 +323,13 @@ fn a_rollout_says_whose_policies_it_plays() {
 fn a_sweep_folder_is_not_a_run() {
     let place = place();
     place.good("sweep grid.toml --out sweep --quiet");
-    let picture = fs::read(place.path("sweep/curves.svg")).unwrap();
+    let picture = place.bytes("sweep/curves.svg");
     for flags in [&[][..], &["--force"], &["--resume"]] {
         let stderr = place.refused(1, &[&["train", "small.toml", "--out", "sweep"], flags].concat());
         assert!(stderr.contains("sweep holds a sweep, not a run"), "{stderr}");
     }
-    assert_eq!(fs::read(place.path("sweep/curves.svg")).unwrap(), picture);
-    assert!(place.refused(1, "plot sweep").contains("name one of the runs in it, as sweep/points/0000"));
+    assert_eq!(place.bytes("sweep/curves.svg"), picture);
+    place.fails(1, "plot sweep", &["name one of the runs in it, as sweep/points/0000"]);
     let stderr = place.refused(1, "replay sweep");
     let first = "sweep holds a sweep; name one of its points:\n  sweep/points/0000  world.coupling = 1, ";
     assert!(stderr.contains(first) && stderr.contains("\n  sweep/points/0003  world.coupling = 2, "), "{stderr}");
@@ -359,11 +339,11 @@ fn a_sweep_folder_is_not_a_run() {
 #[test]
 fn missing_and_damaged_files_of_a_finished_run_are_restored() {
     let place = with_run();
-    let config = fs::read(place.path("run/config.toml")).unwrap();
-    fs::write(place.path("run/config.toml"), "x = 1").unwrap();
+    let config = place.bytes("run/config.toml");
+    place.write("run/config.toml", "x = 1");
     fs::remove_file(place.path("run/curves.svg")).unwrap();
     place.good("train small.toml --out run --resume --quiet");
-    assert_eq!(fs::read(place.path("run/config.toml")).unwrap(), config);
+    assert_eq!(place.bytes("run/config.toml"), config);
     assert!(place.path("run/curves.svg").exists());
     place.good("replay run");
 }
@@ -372,8 +352,8 @@ fn missing_and_damaged_files_of_a_finished_run_are_restored() {
 fn outputs_are_validated_before_any_work_is_done() {
     let place = with_run();
     fs::copy(place.path("small.toml"), place.path("small.svg")).unwrap();
-    assert!(place.refused(2, "check small.svg --out small.svg").contains("is read from"));
-    assert_eq!(fs::read(place.path("small.svg")).unwrap(), fs::read(place.path("small.toml")).unwrap());
+    place.fails(2, "check small.svg --out small.svg", &["is read from"]);
+    assert_eq!(place.bytes("small.svg"), place.bytes("small.toml"));
 }
 
 #[test]
@@ -410,12 +390,12 @@ fn replay_prints_the_number_of_observed_pois() {
     let nine: Vec<_> = (1..=9).map(|at| format!("[{}, 9]", 5 * at)).collect();
     let config =
         TINY.replace("[[10, 9], [20, 9]]", &format!("[{}]", nine.join(", "))).replace("coupling = 2", "coupling = 1");
-    fs::write(place.path("nine.toml"), &config).unwrap();
+    place.write("nine.toml", &config);
     place.good("train nine.toml --out nine --quiet");
     let (stdout, _) = place.good("replay nine --out r.svg");
     let count = stdout.split(": observed ").nth(1).and_then(|rest| rest.split(' ').next()).unwrap();
     assert!(count.parse::<u32>().is_ok_and(|count| (1..=9).contains(&count)), "{stdout}");
-    fs::write(place.path("mean.toml"), config + "episodes_per_team = 3\nstart_jitter = 2.0\n").unwrap();
+    place.write("mean.toml", config + "episodes_per_team = 3\nstart_jitter = 2.0\n");
     place.good("train mean.toml --out mean --quiet");
     let (stdout, _) = place.good("replay mean --out r.svg");
     assert!(
@@ -472,9 +452,7 @@ fn special_characters_in_names_are_escaped_in_every_output() {
     place.good("train small.toml --out other --seed 2 --quiet");
     place.good(&["replay", special, "--out", "page.html"]);
     let page = place.read("page.html");
-    let data = page.split("id=\"data\">").nth(1).unwrap().split("</script>").next().unwrap();
-    let data: serde_json::Value = serde_json::from_str(data).unwrap();
-    assert_eq!(data["run"], special.rsplit('/').next().unwrap());
+    assert_eq!(page_data(&place.path("page.html"))["run"], special.rsplit('/').next().unwrap());
     assert!(!page.contains("<b>"));
     // Runs with equal configs are labelled by their folder.
     place.good("train small.toml --out same --quiet");
@@ -495,8 +473,7 @@ fn special_characters_in_names_are_escaped_in_every_output() {
         "1",
         "--slurm=job.sh",
     ]);
-    let output = place.shell("SLURM_ARRAY_TASK_ID=1 bash job.sh");
-    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+    place.script(0, "SLURM_ARRAY_TASK_ID=1 bash job.sh", &[]);
     assert!(!place.path("x").exists() && !place.path("y").exists());
     place.good(&["sweep", &*sweep, "--out", &format!("sweep {special}"), "--collect"]);
     let mut table = csv::Reader::from_path(place.path(format!("sweep {special}")).join("results.csv")).unwrap();
@@ -516,7 +493,7 @@ fn files_cannot_print_terminal_control_characters() {
         ("[learning]\nfitness = \"\\u001b[31mG\\nx\"\n", 1),
         ("[world]\nleaders = \u{1b}[31m\n", 1),
     ] {
-        fs::write(place.path("bad.toml"), text).unwrap();
+        place.write("bad.toml", text);
         let stderr = place.refused(code, &["check", "bad.toml"]);
         assert!(!stderr.contains('\u{1b}') && !stderr.contains('\u{7}'), "{stderr:?}");
         assert!(stderr.lines().skip(1).all(|line| line.starts_with("bad.toml:")), "{stderr:?}");
@@ -527,14 +504,14 @@ fn files_cannot_print_terminal_control_characters() {
         "\"learning.fitness\" = [\"x\\ny\", \"x\\ny\"]",
         "\"learning.fitness\" = \"x\\ny\"",
     ] {
-        fs::write(place.path("bad.toml"), format!("{TINY}[grid]\n{grid}\n")).unwrap();
+        place.write("bad.toml", format!("{TINY}[grid]\n{grid}\n"));
         let stderr = place.refused(1, "sweep bad.toml");
         assert!(!stderr.contains('\u{1b}') && stderr.lines().count() == 1, "{stderr:?}");
     }
     // A tensor's name has an escape sequence.
     let header = "{\"w\\u001b[31m\\nx\":{\"dtype\":\"F32\",\"shape\":[1],\"data_offsets\":[0,4]}}";
     let bytes = [&(header.len() as u64).to_le_bytes()[..], header.as_bytes(), &[0; 4]].concat();
-    fs::write(place.path("w.safetensors"), bytes).unwrap();
+    place.write("w.safetensors", bytes);
     let stderr = place.refused(1, "rollout small.toml --policies w.safetensors");
     assert!(!stderr.contains('\u{1b}') && stderr.lines().count() == 1, "{stderr:?}");
 }
@@ -574,7 +551,7 @@ fn a_wrong_value_of_a_flag_exits_with_code_2() {
         place.refused(2, words);
     }
     // A wrong file exits with code 1, also together with a wrong flag.
-    fs::write(place.path("wrong.toml"), TINY.replace("steps = 8", "steps = 0")).unwrap();
+    place.write("wrong.toml", TINY.replace("steps = 8", "steps = 0"));
     place.refused(1, "check wrong.toml");
     place.refused(1, "check wrong.toml --seed -1");
     place.refused(1, "check missing.toml --seed -1");
@@ -592,8 +569,7 @@ fn a_wrong_start_leaves_no_folder() {
 fn generations_with_pois_in_different_places_are_not_compared() {
     let place = place();
     place.good("train small.toml --set learning.poi_jitter=0.5 --generations 2 --out moved --quiet");
-    let stderr = place.refused(2, "replay moved --compare 0");
-    assert!(stderr.contains("POIs are elsewhere in every generation (learning.poi_jitter)"), "{stderr}");
+    place.fails(2, "replay moved --compare 0", &["POIs are elsewhere in every generation (learning.poi_jitter)"]);
     place.good("replay moved");
 }
 
@@ -629,7 +605,7 @@ fn names_that_are_not_utf8_work_except_in_scripts() {
     place.good(&[OsStr::new("replay"), name]);
     assert!(place.path(name).join("replay.html").exists());
     let words = [OsStr::new("sweep"), OsStr::new("grid.toml"), OsStr::new("--out"), name, OsStr::new("--slurm=job.sh")];
-    assert!(place.refused(2, &words).contains("UTF-8"));
+    place.fails(2, &words, &["UTF-8"]);
     assert!(!place.path("job.sh").exists());
 }
 
@@ -656,10 +632,7 @@ fn a_training_works_with_fewer_threads_than_requested() {
             // The limit counts all processes of a user. Only `nobody` (65534) is assumed to have no others.
             let started = if root { started } else { "of" };
             let run = |command: &str| {
-                let output = place.shell(&format!("exec {user} prlimit --nproc={limit} ./flotilla {command}"));
-                let stderr = String::from_utf8(output.stderr).unwrap();
-                assert_eq!(output.status.code(), Some(0), "{limit}, {command}: {stderr}");
-                stderr
+                place.script(0, &format!("exec {user} prlimit --nproc={limit} ./flotilla {command}"), &[])
             };
             let stderr = run(&format!(
                 "train small.toml --backend cpu --threads 5 --quiet --out run{limit} --checkpoint-generations 1"

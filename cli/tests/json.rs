@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use crate::support::{Place, SMALL};
+use crate::support::{Place, SMALL, Words};
 use flotilla::backend::cpu::Cpu;
 use serde_json::Value;
 
@@ -12,8 +12,9 @@ const ODD_NAMES: [&str; 5] = ["a\"b", "back\\slash", "it's", "Zürich – 東京
 const INVALID_NAMES: [&str; 4] = ["line\nbreak", "red\u{1b}[31m", "left\u{202e}right", "c1\u{9b}"];
 
 /// Runs a command with `--json`. Returns its exit code and the objects on standard output, line by line.
-fn run_json(place: &Place, words: &[&str]) -> (i32, Vec<Value>) {
-    let output = place.run(&[words, &["--json"]].concat());
+fn run_json(place: &Place, words: impl Words) -> (i32, Vec<Value>) {
+    let words = [words.words(), vec!["--json".into()]].concat();
+    let output = place.run(&words);
     let text = String::from_utf8(output.stdout).expect("JSON is UTF-8");
     assert!(text.ends_with('\n'), "{words:?} printed {text:?}");
     assert!(!text.contains(['\u{202e}', '\u{9b}', '\u{1b}']), "{words:?} could control a terminal: {text:?}");
@@ -22,17 +23,19 @@ fn run_json(place: &Place, words: &[&str]) -> (i32, Vec<Value>) {
 }
 
 /// Runs a command that must succeed, and returns its object.
-fn result(place: &Place, words: &[&str]) -> Value {
-    let (code, objects) = run_json(place, words);
+fn result(place: &Place, words: impl Words) -> Value {
+    let words = words.words();
+    let (code, objects) = run_json(place, &words);
     assert_eq!((code, objects.len()), (0, 1), "{words:?}: {objects:?}");
     assert!(objects[0].get("code").is_none(), "{words:?}: {objects:?}");
     objects.into_iter().next().unwrap()
 }
 
 /// Runs a command that must fail with the same exit code with and without `--json`. Returns its error code and message.
-fn failure(place: &Place, words: &[&str]) -> (String, String) {
-    let (code, objects) = run_json(place, words);
-    assert_eq!(place.run(words).status.code(), Some(code), "{words:?}");
+fn failure(place: &Place, words: impl Words) -> (String, String) {
+    let words = words.words();
+    let (code, objects) = run_json(place, &words);
+    assert_eq!(place.run(&words).status.code(), Some(code), "{words:?}");
     let [object] = &objects[..] else { panic!("{words:?}: {objects:?}") };
     let names: Vec<_> = object.as_object().unwrap().keys().map(String::as_str).collect();
     assert_eq!(names, ["code", "message", "remedy"], "{words:?}");
@@ -56,17 +59,14 @@ fn names_that_need_escapes_give_valid_json() {
         }
         assert_eq!(trained["backend"], "cpu");
         let picture = format!("{name}.svg");
-        let plotted = place.command().args(["plot", name, "--out", &picture, "--json"]).output().unwrap();
-        let plotted: Value = serde_json::from_slice(&plotted.stdout).unwrap();
-        assert_eq!(plotted["out"], *picture);
+        assert_eq!(result(&place, &["plot", name, "--out", &picture])["out"], *picture);
         let replayed = result(&place, &["replay", name]);
         assert!(replayed["out"].as_str().unwrap().starts_with(name), "{replayed}");
         assert_eq!(result(&place, &["rollout", name])["backend"], "cpu");
     }
-    let place = Place::new(&[("x.toml", SMALL)]);
-    let other_seed = &["--set", "learning.seed=1", "--backend", "cpu"][..];
-    for (name, flags) in [(ODD_NAMES[0], &other_seed[2..]), (ODD_NAMES[1], other_seed)] {
-        result(&place, &[&["train", "x.toml", "--out", name], flags].concat());
+    let place = Place::new(&[("x.toml", SMALL)]).on_cpu();
+    for (name, seed) in [(ODD_NAMES[0], "0"), (ODD_NAMES[1], "1")] {
+        result(&place, &["train", "x.toml", "--out", name, "--seed", seed]);
     }
     let compared = result(&place, &["compare", ODD_NAMES[0], ODD_NAMES[1]]);
     let folders = compared["comparisons"][0]["arms"].as_array().unwrap().iter().map(|arm| &arm["folders"][0]);
@@ -77,15 +77,12 @@ fn names_that_need_escapes_give_valid_json() {
 #[test]
 fn other_commands_print_json() {
     let sweep = SMALL.replace("coupling = 2\n", "") + "[grid]\n\"world.coupling\" = [1, 2]\n";
-    let place = Place::new(&[("x.toml", SMALL), ("s.toml", &sweep), ("\"x\".toml", SMALL)]);
-    let cpu = ["--backend", "cpu"];
-    assert!(result(&place, &["check", "\"x\".toml"])["cost"].is_object());
-    assert!(result(&place, &["devices"])["cpu"].is_string());
-    let flags = ["--generations", "1", "--population", "8", "--paradigm", "all-leaders"];
-    let with_flags = result(&place, &[&["baseline", "x.toml", "--seeds", "2"], &flags[..], &cpu].concat());
-    assert_eq!(with_flags["teams"], 16);
-    let baseline = ["baseline", "x.toml", "--seeds", "2", "--set", "learning.generations=1"];
-    let baseline = result(&place, &[&baseline[..], &cpu].concat());
+    let place = Place::new(&[("x.toml", SMALL), ("s.toml", &sweep), ("\"x\".toml", SMALL)]).on_cpu();
+    assert!(result(&place, "check \"x\".toml")["cost"].is_object());
+    assert!(result(&place, "devices")["cpu"].is_string());
+    let flags = "--seeds 2 --generations 1 --population 8 --paradigm all-leaders";
+    assert_eq!(result(&place, &format!("baseline x.toml {flags}"))["teams"], 16);
+    let baseline = result(&place, "baseline x.toml --seeds 2 --set learning.generations=1");
     // Two generations of 8 random teams: generation 0, and generation 1 as in training.
     assert_eq!((&baseline["backend"], &baseline["teams"]), (&"cpu".into(), &16.into()));
     for name in ["constant", "action", "network", "shared", "open_loop", "hill_climbing"] {
@@ -95,27 +92,22 @@ fn other_commands_print_json() {
     // Random episodes are played only if starts or POIs move. Then constant actions have an interval, too.
     assert!(baseline["episodes"] == 1 && baseline["constant"]["interval_95"].is_null(), "{baseline}");
     for key in ["start_jitter", "poi_jitter"] {
-        let set = format!("learning.{key}=2");
-        let moved = ["baseline", "x.toml", "--seeds", "2", "--episodes", "5", "--generations", "1", "--set", &set];
-        let moved = result(&place, &[&moved[..], &cpu].concat());
+        let flags = format!("--seeds 2 --episodes 5 --generations 1 --set learning.{key}=2");
+        let moved = result(&place, &format!("baseline x.toml {flags}"));
         assert!(moved["episodes"] == 5 && moved["constant"]["interval_95"].is_array(), "{moved}");
     }
-    let swept = result(&place, &[&["sweep", "s.toml", "--out", ODD_NAMES[0]][..], &cpu].concat());
+    let swept = result(&place, &["sweep", "s.toml", "--out", ODD_NAMES[0]]);
     assert_eq!(swept["points"].as_array().unwrap().len(), 2);
     // The reason why a point is missing quotes the text of its file.
     place.write(format!("{}/points/0001/config.toml", ODD_NAMES[0]), "[world]\n\"x\u{202e}\u{9b}y\" = 1\n");
     let (code, collected) = run_json(&place, &["sweep", "s.toml", "--out", ODD_NAMES[0], "--collect"]);
     let missing = collected[0]["points"][1]["missing"].as_str().unwrap();
     assert!(code == 1 && missing.contains("x\u{202e}"), "{missing:?}");
-    let (code, lines) = run_json(
-        &place,
-        &[&["bench", "x.toml", "--rollout-only", "--teams", "4,8", "--agents", "6"][..], &cpu].concat(),
-    );
+    let (code, lines) = run_json(&place, "bench x.toml --rollout-only --teams 4,8 --agents 6");
     assert_eq!((code, lines.len()), (0, 2));
     assert!(lines.iter().all(|line| line["backend"] == "cpu" && line["description"].is_string()));
     if Cpu::levels().len() > 1 {
-        let verified =
-            result(&place, &["verify", "x.toml", "--set", "world.steps=2", "--teams", "2", "--adapter", "cpu"]);
+        let verified = result(&place, "verify x.toml --set world.steps=2 --teams 2 --adapter cpu");
         assert_eq!((&verified["equal"], &verified["version"]), (&true.into(), &env!("CARGO_PKG_VERSION").into()));
         assert_eq!(verified["comparisons"].as_array().unwrap().len(), Cpu::levels().len() - 1);
     }
@@ -123,54 +115,53 @@ fn other_commands_print_json() {
 
 #[test]
 fn failures_print_one_object() {
-    let place =
-        Place::new(&[("x.toml", SMALL), ("text", "no folder"), ("bad.toml", "\"\u{202e}\\\"\" = 1\n[world]\n")]);
-    let cpu = ["--backend", "cpu"];
-    result(&place, &[&["train", "x.toml", "--out", "run"][..], &cpu].concat());
-    let on_cpu = |words: &[&str]| failure(&place, &[words, &cpu].concat()).0;
-    assert_eq!(on_cpu(&["train", "none.toml"]), "config_unreadable");
-    assert_eq!(on_cpu(&["train", "bad.toml"]), "config_invalid");
-    assert_eq!(on_cpu(&["train", "x.toml", "--set", "world.steps=0"]), "usage");
-    assert_eq!(on_cpu(&["train", "x.toml", "--out", "run"]), "exists");
-    assert_eq!(on_cpu(&["train", "x.toml", "--out", "text"]), "refused");
-    assert_eq!(on_cpu(&["train", "x.toml", "--out", "text/run"]), "not_written");
-    assert_eq!(on_cpu(&["train", "x.toml", "--adapter", "0"]), "usage");
-    assert_eq!(on_cpu(&["train", "x.toml", "--no-such-flag"]), "usage");
-    assert_eq!(on_cpu(&["paper", "--out", "run"]), "refused");
-    assert_eq!(on_cpu(&["replay", "nowhere"]), "no_run");
-    assert_eq!(on_cpu(&["replay", "run", "--trial", "9"]), "usage");
-    assert_eq!(on_cpu(&["rollout", "x.toml"]), "usage");
-    assert_eq!(on_cpu(&["sweep", "none.toml"]), "config_unreadable");
-    assert_eq!(on_cpu(&["tasks", "none.toml"]), "config_unreadable");
-    assert_eq!(on_cpu(&["tasks", "x.toml", "--set", "world.steps=0"]), "usage");
-    assert_eq!(on_cpu(&["tasks", "x.toml", "./x.toml"]), "usage");
-    assert_eq!(on_cpu(&["sweep", "x.toml", "--collect"]), "config_invalid");
-    assert_eq!(on_cpu(&["bench", "x.toml", "--teams", "0"]), "usage");
-    assert_eq!(on_cpu(&["baseline", "none.toml"]), "config_unreadable");
-    assert_eq!(failure(&place, &["compare", "run"]).0, "usage");
-    assert_eq!(failure(&place, &["plot", "text", "--out", "a.svg"]).0, "no_run");
-    assert_eq!(failure(&place, &["plot", "run", "--out", "a.doc"]).0, "usage");
-    assert_eq!(failure(&place, &["check", "none.toml"]).0, "config_unreadable");
-    assert_eq!(failure(&place, &["verify", "--set", "world.steps=3"]).0, "usage");
-    assert_eq!(failure(&place, &["no-such-command"]).0, "usage");
+    let bad = "\"\u{202e}\\\"\" = 1\n[world]\n";
+    let place = Place::new(&[("x.toml", SMALL), ("text", "no folder"), ("bad.toml", bad)]).on_cpu();
+    result(&place, "train x.toml --out run");
+    let code = |line: &str| failure(&place, line).0;
+    assert_eq!(code("train none.toml"), "config_unreadable");
+    assert_eq!(code("train bad.toml"), "config_invalid");
+    assert_eq!(code("train x.toml --set world.steps=0"), "usage");
+    assert_eq!(code("train x.toml --out run"), "exists");
+    assert_eq!(code("train x.toml --out text"), "refused");
+    assert_eq!(code("train x.toml --out text/run"), "not_written");
+    assert_eq!(code("train x.toml --adapter 0"), "usage");
+    assert_eq!(code("train x.toml --no-such-flag"), "usage");
+    assert_eq!(code("paper --out run"), "refused");
+    assert_eq!(code("replay nowhere"), "no_run");
+    assert_eq!(code("replay run --trial 9"), "usage");
+    assert_eq!(code("rollout x.toml"), "usage");
+    assert_eq!(code("sweep none.toml"), "config_unreadable");
+    assert_eq!(code("tasks none.toml"), "config_unreadable");
+    assert_eq!(code("tasks x.toml --set world.steps=0"), "usage");
+    assert_eq!(code("tasks x.toml ./x.toml"), "usage");
+    assert_eq!(code("sweep x.toml --collect"), "config_invalid");
+    assert_eq!(code("bench x.toml --teams 0"), "usage");
+    assert_eq!(code("baseline none.toml"), "config_unreadable");
+    assert_eq!(code("compare run"), "usage");
+    assert_eq!(code("plot text --out a.svg"), "no_run");
+    assert_eq!(code("plot run --out a.doc"), "usage");
+    assert_eq!(code("check none.toml"), "config_unreadable");
+    assert_eq!(code("verify --set world.steps=3"), "usage");
+    assert_eq!(code("no-such-command"), "usage");
     for name in ["theirs", "locked"] {
         fs::create_dir(place.path(name)).unwrap();
     }
     place.write("theirs/metrics.csv", "of another program");
-    assert_eq!(on_cpu(&["train", "x.toml", "--out", "theirs"]), "not_ours");
+    assert_eq!(code("train x.toml --out theirs"), "not_ours");
     let lock = fs::File::create(place.path("locked/.lock")).unwrap();
     lock.lock().unwrap();
-    assert_eq!(on_cpu(&["train", "x.toml", "--out", "locked", "--resume"]), "locked");
-    assert_eq!(on_cpu(&["rollout", "x.toml", "--policies", "none.safetensors"]), "not_read");
+    assert_eq!(code("train x.toml --out locked --resume"), "locked");
+    assert_eq!(code("rollout x.toml --policies none.safetensors"), "not_read");
     place.write("run/config.toml", SMALL.replace("steps = 9", "steps = 8"));
-    assert_eq!(failure(&place, &["plot", "run", "--out", "a.svg"]).0, "damaged");
+    assert_eq!(code("plot run --out a.svg"), "damaged");
     for name in INVALID_NAMES {
-        let (code, message) = failure(&place, &["check", name]);
-        assert!(code == "usage" && !message.contains(name), "{message}");
+        let (kind, message) = failure(&place, &["check", name]);
+        assert!(kind == "usage" && !message.contains(name), "{message}");
     }
     for name in ODD_NAMES {
-        let (code, message) = failure(&place, &["check", name]);
-        assert!(code == "config_unreadable" && message.contains(name), "{message}");
+        let (kind, message) = failure(&place, &["check", name]);
+        assert!(kind == "config_unreadable" && message.contains(name), "{message}");
     }
 }
 
@@ -193,11 +184,9 @@ fn every_command_with_json_fails_in_json() {
 #[test]
 fn collect_reports_missing_points() {
     let sweep = SMALL.replace("coupling = 2\n", "") + "[grid]\n\"world.coupling\" = [1, 2]\n";
-    let place = Place::new(&[("s.toml", &sweep)]);
-    let cpu = ["--backend", "cpu"];
-    let (code, shard) = run_json(&place, &[&["sweep", "s.toml", "--out", "s", "--shard", "1/2"][..], &cpu].concat());
-    assert_eq!((code, shard.len()), (0, 1));
-    let (code, collected) = run_json(&place, &[&["sweep", "s.toml", "--out", "s", "--collect"][..], &cpu].concat());
+    let place = Place::new(&[("s.toml", &sweep)]).on_cpu();
+    result(&place, "sweep s.toml --out s --shard 1/2");
+    let (code, collected) = run_json(&place, "sweep s.toml --out s --collect");
     assert_eq!((code, collected.len()), (1, 1));
     let points = collected[0]["points"].as_array().unwrap();
     assert_eq!(points.iter().filter(|point| point["missing"].is_string()).count(), 1);

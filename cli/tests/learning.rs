@@ -1,10 +1,8 @@
 //! Tests the keys of `[learning]` that form and test teams through the program: files, extension, pictures and tables.
 
-use std::fs;
-
 use serde_json::Value;
 
-use crate::support::Place;
+use crate::support::{Place, metrics_without_seconds};
 
 /// Two groups whose starts vary. Teams are formed by fitness, the best plays again, and is tested.
 const TESTED: &str = "
@@ -27,16 +25,6 @@ team_elites = 1
 team_g_elites = 2
 ";
 
-/// Returns the rows of a run without their seconds.
-fn metrics(place: &Place, run: &str) -> Vec<String> {
-    let text = fs::read_to_string(place.path(run).join("metrics.csv")).unwrap();
-    text.lines().map(|line| line.rsplit_once(',').unwrap().0.to_string()).collect()
-}
-
-fn json(place: &Place, words: &str) -> Value {
-    serde_json::from_str(&place.good(words).0).unwrap()
-}
-
 #[test]
 fn the_tested_team_is_in_files_pictures_and_tables() {
     let plain = TESTED.replace("test_episodes = 3\n", "");
@@ -44,10 +32,11 @@ fn the_tested_team_is_in_files_pictures_and_tables() {
     let tested = format!("{TESTED}[grid]\n'learning.temperature' = [0.1, 2.0]\n");
     let place =
         Place::new(&[("x.toml", TESTED), ("plain.toml", &plain), ("sweep.toml", &sweep), ("tested.toml", &tested)]);
-    let trained = json(&place, "train x.toml --out run --quiet --json --backend cpu");
-    let rows = metrics(&place, "run");
-    assert_eq!(rows[0], "trial,generation,best_g,mean_g,champion_g,test_g");
-    let last = rows[rows.len() - 2..].iter().map(|row| row.rsplit_once(',').unwrap().1.parse::<f64>().unwrap());
+    let trained = place.json("train x.toml --out run --quiet --json --backend cpu");
+    let metrics = |run: &str| metrics_without_seconds(&place.path(run));
+    let rows = metrics("run");
+    assert_eq!(rows[0], ["trial", "generation", "best_g", "mean_g", "champion_g", "test_g"]);
+    let last = rows[rows.len() - 2..].iter().map(|row| row[5].parse::<f64>().unwrap());
     let mean = last.sum::<f64>() / 2.0;
     assert_eq!(trained["last"]["test_g"]["mean"].as_f64(), Some(mean));
     assert!(mean > 0.0, "no tested team observed anything, so this tests little");
@@ -56,8 +45,7 @@ fn the_tested_team_is_in_files_pictures_and_tables() {
 
     // Test episodes change nothing else.
     place.good("train plain.toml --out plain --quiet --backend cpu");
-    let untested = rows.iter().map(|row| row.rsplit_once(',').unwrap().0);
-    assert!(metrics(&place, "plain").iter().map(String::as_str).eq(untested));
+    assert!(metrics("plain").iter().eq(rows.iter().map(|row| &row[..5])));
 
     // A shorter run, extended, is the same run.
     place.good("train x.toml --generations 3 --out short --quiet --backend cpu");
@@ -66,31 +54,31 @@ fn the_tested_team_is_in_files_pictures_and_tables() {
     let (extended, stderr) = place.good("train x.toml --out short --resume --json --backend cpu");
     assert!(stderr.contains("resuming at generation 4"), "{stderr}");
     let extended: Value = serde_json::from_str(&extended).unwrap();
-    assert_eq!((metrics(&place, "short"), &extended["digest"]), (rows, &trained["digest"]));
+    assert_eq!((metrics("short"), &extended["digest"]), (rows, &trained["digest"]));
     // Generations from before and after the extension can be replayed.
     place.good("replay short --trial 1 --generation 3 --backend cpu");
     place.good("replay short --trial 1 --generation 5 --backend cpu");
 
-    let episodes = json(&place, "replay run --team best --generation 4 --json --backend cpu");
+    let episodes = place.json("replay run --team best --generation 4 --json --backend cpu");
     assert_eq!(episodes["episodes"][0]["which"], "best", "{episodes}");
 
     place.good("plot run --measure test --out test.svg");
-    assert!(fs::read_to_string(place.path("test.svg")).unwrap().contains("G of the tested best team"));
-    assert!(fs::read_to_string(place.path("run/curves.svg")).unwrap().contains("aria-label=\"tested best team\""));
-    let curves = fs::read_to_string(place.path("plain/curves.svg")).unwrap();
+    assert!(place.read("test.svg").contains("G of the tested best team"));
+    assert!(place.read("run/curves.svg").contains("aria-label=\"tested best team\""));
+    let curves = place.read("plain/curves.svg");
     assert!(curves.contains("champion") && !curves.contains("tested"));
     let error = place.refused(1, "plot run plain --measure test --out none.svg");
     assert!(error.contains("plain: it has no tested best team, because learning.test_episodes is 0"), "{error}");
     assert!(error.contains("--set learning.test_episodes=") && !error.contains("--resume"), "{error}");
     let measures = |words: &str| {
-        let compared = json(&place, words);
+        let compared = place.json(words);
         let measures = compared["comparisons"][0]["measures"].as_array().unwrap();
         measures.iter().map(|measured| measured["measure"].as_str().unwrap().to_string()).collect::<Vec<_>>()
     };
     assert_eq!(measures("compare run again --json"), ["champion_g", "test_g", "best_g", "generations_to_reach"]);
     assert_eq!(measures("compare run plain --json"), ["champion_g", "best_g", "generations_to_reach"]);
 
-    let swept = json(&place, "sweep sweep.toml --out swept --quiet --json --backend cpu");
+    let swept = place.json("sweep sweep.toml --out swept --quiet --json --backend cpu");
     let [without, with] = [0, 1].map(|point| &swept["points"][point]);
     assert!(without["test_g"].is_null() && with["test_g"].is_f64(), "{swept}");
     for (name, column) in [("results.csv", 7), ("points.csv", 11)] {
@@ -102,7 +90,7 @@ fn the_tested_team_is_in_files_pictures_and_tables() {
     }
     let error = place.refused(2, "sweep sweep.toml --out other --measure test --backend cpu");
     assert!(error.contains("--measure test: point 0000: it has no tested best team"), "{error}");
-    let measured = json(&place, "sweep tested.toml --out measured --measure test --quiet --json --backend cpu");
+    let measured = place.json("sweep tested.toml --out measured --measure test --quiet --json --backend cpu");
     assert_eq!([&swept["measure"], &measured["measure"]], ["champion", "test"]);
     // The folder of a run is no config, but has one.
     for (line, config) in [("train run", "run/config.toml"), ("sweep measured --collect", "measured/sweep.toml")] {
@@ -148,23 +136,22 @@ fn every_command_takes_starts_and_pois_in_regions() {
     let place = Place::new(&[("x.toml", REGIONS)]);
     let (checked, warnings) = place.good("check x.toml --out layout.svg");
     assert!(checked.contains("of which 3 learn") && !warnings.contains("cannot be reached"), "{checked} {warnings}");
-    let layout = fs::read_to_string(place.path("layout.svg")).unwrap();
+    let layout = place.read("layout.svg");
     assert!(layout.contains("long dashes: regions from which agents of rover, POIs of ring"));
     assert_eq!(layout.matches("stroke-dasharray=\"18 10").count(), 3);
-    let (full, _) = place.good("check x.toml --expand");
-    assert!(full.contains("in = { circle = [25.0, 25.0, 10.0] }"), "{full}");
+    let full = place.prints("check x.toml --expand", &["in = { circle = [25.0, 25.0, 10.0] }"]);
     place.write("full.toml", &full);
 
-    let trained = json(&place, "train x.toml --out run --quiet --json --backend cpu");
-    assert_eq!(trained["digest"], json(&place, "train full.toml --out full --quiet --json --backend cpu")["digest"]);
+    let trained = place.json("train x.toml --out run --quiet --json --backend cpu");
+    assert_eq!(trained["digest"], place.json("train full.toml --out full --quiet --json --backend cpu")["digest"]);
     place.good("train x.toml --generations 1 --out short --quiet --backend cpu");
-    let extended = json(&place, "train x.toml --out short --resume --quiet --json --backend cpu");
+    let extended = place.json("train x.toml --out short --resume --quiet --json --backend cpu");
     assert_eq!(trained["digest"], extended["digest"]);
 
-    let once = json(&place, "rollout run --json --backend cpu");
+    let once = place.json("rollout run --json --backend cpu");
     assert_eq!((&once["episodes"], &once["seed"]), (&1.into(), &0.into()));
     let [first, again, other] = [0, 0, 1].map(|seed| {
-        let played = json(&place, &format!("rollout run --episodes 40 --seed {seed} --json --backend cpu"));
+        let played = place.json(&format!("rollout run --episodes 40 --seed {seed} --json --backend cpu"));
         played["mean"]["mean"].as_f64().unwrap()
     });
     assert!(first == again && first != other, "{first} {again} {other}");
@@ -173,7 +160,7 @@ fn every_command_takes_starts_and_pois_in_regions() {
     place.good("replay run --team best --out still.svg --backend cpu");
     let error = place.refused(2, "replay run --generation 1 --compare 2 --out both.html --backend cpu");
     assert!(error.contains("POIs are elsewhere in every generation (pois.in): show one alone"), "{error}");
-    let baseline = json(&place, "baseline x.toml --seeds 2 --episodes 5 --json --backend cpu");
+    let baseline = place.json("baseline x.toml --seeds 2 --episodes 5 --json --backend cpu");
     assert!(baseline["episodes"] == 5 && baseline["constant"]["interval_95"].is_array(), "{baseline}");
     place.good("bench x.toml --rollout-only --teams 4 --json --backend cpu");
     let error = place.refused(1, "check x.toml --set world.map=[30,30]");

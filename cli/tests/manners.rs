@@ -226,7 +226,7 @@ trials = 1
 #[test]
 fn every_command_that_reads_a_config_reads_standard_input() {
     let place = Place::new(&[]);
-    let read = |name: &str| fs::read(place.path(name)).unwrap();
+    let read = |name: &str| place.bytes(name);
     // The first folder of a series has no number, so these names are not in it.
     for name in ["config-1", "config-07", "config-9x", "config10"] {
         fs::create_dir_all(place.path("runs").join(name)).unwrap();
@@ -336,7 +336,7 @@ fn completions_cover_commands_flags_and_values() {
     }
     assert_eq!(place.run("completions tcsh").status.code(), Some(2));
     // Call the completion function as bash would.
-    fs::write(place.path("flotilla.bash"), place.good("completions bash").0).unwrap();
+    place.write("flotilla.bash", place.good("completions bash").0);
     let complete = |line: &str| {
         let words: Vec<&str> = line.split(' ').collect();
         let (last, before) = (words[words.len() - 1], words[words.len() - 2]);

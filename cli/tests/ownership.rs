@@ -7,7 +7,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use crate::recovery::{Fails, reference, session, with_each_failure};
-use crate::support::{Place, SMALL};
+use crate::support::{Place, SMALL, files};
 use flotilla::config::Config;
 use flotilla::front::cpu;
 use flotilla_app::record::disk::Disk;
@@ -38,19 +38,6 @@ fn with_run() -> Place {
     place
 }
 
-/// Reads all files below a folder.
-fn read_files(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
-    let mut files = Vec::new();
-    for entry in fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()) {
-        match entry.symlink_metadata().unwrap().is_dir() {
-            true => files.extend(read_files(&entry)),
-            false => files.push((entry.clone(), fs::read(&entry).unwrap_or_default())),
-        }
-    }
-    files.sort();
-    files
-}
-
 #[test]
 fn pictures_of_others_are_not_replaced() {
     let place = place();
@@ -68,7 +55,7 @@ fn pictures_of_others_are_not_replaced() {
     let (_, stderr) = place.good("train small.toml --out v --quiet --resume");
     assert!(stderr.contains("v/curves.svg: not drawn") && place.path("v/run.json").exists(), "{stderr}");
     assert_eq!(place.read("v/curves.svg"), "precious");
-    assert!(place.refused(1, "plot v").contains("v/curves.svg was not made by flotilla"));
+    place.fails(1, "plot v", &["v/curves.svg was not made by flotilla"]);
     assert_eq!(place.read("v/curves.svg"), "precious");
     place.good("plot v --out v/curves.svg");
     assert!(place.read("v/curves.svg").starts_with("<svg"), "a file named by --out is replaced");
@@ -82,10 +69,9 @@ fn an_edited_picture_is_kept() {
     place.good("replay run --quiet --trial 1");
     let edited = place.read("run/curves.svg").replace("</svg>", "<!-- for the thesis --></svg>");
     place.write("run/curves.svg", &edited);
-    assert!(place.refused(1, "plot run").contains("not made by flotilla"));
+    place.fails(1, "plot run", &["not made by flotilla"]);
     place.refused(1, "train small.toml --out run --quiet --force");
-    let (_, stderr) = place.good("train small.toml --out run --quiet --resume --generations 8");
-    assert!(stderr.contains("curves.svg: not drawn"), "{stderr}");
+    place.notes("train small.toml --out run --quiet --resume --generations 8", &["curves.svg: not drawn"]);
     assert_eq!(place.read("run/curves.svg"), edited);
     // A line of the list of files that a crash truncated must not invalidate the next line.
     let list = place.read(Path::new("run").join(LIST));
@@ -104,7 +90,7 @@ fn force_removes_only_files_of_the_run() {
     assert_eq!(place.read("v/replay.html"), "precious", "there was no run to replace");
     place.good("train small.toml --out v --quiet --force");
     assert_eq!(place.read("v/replay.html"), "precious");
-    assert!(place.refused(1, "replay v --quiet").contains("v/replay.html was not made by flotilla"));
+    place.fails(1, "replay v --quiet", &["v/replay.html was not made by flotilla"]);
     fs::remove_file(place.path("v/replay.html")).unwrap();
     place.good("replay v --quiet");
     place.good("train small.toml --out v --quiet --force");
@@ -126,16 +112,15 @@ fn folders_with_files_of_others_are_refused_with_every_flag() {
         let file = out.join(name);
         fs::create_dir_all(file.parent().unwrap()).unwrap();
         fs::write(&file, text).unwrap();
-        let before = read_files(&out);
+        let before = files(&out);
         for flags in [&[][..], &["--force"], &["--resume"]] {
             let words = [&["train", "small.toml", "--quiet", "--out", out.to_str().unwrap()], flags].concat();
-            let stderr = place.refused(1, &words);
-            assert!(stderr.contains(&format!("{name} was not made by flotilla")), "{name} {flags:?}: {stderr}");
+            let stderr = place.fails(1, &words, &[&format!("{name} was not made by flotilla")]);
             assert!(
                 stderr.contains("move it away, or choose another --out") && !stderr.contains("--force"),
                 "{stderr}"
             );
-            assert_eq!(read_files(&out), before, "{name} {flags:?}");
+            assert_eq!(files(&out), before, "{name} {flags:?}");
         }
     }
     // A folder with nothing but a user's config can become a run of this config. No other config replaces it.
@@ -218,8 +203,7 @@ fn nothing_is_written_at_the_root_of_the_file_system() {
 fn an_animation_does_not_replace_pictures_of_others() {
     let place = with_run();
     place.write("p0003.png", "precious");
-    let stderr = place.refused(1, "replay run --quiet --width 100 --out p%04d.png");
-    assert!(stderr.contains("p0003.png was not made by flotilla"), "{stderr}");
+    place.fails(1, "replay run --quiet --width 100 --out p%04d.png", &["p0003.png was not made by flotilla"]);
     assert_eq!(place.read("p0003.png"), "precious");
     assert!(!place.path("p0000.png").exists(), "no frame is written");
     place.good("replay run --quiet --width 100 --out q%04d.png");
@@ -239,7 +223,7 @@ fn an_animation_does_not_replace_pictures_of_others() {
     place.good("plot run other");
     place.good("plot run other");
     place.write("comparison.svg", "<svg xmlns=\"http://www.w3.org/2000/svg\"><title>precious</title></svg>");
-    assert!(place.refused(1, "plot run other").contains("comparison.svg was not made by flotilla"));
+    place.fails(1, "plot run other", &["comparison.svg was not made by flotilla"]);
     assert!(place.read("comparison.svg").contains("precious"));
 }
 
@@ -250,8 +234,7 @@ fn a_users_config_is_copied_before_another_replaces_it() {
     let own = format!("# Mine.\n{SMALL}");
     place.write("own/config.toml", &own);
     place.good("train own/config.toml --out own --quiet");
-    let (_, stderr) = place.good("train own/config.toml --out own --quiet --resume --generations 15");
-    assert!(stderr.contains("kept as own/config.old.toml"), "{stderr}");
+    place.notes("train own/config.toml --out own --quiet --resume --generations 15", &["kept as own/config.old.toml"]);
     assert_eq!(place.read("own/config.old.toml"), own);
     assert!(place.read("own/config.toml").contains("generations = 15"));
     // A config that flotilla wrote needs no copy.
@@ -318,14 +301,14 @@ mod links {
 
     /// Runs commands that must report a symbolic link and leave the folder unchanged. Returns their standard error.
     fn assert_unchanged(place: &Place, folder: &Path, lines: &[&str]) -> String {
-        let before = read_files(folder);
+        let before = files(folder);
         let mut messages = String::new();
         for line in lines {
             let output = place.run(*line);
             let stderr = String::from_utf8(output.stderr).unwrap();
             assert!(!stderr.contains("panicked"), "{line}: {stderr}");
             assert!(stderr.contains("is a symbolic link"), "{line}: {stderr}");
-            assert_eq!(read_files(folder), before, "{line}");
+            assert_eq!(files(folder), before, "{line}");
             messages += &stderr;
         }
         messages
@@ -525,8 +508,7 @@ mod links {
         }
         let _ = fs::remove_file(place.path("run/curves.svg"));
         for line in ["replay run --quiet", "plot run"] {
-            let stderr = place.refused(1, line);
-            assert!(stderr.contains("run belongs to another user") && stderr.contains("--out"), "{stderr}");
+            place.fails(1, line, &["run belongs to another user", "--out"]);
         }
         assert!(!place.path("run/replay.html").exists() && !place.path("run/curves.svg").exists());
         place.good("replay run --quiet --out run/replay.html");
@@ -534,8 +516,7 @@ mod links {
         // Without --out, runs/small is chosen by default, so nobody named it.
         fs::create_dir(place.path("runs")).unwrap();
         fs::rename(place.path("run"), place.path("runs/small")).unwrap();
-        let stderr = place.refused(1, "train small.toml --quiet --resume --generations 9");
-        assert!(stderr.contains("runs/small belongs to another user"), "{stderr}");
+        place.fails(1, "train small.toml --quiet --resume --generations 9", &["runs/small belongs to another user"]);
         place.good("train small.toml --quiet --resume --generations 9 --out runs/small");
     }
 }

@@ -236,17 +236,6 @@ fn not_printed<'a>(block: &'a Block, printed: &str) -> Option<&'a (usize, String
     block.lines.iter().find(|(_, shown)| !shown.trim().is_empty() && !printed.any(|line| matches(line, shown)))
 }
 
-fn copy(from: &Path, to: &Path) {
-    fs::create_dir_all(to).unwrap();
-    for entry in fs::read_dir(from).unwrap().map(Result::unwrap) {
-        let to = to.join(entry.file_name());
-        match entry.file_type().unwrap().is_dir() {
-            true => copy(&entry.path(), &to),
-            false => drop(fs::copy(entry.path(), to).unwrap()),
-        }
-    }
-}
-
 /// The results of a page's commands.
 #[derive(Default)]
 struct PageResult {
@@ -259,7 +248,7 @@ struct PageResult {
 fn check_page(name: &str, text: &str) -> PageResult {
     let folder: TempDir = tempfile::tempdir().unwrap();
     for configs in ["configs", "studies/configs"] {
-        copy(&Path::new(crate::ROOT).join(configs), &folder.path().join(configs));
+        support::copy(&Path::new(crate::ROOT).join(configs), &folder.path().join(configs));
     }
     let mut result = PageResult::default();
     let (blocks, inline) = parse_page(text);

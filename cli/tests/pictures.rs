@@ -81,7 +81,7 @@ fn place() -> Place {
 
 fn draw(place: &Place, command: &str, file: &str) -> Vec<u8> {
     place.good(&format!("{command} --out {file}"));
-    fs::read(place.path(file)).unwrap()
+    place.bytes(file)
 }
 
 #[test]

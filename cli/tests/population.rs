@@ -22,7 +22,7 @@ use flotilla::evolve::{self, Breeding, Key, Purpose, UNCHANGED};
 use flotilla::front::cpu;
 use flotilla::trainer::{Row, Snapshot, SnapshotError, Trainer};
 use flotilla_app::record::disk::Disk;
-use flotilla_app::record::folder::{METRICS, POLICIES, RUN, Run, Start, Status};
+use flotilla_app::record::folder::{POLICIES, RUN, Run, Start, Status};
 use flotilla_app::run::{Session, SessionEnd};
 
 fn learning() -> Learning {
@@ -515,9 +515,7 @@ fn a_run_survives_the_loss_of_its_device() {
             assert_eq!(outcome, SessionEnd::Finished);
             session.results(0).cloned().unwrap()
         });
-        let metrics = std::fs::read_to_string(path.join(METRICS)).unwrap();
-        let rows = metrics.lines().map(|line| line.rsplit_once(',').unwrap().0.to_string()).collect::<Vec<_>>();
-        (ended, (rows, std::fs::read(path.join(POLICIES)).ok()), first, requests)
+        (ended, (support::metrics_without_seconds(&path), std::fs::read(path.join(POLICIES)).ok()), first, requests)
     };
     let (expected, files, ..) = run("cpu", Start::Fresh, None, false);
     let expected = expected.unwrap();

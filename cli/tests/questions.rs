@@ -7,24 +7,10 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use assert_cmd::cargo::cargo_bin_cmd;
+use crate::support::Place;
 use flotilla::statistics::Estimate;
 use flotilla_app::report::comparison;
 use flotilla_studies::questions::{END, QUESTIONS, Study, mark, parts};
-use tempfile::TempDir;
-
-fn run_paper(folder: &Path, line: &str) -> (Option<i32>, String, String) {
-    let line = format!("paper {line} --backend cpu");
-    let output = cargo_bin_cmd!("flotilla").args(line.split_whitespace()).current_dir(folder).output().unwrap();
-    let text = |bytes| String::from_utf8(bytes).unwrap();
-    (output.status.code(), text(output.stdout), text(output.stderr))
-}
-
-fn succeed(folder: &Path, line: &str) -> String {
-    let (code, out, stderr) = run_paper(folder, line);
-    assert_eq!(code, Some(0), "{line}: {stderr}");
-    out
-}
 
 /// Returns the block of a part in a page, with its marks.
 fn block<'a>(page: &'a str, part: &Study) -> &'a str {
@@ -34,75 +20,62 @@ fn block<'a>(page: &'a str, part: &Study) -> &'a str {
 
 #[test]
 fn a_short_form_of_the_study_writes_its_page_and_files() {
-    let place = TempDir::new().unwrap();
-    let folder = place.path();
-    let short = "--questions=a,b,c,d,f,g --trials 2 --generations 2 --out short";
-    let (code, out, stderr) = run_paper(folder, short);
-    assert_eq!(code, Some(0), "{stderr}");
+    let place = Place::new(&[]).on_cpu().slow();
+    let short = "paper --questions=a,b,c,d,f,g --trials 2 --generations 2 --out short";
+    let (out, stderr) = place.good(short);
     assert!(stderr.contains("training 126 experiments on "), "{stderr}");
-    let page = fs::read_to_string(folder.join("short/questions.md")).unwrap();
+    let page = place.read("short/questions.md");
     assert!(out.starts_with(&page), "{out}");
     let selected = parts(&['a', 'b', 'c', 'd', 'f', 'g']);
     for part in &selected {
         let block = block(&page, part);
         assert!(block.lines().count() > 4, "{block}");
         for ending in ["svg", "png", "pdf", "csv"] {
-            let file = folder.join("short").join(part.name).with_extension(ending);
+            let file = place.path("short").join(part.name).with_extension(ending);
             assert!(fs::metadata(&file).is_ok_and(|data| data.len() > 500), "{}", file.display());
         }
     }
     // Each part is an ordinary sweep, and `compare` gives the same numbers.
-    let line = "compare short/relay_twice --csv";
-    let compared = cargo_bin_cmd!("flotilla").args(line.split_whitespace()).current_dir(folder).output().unwrap();
-    let compared = String::from_utf8(compared.stdout).unwrap();
-    let saved = fs::read_to_string(folder.join("short/relay_twice.csv")).unwrap();
+    let (compared, _) = place.good("compare short/relay_twice --csv");
+    let saved = place.read("short/relay_twice.csv");
     let columns = |text: &str| -> Vec<Vec<String>> {
         let rows = text.lines().skip(1).map(|line| line.split(',').skip(6).map(String::from).collect());
         rows.collect()
     };
     assert_eq!(columns(&compared), columns(&saved));
     // Warm starts begin with learned policies. Champions are scored with moved POIs, too.
-    let warm = |name: &str| fs::read_to_string(folder.join("short/warm/warm").join(name).join("run.json")).unwrap();
+    let warm = |name: &str| place.read(format!("short/warm/warm/{name}/run.json"));
     assert!(warm("0000-0").contains("\"init\"") && warm("0001-2").contains("\"init\""));
     assert!(block(&page, selected.last().unwrap()).contains("POIs moved by up to 5"), "{page}");
 
-    assert_eq!(succeed(folder, &format!("{short} --resume --quiet")), out);
-    let (code, _, stderr) = run_paper(folder, &format!("{short} --quiet"));
-    assert!(code == Some(1) && stderr.contains("--resume"), "{stderr}");
-    let (code, _, stderr) = run_paper(folder, &format!("{short} --quiet --resume --seed 4"));
-    assert!(code == Some(1) && stderr.contains("holds another sweep"), "{stderr}");
+    assert_eq!(place.good(&format!("{short} --resume --quiet")).0, out);
+    place.fails(1, &format!("{short} --quiet"), &["--resume"]);
+    place.fails(1, &format!("{short} --quiet --resume --seed 4"), &["holds another sweep"]);
 
     // The results of another question are not replaced. A study without results yet may take more questions.
-    succeed(folder, "--questions=d --trials 2 --generations 2 --out mixed --quiet");
-    let (code, _, stderr) = run_paper(folder, "--questions=b --trials 2 --generations 2 --out mixed --quiet");
-    assert!(code == Some(1) && stderr.contains("mixed holds observers.svg already; pass --resume"), "{stderr}");
-    let files = fs::read_dir(folder.join("mixed")).unwrap().map(|entry| entry.unwrap().path());
+    let mixed = |letters: &str| format!("paper --questions={letters} --trials 2 --generations 2 --out mixed --quiet");
+    place.good(&mixed("d"));
+    place.fails(1, &mixed("b"), &["mixed holds observers.svg already; pass --resume"]);
+    let files = fs::read_dir(place.path("mixed")).unwrap().map(|entry| entry.unwrap().path());
     files.filter(|path| path.is_file()).for_each(|path| fs::remove_file(path).unwrap());
     // An error in one part is reported before any part is trained.
-    let (code, _, stderr) = run_paper(folder, "--questions=b,d --trials 2 --generations 2 --out mixed --quiet");
-    assert!(
-        code == Some(1) && stderr.contains("--resume") && !folder.join("mixed/behaviours/points").exists(),
-        "{stderr}"
-    );
+    place.fails(1, &mixed("b,d"), &["--resume"]);
+    assert!(!place.path("mixed/behaviours/points").exists());
 
     // Curricula have stages, so they need more generations.
-    let json = succeed(folder, "--questions=e --trials 2 --generations 60 --out e --quiet --json");
-    let json: serde_json::Value = serde_json::from_str(&json).unwrap();
+    let json = place.json("paper --questions=e --trials 2 --generations 60 --out e --quiet --json");
     assert_eq!(json["questions"][0]["comparisons"].as_array().unwrap().len(), 6);
-    let (code, _, stderr) = run_paper(folder, "--questions=e,x");
-    assert!(code == Some(2) && stderr.contains("allowed a, b, c, d, e, f, g"), "{stderr}");
-    let (code, _, stderr) = run_paper(folder, "--questions=e --out e/curricula");
-    assert!(code == Some(1) && stderr.contains("holds a sweep"), "{stderr}");
+    place.fails(2, "paper --questions=e,x", &["allowed a, b, c, d, e, f, g"]);
+    place.fails(1, "paper --questions=e --out e/curricula", &["holds a sweep"]);
 }
 
 #[test]
 fn a_refused_resume_leaves_a_paper_that_can_be_resumed() {
-    let place = TempDir::new().unwrap();
-    let paper = "--trials 1 --quiet --resume --out paper --set learning.population";
-    succeed(place.path(), &format!("{paper}=12 --generations 1"));
-    let (code, _, stderr) = run_paper(place.path(), &format!("{paper}=14 --generations 2"));
-    assert!(code == Some(1) && stderr.contains("a run of another config"), "{stderr}");
-    succeed(place.path(), &format!("{paper}=12 --generations 1"));
+    let place = Place::new(&[]).on_cpu().slow();
+    let paper = "paper --trials 1 --quiet --resume --out paper --set learning.population";
+    place.good(&format!("{paper}=12 --generations 1"));
+    place.fails(1, &format!("{paper}=14 --generations 2"), &["a run of another config"]);
+    place.good(&format!("{paper}=12 --generations 1"));
 }
 
 fn results_file(name: &str) -> PathBuf {
@@ -136,8 +109,8 @@ fn the_pages_equal_a_new_study() {
         }
         return;
     }
-    let place = TempDir::new().unwrap();
-    let out = succeed(place.path(), "--questions --quiet --out all");
+    let place = Place::new(&[]).on_cpu().slow();
+    let (out, _) = place.good("paper --questions --quiet --out all");
     for (part, path) in parts_and_pages() {
         assert_eq!(
             block(&fs::read_to_string(&path).unwrap(), part),
@@ -146,10 +119,8 @@ fn the_pages_equal_a_new_study() {
             path.display()
         );
         for ending in ["svg", "csv"] {
-            let [expected, actual] = [
-                results_file(&file_name(part, ending)),
-                place.path().join("all").join(part.name).with_extension(ending),
-            ];
+            let expected = results_file(&file_name(part, ending));
+            let actual = place.path("all").join(part.name).with_extension(ending);
             assert!(fs::read(&expected).unwrap() == fs::read(&actual).unwrap(), "{}", expected.display());
         }
     }

@@ -3,11 +3,11 @@
 //! Runs are stopped between generations, by failing disk operations, kills and signals. `FLOTILLA_KILLS` sets how often
 //! the real program is killed (default: 20). Lost devices are in `population.rs`.
 
-use crate::support;
+use crate::support::{self, Place};
 use std::fs;
 use std::io::{self, Cursor, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, ExitStatus, Output, Stdio};
+use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::atomic::{AtomicUsize, Ordering::SeqCst};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
@@ -75,23 +75,19 @@ fn resume(config: &Config, path: &Path) -> (Results, Outcome) {
     (outcome.results.clone().unwrap(), outcome)
 }
 
-/// Returns the metrics without the column of seconds, and the policies.
-fn result_files(path: &Path) -> (String, Vec<u8>) {
-    let metrics = fs::read_to_string(path.join(METRICS)).unwrap();
-    let shared = |line: &str| {
-        let fields = line.split(',').enumerate().filter(|&(at, _)| at != 5).map(|(_, field)| field);
-        fields.collect::<Vec<_>>().join(",") + "\n"
-    };
-    (metrics.lines().map(shared).collect(), fs::read(path.join(POLICIES)).unwrap())
+/// Creates a folder. Returns it, and the path of a run in it.
+fn run_folder() -> (TempDir, PathBuf) {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("run");
+    (folder, path)
 }
 
 /// Trains without interruption. Returns the results and the files.
-pub fn reference(config: &Config) -> (Results, (String, Vec<u8>)) {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("run");
+pub fn reference(config: &Config) -> (Results, (Vec<Vec<String>>, Vec<u8>)) {
+    let (_folder, path) = run_folder();
     let outcome = session(config, &path, Start::Fresh, Disk::default(), cpu(), None);
     assert!(matches!(outcome.end, Ok(SessionEnd::Finished)), "{:?}", outcome.end);
-    (outcome.results.unwrap(), result_files(&path))
+    (outcome.results.unwrap(), support::results(&path))
 }
 
 #[test]
@@ -175,21 +171,6 @@ fn one_slow_write_does_not_stop_timed_checkpoints() {
     }
 }
 
-/// Returns the names and contents of the files in a folder.
-#[cfg(unix)]
-fn contents(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
-    let mut files = Vec::new();
-    for entry in fs::read_dir(folder).unwrap() {
-        let path = entry.unwrap().path();
-        match path.is_dir() {
-            true => files.extend(contents(&path)),
-            false => files.push((path.clone(), fs::read(path).unwrap())),
-        }
-    }
-    files.sort();
-    files
-}
-
 #[test]
 #[cfg(unix)]
 fn a_copy_of_hard_links_is_not_changed_and_not_locked() {
@@ -206,12 +187,12 @@ fn a_copy_of_hard_links_is_not_changed_and_not_locked() {
     // A list of pictures, to which lines are added.
     fs::write(path.join(".flotilla.sha256"), "0  x\n").unwrap();
     link(&path, &copy);
-    let before = contents(&copy);
+    let before = support::files(&copy);
     let disk = Disk::default().within(&path).unwrap();
     disk.extend(&path.join(".flotilla.sha256"), b"1  y\n").unwrap();
     let (results, _) = resume(&small(), &path);
     assert_eq!(results, reference(&small()).0);
-    assert_eq!(contents(&copy), before);
+    assert_eq!(support::files(&copy), before);
     // Both can be used at the same time.
     let open = |path: &Path| Folder::open(path, Start::Resume, &small(), StartFrom::Random, Disk::default());
     let (_run, _copy) = (open(&path).unwrap(), open(&copy).unwrap());
@@ -222,8 +203,7 @@ fn a_copy_of_hard_links_is_not_changed_and_not_locked() {
 
 #[test]
 fn a_finished_run_is_resumed_where_nothing_can_be_written() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("run");
+    let (_folder, path) = run_folder();
     session(&small(), &path, Start::Fresh, Disk::default(), cpu(), None);
     for kind in [io::ErrorKind::ReadOnlyFilesystem, io::ErrorKind::PermissionDenied] {
         let disk = Disk::failing(move |operation, _| match operation {
@@ -272,8 +252,7 @@ fn a_run_stopped_before_any_generation_resumes_to_the_same_results() {
 #[test]
 fn a_finished_run_is_not_trained_again() {
     let config = small();
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("run");
+    let (_folder, path) = run_folder();
     let expected = reference(&config);
     session(&config, &path, Start::Fresh, Disk::default(), cpu(), None).end.unwrap();
     let before = fs::read(path.join(METRICS)).unwrap();
@@ -291,15 +270,14 @@ fn a_finished_run_is_not_trained_again() {
         bytes[at] ^= 1;
         fs::write(path.join(name), bytes).unwrap();
         let (results, _) = resume(&config, &path);
-        assert_eq!((results, result_files(&path)), expected, "{name}");
+        assert_eq!((results, support::results(&path)), expected, "{name}");
     }
 }
 
 #[test]
 fn a_finished_run_whose_metrics_cannot_be_read_is_not_changed() {
     let config = small();
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("run");
+    let (_folder, path) = run_folder();
     session(&config, &path, Start::Fresh, Disk::default(), cpu(), None).end.unwrap();
     let files = || [RUN, POLICIES].map(|name| fs::read(path.join(name)).unwrap());
     let (metrics, before) = (fs::read(path.join(METRICS)).unwrap(), files());
@@ -350,12 +328,11 @@ fn a_run_extended_from_any_length_has_the_same_results() {
         for length in 1..config.learning.generations {
             let mut short = with_generations(&config, length);
             short.checkpoint.generations = interval;
-            let folder = tempfile::tempdir().unwrap();
-            let path = folder.path().join("run");
+            let (_folder, path) = run_folder();
             session(&short, &path, Start::Fresh, Disk::default(), cpu(), None).end.unwrap();
             let (results, outcome) = resume(&config, &path);
             assert_eq!(outcome.start, length + 1, "{:?}", outcome.notes);
-            assert_eq!((results, result_files(&path)), expected, "from {length} generations");
+            assert_eq!((results, support::results(&path)), expected, "from {length} generations");
             assert_eq!(fs::read_to_string(path.join("config.toml")).unwrap(), config.to_toml());
             // The extended run is finished.
             assert_eq!(resume(&config, &path).1.reached, 0);
@@ -369,8 +346,7 @@ fn a_run_with_missing_or_damaged_files_is_extended() {
     let expected = reference(&config);
     let short = with_generations(&config, 7);
     let run = || {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("run");
+        let (folder, path) = run_folder();
         session(&short, &path, Start::Fresh, Disk::default(), cpu(), None).end.unwrap();
         let checkpoints = path.join("checkpoints");
         assert_eq!(checkpoint::list(&checkpoints).unwrap(), [7, 8]);
@@ -379,7 +355,7 @@ fn a_run_with_missing_or_damaged_files_is_extended() {
     let resumes = |path: &Path, start: usize| {
         let (results, outcome) = resume(&config, path);
         assert_eq!(outcome.start, start, "{:?}", outcome.notes);
-        assert_eq!((results, result_files(path)), expected);
+        assert_eq!((results, support::results(path)), expected);
     };
     // Runs of earlier versions have no checkpoint of their end.
     let (_folder, path, [_, end]) = run();
@@ -401,7 +377,7 @@ fn a_run_with_missing_or_damaged_files_is_extended() {
         }
         let (results, outcome) = resume(&config, &path);
         assert_eq!((outcome.start, outcome.notes.len()), (7, 1), "{damage}: {:?}", outcome.notes);
-        assert_eq!((results, result_files(&path)), expected);
+        assert_eq!((results, support::results(&path)), expected);
     }
     // The policies cannot be read for now: a folder has the file's name.
     let (_folder, path, _) = run();
@@ -428,11 +404,11 @@ fn a_run_with_missing_or_damaged_files_is_extended() {
 
     // A run cannot become shorter. The refusal changes no file.
     let (_folder, path, _) = run();
-    let before = result_files(&path);
+    let before = support::results(&path);
     let outcome = session(&with_generations(&config, 6), &path, Start::Resume, Disk::default(), cpu(), None);
     let error = outcome.end.unwrap_err().to_string();
     assert!(error.contains("is a run of 7 generations, which cannot become one of 6"), "{error}");
-    assert_eq!(result_files(&path), before);
+    assert_eq!(support::results(&path), before);
     // An extension cannot change other keys.
     let mut changed = config.clone();
     changed.learning.seed = 3;
@@ -454,7 +430,7 @@ fn an_extension_survives_every_failing_disk_operation() {
     };
     let check = |path: &Path, _: Outcome, _: Operation, context: &str| {
         let (results, resumed) = resume(&config, path);
-        assert_eq!((results, result_files(path)), expected, "{context}");
+        assert_eq!((results, support::results(path)), expected, "{context}");
         assert!(resumed.notes.len() <= 1, "{context}: {:?}", resumed.notes);
         // The run resumes from the end of the shorter run, or is already finished.
         assert!(resumed.start >= 6 || resumed.reached == 0, "{context}: {:?}", resumed.notes);
@@ -494,7 +470,7 @@ fn runs_trained_together_equal_runs_trained_alone() {
     assert_eq!((done.unwrap(), session.generations()), (SessionEnd::Finished, &[16, 7, 11, 16][..]));
     for (run, expected) in expected.iter().enumerate() {
         assert_eq!(
-            (session.results(run), result_files(&path(run))),
+            (session.results(run), support::results(&path(run))),
             (Some(&expected.0), expected.1.clone()),
             "run {run}"
         );
@@ -519,7 +495,7 @@ fn a_run_survives_every_failing_disk_operation() {
             reported.push(operation);
         }
         let (results, resumed) = resume(&config, path);
-        assert_eq!((results, result_files(path)), expected, "{context}");
+        assert_eq!((results, support::results(path)), expected, "{context}");
         // No file is reported as damaged. The only possible note is the generation of the resume.
         assert!(resumed.notes.len() <= 1, "{context}: {:?}", resumed.notes);
         // With a checkpoint per generation, at most two generations are played again.
@@ -622,8 +598,7 @@ fn leftovers(path: &Path) -> Vec<PathBuf> {
 
 /// Trains a run that stops before generation 9. Returns its folder and its checkpoints, oldest first.
 fn stopped_run(config: &Config) -> (TempDir, PathBuf, Vec<PathBuf>) {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("run");
+    let (folder, path) = run_folder();
     session(config, &path, Start::Fresh, Disk::default(), cpu(), Some(9)).end.unwrap();
     let checkpoints = path.join("checkpoints");
     let generations = checkpoint::list(&checkpoints).unwrap();
@@ -717,7 +692,7 @@ fn a_damaged_checkpoint_is_reported_and_the_previous_one_is_used() {
     fs::write(path.join(METRICS), &metrics).unwrap();
     let (results, outcome) = resume(&config, &path);
     assert_eq!((outcome.start, outcome.notes.len()), (0, 3), "{:?}", outcome.notes);
-    assert_eq!((results, result_files(&path)), expected);
+    assert_eq!((results, support::results(&path)), expected);
 }
 
 #[test]
@@ -733,7 +708,7 @@ fn a_checkpoint_of_another_run_is_set_aside_and_the_previous_one_is_used() {
     let note = outcome.notes[0].to_string();
     assert!(note.contains("000000009.safetensors: it is of another run"), "{note}");
     assert_eq!(outcome.start, 8, "{:?}", outcome.notes);
-    assert_eq!((results, result_files(&path)), expected);
+    assert_eq!((results, support::results(&path)), expected);
 }
 
 /// A file of which one read fails, after `left` others.
@@ -789,7 +764,7 @@ fn a_run_with_cut_metrics_resumes_before_the_cut() {
         fs::write(path.join(METRICS), &metrics[..metrics.len() - cut]).unwrap();
         let (results, outcome) = resume(&config, &path);
         assert_eq!(outcome.start, start, "{:?}", outcome.notes);
-        assert_eq!((results, result_files(&path)), expected);
+        assert_eq!((results, support::results(&path)), expected);
     }
 }
 
@@ -858,41 +833,33 @@ fn a_run_can_alternate_between_cpu_and_gpu() {
             let backend = GpuBackend::new(gpu::open(request.clone()).unwrap()).unwrap();
             (Box::new(backend), Machine { backend: "gpu".into(), ..Machine::default() })
         };
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("run");
+        let (_folder, path) = run_folder();
         for (stop_at, backend) in [(4, cpu()), (9, gpu()), (12, cpu())] {
             let outcome = session(&config, &path, Start::Resume, Disk::default(), backend, Some(stop_at));
             assert_eq!((outcome.end.unwrap(), outcome.reached), (SessionEnd::Stopped, stop_at));
         }
         let outcome = session(&config, &path, Start::Resume, Disk::default(), gpu(), None);
         assert_eq!((outcome.end.unwrap(), outcome.results), (SessionEnd::Finished, Some(expected.0.clone())), "{info}");
-        assert_eq!(result_files(&path), expected.1, "{info}");
+        assert_eq!(support::results(&path), expected.1, "{info}");
     }
 }
 
-/// Returns a command of the real program, with captured output.
-fn flotilla() -> Command {
+/// Creates a folder with a config in `config.toml`. Commands run on the CPU, which saves the search for GPUs.
+fn place(config: &str) -> Place {
+    Place::new(&[("config.toml", config)]).on_cpu().slow()
+}
+
+/// Returns the command that trains `config.toml` into a folder.
+fn line(out: &str, flags: &str) -> String {
+    format!("train config.toml --out {out} {flags}")
+}
+
+/// Returns a command on the CPU that is not started yet, with captured output.
+fn process(place: &Place, line: &str) -> Command {
     let mut command = support::flotilla();
+    command.current_dir(place.root()).args(line.split_whitespace()).args(["--backend", "cpu"]);
     command.stdout(Stdio::piped()).stderr(Stdio::piped());
     command
-}
-
-/// Returns a command that trains in a folder.
-fn flotilla_train(config: &Path, out: &Path, flags: &[&str]) -> Command {
-    let mut command = flotilla();
-    // `--backend cpu` saves the search for GPUs.
-    command.arg("train").arg(config).arg("--out").arg(out).args(["--backend", "cpu"]).args(flags);
-    command
-}
-
-fn config_file(folder: &Path, text: &str) -> PathBuf {
-    let path = folder.join("config.toml");
-    fs::write(&path, text).unwrap();
-    path
-}
-
-fn stderr(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
 /// Removes warnings. These short episodes cause one, because no agent reaches a POI.
@@ -931,24 +898,24 @@ fn a_killed_run_resumes_to_the_same_results() {
     let kills: usize = std::env::var("FLOTILLA_KILLS").map_or(20, |text| text.parse().expect("a number of kills"));
     let config = Config::parse(HEAVY, "heavy.toml").unwrap();
     let expected = reference(&config);
-    let folder = tempfile::tempdir().unwrap();
-    let file = config_file(folder.path(), HEAVY);
+    let place = place(HEAVY);
     let mut random = ChaCha8Rng::seed_from_u64(1);
     let (mut killed, mut while_writing, mut runs) = (0, 0, 0);
     while killed < kills {
-        let out = folder.path().join(format!("run-{runs}"));
+        let run = format!("run-{runs}");
+        let out = place.path(&run);
         runs += 1;
         // Every second run first finishes with 25 generations, and is then extended.
         let mut lengths = if runs % 2 == 0 { vec!["60"] } else { vec!["60", "25"] };
         loop {
             let recorded = generations_recorded(&out);
             // The number of threads differs between starts.
-            let threads = (1 + random.random_range(0..3)).to_string();
+            let threads = 1 + random.random_range(0..3);
             let length = lengths.last().expect("a length that remains");
-            let flags = ["--resume", "--threads", &threads, "--generations", length];
+            let flags = format!("--resume --threads {threads} --generations {length}");
             let moment = Instant::now() + Duration::from_micros(random.random_range(0..150_000));
             let is_time = || killed < kills && Instant::now() >= moment;
-            let (ended, stderr) = run_or_kill(flotilla_train(&file, &out, &flags), is_time);
+            let (ended, stderr) = run_or_kill(process(&place, &line(&run, &flags)), is_time);
             let stderr = without_warnings(&stderr);
             // A generation's row is written after the checkpoint before that generation. No recorded generation is
             // played again.
@@ -970,7 +937,7 @@ fn a_killed_run_resumes_to_the_same_results() {
                 while_writing += usize::from(!leftovers(&out).is_empty());
             }
         }
-        assert_eq!(result_files(&out), expected.1);
+        assert_eq!(support::results(&out), expected.1);
         assert_eq!(Run::read(&out.join("run.json")).unwrap().digest, Some(expected.0.digest.clone()));
         fs::remove_dir_all(out).unwrap();
     }
@@ -1000,7 +967,8 @@ fn run_or_kill(mut command: Command, mut is_time: impl FnMut() -> bool) -> (bool
 }
 
 /// Kills and resumes a run up to `kills` times, then lets it finish. Returns the number of kills.
-fn finish_under_kills(file: &Path, out: &Path, flags: &[&str], kills: usize) -> usize {
+fn finish_under_kills(place: &Place, run: &str, flags: &str, kills: usize) -> usize {
+    let out = &place.path(run);
     let (mut random, mut killed) = (ChaCha8Rng::seed_from_u64(2), 0);
     loop {
         let (before, start) = (generations_recorded(out), Instant::now());
@@ -1009,7 +977,7 @@ fn finish_under_kills(file: &Path, out: &Path, flags: &[&str], kills: usize) -> 
             let progressed = generations_recorded(out) > before + random.random_range(0..9);
             killed < kills && (progressed || start.elapsed() > Duration::from_secs(20))
         };
-        if run_or_kill(flotilla_train(file, out, &[&["--resume"], flags].concat()), is_time).0 {
+        if run_or_kill(process(place, &line(run, &format!("--resume {flags}"))), is_time).0 {
             return killed;
         }
         killed += 1;
@@ -1024,30 +992,24 @@ fn a_run_killed_around_changes_of_stage_resumes_to_the_same_results() {
     });
     let text = [HEAVY.to_string()].into_iter().chain(staged).collect::<String>();
     let expected = reference(&Config::parse(&text, "staged.toml").unwrap());
-    let folder = tempfile::tempdir().unwrap();
-    let (file, out) = (config_file(folder.path(), &text), folder.path().join("run"));
-    let killed = finish_under_kills(&file, &out, &[], 8);
+    let place = place(&text);
+    let out = place.path("run");
+    let killed = finish_under_kills(&place, "run", "", 8);
     assert!(killed >= 4, "killed {killed} times");
-    assert_eq!(result_files(&out), expected.1);
+    assert_eq!(support::results(&out), expected.1);
     assert_eq!(Run::read(&out.join("run.json")).unwrap().digest, Some(expected.0.digest));
 }
 
 #[test]
 fn a_killed_run_with_init_resumes_to_the_same_results() {
-    let folder = tempfile::tempdir().unwrap();
-    let file = config_file(folder.path(), HEAVY);
-    let [source, uninterrupted, out] = ["source", "whole", "run"].map(|name| folder.path().join(name));
-    let run = |out: &Path, flags: &[&str]| {
-        let done = flotilla_train(&file, out, flags).output().unwrap();
-        assert_eq!(done.status.code(), Some(0), "{}", stderr(&done));
-    };
-    run(&source, &["--generations", "3"]);
-    let policies = source.join("policies.safetensors");
-    let init = ["--init", policies.to_str().unwrap()];
-    run(&uninterrupted, &init);
-    let killed = finish_under_kills(&file, &out, &init, 5);
+    let place = place(HEAVY);
+    let [uninterrupted, out] = ["whole", "run"].map(|name| place.path(name));
+    place.good(&line("source", "--generations 3"));
+    let init = "--init source/policies.safetensors";
+    place.good(&line("whole", init));
+    let killed = finish_under_kills(&place, "run", init, 5);
     assert!(killed >= 3, "killed {killed} times");
-    assert_eq!(result_files(&out), result_files(&uninterrupted));
+    assert_eq!(support::results(&out), support::results(&uninterrupted));
     let digest = |path: &Path| Run::read(&path.join("run.json")).unwrap().digest;
     assert_eq!(digest(&out), digest(&uninterrupted));
     assert_ne!(digest(&out), Some(reference(&Config::parse(HEAVY, "heavy.toml").unwrap()).0.digest));
@@ -1064,25 +1026,18 @@ fn wait_until(what: &str, mut condition: impl FnMut() -> bool) {
 
 #[test]
 fn a_second_process_is_refused_until_the_first_ends() {
-    let folder = tempfile::tempdir().unwrap();
-    let file = config_file(folder.path(), &HEAVY.replace("generations = 60", "generations = 100000"));
-    let out = folder.path().join("run");
-    let mut first = flotilla_train(&file, &out, &[]).spawn().unwrap();
+    let place = place(&HEAVY.replace("generations = 60", "generations = 100000"));
+    let out = place.path("run");
+    let mut first = process(&place, &line("run", "")).spawn().unwrap();
     wait_until("the run starts", || generations_recorded(&out) > 0);
-    for flags in [&["--resume"][..], &["--force"]] {
-        let second = flotilla_train(&file, &out, flags).output().unwrap();
-        assert_eq!(second.status.code(), Some(1));
-        assert!(stderr(&second).contains("error: another process is training in"), "{}", stderr(&second));
+    for flag in ["--resume", "--force"] {
+        place.fails(1, &line("run", flag), &["error: another process is training in"]);
     }
-    let third = flotilla_train(&file, &out, &[]).output().unwrap();
-    assert_eq!(third.status.code(), Some(1));
-    assert!(stderr(&third).contains("holds a run already; pass --resume to continue it"), "{}", stderr(&third));
+    place.fails(1, &line("run", ""), &["holds a run already; pass --resume to continue it"]);
     first.kill().unwrap();
     first.wait().unwrap();
-    let changed = flotilla_train(&file, &out, &["--resume", "--seed", "3"]).output().unwrap();
-    assert_eq!(changed.status.code(), Some(1));
-    assert!(stderr(&changed).contains("learning.seed: 0 there, 3 here"), "{}", stderr(&changed));
-    let mut resumed = flotilla_train(&file, &out, &["--resume"]).spawn().unwrap();
+    place.fails(1, &line("run", "--resume --seed 3"), &["learning.seed: 0 there, 3 here"]);
+    let mut resumed = process(&place, &line("run", "--resume")).spawn().unwrap();
     let recorded = generations_recorded(&out);
     wait_until("the run continues", || generations_recorded(&out) > recorded + 2);
     resumed.kill().unwrap();
@@ -1109,63 +1064,47 @@ fn no_folder_is_changed_if_one_of_several_runs_cannot_start() {
 /// Tests that no flag overwrites files that flotilla has not written.
 #[test]
 fn files_of_others_are_not_overwritten() {
-    let place = tempfile::tempdir().unwrap();
     let text = format!("# Mine.\n{}", small().to_toml());
-    let out = place.path().join("mine");
-    fs::create_dir(&out).unwrap();
-    let file = config_file(&out, &text);
+    let place = place(&text);
+    fs::create_dir(place.path("mine")).unwrap();
+    place.write("mine/config.toml", &text);
     // A run may start in a folder that has only its config file. That file is not rewritten.
-    let done = flotilla_train(&file, &out, &["--resume", "--quiet"]).output().unwrap();
-    assert_eq!(done.status.code(), Some(0), "{}", stderr(&done));
-    assert_eq!(fs::read_to_string(&file).unwrap(), text);
+    place.good("train mine/config.toml --out mine --resume --quiet");
+    assert_eq!(place.read("mine/config.toml"), text);
     for name in [CONFIG, METRICS, POLICIES] {
-        let out = place.path().join(format!("theirs {name}"));
-        fs::create_dir(&out).unwrap();
-        fs::write(out.join(name), "of another program").unwrap();
+        let out = format!("theirs {name}");
+        fs::create_dir(place.path(&out)).unwrap();
+        place.write(format!("{out}/{name}"), "of another program");
         for flag in ["--resume", "--force"] {
-            let refused = flotilla_train(&file, &out, &[flag]).output().unwrap();
-            let message = stderr(&refused);
-            assert!(
-                refused.status.code() == Some(1)
-                    && message.contains("was not made by flotilla, or has been changed since, and would be"),
-                "{message}"
-            );
-            assert!(message.contains(name) && message.contains("move it away"), "{message}");
-            assert_eq!(fs::read_to_string(out.join(name)).unwrap(), "of another program");
-            assert!(!out.join(RUN).exists());
+            let changed = "was not made by flotilla, or has been changed since, and would be";
+            let words = ["train", "mine/config.toml", "--out", &out, flag];
+            place.fails(1, &words, &[changed, name, "move it away"]);
+            assert_eq!(place.read(format!("{out}/{name}")), "of another program");
+            assert!(!place.path(&out).join(RUN).exists());
         }
     }
     // The policies of --init are not overwritten either.
-    let policies = out.join(POLICIES);
-    let before = fs::read(&policies).unwrap();
+    let policies = Path::new("mine").join(POLICIES);
+    let before = place.bytes(&policies);
     for flag in ["--resume", "--force"] {
-        let refused = flotilla_train(&file, &out, &[flag, "--init", policies.to_str().unwrap()]).output().unwrap();
-        assert_eq!(refused.status.code(), Some(2), "{}", stderr(&refused));
-        assert!(stderr(&refused).contains("would be written over it"), "{}", stderr(&refused));
-        assert!(fs::read(&policies).unwrap() == before && out.join(RUN).exists());
+        let line = format!("train mine/config.toml --out mine {flag} --init {}", policies.display());
+        place.fails(2, &line, &["would be written over it"]);
+        assert!(place.bytes(&policies) == before && place.path("mine").join(RUN).exists());
     }
     // A run without its config file still refuses another config.
-    fs::remove_file(&file).unwrap();
-    let other = config_file(place.path(), &text);
-    let refused = flotilla_train(&other, &out, &["--resume", "--seed", "3"]).output().unwrap();
-    assert_eq!(refused.status.code(), Some(1), "{}", stderr(&refused));
-    let done = flotilla_train(&other, &out, &["--resume"]).output().unwrap();
-    assert_eq!(done.status.code(), Some(0), "{}", stderr(&done));
-    assert!(fs::read(&policies).unwrap() == before);
+    fs::remove_file(place.path("mine/config.toml")).unwrap();
+    place.refused(1, &line("mine", "--resume --seed 3"));
+    place.good(&line("mine", "--resume"));
+    assert!(place.bytes(&policies) == before);
 }
 
 /// Tests that a refused --force or --resume leaves all files of a paper unchanged.
 #[test]
 fn a_refused_paper_is_unchanged() {
-    let place = tempfile::tempdir().unwrap();
-    let out = place.path().join("paper");
-    let paper = |flags: &[&str]| {
-        let mut command = flotilla();
-        command.args(["paper", "--trials", "1", "--backend", "cpu", "--quiet", "--out"]).arg(&out).args(flags);
-        command.output().unwrap()
-    };
-    let done = paper(&["--generations", "1"]);
-    assert_eq!(done.status.code(), Some(0), "{}", stderr(&done));
+    let place = Place::new(&[]).on_cpu().slow();
+    let out = place.path("paper");
+    let paper = |flags: &str| format!("paper --trials 1 --quiet --out paper {flags}");
+    place.good(&paper("--generations 1"));
     let files = || {
         let names = fs::read_dir(&out).unwrap().map(|entry| entry.unwrap().path()).filter(|path| path.is_file());
         let mut files: Vec<_> = names.map(|path| (fs::read(&path).unwrap(), path)).collect();
@@ -1178,14 +1117,11 @@ fn a_refused_paper_is_unchanged() {
     for arm in [&arms[0], &arms[arms.len() - 1]] {
         let config = Config::load(&arm.join(CONFIG)).unwrap();
         let lock = Folder::open(arm, Start::Resume, &config, StartFrom::Unspecified, Disk::default()).unwrap();
-        let results = || arms.iter().map(|arm| result_files(arm)).collect::<Vec<_>>();
+        let results = || arms.iter().map(|arm| support::results(arm)).collect::<Vec<_>>();
         let results_before = results();
-        for flags in
-            [&["--generations", "1", "--force", "--seed", "1"], &["--generations", "2", "--resume", "--seed", "0"]]
-        {
-            let refused = paper(flags);
-            assert!(stderr(&refused).contains("another process is training in"), "{}", stderr(&refused));
-            assert!(files() == files_before && results() == results_before, "{flags:?}");
+        for flags in ["--generations 1 --force --seed 1", "--generations 2 --resume --seed 0"] {
+            place.fails(1, &paper(flags), &["another process is training in"]);
+            assert!(files() == files_before && results() == results_before, "{flags}");
         }
         drop(lock);
     }
@@ -1203,7 +1139,7 @@ mod unix {
     /// Waits for the end of a process. Returns its status and what it printed to standard error.
     fn wait_for_end(child: Child) -> (ExitStatus, String) {
         let output = child.wait_with_output().unwrap();
-        (output.status, stderr(&output))
+        (output.status, String::from_utf8_lossy(&output.stderr).into_owned())
     }
 
     /// Reports whether a process ignores SIGHUP. On Linux only.
@@ -1216,14 +1152,12 @@ mod unix {
     #[cfg(target_os = "linux")]
     #[test]
     fn a_run_under_nohup_survives_a_hangup() {
-        let folder = tempfile::tempdir().unwrap();
-        let file = config_file(folder.path(), HEAVY);
-        let out = folder.path().join("run");
-        let train = flotilla_train(&file, &out, &["--quiet"]);
+        let place = place(HEAVY);
+        let train = process(&place, &line("run", "--quiet"));
         let mut child = Command::new("nohup");
-        child.arg(train.get_program()).args(train.get_args()).stdout(Stdio::piped()).stderr(Stdio::piped());
-        let child = child.spawn().unwrap();
-        wait_until("the run starts", || out.join("run.json").exists());
+        child.current_dir(place.root()).arg(train.get_program()).args(train.get_args());
+        let child = child.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+        wait_until("the run starts", || place.path("run/run.json").exists());
         signal(&child, "HUP");
         let (status, message) = wait_for_end(child);
         assert_eq!(status.code(), Some(0), "{message}");
@@ -1231,22 +1165,18 @@ mod unix {
 
     #[test]
     fn a_signal_stops_the_drawing_of_a_film() {
-        let folder = tempfile::tempdir().unwrap();
         let text = "[world]\nleaders = [[10, 5]]\npois = [[10, 9]]\nsteps = 200\n\
                     [learning]\npopulation = 4\ngenerations = 1\ntrials = 1\n";
-        let (file, out) = (config_file(folder.path(), text), folder.path().join("run"));
-        assert!(flotilla_train(&file, &out, &["--quiet"]).status().unwrap().success());
-        let draw = |name: &str| {
-            let mut command = flotilla();
-            command.arg("replay").arg(&out).args(["--fps", "50", "--width", "2000", "--out"]);
-            command.arg(folder.path().join(name)).stderr(Stdio::piped()).spawn().unwrap()
-        };
+        let place = place(text);
+        place.good(&line("run", "--quiet"));
+        let draw =
+            |name: &str| process(&place, &format!("replay run --fps 50 --width 2000 --out {name}")).spawn().unwrap();
         let child = draw("%04d.png");
-        wait_until("a picture is there", || folder.path().join("0001.png").exists());
+        wait_until("a picture is there", || place.path("0001.png").exists());
         signal(&child, "TERM");
         let (status, message) = wait_for_end(child);
         assert!(status.code() == Some(75) && message.contains("stopped: after "), "{message}");
-        let pictures = fs::read_dir(folder.path()).unwrap().count();
+        let pictures = place.names().len();
         let (_, all) = message.split_once(" of ").expect(&message);
         let all: usize = all.split(' ').next().unwrap().parse().unwrap();
         assert!(pictures < all, "{pictures} of {all}");
@@ -1255,23 +1185,22 @@ mod unix {
         std::thread::sleep(Duration::from_millis(500));
         signal(&child, "TERM");
         let (status, message) = wait_for_end(child);
-        assert!(status.code() == Some(75) && !folder.path().join("film.gif").exists(), "{message}");
+        assert!(status.code() == Some(75) && !place.path("film.gif").exists(), "{message}");
     }
 
     #[test]
     fn a_signal_stops_a_run_after_its_generation_and_prints_how_to_resume() {
         let config = Config::parse(HEAVY, "heavy.toml").unwrap();
         let expected = reference(&config);
-        let folder = tempfile::tempdir().unwrap();
-        let file = config_file(folder.path(), HEAVY);
+        let place = place(HEAVY);
         // Only signals cause checkpoints here.
-        let flags = ["--checkpoint-generations", "0", "--checkpoint-seconds", "0", "--quiet"];
+        let flags = "--checkpoint-generations 0 --checkpoint-seconds 0 --quiet";
         for name in ["TERM", "INT", "HUP"] {
             if name == "HUP" && (!cfg!(target_os = "linux") || ignores_hangup("self")) {
                 continue;
             }
-            let out = folder.path().join(name);
-            let child = flotilla_train(&file, &out, &flags).spawn().unwrap();
+            let out = place.path(name);
+            let child = process(&place, &line(name, flags)).spawn().unwrap();
             wait_until("the run starts", || out.join("run.json").exists());
             signal(&child, name);
             let (status, message) = wait_for_end(child);
@@ -1282,38 +1211,33 @@ mod unix {
                     && command.contains("--backend cpu"),
                 "{message}"
             );
-            let resumed = flotilla().args(command.split_whitespace()).output().unwrap();
-            assert_eq!(resumed.status.code(), Some(0), "{}", stderr(&resumed));
-            assert!(stderr(&resumed).contains("resuming at generation"), "{}", stderr(&resumed));
-            assert!(String::from_utf8_lossy(&resumed.stdout).contains(&expected.0.digest));
-            assert_eq!(result_files(&out), expected.1);
+            let (stdout, stderr) = place.good(command);
+            assert!(stderr.contains("resuming at generation"), "{stderr}");
+            assert!(stdout.contains(&expected.0.digest));
+            assert_eq!(support::results(&out), expected.1);
         }
     }
 
     #[test]
     fn a_stopped_run_whose_folder_was_moved_is_not_resumed_at_its_old_path() {
-        let folder = tempfile::tempdir().unwrap();
-        let file = config_file(folder.path(), HEAVY);
-        let (out, moved) = (folder.path().join("run"), folder.path().join("moved"));
-        let child = flotilla_train(&file, &out, &["--quiet"]).spawn().unwrap();
+        let place = place(HEAVY);
+        let out = place.path("run");
+        let child = process(&place, &line("run", "--quiet")).spawn().unwrap();
         wait_until("the run starts", || out.join(CONFIG).exists());
-        fs::rename(&out, &moved).unwrap();
+        fs::rename(&out, place.path("moved")).unwrap();
         signal(&child, "TERM");
         let (status, message) = wait_for_end(child);
         assert_eq!(status.code(), Some(75), "{message}");
         assert!(message.contains("was moved: continue with --resume and its new path"), "{message}");
-        let resumed = flotilla_train(&file, &moved, &["--resume", "--quiet"]).output().unwrap();
-        assert_eq!(resumed.status.code(), Some(0), "{}", stderr(&resumed));
+        place.good(&line("moved", "--resume --quiet"));
     }
 
     #[test]
     fn an_interrupt_after_another_signal_stops_a_run_at_once() {
-        let folder = tempfile::tempdir().unwrap();
         let text = HEAVY.replace("population = 60", "population = 2000").replace("steps = 4", "steps = 10000");
-        let file = config_file(folder.path(), &text);
-        let out = folder.path().join("run");
-        let child = flotilla_train(&file, &out, &["--threads", "1"]).spawn().unwrap();
-        wait_until("the run starts", || out.join("run.json").exists());
+        let place = place(&text);
+        let child = process(&place, &line("run", "--threads 1")).spawn().unwrap();
+        wait_until("the run starts", || place.path("run/run.json").exists());
         let start = Instant::now();
         signal(&child, "TERM");
         std::thread::sleep(Duration::from_millis(100));
@@ -1324,13 +1248,11 @@ mod unix {
 
     #[test]
     fn sigusr1_writes_a_checkpoint_and_the_run_continues() {
-        let folder = tempfile::tempdir().unwrap();
-        let file = config_file(folder.path(), &HEAVY.replace("generations = 60", "generations = 100000"));
-        let out = folder.path().join("run");
-        let flags = ["--checkpoint-generations", "0", "--checkpoint-seconds", "0"];
-        let child = flotilla_train(&file, &out, &flags).spawn().unwrap();
-        wait_until("the run starts", || out.join("run.json").exists());
-        let checkpoints = out.join("checkpoints");
+        let place = place(&HEAVY.replace("generations = 60", "generations = 100000"));
+        let flags = "--checkpoint-generations 0 --checkpoint-seconds 0";
+        let child = process(&place, &line("run", flags)).spawn().unwrap();
+        wait_until("the run starts", || place.path("run/run.json").exists());
+        let checkpoints = place.path("run/checkpoints");
         assert!(checkpoint::list(&checkpoints).unwrap().is_empty());
         for count in [1, 2] {
             signal(&child, "USR1");
@@ -1345,36 +1267,24 @@ mod unix {
     fn a_write_that_the_system_refuses_is_reported_and_the_run_resumes() {
         let config = Config::parse(HEAVY, "heavy.toml").unwrap();
         let expected = reference(&config);
-        let folder = tempfile::tempdir().unwrap();
-        let file = config_file(folder.path(), HEAVY);
-        let out = folder.path().join("run");
-        let program = assert_cmd::cargo::cargo_bin!("flotilla");
-        let limited = |blocks: &str| {
-            let script = format!("trap '' XFSZ; ulimit -f {blocks}; exec \"$@\"");
-            let mut command = Command::new("sh");
-            command.args(["-c", &script, "sh"]).arg(program).arg("train").arg(&file).arg("--out").arg(&out);
-            command.args(["--resume", "--backend", "cpu"]).output().unwrap()
-        };
+        let place = place(HEAVY);
         // Not even a checkpoint fits.
-        let refused = limited("100");
-        assert_eq!(refused.status.code(), Some(1), "{}", stderr(&refused));
-        assert!(stderr(&refused).contains(".safetensors: cannot be written"), "{}", stderr(&refused));
-        let resumed = flotilla_train(&file, &out, &["--resume"]).output().unwrap();
-        assert_eq!(resumed.status.code(), Some(0), "{}", stderr(&resumed));
-        assert_eq!(result_files(&out), expected.1);
+        let resume = line("run", "--resume");
+        let script = format!("trap '' XFSZ; ulimit -f 100; exec flotilla {resume} --backend cpu");
+        let refused = support::shell("sh", &script).current_dir(place.root()).output().unwrap();
+        let message = String::from_utf8_lossy(&refused.stderr);
+        assert_eq!(refused.status.code(), Some(1), "{message}");
+        assert!(message.contains(".safetensors: cannot be written"), "{message}");
+        place.good(&resume);
+        assert_eq!(support::results(&place.path("run")), expected.1);
     }
 
     #[test]
     fn an_output_folder_that_cannot_be_created_is_refused() {
-        let folder = tempfile::tempdir().unwrap();
-        let file = config_file(folder.path(), &text());
-        let output = flotilla_train(&file, &file, &[]).output().unwrap();
-        assert_eq!(output.status.code(), Some(1));
-        let message = stderr(&output);
-        assert!(message.starts_with("error: ") && message.contains("is a file; choose a folder"), "{message}");
+        let place = place(&text());
+        let message = place.fails(1, &line("config.toml", ""), &["is a file; choose a folder"]);
+        assert!(message.starts_with("error: "), "{message}");
         // The parent is a file.
-        let output = flotilla_train(&file, &file.join("run"), &[]).output().unwrap();
-        assert_eq!(output.status.code(), Some(1));
-        assert!(stderr(&output).contains("cannot be written"), "{}", stderr(&output));
+        place.fails(1, &line("config.toml/run", ""), &["cannot be written"]);
     }
 }

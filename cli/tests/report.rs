@@ -2,11 +2,10 @@
 //!
 //! The tests check pictures and replay pages, and the messages about damaged runs.
 
-use crate::support;
+use crate::support::{self, Place, Words, page_data};
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::Output;
 
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
@@ -21,31 +20,11 @@ use flotilla_app::report::replay::{self, Which};
 use flotilla_app::report::scene::{Color, text_width};
 use flotilla_studies::paper;
 use serde_json::Value;
-use tempfile::TempDir;
 
-fn flotilla(arguments: &[&str]) -> Output {
-    support::flotilla().args(arguments).output().unwrap()
-}
-
-fn succeed(arguments: &[&str]) -> String {
-    let output = flotilla(arguments);
-    assert!(output.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
-    String::from_utf8(output.stdout).unwrap()
-}
-
-/// Runs a command that must fail with exit code 1. Its error message must contain all of `expected`.
-fn fail(arguments: &[&str], expected: &[&str]) {
-    fail_with(1, arguments, expected);
-}
-
-fn fail_with(code: i32, arguments: &[&str], expected: &[&str]) {
-    let output = flotilla(arguments);
-    let message = String::from_utf8(output.stderr).unwrap();
-    assert_eq!(output.status.code(), Some(code), "{arguments:?}: {message}");
+/// Runs a command that must fail with this exit code. Its error message must come first, and contain all of `parts`.
+fn fail(place: &Place, code: i32, words: impl Words, parts: &[&str]) {
+    let message = place.fails(code, words, parts);
     assert!(message.starts_with("error: "), "{message}");
-    for part in expected {
-        assert!(message.contains(part), "{arguments:?}: {message:?} does not contain {part:?}");
-    }
 }
 
 /// Two leaders with two followers each, and two POIs within reach.
@@ -63,62 +42,29 @@ generations = 6
 trials = 3
 ";
 
-struct Run {
-    folder: TempDir,
+/// Creates a folder with a config in `small.toml`, and with a run of it in `run`.
+fn trained(config: &str) -> Place {
+    let place = Place::new(&[("small.toml", config)]).on_cpu().slow();
+    train(&place, "run", "");
+    place
 }
 
-impl Run {
-    fn new(config: &str, arguments: &[&str]) -> Run {
-        let folder = TempDir::new().unwrap();
-        let (config_path, out) = (folder.path().join("small.toml"), folder.path().join("run"));
-        fs::write(&config_path, config).unwrap();
-        let mut command =
-            vec!["train", config_path.to_str().unwrap(), "--out", out.to_str().unwrap(), "--backend", "cpu"];
-        command.extend(arguments);
-        command.push("--quiet");
-        succeed(&command);
-        Run { folder }
-    }
-
-    fn path(&self) -> PathBuf {
-        self.folder.path().join("run")
-    }
-
-    fn file(&self, name: &str) -> PathBuf {
-        self.path().join(name)
-    }
-
-    /// Returns the run's folder as text, for command lines.
-    fn text(&self) -> String {
-        self.path().to_str().unwrap().to_string()
-    }
-
-    /// Marks the run as unfinished. Files of unfinished runs are not compared with digests, so that tests can change
-    /// them.
-    fn mark_unfinished(&self) {
-        let record = fs::read_to_string(self.file("run.json")).unwrap();
-        fs::write(self.file("run.json"), record.replace("\"done\"", "\"running\"")).unwrap();
-    }
-
-    /// Returns G of the best team per trial and generation.
-    fn best(&self) -> BTreeMap<(usize, usize), f64> {
-        let text = fs::read_to_string(self.file("metrics.csv")).unwrap();
-        text.lines()
-            .skip(1)
-            .map(|line| {
-                let fields: Vec<&str> = line.split(',').collect();
-                ((fields[0].parse().unwrap(), fields[1].parse().unwrap()), fields[2].parse().unwrap())
-            })
-            .collect()
-    }
+fn train(place: &Place, run: &str, flags: &str) {
+    place.good(&format!("train small.toml --out {run} {flags} --quiet"));
 }
 
-/// Returns the JSON data of a replay page.
-fn data(path: &Path) -> Value {
-    let page = fs::read_to_string(path).unwrap();
-    let start = page.find("id=\"data\">").unwrap() + "id=\"data\">".len();
-    let end = start + page[start..].find("</script>").unwrap();
-    serde_json::from_str(&page[start..end]).unwrap()
+/// Marks the run as unfinished. Files of unfinished runs are not compared with digests, so that tests can change them.
+fn mark_unfinished(place: &Place) {
+    place.write("run/run.json", place.read("run/run.json").replace("\"done\"", "\"running\""));
+}
+
+/// Returns G of a run's best team per trial and generation.
+fn best(place: &Place, run: &str) -> BTreeMap<(usize, usize), f64> {
+    let row = |line: &str| {
+        let fields: Vec<&str> = line.split(',').collect();
+        ((fields[0].parse().unwrap(), fields[1].parse().unwrap()), fields[2].parse().unwrap())
+    };
+    place.read(format!("{run}/metrics.csv")).lines().skip(1).map(row).collect()
 }
 
 fn floats(text: &Value) -> Vec<f32> {
@@ -134,15 +80,14 @@ fn count(svg: &str, element: &str) -> usize {
 
 #[test]
 fn plot_writes_svg_and_png() {
-    let run = Run::new(CONFIG, &[]);
-    succeed(&["plot", &run.text()]);
-    let svg = fs::read_to_string(run.file("curves.svg")).unwrap();
+    let place = trained(CONFIG);
+    place.good("plot run");
+    let svg = place.read("run/curves.svg");
     for label in ["best team", "champion", "mean team", "Generation", "G (share of POIs observed)"] {
         assert!(svg.contains(label), "{label}");
     }
-    let picture = run.file("curves.png");
-    succeed(&["plot", &run.text(), "--out", picture.to_str().unwrap()]);
-    let png = fs::read(picture).unwrap();
+    place.good("plot run --out run/curves.png");
+    let png = place.bytes("run/curves.png");
     assert_eq!(png[..8], *b"\x89PNG\r\n\x1a\n");
     // The width of a paper's column at 300 dots per inch, which are 11811 per metre.
     assert_eq!(u32::from_be_bytes(png[16..20].try_into().unwrap()), 1004);
@@ -154,16 +99,17 @@ fn plot_writes_svg_and_png() {
 #[test]
 fn curves_follow_the_metrics() {
     // A single trial has no error band, and the mean over trials is the trial itself.
-    let [run, several] = ["1", "3"].map(|trials| Run::new(CONFIG, &["--trials", trials]));
-    let [svg, with_bands] = [&run, &several].map(|run| {
-        succeed(&["plot", &run.text()]);
-        fs::read_to_string(run.file("curves.svg")).unwrap()
+    let place = Place::new(&[("small.toml", CONFIG)]).on_cpu().slow();
+    let [svg, with_bands] = ["1", "3"].map(|trials| {
+        train(&place, trials, &format!("--trials {trials}"));
+        place.good(&format!("plot {trials}"));
+        place.read(format!("{trials}/curves.svg"))
     });
     assert!(count(&svg, "polygon") < count(&with_bands, "polygon"));
     let line = svg.lines().filter(|line| line.starts_with("<polyline")).find(|line| line.matches(',').count() == 7);
     let points = line.unwrap().split('"').nth(1).unwrap();
     let heights: Vec<f64> = points.split(' ').map(|point| point.split(',').nth(1).unwrap().parse().unwrap()).collect();
-    let metrics = fs::read_to_string(run.file("metrics.csv")).unwrap();
+    let metrics = place.read("1/metrics.csv");
     let champion: Vec<f64> =
         metrics.lines().skip(1).map(|row| row.split(',').nth(4).unwrap().parse().unwrap()).collect();
     for (first, first_height) in heights.iter().enumerate() {
@@ -176,51 +122,48 @@ fn curves_follow_the_metrics() {
 
 #[test]
 fn several_runs_are_labelled_by_the_keys_that_differ() {
-    let (first, second) = (Run::new(CONFIG, &["--fitness", "G"]), Run::new(CONFIG, &["--fitness", "D++"]));
-    let out = first.file("both.svg");
-    succeed(&["plot", &first.text(), &second.text(), "--out", out.to_str().unwrap()]);
-    let svg = fs::read_to_string(&out).unwrap();
+    let place = Place::new(&[("small.toml", CONFIG)]).on_cpu().slow();
+    train(&place, "first", "--fitness G");
+    train(&place, "second", "--fitness D++");
+    train(&place, "six", "--fitness G --trials 6");
+    train(&place, "other", "--fitness D++ --trials 6");
+    place.good("plot first second --out both.svg");
+    let svg = place.read("both.svg");
     assert!(svg.contains("\"fitness G\"") && svg.contains("\"fitness D++\""), "{svg}");
     assert!(!svg.contains("population"));
     // Three pairs are too few to compare them.
-    let [six, other] = ["G", "D++"].map(|fitness| Run::new(CONFIG, &["--fitness", fitness, "--trials", "6"]));
-    for (run, with, trials_are_pairs) in [(&six, &other, true), (&six, &second, false), (&first, &second, false)] {
-        let plotted = flotilla(&["plot", &run.text(), &with.text(), "--out", out.to_str().unwrap()]);
-        let notes = String::from_utf8(plotted.stderr).unwrap();
+    for (runs, trials_are_pairs) in [("six other", true), ("six second", false), ("first second", false)] {
+        let (_, notes) = place.good(&format!("plot {runs} --out both.svg"));
         assert_eq!(notes.contains("their trials are pairs"), trials_are_pairs, "{notes}");
     }
 }
 
 #[test]
 fn runs_with_equal_configs_are_labelled_by_their_folders() {
-    let run = Run::new(CONFIG, &[]);
-    let out = run.file("both.svg");
-    succeed(&["plot", &run.text(), &run.text(), "--out", out.to_str().unwrap()]);
-    assert!(fs::read_to_string(out).unwrap().contains("run\""));
+    let place = trained(CONFIG);
+    place.good("plot run run --out both.svg");
+    assert!(place.read("both.svg").contains("run\""));
 }
 
 #[test]
 fn paths_without_a_run_are_refused_with_the_reason() {
-    let empty = TempDir::new().unwrap();
-    let missing = empty.path().join("nowhere");
-    let file = empty.path().join("file");
-    fs::write(&file, "").unwrap();
+    let place = Place::new(&[("file", "")]).on_cpu();
     for command in ["plot", "replay"] {
-        fail(&[command, missing.to_str().unwrap()], &["no such folder", "flotilla train"]);
-        fail(&[command, file.to_str().unwrap()], &["is a file"]);
-        fail(&[command, empty.path().to_str().unwrap()], &["config.toml", "flotilla train"]);
+        fail(&place, 1, &[command, "nowhere"], &["no such folder", "flotilla train"]);
+        fail(&place, 1, &[command, "file"], &["is a file"]);
+        fail(&place, 1, &[command, "."], &["config.toml", "flotilla train"]);
     }
 }
 
 #[test]
 fn errors_about_damaged_runs_name_the_file_and_line() {
-    let run = Run::new(CONFIG, &[]);
-    run.mark_unfinished();
-    let metrics = fs::read_to_string(run.file("metrics.csv")).unwrap();
+    let place = trained(CONFIG);
+    mark_unfinished(&place);
+    let metrics = place.read("run/metrics.csv");
     let refuses_metrics = |text: &[u8], expected: &[&str]| {
-        fs::write(run.file("metrics.csv"), text).unwrap();
-        fail(&["plot", &run.text()], expected);
-        fail(&["replay", &run.text()], expected);
+        place.write("run/metrics.csv", text);
+        fail(&place, 1, "plot run", expected);
+        fail(&place, 1, "replay run", expected);
     };
     let header = metrics.lines().next().unwrap();
     refuses_metrics(b"", &["metrics.csv", "line 1"]);
@@ -231,45 +174,45 @@ fn errors_about_damaged_runs_name_the_file_and_line() {
     refuses_metrics(format!("{header}\n3,0,0,0,0,0\n").as_bytes(), &["line 2", "config.toml"]);
     refuses_metrics(format!("{header}\n0,1000000,0,0,0,0\n").as_bytes(), &["line 2", "config.toml"]);
     refuses_metrics(format!("{header}\n{}\n", "9".repeat(1 << 20)).as_bytes(), &["rows"]);
-    fs::remove_file(run.file("metrics.csv")).unwrap();
-    fail(&["plot", &run.text()], &["metrics.csv", "--resume"]);
-    fs::write(run.file("config.toml"), "[world").unwrap();
-    fail(&["plot", &run.text()], &["config.toml", "flotilla train"]);
+    fs::remove_file(place.path("run/metrics.csv")).unwrap();
+    fail(&place, 1, "plot run", &["metrics.csv", "--resume"]);
+    place.write("run/config.toml", "[world");
+    fail(&place, 1, "plot run", &["config.toml", "flotilla train"]);
 }
 
 #[test]
 fn an_unfinished_run_plots_and_replays_up_to_its_last_whole_generation() {
-    let run = Run::new(CONFIG, &[]);
-    run.mark_unfinished();
-    let metrics = fs::read_to_string(run.file("metrics.csv")).unwrap();
+    let place = trained(CONFIG);
+    mark_unfinished(&place);
+    let metrics = place.read("run/metrics.csv");
     let lines: Vec<&str> = metrics.lines().take(1 + 3 * 4).collect();
     // Only one of three trials has a row of generation 4.
-    fs::write(run.file("metrics.csv"), lines.join("\n") + "\n0,4,1,1,1,0.000\n1,4,0.").unwrap();
-    succeed(&["plot", &run.text()]);
-    let svg = fs::read_to_string(run.file("curves.svg")).unwrap();
+    place.write("run/metrics.csv", lines.join("\n") + "\n0,4,1,1,1,0.000\n1,4,0.");
+    place.good("plot run");
+    let svg = place.read("run/curves.svg");
     assert!(svg.contains("at generation 3") && !svg.contains("at generation 4"), "{svg}");
-    fs::write(run.file("metrics.csv"), lines[..3].join("\n") + "\n").unwrap();
-    fail(&["plot", &run.text()], &["no generation of all trials", "--resume"]);
-    fs::write(run.file("metrics.csv"), lines.join("\n") + "\n0,4,0.").unwrap();
-    let stdout = succeed(&["replay", &run.text(), "--backend", "cpu"]);
-    assert!(stdout.contains("generation 3"), "{stdout}");
-    fail_with(2, &["replay", &run.text(), "--generation", "5", "--backend", "cpu"], &["generation 5", "newest is 3"]);
-    fs::remove_file(run.file("policies.safetensors")).unwrap();
-    fail(&["rollout", &run.text()], &["has no policies.safetensors yet", "finish the run with `flotilla train"]);
+    place.write("run/metrics.csv", lines[..3].join("\n") + "\n");
+    fail(&place, 1, "plot run", &["no generation of all trials", "--resume"]);
+    place.write("run/metrics.csv", lines.join("\n") + "\n0,4,0.");
+    place.prints("replay run", &["generation 3"]);
+    fail(&place, 2, "replay run --generation 5", &["generation 5", "newest is 3"]);
+    fs::remove_file(place.path("run/policies.safetensors")).unwrap();
+    fail(&place, 1, "rollout run", &["has no policies.safetensors yet", "finish the run with `flotilla train"]);
 }
 
 #[test]
 fn removing_a_leader_lowers_g_by_its_credit() {
     // D removes only the leader. Df also removes its group over the whole episode, and Dt its group at each step.
+    let place = Place::new(&[("small.toml", CONFIG)]).on_cpu().slow();
     let mut positive = 0;
     for fitness in ["Df", "Dt"] {
         // Some generations are played again from a checkpoint.
-        let run = Run::new(CONFIG, &["--fitness", fitness, "--checkpoint-generations", "2"]);
-        for ((trial, generation), best) in run.best() {
+        train(&place, fitness, &format!("--fitness {fitness} --checkpoint-generations 2"));
+        let run = place.path(fitness);
+        for ((trial, generation), best) in best(&place, fitness) {
             let (which, verification) = (Which::Best, Verification::Required);
             let watch = &mut |_| true;
-            let played =
-                replay::replay(&run.path(), trial, &[generation], which, verification, &mut Cpu::default(), watch);
+            let played = replay::replay(&run, trial, &[generation], which, verification, &mut Cpu::default(), watch);
             let played = &played.unwrap()[0];
             let count = |observed: &[Option<usize>]| observed.iter().flatten().count() as f32;
             assert_eq!((played.team_g, f64::from(count(&played.observed)) / 2.0), (best, best), "{trial} {generation}");
@@ -289,23 +232,22 @@ fn removing_a_leader_lowers_g_by_its_credit() {
 
 #[test]
 fn a_zipped_run_is_refused_with_the_command_that_unpacks_it() {
-    let folder = tempfile::tempdir().unwrap();
-    let file = folder.path().join("my run.zip");
-    fs::write(&file, b"PK\x03\x04 and the rest of a zip file").unwrap();
-    let (file, run) = (file.to_str().unwrap(), Run::new(CONFIG, &[]));
-    for arguments in [&["plot", file][..], &["replay", file], &["rollout", file], &["compare", file, &run.text()]] {
-        fail(arguments, &["my run.zip is a file", "unpack it with `unzip '", "my run.zip'`"]);
+    let (place, file) = (trained(CONFIG), "my run.zip");
+    place.write(file, b"PK\x03\x04 and the rest of a zip file");
+    for words in [&["plot", file][..], &["replay", file], &["rollout", file], &["compare", file, "run"]] {
+        fail(&place, 1, words, &["my run.zip is a file", "unpack it with `unzip 'my run.zip'`"]);
     }
-    fail(&["train", file, "--resume"], &["my run.zip", "it is a zip file; unpack it"]);
+    fail(&place, 1, &["train", file, "--resume"], &["my run.zip", "it is a zip file; unpack it"]);
 }
 
 #[test]
 fn a_replay_shows_the_episode_that_rollout_traces() {
     // After the last generation, the policies file has the populations that played, in another order. So the replayed
     // team is one of the four possible teams, and `rollout` must trace its episode.
-    let run = Run::new(CONFIG, &["--population", "2", "--trials", "1"]);
-    succeed(&["replay", &run.text(), "--backend", "cpu"]);
-    let page = data(&run.file("replay.html"));
+    let place = Place::new(&[("small.toml", CONFIG)]).on_cpu().slow();
+    train(&place, "run", "--population 2 --trials 1");
+    place.good("replay run");
+    let page = page_data(&place.path("run/replay.html"));
     let episode = &page["episodes"][0];
     assert_eq!(page["exact"], true);
     let observed = episode["observed"].as_array().unwrap().iter().filter(|step| !step.is_null()).count();
@@ -315,8 +257,7 @@ fn a_replay_shows_the_episode_that_rollout_traces() {
     let (agents, steps) = (6, 20);
     assert_eq!(positions.len(), (steps + 1) * agents * 2);
 
-    let policies = run.file("policies.safetensors");
-    let bytes = fs::read(&policies).unwrap();
+    let bytes = place.bytes("run/policies.safetensors");
     let file = safetensors::SafeTensors::deserialize(&bytes).unwrap();
     let tensor = file.tensor("weights.0").unwrap();
     let shape = tensor.shape().to_vec();
@@ -330,21 +271,10 @@ fn a_replay_shows_the_episode_that_rollout_traces() {
         (0..2).flat_map(|leader| teams.iter().flat_map(move |team| policy_of(leader, team[leader]).to_vec())).collect();
     let raw: Vec<u8> = weights.iter().flat_map(|weight| weight.to_le_bytes()).collect();
     let view = safetensors::tensor::TensorView::new(safetensors::Dtype::F32, vec![2, 4, parameters], &raw).unwrap();
-    let teams_file = run.file("all.safetensors");
-    fs::write(&teams_file, safetensors::serialize([("weights", view)], None).unwrap()).unwrap();
-    let trace = run.file("trace.csv");
-    succeed(&[
-        "rollout",
-        run.file("config.toml").to_str().unwrap(),
-        "--policies",
-        teams_file.to_str().unwrap(),
-        "--trace",
-        trace.to_str().unwrap(),
-        "--backend",
-        "cpu",
-    ]);
+    place.write("all.safetensors", safetensors::serialize([("weights", view)], None).unwrap());
+    place.good("rollout run/config.toml --policies all.safetensors --trace trace.csv");
     let mut traced = vec![vec![[0f32; 4]; (steps + 1) * agents]; 4];
-    for line in fs::read_to_string(trace).unwrap().lines().skip(1) {
+    for line in place.read("trace.csv").lines().skip(1) {
         let fields: Vec<&str> = line.split(',').collect();
         let [team, step, agent] = [0, 1, 2].map(|field| fields[field].parse::<usize>().unwrap());
         traced[team][step * agents + agent] = [4, 5, 6, 7].map(|field| fields[field].parse().unwrap());
@@ -356,9 +286,9 @@ fn a_replay_shows_the_episode_that_rollout_traces() {
 
 #[test]
 fn a_replay_that_contradicts_the_metrics_is_refused() {
-    let run = Run::new(CONFIG, &[]);
-    run.mark_unfinished();
-    let metrics = fs::read_to_string(run.file("metrics.csv")).unwrap();
+    let place = trained(CONFIG);
+    mark_unfinished(&place);
+    let metrics = place.read("run/metrics.csv");
     let forged: String = metrics
         .lines()
         .map(|line| {
@@ -369,18 +299,17 @@ fn a_replay_that_contradicts_the_metrics_is_refused() {
             fields.join(",") + "\n"
         })
         .collect();
-    fs::write(run.file("metrics.csv"), forged).unwrap();
-    fail(&["replay", &run.text(), "--backend", "cpu"], &["generation 6", "metrics.csv has"]);
-    fail_with(2, &["replay", &run.text(), "--trial", "3", "--backend", "cpu"], &["no trial 3", "0 to 2"]);
+    place.write("run/metrics.csv", forged);
+    fail(&place, 1, "replay run", &["generation 6", "metrics.csv has"]);
+    fail(&place, 2, "replay run --trial 3", &["no trial 3", "0 to 2"]);
 }
 
 #[test]
 fn replay_writes_svg_png_and_pdf() {
-    let run = Run::new(CONFIG, &[]);
+    let place = trained(CONFIG);
     let write = |name: &str| {
-        let out = run.file(name);
-        succeed(&["replay", &run.text(), "--compare", "0", "--out", out.to_str().unwrap(), "--backend", "cpu"]);
-        fs::read(out).unwrap()
+        place.good(&format!("replay run --compare 0 --out {name}"));
+        place.bytes(name)
     };
     let svg = String::from_utf8(write("still.svg")).unwrap();
     assert!(svg.contains("trial 0, generation 0") && svg.contains("trial 0, generation 6"));
@@ -392,12 +321,11 @@ fn replay_writes_svg_png_and_pdf() {
 
 #[test]
 fn gifs_and_frames_have_the_requested_size_and_rate() {
-    let run = Run::new(&CONFIG.replace("steps = 20", "steps = 5"), &[]);
-    let render = |name: &str, flags: &[&str]| {
-        let out = run.file(name);
-        let arguments = ["replay", &run.text(), "--compare", "0", "--out", out.to_str().unwrap(), "--backend", "cpu"];
-        let output = flotilla(&[&arguments[..], flags].concat());
-        (out, output)
+    let place = trained(&CONFIG.replace("steps = 20", "steps = 5"));
+    let line = |name: &str, flags: &str| format!("replay run --compare 0 --out {name} {flags}");
+    let render = |name: &str, flags: &str| {
+        place.good(&line(name, flags));
+        place.path(name)
     };
     // Returns a GIF's size and the end of each frame, in hundredths of a second.
     let size_and_ends = |path: &Path| {
@@ -411,16 +339,15 @@ fn gifs_and_frames_have_the_requested_size_and_rate() {
         (size, ends)
     };
     // Five steps of 0.2 seconds at 20 frames per second. The last frame stays for two seconds.
-    let (size, ends) = size_and_ends(&render("moving.gif", &[]).0);
+    let (size, ends) = size_and_ends(&render("moving.gif", ""));
     assert!(size.0 == 960 || size.1 == 720, "{size:?}");
     assert_eq!((ends.len(), ends[19], ends[20]), (21, 100, 300));
-    let (size, ends) = size_and_ends(&render("small.gif", &["--width", "333", "--fps", "30"]).0);
+    let (size, ends) = size_and_ends(&render("small.gif", "--width 333 --fps 30"));
     assert_eq!(size.0, 333);
     assert_eq!((ends.len(), ends[29]), (31, 100));
 
     // A name with `%03d` writes one numbered file per frame.
-    let (film, output) = render("film/%03d.png", &["--fps", "10", "--width", "400"]);
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let film = render("film/%03d.png", "--fps 10 --width 400");
     let mut names: Vec<_> = fs::read_dir(film.parent().unwrap()).unwrap().map(|entry| entry.unwrap().path()).collect();
     names.sort();
     assert_eq!(names.len(), 11);
@@ -430,26 +357,20 @@ fn gifs_and_frames_have_the_requested_size_and_rate() {
     }
 
     // A still picture of any step of the episode, with the requested width.
-    let (_, output) = render("still.svg", &["--step", "5"]);
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    let (path, output) = render("late.svg", &["--step", "6"]);
-    let message = String::from_utf8(output.stderr).unwrap();
-    assert!(output.status.code() == Some(2) && message.contains("the episode has steps 0 to 5"), "{message}");
-    assert!(!path.exists());
-    let (still, _) = render("still.png", &["--width", "300"]);
-    assert_eq!(fs::read(still).unwrap()[16..20], 300_u32.to_be_bytes());
+    render("still.svg", "--step 5");
+    place.fails(2, &line("late.svg", "--step 6"), &["the episode has steps 0 to 5"]);
+    assert!(!place.path("late.svg").exists());
+    assert_eq!(fs::read(render("still.png", "--width 300")).unwrap()[16..20], 300_u32.to_be_bytes());
 
     // Flags that do nothing for a format are refused.
     for (name, flags, flag) in [
-        ("a.svg", ["--width", "400"], "--width"),
-        ("a.html", ["--width", "400"], "--width"),
-        ("a.png", ["--fps", "10"], "--fps"),
-        ("a.gif", ["--step", "3"], "--step"),
+        ("a.svg", "--width 400", "--width"),
+        ("a.html", "--width 400", "--width"),
+        ("a.png", "--fps 10", "--fps"),
+        ("a.gif", "--step 3", "--step"),
     ] {
-        let (path, output) = render(name, &flags);
-        let message = String::from_utf8(output.stderr).unwrap();
-        assert_eq!(output.status.code(), Some(2), "{message}");
-        assert!(message.contains(flag) && !path.exists(), "{message}");
+        place.fails(2, &line(name, flags), &[flag]);
+        assert!(!place.path(name).exists());
     }
 }
 
@@ -502,15 +423,12 @@ fn crowded(pois: usize, leaders: usize) -> String {
 #[test]
 fn labels_of_many_pois_and_leaders_do_not_overlap() {
     for (pois, leaders) in [(1, 1), (4, 2), (20, 6), (64, 20), (256, 40)] {
-        let run = Run::new(&crowded(pois, leaders), &[]);
-        let (still, layout) = (run.file("still.svg"), run.file("layout.svg"));
-        succeed(&["replay", &run.text(), "--out", still.to_str().unwrap(), "--backend", "cpu"]);
-        let config = run.file("config.toml");
-        let config = config.to_str().unwrap();
-        let stdout = succeed(&["check", config, "--out", layout.to_str().unwrap()]);
-        assert_eq!(stdout, succeed(&["check", config]));
-        for (what, path) in [("still", still), ("layout", layout)] {
-            let svg = fs::read_to_string(path).unwrap();
+        let place = trained(&crowded(pois, leaders));
+        place.good("replay run --out still.svg");
+        let (stdout, _) = place.good("check run/config.toml --out layout.svg");
+        assert_eq!(stdout, place.good("check run/config.toml").0);
+        for what in ["still", "layout"] {
+            let svg = place.read(format!("{what}.svg"));
             assert!(svg.len() < 400_000, "{} bytes", svg.len());
             let labels = texts(&svg);
             assert_no_overlap(&format!("{what} of {pois} POIs"), &labels);
@@ -533,40 +451,30 @@ fn labels_of_many_pois_and_leaders_do_not_overlap() {
 
 #[test]
 fn a_layout_picture_shows_the_config() {
-    let folder = TempDir::new().unwrap();
-    let config = folder.path().join("small.toml");
-    fs::write(
-        &config,
-        CONFIG.replace("coupling = 2", "coupling = [7, 1]").replace("followers = [", "followers = [[1, 1], "),
-    )
-    .unwrap();
+    let config = CONFIG.replace("coupling = 2", "coupling = [7, 1]").replace("followers = [", "followers = [[1, 1], ");
+    let place = Place::new(&[("small.toml", &config)]);
     for name in ["layout.svg", "layout.png", "layout.pdf"] {
-        let out = folder.path().join(name);
-        succeed(&["check", config.to_str().unwrap(), "--out", out.to_str().unwrap()]);
-        assert!(fs::metadata(out).unwrap().len() > 2_000);
+        place.good(&format!("check small.toml --out {name}"));
+        assert!(place.bytes(name).len() > 2_000);
     }
-    let svg = fs::read_to_string(folder.path().join("layout.svg")).unwrap();
+    let svg = place.read("layout.svg");
     let labels: Vec<String> = texts(&svg).into_iter().map(|(text, _)| text).collect();
     for text in ["7", "1", "0", "2 leaders, 5 followers, 2 POIs", "number at a POI: agents it needs, within 5 of it"] {
         assert!(labels.iter().any(|label| label == text), "{text:?} is not in {labels:?}");
     }
     assert!(svg.contains("Leaders at (8, 5), (20, 5)") && svg.contains("POIs at (8, 10), (20, 10)"));
-    let output = flotilla(&["check", config.to_str().unwrap(), "--out", "layout.gif"]);
-    assert_eq!(output.status.code(), Some(2));
+    assert_eq!(place.run("check small.toml --out layout.gif").status.code(), Some(2));
 }
 
 #[test]
 fn svgs_need_no_fonts_and_describe_themselves() {
-    let run = Run::new(CONFIG, &[]);
-    let config = run.file("config.toml");
-    let svg = |arguments: &[&str]| {
-        let out = run.file("picture.svg");
-        succeed(&[arguments, &["--out", out.to_str().unwrap()]].concat());
-        fs::read_to_string(out).unwrap()
+    let place = trained(CONFIG);
+    let svg = |line: &str| {
+        place.good(&format!("{line} --out picture.svg"));
+        place.read("picture.svg")
     };
-    let curves = svg(&["plot", &run.text()]);
-    let still = svg(&["replay", &run.text(), "--backend", "cpu", "--compare", "0"]);
-    for svg in [&curves, &still, &svg(&["check", config.to_str().unwrap()])] {
+    let (curves, still) = (svg("plot run"), svg("replay run --compare 0"));
+    for svg in [&curves, &still, &svg("check run/config.toml")] {
         // The file contains the outlines of its letters, so that viewers need no font.
         assert!(!svg.contains("<text") && !svg.contains("font"), "{svg}");
         for glyph in svg.split("xlink:href=\"#").skip(1).map(|rest| rest.split('"').next().unwrap()) {
@@ -579,8 +487,8 @@ fn svgs_need_no_fonts_and_describe_themselves() {
         assert!(svg.len() < 50_000 && svg.lines().count() < 250, "{} bytes", svg.len());
     }
     // Descriptions contain the numbers that the pictures show.
-    let last: Vec<f64> =
-        run.best().into_iter().filter(|((_, generation), _)| *generation == 6).map(|(_, g)| g).collect();
+    let best = best(&place, "run").into_iter();
+    let last: Vec<f64> = best.filter(|((_, generation), _)| *generation == 6).map(|(_, g)| g).collect();
     let mean = format!("{:.3}", last.iter().sum::<f64>() / 3.0);
     let mean = mean.trim_end_matches('0').trim_end_matches('.');
     let described = curves.split("<desc").nth(1).unwrap().split("</desc").next().unwrap();
@@ -588,8 +496,8 @@ fn svgs_need_no_fonts_and_describe_themselves() {
     assert!(curves.contains("mean and 95 % interval over 3 trials"));
     assert!(still.contains("generation 6, step 20 of 20: ") && still.contains(" of 2 POIs observed"));
     // With one trial, there is no band to explain.
-    let single = Run::new(CONFIG, &["--trials", "1"]);
-    assert!(!svg(&["plot", &single.text()]).contains("interval over"));
+    train(&place, "single", "--trials 1");
+    assert!(!svg("plot single").contains("interval over"));
 }
 
 /// Returns the largest height of each band of a figure, in millimetres.
@@ -614,44 +522,39 @@ fn band_heights(svg: &str) -> Vec<f64> {
 
 #[test]
 fn curves_show_the_requested_team_and_band() {
-    let (first, second) = (Run::new(CONFIG, &[]), Run::new(CONFIG, &["--fitness", "G"]));
-    let plot = |runs: &[&Run], flags: &[&str]| {
-        let out = first.file("picture.svg");
-        let mut arguments = vec!["plot".to_string()];
-        arguments.extend(runs.iter().map(|run| run.text()));
-        let flags: Vec<String> = flags.iter().map(ToString::to_string).collect();
-        let arguments = [arguments, vec!["--out".into(), out.to_str().unwrap().into()], flags].concat();
-        succeed(&arguments.iter().map(String::as_str).collect::<Vec<_>>());
-        fs::read_to_string(out).unwrap()
+    let place = trained(CONFIG);
+    train(&place, "other", "--fitness G");
+    let plot = |runs: &str, flags: &str| {
+        place.good(&format!("plot {runs} --out picture.svg {flags}"));
+        place.read("picture.svg")
     };
     for (measure, label) in [("best", "best team"), ("champion", "champion"), ("mean", "mean team")] {
-        for runs in [&[&first][..], &[&first, &second]] {
-            let svg = plot(runs, &["--measure", measure]);
+        for runs in ["run", "run other"] {
+            let svg = plot(runs, &format!("--measure {measure}"));
             assert!(svg.contains(&format!("aria-label=\"G of the {label}\"")), "{measure}: {svg}");
             // The curve is labelled with the measure only if there is a single run.
-            assert_eq!(svg.contains(&format!("aria-label=\"{label}\"")), runs.len() == 1, "{measure}");
+            assert_eq!(svg.contains(&format!("aria-label=\"{label}\"")), runs == "run", "{measure}");
         }
     }
     // By default, a plot of several runs shows their champions.
-    assert!(plot(&[&first, &second], &[]).contains("G of the champion"));
-    let [interval, error, none] = ["interval", "error", "none"].map(|band| plot(&[&first], &["--band", band]));
-    assert_eq!(plot(&[&first], &[]), interval);
+    assert!(plot("run other", "").contains("G of the champion"));
+    let [interval, error, none] = ["interval", "error", "none"].map(|band| plot("run", &format!("--band {band}")));
+    assert_eq!(plot("run", ""), interval);
     assert!(error.contains("mean ± standard error over 3 trials") && !none.contains("over 3 trials"));
     let [interval, error, none] = [interval, error, none].map(|svg| band_heights(&svg));
     // A curve whose trials are equal has no standard error. Their interval has a width at every generation.
     assert!(interval.len() == 3 && (1..=3).contains(&error.len()) && none.is_empty());
     let largest = |heights: &[f64]| heights.iter().copied().fold(0.0, f64::max);
     assert!(largest(&interval) > 1.5 * largest(&error), "{interval:?} {error:?}");
-    fail_with(2, &["plot", &first.text(), "--band", "wide"], &["allowed interval, error or none"]);
-    fail_with(2, &["plot", &first.text(), "--measure", "worst"], &["allowed champion, best, mean or test"]);
+    fail(&place, 2, "plot run --band wide", &["allowed interval, error or none"]);
+    fail(&place, 2, "plot run --measure worst", &["allowed champion, best, mean or test"]);
 }
 
 #[test]
 fn pdfs_have_a_valid_object_table_and_an_embedded_font() {
-    let run = Run::new(CONFIG, &[]);
-    let out = run.file("curves.pdf");
-    succeed(&["plot", &run.text(), "--out", out.to_str().unwrap()]);
-    let pdf = fs::read(out).unwrap();
+    let place = trained(CONFIG);
+    place.good("plot run --out run/curves.pdf");
+    let pdf = place.bytes("run/curves.pdf");
     assert!(pdf.len() < 30_000, "{} bytes", pdf.len());
     let find = |text: &str, from: usize| {
         pdf[from..].windows(text.len()).position(|window| window == text.as_bytes()).map(|at| at + from)
@@ -705,21 +608,18 @@ fn shortened_labels_keep_their_differences() {
 
 #[test]
 fn legends_of_many_runs_do_not_overlap_and_fit_the_figure() {
-    let run = Run::new(CONFIG, &[]);
-    let names: Vec<String> = (0..24)
-        .map(|index| {
-            let name = run.folder.path().join(format!("a run with a name that goes on and on, and on, number {index}"));
-            fs::create_dir(&name).unwrap();
-            for file in ["config.toml", "metrics.csv"] {
-                fs::copy(run.file(file), name.join(file)).unwrap();
-            }
-            name.to_str().unwrap().to_string()
-        })
-        .collect();
-    let out = run.file("many.svg");
-    let arguments: Vec<&str> = ["plot"].into_iter().chain(names.iter().map(|name| &**name)).collect();
-    succeed(&[&arguments[..], &["--out", out.to_str().unwrap()]].concat());
-    let svg = fs::read_to_string(out).unwrap();
+    let place = trained(CONFIG);
+    let mut words = vec!["plot".into(), "--out".into(), PathBuf::from("many.svg")];
+    for index in 0..24 {
+        let name = place.path(format!("a run with a name that goes on and on, and on, number {index}"));
+        fs::create_dir(&name).unwrap();
+        for file in ["config.toml", "metrics.csv"] {
+            fs::copy(place.path("run").join(file), name.join(file)).unwrap();
+        }
+        words.push(name);
+    }
+    place.good(&words);
+    let svg = place.read("many.svg");
     // So many bands could not be told apart: each curve has a bar at its end.
     assert!(band_heights(&svg).is_empty() && svg.contains("mean and 95 % interval over 3 trials at the end"));
     let labels = texts(&svg);
@@ -803,10 +703,7 @@ fn columns_of_the_training_summary_stay_apart_with_many_pois() {
     let pois: Vec<String> = (0..12).map(|index| format!("[{}, 6]", 8 + index)).collect();
     let config = CONFIG.replace("pois = [[8.0, 10.0], [20.0, 10.0]]", &format!("pois = [{}]", pois.join(", ")));
     let config = config.replace("coupling = 2", "coupling = 1\nobservation_radius = 8.0");
-    let folder = TempDir::new().unwrap();
-    fs::write(folder.path().join("c.toml"), config).unwrap();
-    let [config, out] = ["c.toml", "run"].map(|name| folder.path().join(name).to_str().unwrap().to_string());
-    let stdout = succeed(&["train", &config, "--out", &out, "--backend", "cpu"]);
+    let (stdout, _) = Place::new(&[("c.toml", &config)]).on_cpu().slow().good("train c.toml --out run");
     let rows: Vec<Vec<&str>> = stdout
         .lines()
         .filter(|line| line.starts_with("  ") && line.contains(" to 1"))
@@ -827,11 +724,11 @@ fn replay_pages_of_long_episodes_stay_small() {
         leaders.join(", "),
         followers.join(", ")
     );
-    let run = Run::new(&config, &[]);
-    succeed(&["replay", &run.text(), "--compare", "0", "--backend", "cpu"]);
-    let size = fs::metadata(run.file("replay.html")).unwrap().len();
+    let place = trained(&config);
+    place.good("replay run --compare 0");
+    let size = place.bytes("run/replay.html").len();
     assert!(size < 2_000_000, "{size} bytes");
-    let page = data(&run.file("replay.html"));
+    let page = page_data(&place.path("run/replay.html"));
     assert_eq!(page["exact"], false);
     let shown = page["episodes"][0]["shown"].as_array().unwrap();
     assert_eq!((shown[0].as_u64(), shown.last().unwrap().as_u64()), (Some(0), Some(1500)));
@@ -839,11 +736,10 @@ fn replay_pages_of_long_episodes_stay_small() {
 
 #[test]
 fn plots_of_long_runs_stay_small() {
-    let run = Run::new(CONFIG, &[]);
-    run.mark_unfinished();
-    let config = fs::read_to_string(run.file("config.toml")).unwrap();
-    let config = config.replace("generations = 6", "generations = 10000").replace("trials = 3", "trials = 20");
-    fs::write(run.file("config.toml"), config).unwrap();
+    let place = trained(CONFIG);
+    mark_unfinished(&place);
+    let config = place.read("run/config.toml").replace("generations = 6", "generations = 10000");
+    place.write("run/config.toml", config.replace("trials = 3", "trials = 20"));
     let mut metrics = "trial,generation,best_g,mean_g,champion_g,seconds\n".to_string();
     for generation in 0..=10_000 {
         for trial in 0..20 {
@@ -851,9 +747,9 @@ fn plots_of_long_runs_stay_small() {
             metrics += &format!("{trial},{generation},{g},{},{g},1.000\n", g / 2.0);
         }
     }
-    fs::write(run.file("metrics.csv"), metrics).unwrap();
-    succeed(&["plot", &run.text()]);
-    let svg = fs::read_to_string(run.file("curves.svg")).unwrap();
+    place.write("run/metrics.csv", metrics);
+    place.good("plot run");
+    let svg = place.read("run/curves.svg");
     assert!(svg.len() < 100_000, "{} bytes", svg.len());
     assert!(svg.contains("Generation (means of "));
 }
@@ -884,30 +780,16 @@ fn arms_that_share_a_run_would_train_the_same_policies() {
 
 #[test]
 fn paper_writes_figures_runs_and_claims() {
-    let folder = TempDir::new().unwrap();
-    let out = folder.path().join("paper");
-    let stdout = succeed(&[
-        "paper",
-        "--out",
-        out.to_str().unwrap(),
-        "--trials",
-        "2",
-        "--generations",
-        "3",
-        "--set",
-        "learning.population=40",
-        "--backend",
-        "cpu",
-        "--quiet",
-    ]);
+    let place = Place::new(&[]).on_cpu().slow();
+    let line = "paper --out paper --trials 2 --generations 3 --set learning.population=40 --quiet";
+    let (stdout, _) = place.good(line);
     for figure in 4..=6 {
-        let svg = fs::read_to_string(out.join(format!("figure{figure}.svg"))).unwrap();
+        let svg = place.read(format!("paper/figure{figure}.svg"));
         assert!(svg.contains("All-leaders teams") && svg.contains("Leader-follower teams"));
         assert!(svg.contains("best constant speed") && svg.contains("best of as many shared random networks"));
-        assert!(fs::metadata(out.join(format!("figure{figure}.png"))).unwrap().len() > 10_000);
-        assert!(fs::metadata(out.join(format!("figure{figure}.pdf"))).unwrap().len() > 10_000);
+        assert!(["png", "pdf"].iter().all(|kind| place.bytes(format!("paper/figure{figure}.{kind}")).len() > 10_000));
     }
-    let summary: Value = serde_json::from_str(&fs::read_to_string(out.join("summary.json")).unwrap()).unwrap();
+    let summary: Value = serde_json::from_str(&place.read("paper/summary.json")).unwrap();
     let arms = summary["arms"].as_array().unwrap();
     assert_eq!(arms.len(), 33 + 48);
     assert_eq!(summary["set"], serde_json::json!(["learning.population = 40"]));
@@ -917,7 +799,8 @@ fn paper_writes_figures_runs_and_claims() {
         }
     }
     // Every arm has a run, including arms that share another arm's training.
-    let folders: Vec<PathBuf> = fs::read_dir(out.join("arms")).unwrap().map(|entry| entry.unwrap().path()).collect();
+    let folders = fs::read_dir(place.path("paper/arms")).unwrap().map(|entry| entry.unwrap().path());
+    let folders: Vec<PathBuf> = folders.collect();
     assert_eq!(folders.len(), 33);
     let last = |folder: &str| {
         let matches = |arm: &&Value| {
@@ -940,31 +823,21 @@ fn paper_writes_figures_runs_and_claims() {
         let name = folder.file_name().unwrap().to_str().unwrap();
         assert!((champions.iter().sum::<f64>() / 2.0 - last(name)).abs() < 1e-9, "{name}");
     }
-    let shared = out.join("arms/chaotic-all-leaders-Df");
-    let retrained = folder.path().join("again");
-    let path = |path: &Path| path.to_str().unwrap().to_string();
-    succeed(&["train", &path(&shared.join("config.toml")), "--out", &path(&retrained), "--backend", "cpu", "--quiet"]);
-    assert!(
-        fs::read(retrained.join("policies.safetensors")).unwrap()
-            == fs::read(shared.join("policies.safetensors")).unwrap()
-    );
-    let digest = |folder: &Path| {
-        let run: Value = serde_json::from_str(&fs::read_to_string(folder.join("run.json")).unwrap()).unwrap();
+    let shared = "paper/arms/chaotic-all-leaders-Df";
+    place.good(&format!("train {shared}/config.toml --out again --quiet"));
+    let [retrained, policies] = ["again", shared].map(|run| place.bytes(format!("{run}/policies.safetensors")));
+    assert!(retrained == policies);
+    let digest = |run: &str| {
+        let run: Value = serde_json::from_str(&place.read(format!("{run}/run.json"))).unwrap();
         assert_eq!(run["state"], "done");
         run["digest"].clone()
     };
-    assert_eq!(digest(&retrained), digest(&shared));
-    succeed(&["replay", &path(&shared), "--trial", "1", "--backend", "cpu"]);
-    succeed(&[
-        "plot",
-        &path(&shared),
-        &path(&out.join("arms/chaotic-leader-follower-Df")),
-        "--out",
-        &path(&out.join("x.svg")),
-    ]);
+    assert_eq!(digest("again"), digest(shared));
+    place.good(&format!("replay {shared} --trial 1"));
+    place.good(&format!("plot {shared} paper/arms/chaotic-leader-follower-Df --out paper/x.svg"));
     // Three generations are too few for claims about 100 generations, and the table reports that.
     assert!(stdout.contains(" open (too few generations or trials)"), "{stdout}");
-    let claims = fs::read_to_string(out.join("claims.md")).unwrap();
+    let claims = place.read("paper/claims.md");
     assert!(claims.contains("2 trials, 3 generations, seed 0. Changed keys: `learning.population = 40`."), "{claims}");
     assert_eq!(claims.lines().filter(|line| line.starts_with("| ")).count(), (2 + 8) + (2 + 8) + (2 + 36));
     // Baselines without learning come first, on the page and in the output.
@@ -974,12 +847,6 @@ fn paper_writes_figures_runs_and_claims() {
     let solved = constant
         .filter(|arm| arm["mean"].as_array().unwrap().iter().all(|mean| *mean == arm["pois"].as_f64().unwrap()));
     assert_eq!(solved.count(), 8);
-}
-
-/// Runs `paper` with two trials on the CPU.
-fn paper(out: &Path, flags: &[&str]) -> Output {
-    let command = ["paper", "--out", out.to_str().unwrap(), "--trials", "2", "--backend", "cpu", "--quiet"];
-    flotilla(&[&command[..], flags].concat())
 }
 
 /// Returns the files of a paper and the policies of its arms, by name.
@@ -1007,23 +874,18 @@ fn outcome(out: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
 
 #[test]
 fn a_paper_is_overwritten_only_with_force() {
-    let folder = TempDir::new().unwrap();
-    let out = folder.path().join("paper");
-    let refused = |out: &Path, flags: &[&str], expected: &[&str]| {
-        let output = paper(out, flags);
-        let stderr = String::from_utf8(output.stderr).unwrap();
-        assert_eq!(output.status.code(), Some(1), "{stderr}");
-        expected.iter().for_each(|part| assert!(stderr.contains(part), "{stderr}"));
-    };
-    let output = paper(&out, &["--generations", "4", "--json"]);
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    let summary: Value = serde_json::from_slice(&output.stdout).unwrap();
+    let place = trained(CONFIG);
+    let out = place.path("paper");
+    let line = |out: &str, flags: &str| format!("paper --out {out} --trials 2 --quiet {flags}");
+    let paper = |flags: &str| place.good(&line("paper", flags));
+    let refused = |out: &str, flags: &str, parts: &[&str]| place.fails(1, &line(out, flags), parts);
+    let summary = place.json(&line("paper", "--generations 4 --json"));
     assert_eq!((&summary["trials"], &summary["generations"], &summary["seed"]), (&2.into(), &4.into(), &0.into()));
     for arm in summary["arms"].as_array().unwrap() {
-        let folder = Path::new(arm["folder"].as_str().unwrap());
-        let run: Value = serde_json::from_str(&fs::read_to_string(folder.join("run.json")).unwrap()).unwrap();
+        let folder = arm["folder"].as_str().unwrap();
+        let run: Value = serde_json::from_str(&place.read(format!("{folder}/run.json"))).unwrap();
         assert_eq!(run["digest"], arm["digest"]);
-        let metrics = fs::read_to_string(folder.join("metrics.csv")).unwrap();
+        let metrics = place.read(format!("{folder}/metrics.csv"));
         let rows = metrics.lines().map(|line| line.split(',').collect::<Vec<_>>()).filter(|row| row[1] == "4");
         let rows: Vec<_> = rows.collect();
         for (name, column) in [("champion_g", 4), ("best_g", 2)] {
@@ -1032,9 +894,9 @@ fn a_paper_is_overwritten_only_with_force() {
         }
     }
     let original = outcome(&out);
-    refused(&out, &["--generations", "4"], &["holds a paper already", "--resume", "--force"]);
-    refused(&out, &["--generations", "3", "--resume"], &["another paper", "generations: 4 there, 3 here"]);
-    refused(&out, &["--generations", "4", "--seed", "1", "--resume"], &["another paper", "seed: 0 there, 1 here"]);
+    refused("paper", "--generations 4", &["holds a paper already", "--resume", "--force"]);
+    refused("paper", "--generations 3 --resume", &["another paper", "generations: 4 there, 3 here"]);
+    refused("paper", "--generations 4 --seed 1 --resume", &["another paper", "seed: 0 there, 1 here"]);
     assert!(outcome(&out) == original);
 
     // --resume restores missing files, and does not train the other arms again.
@@ -1043,52 +905,47 @@ fn a_paper_is_overwritten_only_with_force() {
     for missing in ["figure5.svg", "claims.md", "arms/chaotic-all-leaders-Df/policies.safetensors"] {
         fs::remove_file(out.join(missing)).unwrap();
     }
-    assert!(paper(&out, &["--generations", "4", "--resume"]).status.success());
+    paper("--generations 4 --resume");
     assert!(outcome(&out) == original && fs::read(&run).unwrap() == before);
 
     // An extended paper equals one that was longer from the start.
-    assert!(paper(&out, &["--generations", "6", "--resume"]).status.success());
-    let longer = folder.path().join("longer");
-    assert!(paper(&longer, &["--generations", "6"]).status.success());
-    assert!(outcome(&out) == outcome(&longer));
+    paper("--generations 6 --resume");
+    place.good(&line("longer", "--generations 6"));
+    assert!(outcome(&out) == outcome(&place.path("longer")));
 
     // --force overwrites only the paper's own files. A folder with other results is refused.
     fs::write(out.join("notes.txt"), "mine").unwrap();
-    assert!(paper(&out, &["--generations", "4", "--force"]).status.success());
+    paper("--generations 4 --force");
     assert_eq!(fs::read(out.join("notes.txt")).unwrap(), b"mine");
     fs::remove_file(out.join("notes.txt")).unwrap();
     assert!(outcome(&out) == original);
-    let run = Run::new(CONFIG, &[]);
-    for flags in [&[][..], &["--resume"]] {
-        refused(&run.path(), &[&["--generations", "4"], flags].concat(), &["holds a run, no paper"]);
+    for flag in ["", "--resume"] {
+        refused("run", &format!("--generations 4 {flag}"), &["holds a run, no paper"]);
     }
-    let sweep = folder.path().join("sweep");
-    fs::create_dir(&sweep).unwrap();
-    fs::write(sweep.join("sweep.toml"), "").unwrap();
-    refused(&sweep, &[], &["holds a sweep, no paper"]);
-    let old = folder.path().join("old");
-    fs::create_dir(&old).unwrap();
-    fs::write(old.join("figure4.svg"), "").unwrap();
-    for flags in [&[][..], &["--resume"], &["--force"]] {
-        refused(&old, flags, &["holds figure4.svg but no paper.toml"]);
+    for (folder, file) in [("sweep", "sweep.toml"), ("old", "figure4.svg")] {
+        fs::create_dir(place.path(folder)).unwrap();
+        place.write(format!("{folder}/{file}"), "");
     }
-    assert!(old.join("figure4.svg").exists());
-    refused(&sweep, &["--force"], &["holds a sweep, no paper"]);
-    refused(&sweep.join("sweep.toml"), &[], &["is a file"]);
+    refused("sweep", "", &["holds a sweep, no paper"]);
+    for flag in ["", "--resume", "--force"] {
+        refused("old", flag, &["holds figure4.svg but no paper.toml"]);
+    }
+    assert!(place.path("old/figure4.svg").exists());
+    refused("sweep", "--force", &["holds a sweep, no paper"]);
+    refused("sweep/sweep.toml", "", &["is a file"]);
 }
 
 #[cfg(unix)]
 #[test]
 fn a_paper_stopped_by_a_signal_resumes_to_the_same_files() {
     use std::process::{Command, Stdio};
-    let folder = TempDir::new().unwrap();
-    let out = folder.path().join("a paper");
-    let program = assert_cmd::cargo::cargo_bin!("flotilla");
+    let place = Place::new(&[]).slow();
+    let out = place.path("a paper");
     let flags = ["--trials", "1", "--generations", "25", "--backend", "cpu", "--quiet"];
     // The folder has an older paper, which --force overwrites. Its files must not disturb the resume.
     let older = ["--trials", "1", "--generations", "1", "--seed", "9", "--backend", "cpu", "--quiet"];
-    succeed(&[&["paper", "--out", out.to_str().unwrap()], &older[..]].concat());
-    let mut child = Command::new(program);
+    place.good(&[&["paper", "--out", "a paper"], &older[..]].concat());
+    let mut child = support::flotilla();
     child.args(["paper", "--force", "--out"]).arg(&out).args(flags);
     let child = child.stderr(Stdio::piped()).spawn().unwrap();
     let run = out.join("arms/chaotic-leader-follower-Df/run.json");
@@ -1107,12 +964,10 @@ fn a_paper_stopped_by_a_signal_resumes_to_the_same_files() {
     let command = stderr.lines().last().unwrap().trim();
     assert!(command.starts_with("flotilla paper --out '") && command.ends_with("--resume --backend cpu"), "{command}");
     assert!(!out.join("claims.md").exists());
-    let path = format!("{}:{}", program.parent().unwrap().display(), std::env::var("PATH").unwrap());
-    let resumed = Command::new("sh").args(["-c", command]).env("PATH", path).output().unwrap();
+    let resumed = support::shell("sh", command).output().unwrap();
     assert!(resumed.status.success(), "{}", String::from_utf8_lossy(&resumed.stderr));
-    let uninterrupted = folder.path().join("whole");
-    succeed(&[&["paper", "--out", uninterrupted.to_str().unwrap()], &flags[..]].concat());
-    assert!(outcome(&out) == outcome(&uninterrupted));
+    place.good(&[&["paper", "--out", "whole"], &flags[..]].concat());
+    assert!(outcome(&out) == outcome(&place.path("whole")));
 }
 
 /// Tests that pictures in docs/ have a title and a description, like the program's own pictures.

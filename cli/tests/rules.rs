@@ -2,10 +2,7 @@
 //!
 //! Rules say which agents observe, when and in which order POIs can be observed, and who counts as leading a follower.
 
-use std::fs;
-use std::path::{Path, PathBuf};
-
-use assert_cmd::Command;
+use crate::support::{Place, page_data};
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
 use flotilla::backend::cpu::Cpu;
@@ -13,8 +10,6 @@ use flotilla::config::{Config, Fitness, LedBy, Observers, Override};
 use flotilla::evaluate::Starts;
 use flotilla_app::record::config_digest;
 use flotilla_app::sweep::Sweep;
-use serde_json::Value;
-use tempfile::TempDir;
 
 /// Two leaders with two followers each. Only followers observe. The second POI counts only after the first.
 const RELAY: &str = "
@@ -37,23 +32,11 @@ trials = 1
 led_within = 4
 ";
 
-fn succeed(arguments: &[&str]) -> String {
-    let output = Command::cargo_bin("flotilla").unwrap().args(arguments).output().unwrap();
-    assert!(output.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
-    String::from_utf8(output.stdout).unwrap()
-}
-
-/// Trains a config. Returns the directory and the run in it.
-fn train(config: &str) -> (TempDir, PathBuf) {
-    let folder = TempDir::new().unwrap();
-    let (path, run) = (folder.path().join("relay.toml"), folder.path().join("run"));
-    fs::write(&path, config).unwrap();
-    succeed(&["train", text(&path), "--out", text(&run), "--backend", "cpu", "--quiet"]);
-    (folder, run)
-}
-
-fn text(path: &Path) -> &str {
-    path.to_str().unwrap()
+/// Creates a folder with the config [`RELAY`], and with a run of it in `run`.
+fn trained() -> Place {
+    let place = Place::new(&[("relay.toml", RELAY)]).on_cpu().slow();
+    place.good("train relay.toml --out run --quiet");
+    place
 }
 
 #[test]
@@ -80,13 +63,8 @@ fn fitness(word: &str) -> Override {
 
 #[test]
 fn check_predicts_the_memory_for_dt() {
-    let folder = TempDir::new().unwrap();
-    let path = folder.path().join("relay.toml");
-    fs::write(&path, RELAY).unwrap();
-    let cost = |fitness: &str| -> Value {
-        let stdout = succeed(&["check", text(&path), "--fitness", fitness, "--json"]);
-        serde_json::from_str::<Value>(&stdout).unwrap()["cost"].clone()
-    };
+    let place = Place::new(&[("relay.toml", RELAY)]);
+    let cost = |fitness: &str| place.json(&format!("check relay.toml --fitness {fitness} --json"))["cost"].clone();
     let (df, dt) = (cost("Df"), cost("Dt"));
     // Sets of two POIs, and counts of four followers. Dt adds one word per follower and step.
     assert_eq!(
@@ -101,22 +79,19 @@ fn check_predicts_the_memory_for_dt() {
 /// Only followers observe, so D is 0 and Dt is not.
 #[test]
 fn rollout_and_library_report_the_same_dt() {
-    let (_folder, run) = train(RELAY);
-    let (config, policies, scores) =
-        (run.join("config.toml"), run.join("policies.safetensors"), run.join("scores.csv"));
-    let score_rows = |flags: &[&str]| -> Vec<Vec<f32>> {
-        let (config, policies, scores) = (text(&config), text(&policies), text(&scores));
-        let line = ["rollout", config, "--policies", policies, "--scores", scores, "--backend", "cpu", "--quiet"];
-        succeed(&[&line, flags].concat());
-        let file = fs::read_to_string(scores).unwrap();
+    let place = trained();
+    let score_rows = |flags: &str| -> Vec<Vec<f32>> {
+        let files = "run/config.toml --policies run/policies.safetensors --scores run/scores.csv";
+        place.good(&format!("rollout {files} --quiet {flags}"));
+        let file = place.read("run/scores.csv");
         assert!(file.starts_with("team,leader,g,d,df,dpp,dt"), "{file}");
         file.lines().skip(1).map(|line| line.split(',').map(|word| word.parse().unwrap()).collect()).collect()
     };
-    let rows = score_rows(&[]);
-    let bytes = fs::read(&policies).unwrap();
+    let rows = score_rows("");
+    let bytes = place.bytes("run/policies.safetensors");
     let file = safetensors::SafeTensors::deserialize(&bytes).unwrap();
     let weights: Vec<f32> = bytemuck::pod_collect_to_vec(file.tensor("weights.0").unwrap().data());
-    let config = Config::load(&config).unwrap();
+    let config = Config::load(&place.path("run/config.toml")).unwrap();
     let played = |config: &Config| flotilla::play(config, &mut Cpu::default(), 20, &weights, &Starts::Own).unwrap();
     let by_dt = played(&config);
     let column = |index: usize| rows.iter().map(|row| row[index]).collect::<Vec<f32>>();
@@ -126,19 +101,16 @@ fn rollout_and_library_report_the_same_dt() {
     // Dt is computed only if it is the config's fitness.
     let by_df = played(&config.with(&[fitness("Df")]).unwrap());
     assert_eq!((by_df.df, by_df.dt), (by_dt.df, vec![]));
-    let several = score_rows(&["--episodes", "3", "--start-jitter", "0.5"]);
+    let several = score_rows("--episodes 3 --start-jitter 0.5");
     assert_eq!((several.len(), several[0].len()), (40, 12));
 }
 
 /// The page of a run with Dt shows which leader led each follower at every step, and the rules for POIs.
 #[test]
 fn replays_show_rules_and_who_leads_whom() {
-    let (_folder, run) = train(RELAY);
-    succeed(&["replay", text(&run), "--backend", "cpu"]);
-    let page = fs::read_to_string(run.join("replay.html")).unwrap();
-    let start = page.find("id=\"data\">").unwrap() + "id=\"data\">".len();
-    let end = start + page[start..].find("</script>").unwrap();
-    let data: Value = serde_json::from_str(&page[start..end]).unwrap();
+    let place = trained();
+    place.good("replay run");
+    let data = page_data(&place.path("run/replay.html"));
     assert_eq!(data["observers"], "followers");
     assert_eq!(data["windows"], serde_json::json!([[3, 12], [2, 20]]));
     assert_eq!(data["after"], serde_json::json!([[], [0]]));
@@ -172,11 +144,9 @@ fn replays_show_rules_and_who_leads_whom() {
     }
     assert!(leaders[1] > 0 && leaders[2] > 0, "{leaders:?}");
 
-    let still = run.join("still.svg");
-    succeed(&["replay", text(&run), "--backend", "cpu", "--step", "1", "--out", text(&still)]);
-    let layout = run.join("layout.svg");
-    succeed(&["check", text(&run.join("config.toml")), "--out", text(&layout)]);
-    let (still, layout) = (fs::read_to_string(still).unwrap(), fs::read_to_string(layout).unwrap());
+    place.good("replay run --step 1 --out run/still.svg");
+    place.good("check run/config.toml --out run/layout.svg");
+    let [still, layout] = ["still", "layout"].map(|name| place.read(format!("run/{name}.svg")));
     for (picture, label) in [
         (&still, "/2, steps 2 to 20, after 0\""),
         (&still, "\"does not observe\""),

@@ -1,12 +1,10 @@
 //! Tests the study of followers and populations, `flotilla paper --populations`.
 
-use std::fs;
-
 use crate::support::Place;
 
 /// Returns the rows of a table of comma-separated values. Quoted cells may have commas.
 fn rows(place: &Place, name: &str) -> Vec<Vec<String>> {
-    let text = fs::read(place.path(name)).unwrap();
+    let text = place.bytes(name);
     let mut reader = csv::ReaderBuilder::new().has_headers(false).from_reader(&text[..]);
     reader.records().map(|row| row.unwrap().iter().map(String::from).collect()).collect()
 }
@@ -47,10 +45,10 @@ fn contrasts_are_differences_of_cells_over_pairs() {
         differ += usize::from(one != other);
     }
     assert!(differ > 10, "only {differ} contrasts are not 0");
-    let before = fs::read(place.path("study/cells.csv")).unwrap();
-    assert!(place.refused(1, line).contains("study"));
+    let before = place.bytes("study/cells.csv");
+    place.fails(1, line, &["study"]);
     place.good(&format!("{line} --resume"));
-    assert_eq!(fs::read(place.path("study/cells.csv")).unwrap(), before);
+    assert_eq!(place.bytes("study/cells.csv"), before);
     assert!(place.path("study/populations.svg").is_file());
-    assert!(place.refused(2, "paper --populations=nowhere --out other").contains("generally-forward"));
+    place.fails(2, "paper --populations=nowhere --out other", &["generally-forward"]);
 }

@@ -3,10 +3,9 @@
 //! Errors in stages name their line. A resumed run must end in the same results as one without a stop, byte for byte.
 
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use crate::support::{self, SMALL, table};
-use assert_cmd::cargo::cargo_bin_cmd;
+use crate::support::{self, Place, SMALL, files, metrics_without_seconds, results, table};
 use flotilla::backend::cpu::Cpu;
 use flotilla::config::{Config, Sharing};
 use flotilla::front;
@@ -14,7 +13,7 @@ use flotilla::trainer::{Row, Trainer};
 use flotilla::verify;
 use flotilla_app::record::digests::Verification;
 use flotilla_app::record::disk::Disk;
-use flotilla_app::record::folder::{Folder, METRICS, POLICIES, RUN, Run, Start, StartFrom};
+use flotilla_app::record::folder::{Folder, POLICIES, RUN, Run, Start, StartFrom};
 use flotilla_app::record::metrics::Lines;
 use flotilla_app::record::policies::{self, Init, read_init};
 use flotilla_app::report::replay::{Which, replay};
@@ -170,7 +169,7 @@ pub fn check_resumes(config: &Config, lengths: &[usize], replayed: &[usize]) -> 
         assert_eq!((session.generations(), session.is_done()), (&[next][..], next == done), "{}", path.display());
         assert_eq!(train_until(&mut session, |_| false).unwrap(), SessionEnd::Finished);
         assert_eq!(session.results(0), expected.as_ref(), "{}", path.display());
-        assert_eq!((rows(path), policy_bytes(path)), (rows(&whole), policy_bytes(&whole)), "{}", path.display());
+        assert_eq!(results(path), results(&whole), "{}", path.display());
     };
     for until in 1..=done {
         let path = path("stopped", until);
@@ -196,28 +195,6 @@ pub fn check_resumes(config: &Config, lengths: &[usize], replayed: &[usize]) -> 
     place
 }
 
-/// Reads all files below a folder, except locks.
-fn read_files(path: &Path) -> Vec<(PathBuf, Vec<u8>)> {
-    let mut files = Vec::new();
-    for entry in fs::read_dir(path).unwrap() {
-        let path = entry.unwrap().path();
-        match path.is_dir() {
-            true => files.extend(read_files(&path)),
-            false if path.extension().is_some_and(|extension| extension == "lock") => {}
-            false => files.push((path.clone(), fs::read(&path).unwrap())),
-        }
-    }
-    files.sort();
-    files
-}
-
-/// Reads the metrics without the column of seconds, which differs between runs.
-fn rows(path: &Path) -> Vec<Vec<String>> {
-    let text = fs::read_to_string(path.join(METRICS)).unwrap();
-    let fields = |line: &str| line.split(',').enumerate().filter(|&(at, _)| at != 5).map(|(_, f)| f.into()).collect();
-    text.lines().map(fields).collect()
-}
-
 fn policy_bytes(path: &Path) -> Vec<u8> {
     fs::read(path.join(POLICIES)).unwrap()
 }
@@ -227,7 +204,7 @@ fn a_staged_run_resumes_to_the_same_results() {
     let config = staged();
     let place = check_resumes(&config, &[], &[]);
     let whole = place.path().join("whole");
-    let (metrics, valid) = (rows(&whole), config.validate().unwrap());
+    let (metrics, valid) = (metrics_without_seconds(&whole), config.validate().unwrap());
     assert_eq!(metrics[0], ["trial", "generation", "best_g", "mean_g", "champion_g", "stage"]);
     for row in &metrics[1..] {
         assert_eq!(row[5], valid.stage_of(row[1].parse().unwrap()).to_string());
@@ -235,7 +212,7 @@ fn a_staged_run_resumes_to_the_same_results() {
     // Before generation 2, where a stage begins, the metrics equal those of a run without stages.
     let plain = place.path().join("plain");
     train(&Config { stages: vec![], ..config.clone() }, &plain, None, Start::Fresh, 99).unwrap();
-    let without: Vec<_> = rows(&plain).iter().map(|row| row.to_vec()).collect();
+    let without: Vec<_> = metrics_without_seconds(&plain).iter().map(|row| row.to_vec()).collect();
     assert!((1..7).all(|row| metrics[row][..5] == without[row][..5]) && metrics[7][..5] != without[7][..5]);
     // A run cannot be resumed with other stages.
     let mut other = config.clone();
@@ -293,7 +270,7 @@ fn evolution_strategies_resume_to_the_same_results() {
         let place = check_resumes(&config, &[], &[0, 2, 3, 6]);
         check_resumes(&Config { stages: vec![], ..config.clone() }, &[0, 1, 3, 5], &[]);
         let whole = place.path().join("whole");
-        let varied = rows(&whole)[1..].iter().filter(|row| row[2] != row[3]).count();
+        let varied = metrics_without_seconds(&whole)[1..].iter().filter(|row| row[2] != row[3]).count();
         assert!(varied > 10, "{method}: teams differ in only {varied} rows, so the search hardly moves");
         // A search that starts from given policies resumes, too.
         let init = || Some(read_init(&whole.join(POLICIES), &config).unwrap());
@@ -301,7 +278,7 @@ fn evolution_strategies_resume_to_the_same_results() {
         train(&config, &warm, init(), Start::Fresh, 99).unwrap();
         train(&config, &again, init(), Start::Fresh, 2).unwrap();
         train(&config, &again, init(), Start::Resume, 99).unwrap();
-        assert_eq!((rows(&again), policy_bytes(&again)), (rows(&warm), policy_bytes(&warm)));
+        assert_eq!(results(&again), results(&warm));
         assert!(policy_bytes(&warm) != policy_bytes(&whole));
     }
 }
@@ -338,7 +315,7 @@ fn a_warm_started_run_resumes_to_the_same_results() {
     }
     assert!(!trainer.start_from(0, 0, policies, &learned[0][1..]));
     let trained = trainer.advance(&mut Cpu::default()).and_then(|_| trainer.advance(&mut Cpu::default())).unwrap();
-    for (metrics, row) in rows(&whole)[1..].iter().zip(&trained) {
+    for (metrics, row) in metrics_without_seconds(&whole)[1..].iter().zip(&trained) {
         assert_eq!(metrics[2..4], [row.best_g.to_string(), row.mean_g.to_string()], "trial {}", row.trial);
     }
     // Each trial starts from the policies of the same trial.
@@ -363,12 +340,12 @@ fn a_warm_started_run_resumes_to_the_same_results() {
         // The file may be given again, but need not be.
         let given = if until % 2 == 0 { init() } else { None };
         assert_eq!(train(&config, &path, given, Start::Resume, 99).unwrap().as_ref(), Some(&expected), "{until}");
-        assert_eq!((rows(&path), policy_bytes(&path)), (rows(&whole), policy_bytes(&whole)), "{until}");
+        assert_eq!(results(&path), results(&whole), "{until}");
     }
     // A run cannot be resumed with another file, or with a file if it did not start from one.
     let other = read_init(&whole.join(POLICIES), &config).unwrap();
     for config in [&config, &longer] {
-        let before = [&whole, &first].map(|path| read_files(path));
+        let before = [&whole, &first].map(|path| files(path));
         let error = train(config, &whole, Some(other.clone()), Start::Resume, 99).unwrap_err().to_string();
         assert!(error.contains("started from a file of policies with SHA-256") && !error.contains('\n'), "{error}");
         // The message has the start of both digests.
@@ -378,7 +355,7 @@ fn a_warm_started_run_resumes_to_the_same_results() {
         );
         let error = train(config, &first, init(), Start::Resume, 99).unwrap_err().to_string();
         assert!(error.contains("did not start from a file"), "{error}");
-        assert!(before == [&whole, &first].map(|path| read_files(path)), "a refused command changed files");
+        assert!(before == [&whole, &first].map(|path| files(path)), "a refused command changed files");
     }
     // Without a checkpoint, the file has to be given again.
     let bare = place.path().join("bare");
@@ -460,61 +437,44 @@ fn verify_plays_the_world_of_the_first_stage() {
 }
 
 /// Creates a folder with three configs: without sharing, with a shared policy, and with more leaders that share one.
-fn place() -> (TempDir, PathBuf) {
-    let place = tempfile::tempdir().unwrap();
-    fs::write(place.path().join("small.toml"), SMALL).unwrap();
+fn place() -> Place {
     let shared = SMALL.replace("population = 8", "population = 8\nsharing = 'all'");
-    fs::write(place.path().join("shared.toml"), &shared).unwrap();
     let more = shared.replace("[[10, 5], [20, 5]]", "[[10, 5], [20, 5], [40, 5]]").replace("trials = 3", "trials = 2");
-    fs::write(place.path().join("more.toml"), more.replace("population = 8", "population = 12")).unwrap();
-    let path = place.path().to_path_buf();
-    (place, path)
-}
-
-/// Runs a command on the CPU. Returns its exit code, standard output and standard error.
-fn run(folder: &Path, line: &str) -> (Option<i32>, String, String) {
-    let line = if line.starts_with("plot") { line.to_string() } else { format!("{line} --backend cpu") };
-    let output = cargo_bin_cmd!("flotilla").args(line.split_whitespace()).current_dir(folder).output().unwrap();
-    let text = |bytes| String::from_utf8(bytes).unwrap();
-    (output.status.code(), text(output.stdout), text(output.stderr))
+    let more = more.replace("population = 8", "population = 12");
+    Place::new(&[("small.toml", SMALL), ("shared.toml", &shared), ("more.toml", &more)]).on_cpu().slow()
 }
 
 #[test]
 fn a_shared_policy_fits_any_number_of_leaders() {
-    let (_place, folder) = place();
-    let good = |line: &str| {
-        let (code, stdout, stderr) = run(&folder, line);
-        assert_eq!(code, Some(0), "{line}: {stderr}");
-        stdout
-    };
+    let place = place();
+    let good = |line: &str| place.good(line).0;
     good("train shared.toml --out run");
-    let bytes = fs::read(folder.join("run").join(POLICIES)).unwrap();
+    let bytes = place.bytes("run/policies.safetensors");
     let tensors = safetensors::SafeTensors::deserialize(&bytes).unwrap();
     assert_eq!(tensors.tensor("weights.1").unwrap().shape(), [1, 8, 57]);
     // The file fits its own config, one without sharing, and one with more leaders.
     let own = good("rollout shared.toml --policies run/policies.safetensors --scores own.csv");
     assert_eq!(good("rollout small.toml --policies run/policies.safetensors --scores other.csv"), own);
-    assert_eq!(fs::read(folder.join("own.csv")).unwrap(), fs::read(folder.join("other.csv")).unwrap());
+    assert_eq!(place.read("own.csv"), place.read("other.csv"));
     good("rollout more.toml --policies run/policies.safetensors --scores more.csv");
-    assert_eq!(fs::read_to_string(folder.join("more.csv")).unwrap().lines().count(), 1 + 8 * 3);
+    assert_eq!(place.read("more.csv").lines().count(), 1 + 8 * 3);
     // Training can start from it with a larger population and more leaders that share a policy.
     good("train more.toml --out warm --init run/policies.safetensors");
     good("replay warm --generation 1 --out replay.html");
-    let (code, _, stderr) = run(&folder, "train shared.toml --population 3 --out few --init run/policies.safetensors");
-    assert!(code == Some(0) && stderr.contains("8 policies of each leader; only the first 3 are used"), "{stderr}");
-    let (code, _, stderr) = run(&folder, "train small.toml --out cold --init run/policies.safetensors");
+    let few = "train shared.toml --population 3 --out few --init run/policies.safetensors";
+    place.notes(few, &["8 policies of each leader; only the first 3 are used"]);
+    let cold = "train small.toml --out cold --init";
     let reason = "weights.0 is F32 [1, 8, 57], but the config needs F32 [2, 1 to 1048576, 57]";
-    assert!(code == Some(1) && stderr.contains(reason) && stderr.lines().count() == 1, "{stderr}");
-    assert!(stderr.contains("of another config") && !stderr.contains("restore"), "{stderr}");
+    let stderr = place.fails(1, &format!("{cold} run/policies.safetensors"), &[reason, "of another config"]);
+    assert!(stderr.lines().count() == 1 && !stderr.contains("restore"), "{stderr}");
     // Every trial needs policies of its own.
-    let (code, _, stderr) = run(&folder, "train shared.toml --trials 4 --out cold --init run/policies.safetensors");
-    assert!(code == Some(1) && stderr.contains("it has no tensor weights.3; it has weights.0"), "{stderr}");
-    let (code, _, stderr) = run(&folder, "train small.toml --out cold --init small.toml");
-    assert!(code == Some(1) && stderr.starts_with("error: small.toml: ") && stderr.lines().count() == 1, "{stderr}");
-    let (code, _, stderr) = run(&folder, "train small.toml --out cold --init missing.safetensors");
-    assert!(code == Some(1) && stderr.contains("missing.safetensors: cannot be read"), "{stderr}");
-    assert!(!folder.join("cold").exists());
-    assert_eq!(Config::load(&folder.join("run/config.toml")).unwrap().learning.sharing, Sharing::Shared);
+    let more = "train shared.toml --trials 4 --out cold --init run/policies.safetensors";
+    place.fails(1, more, &["it has no tensor weights.3; it has weights.0"]);
+    let stderr = place.refused(1, &format!("{cold} small.toml"));
+    assert!(stderr.starts_with("error: small.toml: ") && stderr.lines().count() == 1, "{stderr}");
+    place.fails(1, &format!("{cold} missing.safetensors"), &["missing.safetensors: cannot be read"]);
+    assert!(!place.path("cold").exists());
+    assert_eq!(Config::load(&place.path("run/config.toml")).unwrap().learning.sharing, Sharing::Shared);
 }
 
 #[test]
@@ -527,92 +487,75 @@ fn all_problems_of_a_stage_are_counted() {
 
 #[test]
 fn every_command_supports_stages() {
-    let (_place, folder) = place();
-    fs::write(folder.join("staged.toml"), [SMALL, STAGES].concat()).unwrap();
-    let good = |line: &str| {
-        let (code, stdout, stderr) = run(&folder, line);
-        assert_eq!(code, Some(0), "{line}: {stderr}");
-        stdout
-    };
+    let place = place();
+    place.write("staged.toml", [SMALL, STAGES].concat());
+    let good = |line: &str| place.good(line).0;
     let report = good("train staged.toml --out run");
     assert!(report.contains("\n  start, stage 0  ") && report.contains("\n  generation 6, stage 2  "), "{report}");
     // Generations of all stages can be replayed.
     for generation in [1, 2, 3, 4, 6] {
         good(&format!("replay run --generation {generation} --out replay.html"));
     }
-    let (code, _, stderr) = run(&folder, "replay run --generation 6 --compare 1");
-    assert!(code == Some(2) && stderr.contains("different stages"), "{stderr}");
+    place.fails(2, "replay run --generation 6 --compare 1", &["different stages"]);
     good("plot run --out curves.svg");
-    let curves = fs::read_to_string(folder.join("curves.svg")).unwrap();
+    let curves = place.read("curves.svg");
     assert!(curves.contains("Stage 1 begins at generation 2. Stage 2 begins at generation 4."), "{curves}");
     // A plot of several runs shows only stages that all have. A plot of a stopped run shows only the stages it reached.
-    let rows = fs::read_to_string(folder.join("run/metrics.csv")).unwrap();
+    let rows = place.read("run/metrics.csv");
     let short: String = rows.split_inclusive('\n').take(1 + 3 * 3).collect();
     good("train small.toml --out plain");
     good("plot run plain --out both.svg");
-    assert!(!fs::read_to_string(folder.join("both.svg")).unwrap().contains("begins at"));
-    fs::write(folder.join("run/metrics.csv"), short).unwrap();
+    assert!(!place.read("both.svg").contains("begins at"));
+    place.write("run/metrics.csv", short);
     good("plot run --unverified --out short.svg");
-    let curves = fs::read_to_string(folder.join("short.svg")).unwrap();
+    let curves = place.read("short.svg");
     assert!(curves.contains("Stage 1 begins") && !curves.contains("Stage 2 begins"), "{curves}");
-    fs::write(folder.join("run/metrics.csv"), rows.split_once('\n').unwrap().1).unwrap();
-    let (_, _, stderr) = run(&folder, "plot run --unverified --out short.svg");
-    assert!(stderr.contains("line 1 is not trial,") && stderr.contains("test_g and stage if the config"), "{stderr}");
-    fs::write(folder.join("run/metrics.csv"), rows).unwrap();
-    good("rollout staged.toml --policies run/policies.safetensors");
-    assert!(good("rollout staged.toml --policies run/policies.safetensors --stage 2").contains("of 3"));
-    let (code, _, stderr) = run(&folder, "rollout staged.toml --policies run/policies.safetensors --stage 3");
-    assert!(code == Some(2) && stderr.contains("the config has 3 stages, 0 to 2"), "{stderr}");
+    place.write("run/metrics.csv", rows.split_once('\n').unwrap().1);
+    let parts = ["line 1 is not trial,", "test_g and stage if the config"];
+    place.fails(1, "plot run --unverified --out short.svg", &parts);
+    place.write("run/metrics.csv", rows);
+    let rollout = "rollout staged.toml --policies run/policies.safetensors";
+    good(rollout);
+    place.prints(&format!("{rollout} --stage 2"), &["of 3"]);
+    place.fails(2, &format!("{rollout} --stage 3"), &["the config has 3 stages, 0 to 2"]);
     // A flag counts after the stage's own keys. Stages beyond the end can be played, too.
     let jitters = ["", " --poi-jitter 3.0"].map(|flag| {
-        let line = "rollout staged.toml --policies run/policies.safetensors --json --episodes 2 --stage 2";
-        let found: serde_json::Value = serde_json::from_str(&good(&format!("{line}{flag}"))).unwrap();
+        let found = place.json(&format!("{rollout} --json --episodes 2 --stage 2{flag}"));
         assert_eq!(found["stage"], 2);
         (found["pois"].as_u64(), found["poi_jitter"].as_f64())
     });
     assert_eq!(jitters, [(Some(3), Some(1.0)), (Some(3), Some(3.0))]);
-    let held_out = good("rollout staged.toml --policies run/policies.safetensors --episodes 2 --stage 2");
-    assert!(held_out.contains("2 episodes each, POIs moved by up to 1 (seed 0)."), "{held_out}");
-    good("rollout staged.toml --policies run/policies.safetensors --set learning.generations=3 --stage 2");
-    let (_, text, stderr) = run(&folder, "baseline staged.toml --seeds 1 --episodes 1");
+    place.prints(&format!("{rollout} --episodes 2 --stage 2"), &["2 episodes each, POIs moved by up to 1 (seed 0)."]);
+    good(&format!("{rollout} --set learning.generations=3 --stage 2"));
+    let (text, stderr) = place.good("baseline staged.toml --seeds 1 --episodes 1");
     assert!(text.contains("of 2") && stderr.contains("note: this plays in the world before any stage"), "{stderr}");
-    assert!(good("baseline staged.toml --seeds 1 --episodes 1 --stage 2").contains("of 3"));
+    place.prints("baseline staged.toml --seeds 1 --episodes 1 --stage 2", &["of 3"]);
     // 27 teams play 9 steps in 2 generations, two episodes of 14 steps in 2 generations, and 9 steps in 3.
-    let output = cargo_bin_cmd!("flotilla").args(["check", "staged.toml"]).current_dir(&folder).output().unwrap();
-    let text = String::from_utf8(output.stdout).unwrap();
+    let text = good("check staged.toml");
     let steps = text.lines().find_map(|line| line.strip_prefix("#   team-steps")).map(str::trim);
     assert_eq!(steps, Some(format!("{}", 27 * (2 * 9 + 2 * 2 * 14 + 3 * 9)).as_str()), "{text}");
     // Notes name their stage, and flags that a stage overrides.
-    fs::write(
-        folder.join("noted.toml"),
-        format!("{SMALL}[[stages]]\nfrom = 2\nset = {{ world.heading = 90, world.coupling = 1 }}\n"),
-    )
-    .unwrap();
-    let flags = ["check", "noted.toml", "--set", "world.coupling=2", "--set", "world.steps=9"];
-    let output = cargo_bin_cmd!("flotilla").args(flags).current_dir(&folder).output().unwrap();
-    let stderr = String::from_utf8(output.stderr).unwrap();
+    let noted = "[[stages]]\nfrom = 2\nset = { world.heading = 90, world.coupling = 1 }\n";
+    place.write("noted.toml", [SMALL, noted].concat());
+    let (_, stderr) = place.good("check noted.toml --set world.coupling=2 --set world.steps=9");
     assert!(stderr.contains("--set world.coupling: the stage from generation 2 on sets this, too"), "{stderr}");
     assert!(stderr.contains("note: stage 1: world.heading has 90"), "{stderr}");
     assert!(!stderr.contains("--set world.steps"), "{stderr}");
     // If --generations ends the run before a stage, either config can resume or extend it.
-    let (code, _, stderr) = run(&folder, "train staged.toml --generations 3 --out short --quiet");
-    assert_eq!(code, Some(0), "{stderr}");
-    assert!(stderr.contains("note: the stage from generation 4 on is never played"), "{stderr}");
+    let never = "note: the stage from generation 4 on is never played";
+    place.notes("train staged.toml --generations 3 --out short --quiet", &[never]);
     good("train staged.toml --generations 3 --out short --resume");
     good("train short/config.toml --out short --resume --generations 4");
     let report = good("train staged.toml --out short --resume");
     assert!(report.starts_with("Trained 3 trials of 8 teams, 2 generations after generation 4, in "), "{report}");
-    assert!(policy_bytes(&folder.join("short")) == policy_bytes(&folder.join("run")));
+    assert!(policy_bytes(&place.path("short")) == policy_bytes(&place.path("run")));
     // The same with sweeps, whose points tell what a stage overrides.
     let grid = "[grid]\n'world.coupling' = [1, 2]\n";
-    fs::write(folder.join("sweep.toml"), [SMALL, STAGES, grid].concat()).unwrap();
-    let (code, _, stderr) = run(&folder, "sweep sweep.toml --generations 3 --out swept");
-    assert_eq!(code, Some(0), "{stderr}");
+    place.write("sweep.toml", [SMALL, STAGES, grid].concat());
     let note = "grid.\"world.coupling\"[1]: the stage from generation 2 on sets this, too";
-    assert!(stderr.contains(note) && stderr.contains("4 on is never played, because"), "{stderr}");
-    assert!(stderr.contains("at 2 of 2 points"), "{stderr}");
-    cargo_bin_cmd!("flotilla").args(["compare", "swept"]).current_dir(&folder).assert().success();
+    let notes = [note, "4 on is never played, because", "at 2 of 2 points"];
+    place.notes("sweep sweep.toml --generations 3 --out swept", &notes);
+    good("compare swept");
     good("sweep swept/sweep.toml --out swept --resume");
-    let (code, _, stderr) = run(&folder, "train staged.toml --set stages=[{from=true}]");
-    assert!(code == Some(2) && stderr.contains("--set stages: stages[0].from: found"), "{stderr}");
+    place.fails(2, "train staged.toml --set stages=[{from=true}]", &["--set stages: stages[0].from: found"]);
 }

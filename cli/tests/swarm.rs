@@ -26,13 +26,13 @@ fn a_swarm_trains_resumes_and_is_drawn_by_a_sample() {
     let [whole, parts] = ["whole", "parts"].map(|run| fs::read(place.path(run).join("policies.safetensors")).unwrap());
     assert!(whole == parts, "the policies differ");
     place.good("replay whole --out page.html");
-    let page = fs::read_to_string(place.path("page.html")).unwrap();
+    let page = place.read("page.html");
     assert!(page.contains("1 of 3 followers drawn"), "the page does not say that it has a sample");
     assert!(page.contains(r#""size":5000"#), "the legend does not count all followers");
     // 1667 of 5000 followers, at 76 moments.
     assert!(page.len() < 4 << 20, "{} bytes", page.len());
     place.good("replay whole --out still.svg");
-    let still = fs::read_to_string(place.path("still.svg")).unwrap();
+    let still = place.read("still.svg");
     assert!(still.contains("1 of 3 followers drawn") && still.len() < 1 << 20, "{} bytes", still.len());
 }
 
@@ -44,7 +44,7 @@ fn pages_count_all_agents_near_a_poi() {
     let place = Place::new(&[("swarm.toml", &text.replace(pois, "at = [[100.0, 100.0]]"))]);
     place.good("train swarm.toml --backend cpu --generations 0 --set learning.population=4 --out run");
     place.good("replay run --out page.html");
-    let page = fs::read_to_string(place.path("page.html")).unwrap();
+    let page = place.read("page.html");
     // 0 at the start and 70 000 at the only step.
     assert!(page.contains(r#""near":"AAAAAHARAQA=""#), "not all agents are counted");
 }
@@ -53,7 +53,7 @@ fn pages_count_all_agents_near_a_poi() {
 fn layouts_of_swarms_are_samples() {
     let place = Place::new(&[("swarm.toml", &config(100_000))]);
     place.good("check swarm.toml --out layout.svg");
-    let layout = fs::read_to_string(place.path("layout.svg")).unwrap();
+    let layout = place.read("layout.svg");
     assert!(layout.contains("1 of 50 followers drawn") && layout.len() < 1 << 20, "{} bytes", layout.len());
 }
 

@@ -2,7 +2,7 @@
 //!
 //! Results must not depend on shards, batches or kills.
 
-use crate::support;
+use crate::support::{self, Place};
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -18,7 +18,6 @@ use flotilla_app::record::ownership::LIST;
 use flotilla_app::sweep::shard::{Shard, cost};
 use flotilla_app::sweep::{Sweep, layout, run};
 use proptest::prelude::*;
-use tempfile::TempDir;
 
 /// Eight points of different couplings, steps and lengths.
 const SMALL: &str = "\
@@ -47,28 +46,20 @@ fn parse_error(text: &str) -> String {
     Sweep::read(text, "x.toml", &[], false).unwrap_err().to_string()
 }
 
-/// Writes a sweep file into a new folder. Returns the folder and the path of the file.
-fn write_sweep(text: &str) -> (TempDir, PathBuf) {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("x.toml");
-    fs::write(&path, text).unwrap();
-    (folder, path)
+/// Creates a folder with a sweep in `x.toml`. Commands run on the CPU.
+fn place(sweep: &str) -> Place {
+    Place::new(&[("x.toml", sweep)]).on_cpu().slow()
 }
 
-/// Writes a sweep over so many seeds, as [`write_sweep`] does.
-fn sweep_of_seeds(points: usize) -> (TempDir, PathBuf) {
+/// Creates a folder with a sweep over this many seeds.
+fn place_of_seeds(points: usize) -> Place {
     let seeds: Vec<usize> = (0..points).collect();
-    write_sweep(&format!("{}[grid]\n\"learning.seed\" = {seeds:?}\n", support::TINY))
+    place(&format!("{}[grid]\n\"learning.seed\" = {seeds:?}\n", support::TINY))
 }
 
-fn command(sweep: &Path, out: &Path, flags: &[&str]) -> Command {
-    let mut command = support::flotilla();
-    command.arg("sweep").arg(sweep).arg("--out").arg(out).args(["--backend", "cpu"]).args(flags);
-    command
-}
-
-fn flotilla(sweep: &Path, out: &Path, flags: &[&str]) -> Output {
-    command(sweep, out, flags).output().unwrap()
+/// Returns the command that trains the sweep into a folder.
+fn line(out: &str, flags: &str) -> String {
+    format!("sweep x.toml --out {out} {flags}")
 }
 
 /// Checks that a command succeeded. Returns its standard output.
@@ -80,10 +71,19 @@ fn succeed(output: Output) -> String {
 
 /// Checks the exit code. Returns standard error without warnings, because no agent reaches the POIs of these small
 /// sweeps.
-fn fail(output: Output, code: i32) -> String {
+fn failure(output: Output, code: i32) -> String {
     let error = String::from_utf8(output.stderr).unwrap();
     assert_eq!(output.status.code(), Some(code), "{error}");
     error.split_inclusive('\n').filter(|line| !line.starts_with("warning: ")).collect()
+}
+
+/// Runs a command that must fail with this exit code. Its [`failure`] must contain all of `parts`, and is returned.
+fn fail(place: &Place, code: i32, line: &str, parts: &[&str]) -> String {
+    let error = failure(place.run(line), code);
+    for part in parts {
+        assert!(error.contains(part), "{line}: {part:?} is missing in: {error}");
+    }
+    error
 }
 
 /// Returns the files of a folder, without its subfolders.
@@ -104,12 +104,6 @@ fn policies(out: &Path) -> Vec<Vec<u8>> {
     let mut points: Vec<_> = fs::read_dir(out.join("points")).unwrap().map(|entry| entry.unwrap().path()).collect();
     points.sort();
     points.iter().map(|point| fs::read(point.join("policies.safetensors")).unwrap()).collect()
-}
-
-/// Returns the lines of a metrics file without the last column, the elapsed time.
-fn metrics_without_time(metrics: &Path) -> Vec<String> {
-    let text = fs::read_to_string(metrics).unwrap();
-    text.lines().map(|line| line.rsplit_once(',').unwrap().0.to_string()).collect()
 }
 
 #[test]
@@ -342,17 +336,16 @@ fn errors_in_varied_keys_name_the_line() {
 
 #[test]
 fn a_varied_sweep_has_columns_and_a_picture_of_its_keys() {
-    let (folder, sweep) = write_sweep(&varied());
-    let (unsharded, sharded) = (folder.path().join("whole"), folder.path().join("sharded"));
+    let place = place(&varied());
+    let [unsharded, sharded] = ["unsharded", "sharded"].map(|name| place.path(name));
     let skip = "--skip-impossible";
-    assert!(fail(flotilla(&sweep, &unsharded, &[]), 1).contains("found 7"));
-    fs::write(&sweep, varied().replace("[1, 7]", "[1, 2]")).unwrap();
-    let listed = succeed(flotilla(&sweep, &unsharded, &["--list"]));
-    assert!(listed.contains("learning.fitness = Df, world.coupling = 2\n"), "{listed}");
-    let stdout = succeed(flotilla(&sweep, &unsharded, &["--quiet", skip]));
-    assert!(stdout.contains("10 of 10 points are done") && stdout.contains("  final (.svg, .png, .pdf)"), "{stdout}");
+    fail(&place, 1, &line("unsharded", ""), &["found 7"]);
+    place.write("x.toml", varied().replace("[1, 7]", "[1, 2]"));
+    place.prints(&line("unsharded", "--list"), &["learning.fitness = Df, world.coupling = 2\n"]);
+    let parts = ["10 of 10 points are done", "  final (.svg, .png, .pdf)"];
+    place.prints(&line("unsharded", &format!("--quiet {skip}")), &parts);
 
-    let table = fs::read_to_string(unsharded.join("points.csv")).unwrap();
+    let table = place.read("unsharded/points.csv");
     let rows: Vec<Vec<&str>> = table.lines().map(|line| line.split(',').collect()).collect();
     assert_eq!(rows[0][..4], ["learning.fitness", "learning.generations", "world.coupling", "point"]);
     let axes: Vec<&[&str]> = rows[1..].iter().map(|row| &row[..3]).collect();
@@ -361,18 +354,18 @@ fn a_varied_sweep_has_columns_and_a_picture_of_its_keys() {
     let names: Vec<String> = results(&unsharded).into_iter().map(|(name, _)| name).collect();
     assert_eq!(names, ["final.pdf", "final.png", "final.svg", "points.csv", "results.csv", "sweep.toml"]);
 
-    let picture = fs::read_to_string(unsharded.join("final.svg")).unwrap();
+    let picture = place.read("unsharded/final.svg");
     assert!(picture.contains("as in the file; generations (6): 3 "), "{}", &picture[..800]);
     // Every varied value is a dot. The file's own values are lines.
-    assert_eq!(fs::read_to_string(unsharded.join("final.svg")).unwrap().matches("<circle").count(), 8);
+    assert_eq!(picture.matches("<circle").count(), 8);
 
     for shard in ["1/2", "2/2"] {
-        succeed(flotilla(&sweep, &sharded, &["--quiet", skip, "--shard", shard]));
+        place.good(&line("sharded", &format!("--quiet {skip} --shard {shard}")));
     }
     // Nothing is impossible, so the flag makes no other sweep.
-    succeed(flotilla(&sweep, &sharded, &["--collect"]));
+    place.good(&line("sharded", "--collect"));
     assert_eq!(results(&unsharded), results(&sharded));
-    assert!(fail(flotilla(&sweep, &unsharded, &["--collect", "--axes", "coupling"]), 2).contains("one picture"));
+    fail(&place, 2, &line("unsharded", "--collect --axes coupling"), &["one picture"]);
 }
 
 proptest! {
@@ -450,10 +443,9 @@ fn batches_fit_in_memory() {
 
 #[test]
 fn collected_shards_equal_the_unsharded_sweep() {
-    let (folder, sweep) = write_sweep(SMALL);
-    let unsharded = folder.path().join("whole");
-    let stdout = succeed(flotilla(&sweep, &unsharded, &["--quiet"]));
-    assert!(stdout.contains("8 of 8 points are done"), "{stdout}");
+    let place = place(SMALL);
+    let unsharded = place.path("unsharded");
+    place.prints(&line("unsharded", "--quiet"), &["8 of 8 points are done"]);
     let expected = results(&unsharded);
     assert_eq!(
         expected.iter().map(|(name, _)| name.as_str()).collect::<Vec<_>>(),
@@ -479,54 +471,46 @@ fn collected_shards_equal_the_unsharded_sweep() {
         ("reach.svg", &["Generations until G of the champion is 0.75, median over trials", "never"]),
         ("curves.svg", &["G of the champion", "mean and 95 % interval over 2 trials"]),
     ] {
-        let svg = fs::read_to_string(unsharded.join(picture)).unwrap();
+        let svg = place.read(Path::new("unsharded").join(picture));
         for label in labels {
             assert!(svg.contains(&format!("aria-label=\"{label}\"")), "{picture}: {label}");
         }
     }
-    let text = fs::read_to_string(unsharded.join("results.csv")).unwrap();
+    let text = place.read("unsharded/results.csv");
     let head = "world.coupling,world.steps,learning.generations,point,trial,generation,best_g,mean_g,champion_g";
     assert_eq!(text.lines().next(), Some(head));
     // Two trials each of 4 points with 3 generations and 4 points with 12, each plus generation 0.
     assert_eq!(text.lines().count(), 1 + 2 * (4 * 4 + 4 * 13));
 
-    succeed(flotilla(&sweep, &unsharded, &["--collect", "--measure", "best", "--band", "error"]));
-    let svg = fs::read_to_string(unsharded.join("final.svg")).unwrap();
+    place.good(&line("unsharded", "--collect --measure best --band error"));
+    let svg = place.read("unsharded/final.svg");
     assert!(svg.contains("G of the best team") && svg.contains("below: ± standard error"), "{svg}");
 
     for count in [2, 3, 11] {
-        let out = folder.path().join(format!("{count}"));
+        let out = format!("{count}");
         for index in (1..=count).rev() {
             if index == 1 {
-                let error = fail(flotilla(&sweep, &out, &["--collect"]), 1);
-                assert!(error.contains("points are missing") && error.contains("it was not run"), "{error}");
+                fail(&place, 1, &line(&out, "--collect"), &["points are missing", "it was not run"]);
             }
             // Shards also differ in the size of their batches.
             let memory = if index % 2 == 0 { "0.00001" } else { "1" };
-            succeed(flotilla(&sweep, &out, &["--quiet", "--shard", &format!("{index}/{count}"), "--memory", memory]));
+            place.good(&line(&out, &format!("--quiet --shard {index}/{count} --memory {memory}")));
         }
-        succeed(flotilla(&sweep, &out, &["--collect"]));
-        assert!(results(&out) == expected, "{count} shards");
-        assert!(policies(&out) == policies(&unsharded), "{count} shards");
+        place.good(&line(&out, "--collect"));
+        assert!(results(&place.path(&out)) == expected, "{count} shards");
+        assert!(policies(&place.path(&out)) == policies(&unsharded), "{count} shards");
     }
 
     // A point equals a run with the same config.
-    let point = unsharded.join("points/0003");
-    let alone = folder.path().join("alone");
-    let mut train = support::flotilla();
-    train.arg("train").arg(point.join("config.toml")).arg("--out").arg(&alone).args(["--quiet", "--backend", "cpu"]);
-    succeed(train.output().unwrap());
-    assert_eq!(metrics_without_time(&alone.join("metrics.csv")), metrics_without_time(&point.join("metrics.csv")));
-    assert!(
-        fs::read(alone.join("policies.safetensors")).unwrap() == fs::read(point.join("policies.safetensors")).unwrap()
-    );
+    place.good("train unsharded/points/0003/config.toml --out alone --quiet");
+    assert!(support::results(&place.path("alone")) == support::results(&unsharded.join("points/0003")));
 }
 
 #[test]
 fn results_have_every_fifth_generation_and_the_last() {
-    let (folder, sweep) = write_sweep(SMALL);
-    let out = folder.path().join("out");
-    succeed(flotilla(&sweep, &out, &["--quiet", "--every", "5", "--reach", "0.5", "--axes", "steps"]));
+    let place = place(SMALL);
+    let out = place.path("out");
+    place.good(&line("out", "--quiet --every 5 --reach 0.5 --axes steps"));
     let mut table = csv::Reader::from_path(out.join("results.csv")).unwrap();
     let rows: Vec<(usize, usize, usize)> = table
         .records()
@@ -541,7 +525,7 @@ fn results_have_every_fifth_generation_and_the_last() {
     for point in points.records() {
         let point = point.unwrap();
         let index: usize = point[3].parse().unwrap();
-        let metrics = fs::read_to_string(out.join(format!("points/{index:04}/metrics.csv"))).unwrap();
+        let metrics = place.read(format!("out/points/{index:04}/metrics.csv"));
         let rows: Vec<Vec<f64>> =
             metrics.lines().skip(1).map(|line| line.split(',').map(|field| field.parse().unwrap()).collect()).collect();
         let last = rows.iter().map(|row| row[1]).fold(0.0, f64::max);
@@ -557,22 +541,24 @@ fn results_have_every_fifth_generation_and_the_last() {
         let median = reached[0].zip(reached[1]).map(|(a, b)| (a + b) / 2.0);
         assert_eq!(point[12].parse::<f64>().ok(), median, "{point:?}");
     }
-    let error = fail(flotilla(&sweep, &out, &["--collect", "--axes", "radius"]), 2);
-    assert!(error.contains("it has world.coupling, world.steps, learning.generations"), "{error}");
-    let error = fail(flotilla(&sweep, &out, &["--collect", "--axes", "steps,world.steps"]), 2);
-    assert!(error.contains("--axes: world.steps twice"), "{error}");
+    fail(
+        &place,
+        2,
+        &line("out", "--collect --axes radius"),
+        &["it has world.coupling, world.steps, learning.generations"],
+    );
+    fail(&place, 2, &line("out", "--collect --axes steps,world.steps"), &["--axes: world.steps twice"]);
     // Windows does not replace open files.
     drop((table, points));
-    succeed(flotilla(&sweep, &out, &["--collect", "--axes", "steps,world.coupling"]));
+    place.good(&line("out", "--collect --axes steps,world.coupling"));
 }
 
 #[test]
 fn a_large_sweep_prints_its_best_and_its_worst_points() {
     for points in [12, 15] {
-        let (folder, sweep) = sweep_of_seeds(points);
-        let out = folder.path().join("out");
-        let text = succeed(flotilla(&sweep, &out, &["--quiet"]));
-        let mut table = csv::Reader::from_path(out.join("points.csv")).unwrap();
+        let place = place_of_seeds(points);
+        let text = place.good(&line("out", "--quiet")).0;
+        let mut table = csv::Reader::from_path(place.path("out/points.csv")).unwrap();
         let column = table.headers().unwrap().iter().position(|name| name == "champion_g").unwrap();
         let mut means: Vec<f64> = table.records().map(|row| row.unwrap()[column].parse().unwrap()).collect();
         means.sort_by(|a, b| b.total_cmp(a));
@@ -600,10 +586,13 @@ fn checkpoints(out: &Path) -> BTreeSet<PathBuf> {
     files.map(|file| file.path()).filter(is_complete).collect()
 }
 
-/// Starts a shard and waits until it has written a new checkpoint, or has finished.
-fn start_until_checkpoint(sweep: &Path, out: &Path, flags: &[&str]) -> Child {
+/// Starts a shard and waits until it has written a new checkpoint to `out`, or has finished.
+fn start_until_checkpoint(place: &Place, flags: &str) -> Child {
+    let out = &place.path("out");
     let before = checkpoints(out);
-    let mut child = command(sweep, out, flags).stderr(Stdio::piped()).stdout(Stdio::null()).spawn().unwrap();
+    let mut command = support::flotilla();
+    command.current_dir(place.root()).args(line("out", flags).split_whitespace()).args(["--backend", "cpu"]);
+    let mut child = command.stderr(Stdio::piped()).stdout(Stdio::null()).spawn().unwrap();
     let start = Instant::now();
     while checkpoints(out).is_subset(&before) && child.try_wait().unwrap().is_none() {
         assert!(start.elapsed() < Duration::from_secs(60), "no checkpoint in a minute");
@@ -614,19 +603,17 @@ fn start_until_checkpoint(sweep: &Path, out: &Path, flags: &[&str]) -> Child {
 
 #[test]
 fn killed_shards_resume_to_the_same_bytes() {
-    let (folder, sweep) = write_sweep(&long());
-    let uninterrupted = folder.path().join("whole");
-    succeed(flotilla(&sweep, &uninterrupted, &["--quiet"]));
+    let place = place(&long());
+    let [out, uninterrupted] = ["out", "uninterrupted"].map(|name| place.path(name));
+    place.good(&line("uninterrupted", "--quiet"));
 
-    let out = folder.path().join("out");
     let shards = ["1/2", "2/2"];
     let mut interrupted = [0; 2];
     for (at, shard) in shards.into_iter().enumerate() {
         // Stops each shard three times, after different pauses: the first with SIGKILL, the second with SIGTERM. Windows
         // has no SIGTERM, so both are killed there.
         for pause in [0, 15, 40] {
-            let flags = ["--quiet", "--resume", "--shard", shard, "--band", "none"];
-            let mut child = start_until_checkpoint(&sweep, &out, &flags);
+            let mut child = start_until_checkpoint(&place, &format!("--quiet --resume --shard {shard} --band none"));
             std::thread::sleep(Duration::from_millis(pause));
             if at == 0 || cfg!(windows) {
                 let _ = child.kill();
@@ -647,26 +634,26 @@ fn killed_shards_resume_to_the_same_bytes() {
         }
     }
     assert!(!interrupted.contains(&0), "shards finished before they were stopped: {interrupted:?}");
-    fail(flotilla(&sweep, &out, &["--quiet", "--shard", "1/2"]), 1);
+    fail(&place, 1, &line("out", "--quiet --shard 1/2"), &[]);
     // Points resume at generations of their own: one loses its checkpoints, another its whole folder.
     fs::remove_dir_all(out.join("points/0001/checkpoints")).unwrap();
     fs::remove_dir_all(out.join("points/0002")).unwrap();
     for shard in shards {
-        succeed(flotilla(&sweep, &out, &["--quiet", "--resume", "--shard", shard]));
+        place.good(&line("out", &format!("--quiet --resume --shard {shard}")));
     }
-    succeed(flotilla(&sweep, &out, &["--collect"]));
+    place.good(&line("out", "--collect"));
     assert!(results(&out) == results(&uninterrupted));
     assert!(policies(&out) == policies(&uninterrupted));
     // Finished points are not trained again.
     let before = fs::read(out.join("points/0000/run.json")).unwrap();
-    succeed(flotilla(&sweep, &out, &["--quiet", "--resume"]));
+    place.good(&line("out", "--quiet --resume"));
     assert!(fs::read(out.join("points/0000/run.json")).unwrap() == before);
 }
 
 #[test]
 fn wrong_usage_is_refused_before_any_work() {
-    let (folder, sweep) = write_sweep(SMALL);
-    let out = folder.path().join("out");
+    let place = place(SMALL);
+    let out = place.path("out");
     for (shard, expected) in [
         ("5/4", "there is no shard 5 of 4; they are 1/4 to 4/4"),
         ("0/4", "there is no shard 0 of 4"),
@@ -675,116 +662,107 @@ fn wrong_usage_is_refused_before_any_work() {
         ("-1/2", "allowed I/N"),
         ("1/99999999999", "allowed 1 to 65536"),
     ] {
-        let error = fail(flotilla(&sweep, &out, &["--shard", shard]), 2);
-        assert!(error.contains(expected), "{shard}: {error}");
+        fail(&place, 2, &line("out", &format!("--shard {shard}")), &[expected]);
     }
-    let error = fail(flotilla(&sweep, &out, &["--seed", "3", "--skip-impossible", "--generations", "3"]), 2);
-    assert!(error.contains("--generations: the grid has learning.generations already"), "{error}");
-    let mut array = command(&sweep, &out, &[]);
-    let error = fail(array.env("JOB_COMPLETION_INDEX", "1").output().unwrap(), 2);
+    fail(
+        &place,
+        2,
+        &line("out", "--seed 3 --skip-impossible --generations 3"),
+        &["--generations: the grid has learning.generations already"],
+    );
+    let mut array = place.command();
+    array.args(line("out", "--backend cpu").split_whitespace()).env("JOB_COMPLETION_INDEX", "1");
+    let error = failure(array.output().unwrap(), 2);
     assert!(error.contains("FLOTILLA_SHARDS"), "{error}");
-    let error = fail(flotilla(&sweep, &out, &["--collect"]), 2);
-    assert!(error.contains("holds no sweep"), "{error}");
-    let (_other, impossible) = write_sweep(&SMALL.replace("[1, 3]", "[1, 9]"));
-    let error = fail(flotilla(&impossible, &out, &[]), 1);
-    assert!(error.contains("x.toml:13: ") && error.contains("found 9, allowed 1 to 6"), "{error}");
-    let (_other, empty) = write_sweep(&SMALL.replace("[1, 3]", "[]"));
-    assert!(fail(flotilla(&empty, &out, &[]), 1).contains("found no values"));
-    assert!(fail(flotilla(&out, &out, &[]), 1).contains("cannot be read"));
-    assert!(fail(flotilla(&sweep, &sweep, &[]), 1).contains("is a file; choose a folder"));
+    fail(&place, 2, &line("out", "--collect"), &["holds no sweep"]);
+    place.write("other.toml", SMALL.replace("[1, 3]", "[1, 9]"));
+    fail(&place, 1, "sweep other.toml --out out", &["other.toml:13: ", "found 9, allowed 1 to 6"]);
+    place.write("other.toml", SMALL.replace("[1, 3]", "[]"));
+    fail(&place, 1, "sweep other.toml --out out", &["found no values"]);
+    fail(&place, 1, "sweep out --out out", &["cannot be read"]);
+    fail(&place, 1, &line("x.toml", ""), &["is a file; choose a folder"]);
     assert!(!out.exists(), "nothing was written");
 }
 
 #[test]
 fn a_folder_with_another_sweep_or_a_run_is_refused() {
-    let (folder, sweep) = write_sweep(SMALL);
-    let out = folder.path().join("out");
-    succeed(flotilla(&sweep, &out, &["--quiet"]));
+    let place = place(SMALL);
+    let out = place.path("out");
+    place.good(&line("out", "--quiet"));
     let before = results(&out);
-    let (_other, another) = write_sweep(&SMALL.replace("[1, 3]", "[1, 2, 3]"));
-    for flags in [&["--resume"][..], &["--force"], &["--collect"], &["--shard", "1/3"], &[]] {
-        let error = fail(flotilla(&another, &out, flags), 1);
-        assert!(error.contains("holds another sweep"), "{error}");
-        assert!(
-            error.contains(&format!("`flotilla sweep {0}/sweep.toml --out {0} --resume`", out.display())),
-            "{error}"
-        );
-        assert!(error.contains("there: \"world.coupling\" = [1, 3]"), "{error}");
-        assert!(error.contains("here: \"world.coupling\" = [1, 2, 3]"), "{error}");
+    place.write("other.toml", SMALL.replace("[1, 3]", "[1, 2, 3]"));
+    let parts = [
+        "holds another sweep",
+        "`flotilla sweep out/sweep.toml --out out --resume`",
+        "there: \"world.coupling\" = [1, 3]",
+        "here: \"world.coupling\" = [1, 2, 3]",
+    ];
+    for flags in ["--resume", "--force", "--collect", "--shard 1/3", ""] {
+        let error = fail(&place, 1, &format!("sweep other.toml --out out {flags}"), &parts);
         assert!(!error.contains('…'), "{error}");
     }
     // At most eight lines are shown of each.
     let keys = ["seed=6", "population=12", "trials=3", "fitness='G'", "episodes_per_team=2"];
     let keys = keys.into_iter().chain(["start_jitter=1.0", "poi_jitter=1.0", "hall_of_fame=1", "elites=3"]);
-    let set: Vec<String> = keys.flat_map(|key| ["--set".to_string(), format!("learning.{key}")]).collect();
-    let flags: Vec<&str> = ["--resume"].into_iter().chain(set.iter().map(|flag| &**flag)).collect();
-    let error = fail(flotilla(&sweep, &out, &flags), 1);
+    let set: String = keys.map(|key| format!(" --set learning.{key}")).collect();
+    let error = fail(&place, 1, &line("out", &format!("--resume{set}")), &[]);
     assert!(error.matches("\n  here: ").count() == 8 && error.matches('…').count() == 1, "{error}");
     // Another seed makes another sweep. Another comment does not.
-    assert!(fail(flotilla(&sweep, &out, &["--seed", "6", "--resume"]), 1).contains("there: seed = 5"));
-    let (_other, same) = write_sweep(&format!("# The same.\n{SMALL}"));
-    succeed(flotilla(&same, &out, &["--quiet", "--resume", "--skip-impossible"]));
+    fail(&place, 1, &line("out", "--seed 6 --resume"), &["there: seed = 5"]);
+    place.write("other.toml", format!("# The same.\n{SMALL}"));
+    place.good("sweep other.toml --out out --quiet --resume --skip-impossible");
     assert!(results(&out) == before);
     // A file that is cut off is damaged, and not another sweep.
-    let text = fs::read_to_string(out.join("sweep.toml")).unwrap();
-    fs::write(out.join("sweep.toml"), &text[..20]).unwrap();
+    let text = place.read("out/sweep.toml");
+    place.write("out/sweep.toml", &text[..20]);
+    let damaged = "sweep.toml is damaged; restore it, or choose another --out";
     for flag in ["--resume", "--force"] {
-        let error = fail(flotilla(&sweep, &out, &["--quiet", flag]), 1);
-        assert!(error.contains("sweep.toml is damaged; restore it, or choose another --out"), "{error}");
+        fail(&place, 1, &line("out", &format!("--quiet {flag}")), &[damaged]);
     }
-    fs::write(out.join("sweep.toml"), text).unwrap();
+    place.write("out/sweep.toml", text);
     // A sweep does not write into a run's folder.
-    let error = fail(flotilla(&sweep, &out.join("points/0000"), &[]), 1);
-    assert!(error.contains("holds a run, not a sweep"), "{error}");
+    fail(&place, 1, &line("out/points/0000", ""), &["holds a run, not a sweep"]);
     // A finished sweep needs --resume or --force. With --force, it is trained again to the same results.
-    assert!(fail(flotilla(&sweep, &out, &["--quiet"]), 1).contains("--resume"));
-    succeed(flotilla(&sweep, &out, &["--quiet", "--force"]));
+    fail(&place, 1, &line("out", "--quiet"), &["--resume"]);
+    place.good(&line("out", "--quiet --force"));
     assert!(results(&out) == before);
 }
 
 /// Tests that files with the names of results are overwritten only beside a sweep.toml, which a user may have written.
 #[test]
 fn files_of_others_in_a_sweeps_folder_are_not_overwritten() {
-    let (folder, sweep) = write_sweep(SMALL);
+    let place = place(SMALL);
     for name in ["results.csv", "points.csv", "final.svg"] {
-        let out = folder.path().join(name);
-        fs::create_dir(&out).unwrap();
-        fs::write(out.join(name), "mine").unwrap();
-        let error = fail(flotilla(&sweep, &out, &["--quiet", "--force"]), 1);
-        assert!(error.contains(&format!("holds {name} but no sweep.toml")), "{error}");
-        assert_eq!(fs::read_to_string(out.join(name)).unwrap(), "mine");
+        fs::create_dir(place.path(name)).unwrap();
+        place.write(Path::new(name).join(name), "mine");
+        fail(&place, 1, &line(name, "--quiet --force"), &[&format!("holds {name} but no sweep.toml")]);
+        assert_eq!(place.read(Path::new(name).join(name)), "mine");
     }
-    let started_by_hand = folder.path().join("own");
-    fs::create_dir(&started_by_hand).unwrap();
+    // This sweep was started by hand.
+    fs::create_dir(place.path("own")).unwrap();
     let text = format!("# Mine.\n{SMALL}");
-    fs::write(started_by_hand.join("sweep.toml"), &text).unwrap();
-    succeed(flotilla(&started_by_hand.join("sweep.toml"), &started_by_hand, &["--quiet"]));
-    assert_eq!(fs::read_to_string(started_by_hand.join("sweep.toml")).unwrap(), text);
+    place.write("own/sweep.toml", &text);
+    place.good("sweep own/sweep.toml --out own --quiet");
+    assert_eq!(place.read("own/sweep.toml"), text);
     // A point may be resumed with another interval of checkpoints, which does not change its results.
-    let point = started_by_hand.join("points/0000");
-    let config = point.join("config.toml");
-    fs::remove_file(point.join("run.json")).unwrap();
-    let mut resumed = support::flotilla();
-    resumed.arg("train").arg(&config).arg("--out").arg(&point);
-    succeed(resumed.args(["--resume", "--checkpoint-seconds", "5", "--backend", "cpu", "--quiet"]).output().unwrap());
-    succeed(flotilla(&started_by_hand.join("sweep.toml"), &started_by_hand, &["--collect"]));
+    let point = "own/points/0000";
+    fs::remove_file(place.path(point).join("run.json")).unwrap();
+    place.good(&format!("train {point}/config.toml --out {point} --resume --checkpoint-seconds 5 --quiet"));
+    place.good("sweep own/sweep.toml --out own --collect");
     // A sweep that needs more memory than any machine has is refused before anything starts.
-    let (_large, huge) = write_sweep(&SMALL.replacen(
-        "[grid]",
-        "[grid]\n\"learning.population\" = [1048576]\n\"policy.hidden\" = [[64, 64]]\n\"learning.trials\" = [1000]",
-        1,
-    ));
-    let out = folder.path().join("huge");
-    let error = fail(flotilla(&huge, &out, &["--quiet"]), 1);
-    assert!(error.contains("GiB") && !out.join("sweep.toml").exists(), "{error}");
+    let grid =
+        "[grid]\n\"learning.population\" = [1048576]\n\"policy.hidden\" = [[64, 64]]\n\"learning.trials\" = [1000]";
+    place.write("huge.toml", SMALL.replacen("[grid]", grid, 1));
+    fail(&place, 1, "sweep huge.toml --out huge --quiet", &["GiB"]);
+    assert!(!place.path("huge/sweep.toml").exists());
 }
 
 /// Tests that --force overwrites nothing while another process trains a point, whatever its batch.
 #[test]
 fn nothing_is_overwritten_while_another_process_trains_a_point() {
-    let (folder, sweep) = write_sweep(SMALL);
-    let out = folder.path().join("out");
-    succeed(flotilla(&sweep, &out, &["--quiet"]));
+    let place = place(SMALL);
+    let out = place.path("out");
+    place.good(&line("out", "--quiet"));
     let all_files = || {
         let points = (0..8).map(|point| out.join(format!("points/{point:04}")));
         let files = points.flat_map(|point| [results(&point), results(&point.join("checkpoints"))]);
@@ -795,25 +773,26 @@ fn nothing_is_overwritten_while_another_process_trains_a_point() {
     let config = Config::load(&point.join("config.toml")).unwrap();
     let lock = Folder::open(&point, Start::Resume, &config, StartFrom::Unspecified, Disk::default()).unwrap();
     for memory in ["1", "0.000001"] {
-        let error = fail(flotilla(&sweep, &out, &["--quiet", "--force", "--memory", memory]), 1);
+        let error = fail(&place, 1, &line("out", &format!("--quiet --force --memory {memory}")), &[]);
+        let point = Path::new("out").join("points").join("0005");
         let expected = format!("error: another process is training in {}; ", point.display());
         assert!(error.starts_with(&expected) && error.lines().count() == 1, "{error}");
         assert!(all_files() == before, "files were overwritten, with --memory {memory}");
     }
     drop(lock);
-    succeed(flotilla(&sweep, &out, &["--quiet", "--force", "--memory", "0.000001"]));
+    place.good(&line("out", "--quiet --force --memory 0.000001"));
     // Existing runs of later batches are reported before the first batch starts.
     fs::remove_dir_all(out.join("points/0000")).unwrap();
-    let error = fail(flotilla(&sweep, &out, &["--quiet", "--memory", "0.000001"]), 1);
     let exists = format!("{} holds a run already", Path::new("points").join("0001").display());
-    assert!(error.contains(&exists) && !out.join("points/0000").exists(), "{error}");
+    fail(&place, 1, &line("out", "--quiet --memory 0.000001"), &[&exists]);
+    assert!(!out.join("points/0000").exists());
 }
 
 #[test]
 fn damaged_points_are_reported_as_missing() {
-    let (folder, sweep) = write_sweep(SMALL);
-    let out = folder.path().join("out");
-    succeed(flotilla(&sweep, &out, &["--quiet"]));
+    let place = place(SMALL);
+    let out = place.path("out");
+    place.good(&line("out", "--quiet"));
     let before = results(&out);
     let metrics = |point: usize| out.join(format!("points/{point:04}/metrics.csv"));
     let text = fs::read_to_string(metrics(1)).unwrap();
@@ -825,8 +804,7 @@ fn damaged_points_are_reported_as_missing() {
     fs::write(metrics(2), text.replacen("\n0,0,", "\n0,0,7", 1)).unwrap();
     fs::remove_file(metrics(3)).unwrap();
     fs::copy(out.join("points/0000/config.toml"), out.join("points/0004/config.toml")).unwrap();
-    let error = fail(flotilla(&sweep, &out, &["--collect"]), 1);
-    for expected in [
+    let expected = [
         "4 of 8 points are missing",
         "point 0001 (world.coupling = 1, world.steps = 8, learning.generations = 12): \
          it has 2 of 13 generations",
@@ -834,65 +812,62 @@ fn damaged_points_are_reported_as_missing() {
         "metrics.csv: line 2 is not",
         "it was not run",
         "it is of another config",
-    ] {
-        assert!(error.contains(expected), "{expected}: {error}");
-    }
+    ];
+    fail(&place, 1, &line("out", "--collect"), &expected);
     // --resume trains damaged points again, but refuses a point with another config.
-    assert!(fail(flotilla(&sweep, &out, &["--quiet", "--resume"]), 1).contains("another config"));
+    fail(&place, 1, &line("out", "--quiet --resume"), &["another config"]);
     fs::remove_dir_all(out.join("points/0004")).unwrap();
-    succeed(flotilla(&sweep, &out, &["--quiet", "--resume"]));
+    place.good(&line("out", "--quiet --resume"));
     assert!(results(&out) == before);
 }
 
 #[test]
 fn at_most_twenty_missing_points_are_listed() {
     for points in [21, 22] {
-        let (folder, sweep) = sweep_of_seeds(points);
-        let out = folder.path().join("out");
-        succeed(flotilla(&sweep, &out, &["--quiet", "--shard", &format!("1/{points}")]));
-        let error = fail(flotilla(&sweep, &out, &["--collect"]), 1);
-        assert!(error.contains(&format!("{} of {points} points are missing", points - 1)), "{error}");
+        let place = place_of_seeds(points);
+        place.good(&line("out", &format!("--quiet --shard 1/{points}")));
+        let missing = format!("{} of {points} points are missing", points - 1);
+        let error = fail(&place, 1, &line("out", "--collect"), &[&missing]);
         assert_eq!((error.matches("it was not run").count(), error.contains('…')), (20, points == 22), "{error}");
     }
 }
 
 #[test]
 fn json_summaries_agree_with_the_files() {
-    let (folder, sweep) = write_sweep(SMALL);
-    let out = folder.path().join("out");
+    let place = place(SMALL);
     // The first task of a job array of two is the first shard.
-    let mut shard = command(&sweep, &out, &["--quiet", "--json", "--every", "2", "--reach", "0.5"]);
+    let mut shard = place.command();
+    shard.args(line("out", "--backend cpu --quiet --json --every 2 --reach 0.5").split_whitespace());
     shard.env("SLURM_ARRAY_TASK_ID", "0").env("SLURM_ARRAY_TASK_COUNT", "2").env("SLURM_ARRAY_TASK_MIN", "0");
     let summary: serde_json::Value = serde_json::from_str(&succeed(shard.output().unwrap())).unwrap();
-    assert_eq!((&summary["shard"], &summary["folder"]), (&"1/2".into(), &out.to_str().unwrap().into()));
+    assert_eq!((&summary["shard"], &summary["folder"]), (&"1/2".into(), &"out".into()));
     assert!(summary["collect"].as_str().unwrap().ends_with("--every 2 --reach 0.5 --collect"));
-    let output = flotilla(&sweep, &out, &["--collect", "--json"]);
+    let output = place.run(&line("out", "--collect --json"));
     assert_eq!(output.status.code(), Some(1));
     let summary: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
     let missing =
         summary["points"].as_array().unwrap().iter().filter(|point| point["missing"] == "it was not run").count();
     assert!((1..8).contains(&missing), "{summary}");
-    let summary: serde_json::Value =
-        serde_json::from_str(&succeed(flotilla(&sweep, &out, &["--quiet", "--json", "--resume"]))).unwrap();
-    let mut table = csv::Reader::from_path(summary["files"]["points"].as_str().unwrap()).unwrap();
+    let summary = place.json(&line("out", "--quiet --json --resume"));
+    let mut table = csv::Reader::from_path(place.path(summary["files"]["points"].as_str().unwrap())).unwrap();
     for (row, point) in table.records().map(|row| row.unwrap()).zip(summary["points"].as_array().unwrap()) {
         assert_eq!(row[0], point["values"]["world.coupling"].to_string());
         assert_eq!(row[3], point["point"].to_string());
         assert_eq!(row[6].parse::<f64>().unwrap(), point["champion_g"].as_f64().unwrap());
         assert_eq!(row[8].parse::<f64>().ok(), point["champion_g_interval_95"][1].as_f64());
         assert_eq!(row[11], point["reached"].to_string());
-        let run = fs::read_to_string(Path::new(point["folder"].as_str().unwrap()).join("run.json")).unwrap();
+        let run = place.read(Path::new(point["folder"].as_str().unwrap()).join("run.json"));
         assert!(run.contains(point["digest"].as_str().unwrap()));
     }
     for picture in summary["files"]["pictures"].as_array().unwrap() {
-        assert!(Path::new(picture.as_str().unwrap()).exists(), "{picture}");
+        assert!(place.path(picture.as_str().unwrap()).exists(), "{picture}");
     }
 }
 
 #[test]
 fn list_prints_costs_and_shards() {
-    let (folder, sweep) = write_sweep(SMALL);
-    let stdout = succeed(flotilla(&sweep, &folder.path().join("out"), &["--list", "--shards", "3"]));
+    let place = place(SMALL);
+    let stdout = place.good(&line("out", "--list --shards 3")).0;
     assert_eq!(stdout.lines().count(), 10, "{stdout}");
     let shares: f64 = stdout
         .lines()
@@ -901,17 +876,21 @@ fn list_prints_costs_and_shards() {
         .map(|line| line.split_whitespace().nth(1).unwrap().parse::<f64>().unwrap())
         .sum();
     assert!((shares - 100.0).abs() < 0.1, "{stdout}");
-    assert!(!folder.path().join("out").exists());
+    assert!(!place.path("out").exists());
 }
 
 /// Slurm does not run on Windows, whose paths bash would not understand.
 #[cfg(unix)]
 #[test]
 fn the_batch_script_runs_in_bash() {
-    let (folder, sweep) = write_sweep(SMALL);
-    let out = folder.path().join("a folder's");
-    let flags = ["--slurm", "--shards", "3", "--time", "02:00:00", "--threads", "4", "--seed", "7"];
-    let script = succeed(flotilla(&sweep, &out, &[&flags[..], &["--sbatch=--partition=long"]].concat()));
+    let place = place(SMALL);
+    let (sweep, out) = (place.path("x.toml"), place.path("a folder's"));
+    let run = |flags: &str| {
+        let line = ["sweep", sweep.to_str().unwrap(), "--out", out.to_str().unwrap()];
+        place.good(&line.into_iter().chain(flags.split_whitespace()).collect::<Vec<_>>()).0
+    };
+    let flags = "--shards 3 --time 02:00:00 --threads 4 --seed 7";
+    let script = run(&format!("--slurm {flags} --sbatch=--partition=long"));
     for line in [
         "#SBATCH --array=1-3",
         "#SBATCH --time=02:00:00",
@@ -923,8 +902,7 @@ fn the_batch_script_runs_in_bash() {
         assert!(script.lines().any(|other| other == line), "{line}: {script}");
     }
     assert!(!script.contains("--gpus"), "a GPU is requested for a sweep on the CPU: {script}");
-    let host = ["--slurm", "--seed", "7", "--breed", "host", "--axes", "steps", "--measure", "best"];
-    let host_script = succeed(flotilla(&sweep, &out, &host));
+    let host_script = run("--slurm --seed 7 --breed host --axes steps --measure best");
     for then in ["--shard", "--collect"] {
         let words = format!("--backend cpu --breed host --axes steps --measure best {then}");
         assert!(host_script.contains(&words), "{host_script}");
@@ -934,15 +912,13 @@ fn the_batch_script_runs_in_bash() {
         "{script}"
     );
     // As a task of the array, the script trains its shard. The folder's name needs quotes.
-    let path = folder.path().join("job.sh");
-    succeed(flotilla(&sweep, &out, &[&flags[..1], &flags[1..]].concat()));
-    let file = format!("--slurm={}", path.display());
-    succeed(flotilla(&sweep, &out, &[&[&*file], &flags[1..]].concat()));
+    run(&format!("--slurm {flags}"));
+    run(&format!("--slurm=job.sh {flags}"));
     for task in ["1", "2", "3"] {
-        let output = Command::new("bash").arg(&path).env("SLURM_ARRAY_TASK_ID", task).output().unwrap();
+        let output = Command::new("bash").arg(place.path("job.sh")).env("SLURM_ARRAY_TASK_ID", task).output().unwrap();
         succeed(output);
     }
-    succeed(flotilla(&sweep, &out, &["--collect", "--seed", "7"]));
+    run("--collect --seed 7");
 }
 
 /// Measures how much longer a batch takes than its points one by one. `benches/README.md` has results.
@@ -977,19 +953,19 @@ fn a_batch_of_unequal_points_takes_as_long_as_its_points() {
 #[test]
 fn the_limit_of_open_files_is_raised_if_possible_and_reported_otherwise() {
     let points = "1, 2, 3, 4, 5, 6, 7, 8";
-    let (folder, _) = write_sweep(&format!("{SMALL}\"learning.seed\" = [{points}]\n"));
+    let place = place(&format!("{SMALL}\"learning.seed\" = [{points}]\n"));
     let run = |limit: &str, out: &str, flags: &str| {
-        let script = format!("ulimit {limit} 48; exec flotilla sweep x.toml --quiet --backend cpu --out {out} {flags}");
-        support::shell("bash", &script).current_dir(folder.path()).output().unwrap()
+        let flags = format!("--quiet --backend cpu {flags}");
+        place.shell(&format!("ulimit {limit} 48; exec flotilla {}", line(out, &flags)))
     };
     // The program raises a soft limit.
     succeed(run("-S -n", "soft", ""));
-    let error = fail(run("-n", "hard", ""), 1);
+    let error = failure(run("-n", "hard", ""), 1);
     assert!(error.contains("ulimit -n") && error.contains("--resume"), "{error}");
     assert_eq!(error.lines().count(), 1, "{error}");
     // The points that were finished are kept.
     succeed(run("-S -n", "hard", "--resume"));
-    assert_eq!(policies(&folder.path().join("hard")), policies(&folder.path().join("soft")));
+    assert_eq!(policies(&place.path("hard")), policies(&place.path("soft")));
 }
 
 #[test]

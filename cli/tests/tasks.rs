@@ -7,10 +7,10 @@ use crate::support;
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::process::Output;
 use std::sync::atomic::AtomicBool;
 
 use crate::support::{Place, TINY};
-use assert_cmd::cargo::cargo_bin_cmd;
 use flotilla::evaluate::Starts;
 use flotilla::{Config, front};
 use flotilla_app::ops::{ConfigText, Context};
@@ -19,7 +19,6 @@ use flotilla_app::script::Script;
 use flotilla_studies::questions::parts;
 use flotilla_studies::tasks::{self, Request, Task};
 use serde_json::Value;
-use tempfile::TempDir;
 
 fn task_files(ending: &str) -> Vec<PathBuf> {
     let folder = std::env::var_os("FLOTILLA_TASKS").map(PathBuf::from);
@@ -64,11 +63,12 @@ fn a_scripted_team_solves_the_relay_with_an_enforced_hand_over() {
 
 #[test]
 fn invalid_scripts_are_refused_before_training() {
-    let folder = TempDir::new().unwrap();
+    let place = Place::new(&[]).on_cpu().slow();
     // Nobody reaches a POI in two steps.
     let task =
         TINY.replace("pois = [[10, 9], [20, 9]]", "pois = [[10, 40], [20, 40]]").replace("steps = 8", "steps = 2");
-    fs::write(folder.path().join("task.toml"), task).unwrap();
+    place.write("task.toml", &task);
+    let play = |words: &str| format!("tasks {words} --trials 2 --population 0 --quiet");
     let head = "leader,until,x,y,speed\n";
     for (rows, message) in [
         ("", "there are no rows"),
@@ -78,35 +78,29 @@ fn invalid_scripts_are_refused_before_training() {
         ("0,5,1,1,1\n0,5,2,2,1\n", "row 2: `until` has to be larger"),
         ("0,5,1,1,fast\n", "task.csv"),
     ] {
-        fs::write(folder.path().join("task.csv"), format!("{head}{rows}")).unwrap();
-        let (code, _, error) = run(folder.path(), "task.toml --trials 2");
-        assert!(code == Some(2) && error.contains(message), "{rows}: {error}");
-        assert!(!folder.path().join("tasks").exists());
+        place.write("task.csv", format!("{head}{rows}"));
+        place.fails(2, &play("task.toml"), &[message]);
+        assert!(!place.path("tasks").exists());
     }
-    fs::write(folder.path().join("task.csv"), format!("{head}0,5,1,1,1\n")).unwrap();
-    let (code, _, error) = run(folder.path(), "task.toml --trials 2");
-    assert!(code == Some(1) && error.contains("the scripted team has G 0.00"), "{error}");
+    place.write("task.csv", format!("{head}0,5,1,1,1\n"));
+    finds(&place, &play("task.toml"), "the scripted team has G 0.00");
     // Baselines and teams would play in different worlds.
-    let staged = fs::read_to_string(folder.path().join("task.toml")).unwrap()
-        + "\n[[stages]]\nfrom = 1\nset = { \"world.coupling\" = 1 }\n";
-    fs::write(folder.path().join("staged.toml"), staged).unwrap();
-    let (code, _, error) = run(folder.path(), "staged.toml --trials 2 --resume");
-    assert!(code == Some(1) && error.contains("leave the stages out"), "{error}");
+    place.write("staged.toml", task + "\n[[stages]]\nfrom = 1\nset = { \"world.coupling\" = 1 }\n");
+    place.fails(1, &play("staged.toml --resume"), &["leave the stages out"]);
     // Without a scripted team, a champion has to solve the task.
-    fs::remove_file(folder.path().join("task.csv")).unwrap();
-    let (code, _, error) = run(folder.path(), "task.toml --trials 2 --resume");
-    assert!(code == Some(1) && error.contains("no champion solves it, and there is no scripted team"), "{error}");
+    fs::remove_file(place.path("task.csv")).unwrap();
+    finds(&place, &play("task.toml --resume"), "no champion solves it, and there is no scripted team");
 }
 
 /// Between these marks, the page has what the test below prints.
 const MARKS: [&str; 2] = ["<!-- what comes out: cargo test tasks:: -->\n", "<!-- so far -->\n"];
 
-/// Runs `flotilla tasks` without large populations. Returns its exit code, standard output and standard error.
-fn run(folder: &Path, line: &str) -> (Option<i32>, String, String) {
-    let line = format!("tasks {line} --population 0 --backend cpu --quiet");
-    let output = cargo_bin_cmd!("flotilla").args(line.split_whitespace()).current_dir(folder).output().unwrap();
-    let text = |bytes| String::from_utf8(bytes).unwrap();
-    (output.status.code(), text(output.stdout), text(output.stderr))
+/// Runs a command that must fail with exit code 1 and this message. It may print a table before. Returns its output.
+fn finds(place: &Place, line: &str, message: &str) -> Output {
+    let output = place.run(line);
+    let error = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.code() == Some(1) && error.contains(message), "{line}: {error}");
+    output
 }
 
 /// Returns the cells of a table by the task, which is in the first column.
@@ -133,10 +127,9 @@ fn baselines_and_small_populations_do_not_solve_tasks() {
     // This task takes a twentieth of the time of all.
     let is_played = |task: &&PathBuf| support::is_long() || task.ends_with("slalom.toml");
     let list: Vec<String> = tasks.iter().filter(is_played).map(|task| task.display().to_string()).collect();
-    let folder = TempDir::new().unwrap();
-    let (code, table, error) = run(folder.path(), &format!("{} --trials 10", list.join(" ")));
+    let place = Place::new(&[]).on_cpu().slow();
+    let (table, _) = place.good(&format!("tasks {} --trials 10 --population 0 --quiet", list.join(" ")));
     println!("{table}");
-    assert_eq!(code, Some(0), "{error}");
     let (before, rest) = page.split_once(MARKS[0]).unwrap();
     let (expected, after) = rest.split_once(MARKS[1]).unwrap();
     let (actual, rows) = (format!("\n{table}"), cells(expected));
@@ -155,25 +148,21 @@ fn baselines_and_small_populations_do_not_solve_tasks() {
 
 #[test]
 fn tasks_resume_and_those_that_a_constant_speed_solves_fail() {
-    let folder = TempDir::new().unwrap();
-    let run = |line: &str| run(folder.path(), &format!("{line} --trials 2"));
-    fs::write(folder.path().join("tiny.toml"), TINY).unwrap();
+    let place = Place::new(&[("tiny.toml", TINY)]).on_cpu().slow();
+    let play = |words: &str| format!("tasks {words} --trials 2 --population 0 --quiet");
     // Only large populations fix the number of elites.
-    let (code, table, error) = run("tiny.toml --out a --set learning.elites=1");
-    assert!(code == Some(1) && error.contains("the baseline constant action reaches G 1.00"), "{error}");
-    assert_eq!(run("tiny.toml --out a --set learning.elites=1 --resume"), (code, table, error));
+    let line = play("tiny.toml --out a --set learning.elites=1");
+    let output = finds(&place, &line, "the baseline constant action reaches G 1.00");
+    assert_eq!(place.run(&format!("{line} --resume")), output);
     // Without `--resume`, the same command does not overwrite the runs.
-    let (code, _, error) = run("tiny.toml --out a");
-    assert!(code == Some(1) && error.contains("--resume"), "{error}");
-    let (code, _, error) = run("tiny.toml tiny.toml --out c");
-    assert!(code == Some(2) && error.contains("two configs"), "{error}");
+    place.fails(1, &play("tiny.toml --out a"), &["--resume"]);
+    place.fails(2, &play("tiny.toml tiny.toml --out c"), &["two configs"]);
 }
 
 /// Both would train in the same directories.
 #[test]
 fn the_large_population_differs_from_the_small_ones() {
-    let place = Place::new(&[]).on_cpu();
-    place.write("tiny.toml", TINY);
+    let place = Place::new(&[("tiny.toml", TINY)]).on_cpu();
     let error = place.refused(2, "tasks tiny.toml --trials 2 --population 50 --out refused");
     assert!(error.contains("--population 50") && !place.path("refused").exists(), "{error}");
     for key in ["fitness=G", "trials=3", "elites=1"] {
@@ -213,7 +202,7 @@ fn champions_play_held_out_episodes_if_starts_or_pois_move() {
             let run = format!("tasks/{name}/50-{}", trained["fitness"].as_str().unwrap());
             for trial in 0..2 {
                 let line = format!("rollout {run} --trial {trial} --episodes 200 --seed 0 --json");
-                let played: Value = serde_json::from_str(&place.good(&line).0).unwrap();
+                let played = place.json(&line);
                 // The champions are policy 0 of every leader.
                 let expected = played["team_0"]["mean"].as_f64().unwrap() / played["pois"].as_f64().unwrap();
                 assert_eq!(trained["champion_g"][trial].as_f64(), Some(expected), "{run}, trial {trial}");

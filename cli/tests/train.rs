@@ -6,7 +6,7 @@ use std::fs;
 use std::ops::ControlFlow::Continue;
 use std::path::{Path, PathBuf};
 
-use crate::support::{Place, SMALL};
+use crate::support::{self, Place, SMALL};
 use flotilla::trainer::Row;
 use flotilla::{Config, front};
 use flotilla_app::ops;
@@ -77,7 +77,7 @@ fn train_writes_a_complete_folder() {
     }
 
     // The policies are readable with the safetensors crate.
-    let bytes = fs::read(place.path("runs/small/policies.safetensors")).unwrap();
+    let bytes = place.bytes("runs/small/policies.safetensors");
     let (_, header) = SafeTensors::read_metadata(&bytes).unwrap();
     assert_eq!(header.metadata().as_ref().unwrap()["layers"], "8,5,2");
     let tensors = SafeTensors::deserialize(&bytes).unwrap();
@@ -98,9 +98,8 @@ fn train_writes_a_complete_folder() {
     assert!(summary.contains(run["digest"].as_str().unwrap()));
 
     // The resolved config reproduces the run, also with another number of threads.
-    let (repeated, _) = place.good("train runs/small/config.toml --out again --threads 1");
-    assert!(repeated.contains(run["digest"].as_str().unwrap()), "{repeated}");
-    assert_eq!(fs::read(place.path("again/policies.safetensors")).unwrap(), bytes);
+    place.prints("train runs/small/config.toml --out again --threads 1", &[run["digest"].as_str().unwrap()]);
+    assert_eq!(place.bytes("again/policies.safetensors"), bytes);
     assert_eq!(place.read("again/config.toml"), place.read("runs/small/config.toml"));
 }
 
@@ -125,8 +124,7 @@ fn flags_are_in_the_resolved_config_and_quiet_prints_nothing_to_stderr() {
         assert!(config.contains(line), "{line}: {config}");
     }
     assert_eq!(place.read("runs/small/metrics.csv").lines().count(), 1 + 3);
-    let error = place.refused(2, "train small.toml --checkpoint-seconds -1");
-    assert!(error.contains("--checkpoint-seconds: found -1"), "{error}");
+    place.fails(2, "train small.toml --checkpoint-seconds -1", &["--checkpoint-seconds: found -1"]);
     // A config that is refused leaves no folder.
     assert!(!place.path("runs/small-2").exists());
 }
@@ -140,8 +138,7 @@ fn a_run_is_overwritten_only_with_force() {
     place.good(&format!("train small.toml {short}"));
     place.good(&format!("train small.toml {short}"));
     assert!(place.path("runs/small-2/run.json").exists() && place.path("runs/small-3/run.json").exists());
-    let error = place.refused(1, &format!("train small.toml --out runs/small {short}"));
-    assert!(error.contains("runs/small holds a run already"), "{error}");
+    place.fails(1, &format!("train small.toml --out runs/small {short}"), &["runs/small holds a run already"]);
     let error = place.refused(1, &format!("train small.toml --out runs/small --resume --seed 9 {short}"));
     assert!(error.contains("learning.seed: 0 there, 9 here"), "{error}");
     place.good(&format!("train small.toml --out runs/small --force --seed 9 {short}"));
@@ -252,34 +249,32 @@ fn rollout_reads_files_of_other_programs_and_refuses_invalid_ones() {
         (Dtype::I32, vec![2, 3, PARAMETERS], format!("weights is I32 [2, 3, {PARAMETERS}]")),
     ] {
         write_tensor(place.path("bad.safetensors"), "weights", dtype, &shape, bytes, None);
-        let error = place.refused(1, &line("bad"));
-        assert!(error.contains(&description) && error.contains(&needs), "{error}");
+        place.fails(1, &line("bad"), &[&description, &needs]);
     }
     write_tensor(place.path("bad.safetensors"), "weights", Dtype::F32, &[2, 0, PARAMETERS], &[], None);
-    assert!(place.refused(1, &line("bad")).contains(&needs));
+    place.fails(1, &line("bad"), &[&needs]);
     write_tensor(place.path("bad.safetensors"), "weights", Dtype::F32, &[2, 3, PARAMETERS], bytes, Some("8,4,1,2"));
-    assert!(place.refused(1, &line("bad")).contains("layers \"8,4,1,2\", but the config's have \"8,5,2\""));
+    place.fails(1, &line("bad"), &["layers \"8,4,1,2\", but the config's have \"8,5,2\""]);
     write_tensor(place.path("bad.safetensors"), "w", Dtype::F32, &[2, 3, PARAMETERS], bytes, None);
-    assert!(place.refused(1, &line("bad")).contains("it has no tensor weights.0; it has w"));
-    assert!(place.refused(2, &(line("good") + " --trial 2")).contains("it has no tensor weights.2; it has weights"));
+    place.fails(1, &line("bad"), &["it has no tensor weights.0; it has w"]);
+    place.fails(2, &(line("good") + " --trial 2"), &["it has no tensor weights.2; it has weights"]);
     // A checkpoint is refused, although it has weights.
     place.good("train small.toml --out run --trials 1");
     let newest = fs::read_dir(place.path("run/checkpoints")).unwrap().next().unwrap().unwrap().path();
     let checkpoint = ["rollout", "small.toml", "--policies", newest.to_str().unwrap()];
-    assert!(place.refused(1, &checkpoint).contains("it holds \"checkpoint "));
+    place.fails(1, &checkpoint, &["it holds \"checkpoint "]);
     // The file must have policies for every leader.
-    assert!(place.refused(1, &(line("good") + " --paradigm all-leaders")).contains("needs F32 [5, "));
+    place.fails(1, &(line("good") + " --paradigm all-leaders"), &["needs F32 [5, "]);
 
-    let complete = fs::read(place.path("good.safetensors")).unwrap();
+    let complete = place.bytes("good.safetensors");
     for length in [0, 7, 8, 40, complete.len() - 1] {
-        fs::write(place.path("bad.safetensors"), &complete[..length]).unwrap();
-        let error = place.refused(1, &line("bad"));
-        assert!(error.contains("bad.safetensors: it is cut short"), "{error}");
+        place.write("bad.safetensors", &complete[..length]);
+        place.fails(1, &line("bad"), &["bad.safetensors: it is cut short"]);
     }
-    fs::write(place.path("bad.safetensors"), "not tensors at all").unwrap();
+    place.write("bad.safetensors", "not tensors at all");
     let error = place.refused(1, &line("bad"));
     assert!(error.contains("it is not a safetensors file") && !error.contains("1048576"), "{error}");
-    assert!(place.refused(1, &line("missing")).contains("missing.safetensors: cannot be read"));
+    place.fails(1, &line("missing"), &["missing.safetensors: cannot be read"]);
     place.refused(1, "rollout small.toml --policies good.safetensors --scores no/such/folder.csv");
     assert_eq!(place.run("rollout small.toml").status.code(), Some(2));
 }
@@ -295,14 +290,12 @@ fn printed_commands_can_be_run() {
     let commands: Vec<&str> = next.lines().map(str::trim).filter(|line| !line.is_empty()).collect();
     assert_eq!(commands.len(), 3, "{stdout}");
     for command in commands {
-        let output = place.shell(&format!("{command} --backend cpu"));
-        assert!(output.status.success(), "{command}: {}", String::from_utf8_lossy(&output.stderr));
+        place.script(0, &format!("{command} --backend cpu"), &[]);
     }
     // run.json has the typed command, quoted for a shell.
     let record: serde_json::Value = serde_json::from_str(&place.read("it's my $HOME; run/run.json")).unwrap();
     let recorded = record["command"].as_str().unwrap().to_string() + " --force";
-    let output = place.shell(&recorded);
-    assert!(output.status.success(), "{recorded}: {}", String::from_utf8_lossy(&output.stderr));
+    place.script(0, &recorded, &[]);
     assert!(record.get("commit").is_some_and(|commit| *commit != ""));
 }
 
@@ -339,8 +332,7 @@ fn the_json_summary_agrees_with_the_files() {
             assert_eq!(score("highest"), values.iter().copied().fold(0.0, f64::max));
         }
     }
-    let (resumed, _) = place.good("train small.toml --out run --json --resume");
-    let resumed: serde_json::Value = serde_json::from_str(&resumed).unwrap();
+    let resumed = place.json("train small.toml --out run --json --resume");
     assert_eq!((&resumed["digest"], &resumed["trained_generations"]), (&summary["digest"], &0.into()));
 }
 
@@ -479,7 +471,7 @@ fn held_out_episodes_are_summarised_by_mean_deviation_and_interval() {
         let moved = SMALL
             .replace("[[10, 5], [20, 5]]", &format!("{:?}", &start[..2]))
             .replace("[[12, 2], [22, 2], [30, 2]]", &format!("{:?}", &start[2..]));
-        fs::write(place.path("moved.toml"), moved).unwrap();
+        place.write("moved.toml", moved);
         place.good("rollout moved.toml --policies run/policies.safetensors --scores one.csv");
         for (sums, row) in sums.iter_mut().zip(self::rows(&place.read("one.csv")).1) {
             sums.iter_mut().zip(&row[2..]).for_each(|(sum, text)| *sum += text.parse::<f32>().unwrap() as f64);
@@ -499,8 +491,7 @@ fn a_rollout_of_one_episode_has_no_columns_of_statistics() {
     let moved = place.read("trace.csv");
     place.good("rollout small.toml --policies run/policies.safetensors --trace trace.csv");
     assert_ne!(place.read("trace.csv"), moved, "--episodes 1 also moves the starts");
-    let (json, _) = place.good("rollout small.toml --policies run/policies.safetensors --json");
-    let json: serde_json::Value = serde_json::from_str(&json).unwrap();
+    let json = place.json("rollout small.toml --policies run/policies.safetensors --json");
     assert_eq!((&json["episodes"], &json["backend"]), (&1.into(), &"cpu".into()));
     for absent in [&json["seed"], &json["start_jitter"], &json["adapter"], &json["best"]["standard_deviation"]] {
         assert!(absent.is_null(), "{json}");
@@ -521,13 +512,11 @@ fn rollout_refuses_flags_without_effect() {
         assert!(error.contains("--start-jitter"), "does not suggest a flag: {error}");
     }
     place.refused(2, &format!("{line} --episodes 0"));
-    let error = place.refused(2, &format!("{line} --episodes 2 --start-jitter -1"));
-    assert!(error.contains("--start-jitter: found -1"), "{error}");
+    place.fails(2, &format!("{line} --episodes 2 --start-jitter -1"), &["--start-jitter: found -1"]);
     place.good(&format!("{line} --episodes 1"));
     // If the config has a start jitter, no flag is needed.
-    fs::write(place.path("small.toml"), SMALL.to_string() + "start_jitter = 1.5\n").unwrap();
-    let (summary, _) = place.good(&format!("{line} --episodes 3"));
-    assert!(summary.contains("starts moved by up to 1.5 (seed 0)"), "{summary}");
+    place.write("small.toml", SMALL.to_string() + "start_jitter = 1.5\n");
+    place.prints(&format!("{line} --episodes 3"), &["starts moved by up to 1.5 (seed 0)"]);
 }
 
 #[test]
@@ -541,7 +530,7 @@ fn a_trace_has_the_inputs_and_outputs_of_leaders() {
          pois_back_right,pois_front_right,pois_front_left,pois_back_left,\
          agents_back_right,agents_front_right,agents_front_left,agents_back_left,turn_output,speed_output"
     );
-    let bytes = fs::read(place.path("run/policies.safetensors")).unwrap();
+    let bytes = place.bytes("run/policies.safetensors");
     let file = SafeTensors::deserialize(&bytes).unwrap();
     let tensor = file.tensor("weights.0").unwrap();
     let weights: Vec<f64> =
@@ -650,11 +639,10 @@ fn notes_on_a_config_are_printed() {
                 [learning]\ntrials = 1\ngenerations = 0\n";
     place.write("noted.toml", text);
     for command in ["check noted.toml --json", "train noted.toml --json --quiet"] {
-        let output = place.command().args(command.split(' ')).output().unwrap();
-        let stderr = String::from_utf8(output.stderr).unwrap();
+        let (stdout, stderr) = place.good(command);
         assert!(stderr.contains("note: world.coupling is not set: 2 is used"), "{command}: {stderr}");
         assert!(stderr.contains("note: motion.max_speed times world.dt is 3.00e-3 units"), "{command}: {stderr}");
-        let json: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+        let json: serde_json::Value = serde_json::from_str(&stdout).unwrap();
         assert_eq!(json["notes"].as_array().unwrap().len(), 2, "{json}");
     }
     let (_, stderr) = place.good("train small.toml --out plain --quiet");
@@ -666,8 +654,7 @@ fn notes_on_a_config_are_printed() {
 fn errors_repeat_large_numbers_as_typed() {
     let place = place();
     for number in ["9223372036854775808", "18446744073709551616", "-9223372036854775809"] {
-        let error = place.refused(2, &["train", "small.toml", "--seed", number]);
-        assert!(error.contains(&format!("--seed: found {number}, allowed")), "{error}");
+        place.fails(2, &["train", "small.toml", "--seed", number], &[&format!("--seed: found {number}, allowed")]);
     }
     place.good("train small.toml --seed 9223372036854775807 --generations 0 --quiet");
     assert!(place.read("runs/small/config.toml").contains("seed = 9223372036854775807"));
@@ -697,29 +684,20 @@ fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
         value.get_mut("__metadata__").into_iter().for_each(drop);
         value.to_string().into_bytes()
     }
-    let mut contents = BTreeMap::new();
-    let mut folders = vec![folder.to_path_buf()];
-    while let Some(next) = folders.pop() {
-        for path in fs::read_dir(next).unwrap().map(|entry| entry.unwrap().path()) {
-            if path.is_dir() {
-                folders.push(path);
-                continue;
+    let mut contents = support::files(folder);
+    for (path, bytes) in &mut contents {
+        match path.file_name().unwrap().to_str().unwrap() {
+            "metrics.csv" => {
+                let rows = support::metrics_without_seconds(&folder.join(path.parent().unwrap()));
+                *bytes = format!("{rows:?}").into_bytes();
             }
-            let bytes = fs::read(&path).unwrap();
-            let content = match path.file_name().unwrap().to_str().unwrap() {
-                "metrics.csv" => {
-                    let text = String::from_utf8(bytes).unwrap();
-                    text.lines().map(|line| line.rsplit_once(',').unwrap().0).collect::<Vec<_>>().join("\n").into()
-                }
-                "run.json" => without(&bytes, &["started", "updated", "seconds", "command", "name"]),
-                name if name.ends_with(".safetensors") && name != "policies.safetensors" => {
-                    let length = u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
-                    let times = ["seconds", "metrics_bytes", "metrics_sha256", "checksum", "sha256"];
-                    [without(&bytes[8..8 + length], &times), bytes[8 + length..].to_vec()].concat()
-                }
-                _ => bytes,
-            };
-            contents.insert(path.strip_prefix(folder).unwrap().to_path_buf(), content);
+            "run.json" => *bytes = without(bytes, &["started", "updated", "seconds", "command", "name"]),
+            name if name.ends_with(".safetensors") && name != "policies.safetensors" => {
+                let length = u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
+                let times = ["seconds", "metrics_bytes", "metrics_sha256", "checksum", "sha256"];
+                *bytes = [without(&bytes[8..8 + length], &times), bytes[8 + length..].to_vec()].concat();
+            }
+            _ => {}
         }
     }
     contents
@@ -737,7 +715,7 @@ fn the_command_and_the_library_write_the_same_files() {
 fn compare_files(method: &str) {
     let place = place();
     let set = format!("--set learning.method=\"{method}\"");
-    place.good(&*format!("train small.toml --out theirs --quiet {set}"));
+    place.good(&format!("train small.toml --out theirs --quiet {set}"));
     let text = SMALL.replacen("[learning]", &format!("[learning]\nmethod = \"{method}\""), 1);
     let config = Config::parse(&text, "small.toml").unwrap();
     assert!(config.to_toml().contains(&format!("method = \"{method}\"")));
@@ -789,12 +767,10 @@ fn compare_files(method: &str) {
         }
         assert!(actual.is_empty(), "{folder}: {:?}", actual.keys());
     }
-    let uninterrupted = place.good(&*format!("train small.toml --out straight --generations 16 --json {set}")).0;
-    let uninterrupted: serde_json::Value = serde_json::from_str(&uninterrupted).unwrap();
+    let uninterrupted = place.json(&format!("train small.toml --out straight --generations 16 --json {set}"));
     for folder in ["theirs", "saved", "archived"] {
-        let summary =
-            place.good(&*format!("train {folder}/config.toml --out {folder} --resume --generations 16 --json")).0;
-        let summary: serde_json::Value = serde_json::from_str(&summary).unwrap();
+        let line = format!("train {folder}/config.toml --out {folder} --resume --generations 16 --json");
+        let summary = place.json(&line);
         // Only the 10 new generations are trained.
         assert_eq!(
             (&summary["digest"], &summary["trained_generations"]),
@@ -859,7 +835,7 @@ fn a_run_whose_folder_is_moved_ends_where_it_is() {
                 Run::read(&place.path(folder).join("run.json")).unwrap().digest.as_deref(),
                 of["digest"].as_str()
             );
-            place.good(&*format!("replay {folder}"));
+            place.good(&format!("replay {folder}"));
         }
     };
     // Another run takes the path.

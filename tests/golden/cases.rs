@@ -34,17 +34,18 @@ pub static CASES: LazyLock<Vec<Case>> = LazyLock::new(|| {
 
 pub static CONFIGS: LazyLock<Vec<Config>> = LazyLock::new(|| {
     let small = "learning.trials = 2; learning.generations = 8; learning.population = 20";
-    let overrides = |changes: &str| -> Vec<Override> {
+    CASES.iter().map(|&(_, _, base, changes)| config(base, &[small, changes])).collect()
+});
+
+/// Returns a config by its name, with changed keys as in `cases.txt`. Later changes replace earlier ones.
+pub fn config(base: &str, changes: &[&str]) -> Config {
+    let parsed = Config::parse(text(base), base).unwrap_or_else(|error| panic!("{error}"));
+    changes.iter().fold(parsed, |config, changes| {
         let change = |change: &str| {
             let (key, text) = change.split_once(" = ").unwrap_or_else(|| panic!("not a key and a value: {change}"));
             Override::of_text(key, text, key)
         };
-        changes.split("; ").filter(|change| !change.is_empty()).map(change).collect()
-    };
-    let config = |&(name, _, base, changes): &Case| {
-        let config = Config::parse(text(base), name);
-        let config = config.and_then(|config| config.with(&overrides(small))?.with(&overrides(changes)));
-        config.unwrap_or_else(|error| panic!("{name}: {error}"))
-    };
-    CASES.iter().map(config).collect()
-});
+        let changed: Vec<Override> = changes.split("; ").filter(|change| !change.is_empty()).map(change).collect();
+        config.with(&changed).unwrap_or_else(|error| panic!("{base}, {changes}: {error}"))
+    })
+}
