@@ -7,9 +7,9 @@
 //! | module | contents |
 //! |---|---|
 //! | [`shell`] | command lines for people to copy |
-//! | [`import`] | configs of the authors' programs |
 //! | [`script`] | teams whose leaders drive to given places |
 //! | [`record`] | files: policies, metrics, checkpoints, folders |
+//! | [`import`] | configs of the authors' programs |
 //! | [`run`] | a trainer together with its runs' folders |
 //! | [`report`] | pictures, films and pages |
 //! | [`sweep`] | many runs of a parameter grid |

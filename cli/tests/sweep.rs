@@ -709,8 +709,8 @@ fn a_folder_with_another_sweep_or_a_run_is_refused() {
     assert!(error.matches("\n  here: ").count() == 8 && error.matches('…').count() == 1, "{error}");
     // Another seed makes another sweep. Another comment does not.
     fail(&place, 1, &line("out", "--seed 6 --resume"), &["there: seed = 5"]);
-    place.write("other.toml", format!("# The same.\n{SMALL}"));
-    place.good("sweep other.toml --out out --quiet --resume --skip-impossible");
+    place.write("x.toml", format!("# The same.\n{SMALL}"));
+    place.good(&line("out", "--quiet --resume --skip-impossible"));
     assert!(results(&out) == before);
     // A file that is cut off is damaged, and not another sweep.
     let text = place.read("out/sweep.toml");

@@ -475,7 +475,7 @@ fn resolve<'a>(
         }),
     };
     let (stages, configs): (Vec<_>, Vec<_>) = resolved.map_err(invalid)?.into_iter().unzip();
-    if configs.iter().all(valid::learn_by_own_fitness) {
+    if std::iter::once(&own).chain(&configs).all(valid::learn_by_own_fitness) {
         let unused = overrides.iter().filter(|set| set.key == "learning.fitness").map(|set| Problem {
             line: None,
             key: set.name.clone(),

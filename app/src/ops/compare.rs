@@ -105,7 +105,7 @@ pub fn run(args: &CompareRequest, context: Context<'_>) -> Result<CompareOutcome
     }
     // For several runs, the notes so far report different layouts or copies. Then pairing is no useful advice.
     let alike = args.folders.len() == 1 || reported == 0;
-    let enough = |arms: &[Cohort]| comparison::paired(arms) && arms[0].trials.len() >= comparison::ENOUGH_PAIRS;
+    let enough = |arms: &[Cohort]| comparison::paired(arms) && arms[0].trials.len() >= runs::ENOUGH_PAIRS;
     if !args.paired && alike && groups.iter().all(|(_, arms)| enough(arms)) {
         notes.push("these arms have the same seeds, so their trials are pairs: --paired compares pair by pair".into());
     }

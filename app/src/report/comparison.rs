@@ -78,9 +78,6 @@ impl Cohort {
     }
 }
 
-/// Fewer pairs never give a p-value below 0.05.
-pub const ENOUGH_PAIRS: usize = 6;
-
 /// Reports whether all arms have the same seeds and trials, so that their trials form pairs.
 pub fn paired(arms: &[Cohort]) -> bool {
     arms.iter().all(|arm| arm.keys() == arms[0].keys())

@@ -5,7 +5,6 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::comparison::ENOUGH_PAIRS;
 use super::curves::{Band, Curve, Figure, Panel};
 use super::map::counted;
 use crate::record::digests::{Digests, UNVERIFIED, Verification};
@@ -193,6 +192,9 @@ fn figure_of_runs(
         ..Figure::default()
     }
 }
+
+/// Fewer pairs never give a p-value below 0.05.
+pub(crate) const ENOUGH_PAIRS: usize = 6;
 
 /// Reports whether trials of several runs form enough pairs to compare them, because all runs have the same seed and number
 /// of trials.
