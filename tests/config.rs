@@ -554,7 +554,7 @@ fn counts_at_their_limits_are_valid() {
 #[test]
 fn wrong_values_are_reported_with_line_and_range() {
     let message = |text: String| Config::parse(&text, "x.toml").expect_err(&text).to_string();
-    for [line, text, expected] in table(include_str!("data/refusals/keys.txt"), 104) {
+    for [line, text, expected] in table(include_str!("data/refusals/keys.txt"), 106) {
         let found = message(with_line(line.parse().unwrap(), &text));
         assert_eq!(found.lines().next(), Some(&*format!("x.toml:{line}: {expected}")), "{text}");
     }

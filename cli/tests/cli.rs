@@ -105,7 +105,7 @@ fn another_language_is_one_problem() {
 /// The program prints the messages of the engine, which `tests/config.rs` checks for every line of the table.
 #[test]
 fn wrong_values_are_reported_with_line_and_range() {
-    for [line, text, expected] in table(include_str!("../../tests/data/refusals/keys.txt"), 104).iter().step_by(10) {
+    for [line, text, expected] in table(include_str!("../../tests/data/refusals/keys.txt"), 106).iter().step_by(10) {
         let found = failure_message(check(with_line(line.parse().unwrap(), text), &[]));
         assert_eq!(found.lines().next(), Some(&*format!("x.toml:{line}: {expected}")), "{text}");
     }

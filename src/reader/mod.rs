@@ -714,6 +714,12 @@ fn syntax_problem(error: &Error, text: &str) -> String {
             format!("found a further section [{list}], allowed tables [[{list}]]")
         }
         Some(at) if is_numbers(at) => format!("found `{}`, allowed numbers with a comma between them", shorten(at)),
+        Some(at) if message.starts_with("string values must be quoted") => {
+            let number = at.split(' ').next().is_some_and(|word| word.parse::<f64>().is_ok());
+            let allowed =
+                if number { "a number without a unit".into() } else { format!("\"{}\", in quotes", shorten(at)) };
+            format!("found `{}`, allowed {allowed}", shorten(at))
+        }
         Some(at) => format!("{message} (at `{}`)", shorten(at)),
         None => message,
     }
