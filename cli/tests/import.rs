@@ -194,6 +194,15 @@ fn rovers_and_uavs_become_classes() {
     );
 }
 
+#[test]
+fn the_example_of_the_documentation_is_a_whole_config() {
+    let page = include_str!("../../docs/how-to/from-the-authors-programs.md");
+    let example = page.split("```yaml\n").nth(1).and_then(|rest| rest.split("```").next()).unwrap();
+    let config = import(example).0;
+    let learning = &config.learning;
+    assert_eq!((config.agent_count(), learning.trials, learning.fitness.to_string()), (2, 3, "D".to_string()));
+}
+
 fn line_of(text: &str, part: &str) -> usize {
     text.lines().position(|line| line.contains(part)).unwrap() + 1
 }
