@@ -92,13 +92,12 @@ fn in_words(found: &RolloutOutcome) -> String {
             best.team
         );
     }
-    let drawn = found.is_drawn.then(|| "places drawn anew".into());
-    let moved =
-        [("starts", found.start_jitter), ("POIs", found.poi_jitter)].into_iter().filter_map(|(what, jitter)| {
-            let jitter = jitter.filter(|&jitter| jitter > 0.0)?;
-            Some(format!("{what} moved by up to {jitter}"))
-        });
-    let mut from = drawn.into_iter().chain(moved).map(|part: String| format!(", {part}")).collect::<String>();
+    let mut from = if found.is_drawn { ", places drawn anew" } else { "" }.to_string();
+    for (what, jitter) in [("starts", found.start_jitter), ("POIs", found.poi_jitter)] {
+        if let Some(jitter) = jitter.filter(|&jitter| jitter > 0.0) {
+            from += &format!(", {what} moved by up to {jitter}");
+        }
+    }
     if let Some(seed) = found.seed {
         from += &format!(" (seed {seed})");
     }

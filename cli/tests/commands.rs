@@ -96,7 +96,7 @@ impl Place {
         place
     }
 
-    /// Makes all commands use the CPU: adds `--backend cpu` to every command that knows the flag and does not set it.
+    /// Makes all commands use the CPU: adds `--backend cpu` to every command that has the flag and does not set it.
     pub fn on_cpu(self) -> Place {
         Place { on_cpu: true, ..self }
     }
@@ -220,7 +220,7 @@ impl Place {
     }
 }
 
-/// Returns whether the command knows the flag `--backend`.
+/// Reports whether the command has the flag `--backend`.
 fn has_backend(words: &[OsString]) -> bool {
     let program = flotilla_cli::command();
     let command = words.first().and_then(|name| program.find_subcommand(name));
@@ -230,7 +230,7 @@ fn has_backend(words: &[OsString]) -> bool {
 /// Returns a text that must contain all of `parts`.
 fn containing(text: String, parts: &[&str], words: &[OsString]) -> String {
     for part in parts {
-        assert!(text.contains(part), "{words:?}: {part:?} is missing in: {text}");
+        assert!(text.contains(part), "{words:?}: {part:?} is not in: {text}");
     }
     text
 }

@@ -692,6 +692,9 @@ fn a_damaged_checkpoint_is_reported_and_the_previous_one_is_used() {
     fs::write(path.join(METRICS), &metrics).unwrap();
     let (results, outcome) = resume(&config, &path);
     assert_eq!((outcome.start, outcome.notes.len()), (0, 3), "{:?}", outcome.notes);
+    let ends = ["; set aside, and the one before is tried", "; set aside, and there is no other"];
+    let notes = outcome.notes.iter().map(ToString::to_string);
+    assert!(notes.zip(ends).all(|(note, end)| note.ends_with(end)), "{:?}", outcome.notes);
     assert_eq!((results, support::results(&path)), expected);
 }
 

@@ -81,7 +81,7 @@ fn failure(output: Output, code: i32) -> String {
 fn fail(place: &Place, code: i32, line: &str, parts: &[&str]) -> String {
     let error = failure(place.run(line), code);
     for part in parts {
-        assert!(error.contains(part), "{line}: {part:?} is missing in: {error}");
+        assert!(error.contains(part), "{line}: {part:?} is not in: {error}");
     }
     error
 }

@@ -475,16 +475,10 @@ fn resolve<'a>(
         }),
     };
     let (stages, configs): (Vec<_>, Vec<_>) = resolved.map_err(invalid)?.into_iter().unzip();
-    if std::iter::once(&own).chain(&configs).all(valid::learn_by_own_fitness) {
-        let unused = overrides.iter().filter(|set| set.key == "learning.fitness").map(|set| Problem {
-            line: None,
-            key: set.name.clone(),
-            message: "no effect, because every class that learns has its own; set agents.NAME.fitness instead".into(),
-        });
-        let unused: Vec<Problem> = unused.collect();
-        if !unused.is_empty() {
-            return Err(invalid(unused));
-        }
+    let is_unused = std::iter::once(&own).chain(&configs).all(valid::learn_by_own_fitness);
+    if let Some(set) = overrides.iter().find(|set| is_unused && set.key == "learning.fitness") {
+        let message = "no effect, because every class that learns has its own; set agents.NAME.fitness instead";
+        return Err(invalid(vec![Problem { line: None, key: set.name.clone(), message: message.into() }]));
     }
     for set in &overrides {
         let path = stages::path_of(&set.key, &own);
