@@ -53,7 +53,7 @@ fn check_prints_the_resolved_config_and_accepts_it_again() {
         assert!(text.lines().any(|found| found == line), "no {line:?} in\n{text}");
     }
     assert_eq!(String::from_utf8(check(&text, &[]).stdout).unwrap(), text);
-    let single = check(&GOOD.replace("[[10, 5], [20, 5]]", "[[10, 5]]"), &[]);
+    let single = check(GOOD.replace("[[10, 5], [20, 5]]", "[[10, 5]]"), &[]);
     assert!(String::from_utf8(single.stdout).unwrap().contains("of which 1 learns\n"));
 }
 
