@@ -509,8 +509,8 @@ pub struct SetKeys {
 
 /// Parses `KEY=VALUE`. The value is TOML or a word.
 fn assignment(text: &str) -> Result<Override, String> {
-    let (key, value) = text.split_once('=').ok_or("allowed KEY=VALUE, as world.steps=60")?;
-    let (key, value) = (key.trim(), value.trim());
+    let parts = text.split_once('=').map(|(key, value)| (key.trim(), value.trim()));
+    let (key, value) = parts.filter(|(key, _)| !key.is_empty()).ok_or("allowed KEY=VALUE, as world.steps=60")?;
     let is_toml = format!("value = {value}").parse::<toml::Table>().is_ok();
     let text = if is_toml { value.to_string() } else { toml::Value::from(value).to_string() };
     Ok(Override { key: key.into(), text, name: format!("--set {key}") })

@@ -158,6 +158,19 @@ fn a_finished_run_without_digests_is_damaged() {
     place.good("plot run");
 }
 
+/// Tests that a run whose digests were removed does not pass as compared.
+#[test]
+fn a_run_without_its_record_is_not_verified() {
+    let place = place();
+    fs::remove_file(place.path("run/run.json")).unwrap();
+    for command in ["plot run", "replay run", "rollout run", ROLLOUT] {
+        place.fails(1, command, &["run/run.json: it is missing", "--out run --resume`, or read it all the same"]);
+    }
+    place.good("plot run --unverified");
+    place.good("train small.toml --out run --resume");
+    place.good("plot run");
+}
+
 #[test]
 fn unfinished_runs_are_not_verified() {
     let place = place();

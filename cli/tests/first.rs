@@ -126,6 +126,13 @@ fn pictures_are_labelled_with_the_team_they_show() {
     place.good("train one.toml --out one");
     place.good("replay one -o one.svg");
     assert!(place.read("one.svg").contains("0/1: 0 agents near of 1 needed"));
+    // POIs that are observed have no number of agents to explain.
+    let near = SMALL.replace("coupling = 3", "coupling = 1").replace("[[10, 20], [20, 20]]", "[[10, 9], [20, 9]]");
+    place.write("near.toml", near);
+    place.good("train near.toml --out near");
+    place.good("replay near -o near.svg");
+    let svg = place.read("near.svg");
+    assert!(svg.contains("observed POI, with its step") && !svg.contains("needed"), "{svg}");
     place.good("replay run --trial 1 --team champion");
     assert!(place.read("run/replay.html").contains("\"name\":\"Champion\""));
 }
@@ -334,7 +341,9 @@ fn keys_are_set_from_the_command_line() {
     let stderr = place.refused(2, "check small.toml --set world.stps=3");
     assert!(stderr.contains("--set world.stps: unknown key, did you mean `world.steps`?"), "{stderr}");
     place.fails(2, "check small.toml --set world.steps=0", &["--set world.steps: found 0, allowed 1 to 10000"]);
-    place.fails(2, "check small.toml --set steps", &["allowed KEY=VALUE, as world.steps=60"]);
+    for set in ["steps", "=3"] {
+        place.fails(2, &format!("check small.toml --set {set}"), &["allowed KEY=VALUE, as world.steps=60"]);
+    }
 }
 
 #[test]

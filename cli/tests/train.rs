@@ -367,12 +367,12 @@ fn traced(text: &str, episodes: usize) -> Vec<Vec<Vec<Vec<Vec<f64>>>>> {
     numbers
 }
 
-/// Returns the number of POIs of [`SMALL`] that a traced team observed.
-fn observed(steps: &[Vec<Vec<f64>>]) -> f64 {
+/// Returns the number of POIs that a traced team observed in the world of [`SMALL`].
+fn observed(steps: &[Vec<Vec<f64>>], pois: [[f64; 2]; 2]) -> f64 {
     let within_radius = |agent: &[f64], [x, y]: [f64; 2]| (agent[0] - x).powi(2) + (agent[1] - y).powi(2) <= 25.0;
     let is_observed =
         |poi| steps[1..].iter().any(|agents| agents.iter().filter(|agent| within_radius(agent, poi)).count() >= 2);
-    [[10.0, 9.0], [20.0, 9.0]].into_iter().filter(|&poi| is_observed(poi)).count() as f64
+    pois.into_iter().filter(|&poi| is_observed(poi)).count() as f64
 }
 
 #[test]
@@ -418,8 +418,9 @@ fn held_out_episodes_are_summarised_by_mean_deviation_and_interval() {
         assert_eq!(actual.len(), expected.len());
         assert!(actual.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-4), "{actual:?} is not {expected:?}");
     };
+    let pois = [[10.0, 9.0], [20.0, 9.0]];
     let teams: Vec<Vec<f64>> =
-        (0..8).map(|team| episodes.iter().map(|episode| observed(&episode[team])).collect()).collect();
+        (0..8).map(|team| episodes.iter().map(|episode| observed(&episode[team], pois)).collect()).collect();
     let (header, rows) = rows(&scores);
     assert_eq!(header, "team,leader,g,d,df,dpp,dt,episodes,pois,pois_deviation,pois_low,pois_high");
     assert_eq!(rows.len(), 8 * 2);
@@ -481,6 +482,33 @@ fn held_out_episodes_are_summarised_by_mean_deviation_and_interval() {
         let actual: Vec<f32> = row[2..6].iter().map(|text| text.parse().unwrap()).collect();
         assert!(actual.iter().zip(sums).all(|(actual, sum)| (actual - (sum / 12.0) as f32).abs() < 1e-7), "{row:?}");
     }
+}
+
+/// Tests the positions of jittered POIs in a trace: what teams observe there is what their scores say.
+#[test]
+fn a_trace_has_the_positions_of_jittered_pois() {
+    let place = trained();
+    let flags = "--episodes 12 --poi-jitter 4 --scores scores.csv --trace trace.csv";
+    place.good(&format!("rollout small.toml --policies run/policies.safetensors {flags}"));
+    let (scores, trace) = (place.read("scores.csv"), place.read("trace.csv"));
+    let (pois, agents): (Vec<&str>, Vec<&str>) = trace.lines().partition(|line| line.contains(",poi,"));
+    let position = |episode: usize, poi: usize| {
+        let row: Vec<&str> = pois[2 * episode + poi].split(',').collect();
+        assert_eq!((row[..2].join(","), row[2], row[19]), ("0,0".into(), &*poi.to_string(), &*episode.to_string()));
+        assert!(row[6..19].iter().all(|text| text.is_empty()), "{row:?}");
+        [4, 5].map(|column| row[column].parse::<f64>().unwrap())
+    };
+    let drawn: Vec<_> = (0..12).map(|episode| [0, 1].map(|poi| position(episode, poi))).collect();
+    assert!(pois.len() == 24 && drawn[0] != drawn[1]);
+    let episodes = traced(&agents.join("\n"), 12);
+    let (_, rows) = rows(&scores);
+    let mut all = 0.0;
+    for team in 0..8 {
+        let expected: f64 = (0..12).map(|episode| observed(&episodes[episode][team], drawn[episode])).sum();
+        assert_eq!(rows[2 * team][8].parse::<f64>().unwrap(), expected / 12.0, "team {team}");
+        all += expected;
+    }
+    assert!(all > 0.0, "no team observes a POI");
 }
 
 #[test]

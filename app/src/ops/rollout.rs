@@ -26,6 +26,7 @@ use flotilla::model::classes::Frame;
 use flotilla::model::sense::{ChannelConstants, ChannelShape};
 use flotilla::parallel;
 use flotilla::world::{OUTPUTS, World};
+use glam::Vec2;
 
 /// The first columns of scores.
 const SCORES: &str = "team,leader,g,d,df,dpp,dt";
@@ -288,7 +289,7 @@ fn write_scores(file: &mut dyn Write, evaluation: &Evaluation) -> io::Result<()>
     Ok(())
 }
 
-/// Writes a trace as CSV, with one row per episode, team, step and agent.
+/// Writes a trace as CSV, with one row per episode, team, step and agent, and one per drawn POI of an episode.
 fn write_trace(
     path: &Path,
     backend: &mut dyn Backend,
@@ -304,6 +305,12 @@ fn write_trace(
         for episode in 0..episodes {
             let starts = starts.of(episode, group.world);
             let last = if episodes > 1 { format!(",{episode}") } else { String::new() };
+            // Drawn POIs follow the agents. All teams of an episode have the same.
+            let unused = ",".repeat(3 + group.world.inputs() + OUTPUTS);
+            for (poi, [x, y]) in starts.iter().skip(agents).take(group.world.pois.len()).map(Vec2::to_array).enumerate()
+            {
+                writeln!(file, "0,0,{poi},poi,{x},{y}{unused}{last}")?;
+            }
             for (first, part) in evaluate::parts(&Group { starts: &starts, fitnesses: &[], ..*group }) {
                 let enough = memory::check_rollout(part.world, &[], 1, part.team_count()).map_err(RunError::from);
                 let trace = match enough.map_err(Error::from).and_then(|()| Ok(backend.trace(&part)?)) {

@@ -12,7 +12,7 @@ use std::path::Path;
 use sha2::{Digest, Sha256};
 
 use super::disk::Place;
-use super::folder::{FileSums, Origin, RUN, Run, Status};
+use super::folder::{FileSums, METRICS, Origin, RUN, Run, Status};
 use super::{RecordError, hex};
 use flotilla::config::Config;
 
@@ -62,7 +62,14 @@ impl Digests {
                 Ok(Digests { run: digest, origin: Some(origin), files })
             }
             Ok(_) => Ok(Digests::default()),
-            Err(RecordError::Read { error, .. }) if error.kind() == ErrorKind::NotFound => Ok(Digests::default()),
+            Err(RecordError::Read { path, error }) if error.kind() == ErrorKind::NotFound => {
+                // A folder with a config or policies alone is not a run.
+                let metrics = folder.path().join(METRICS);
+                match folder.at(&metrics).exists().map_err(RecordError::read(&metrics))? {
+                    true => Err(RecordError::Unrecorded(path)),
+                    false => Ok(Digests::default()),
+                }
+            }
             Err(error) => Err(error),
         }
     }

@@ -83,6 +83,9 @@ pub enum RecordError {
     /// The file has changed since the run wrote it.
     #[error("{}: it has changed since the run wrote it (run.json has another digest)", .0.escaped())]
     Differs(PathBuf),
+    /// A run has no `run.json`.
+    #[error("{}: it is missing, so the run's files cannot be compared with their digests", .0.escaped())]
+    Unrecorded(PathBuf),
     /// The files are intact, but do not fit the request.
     #[error("{message}")]
     Refused { message: String, remedy: String },
@@ -212,7 +215,7 @@ impl RecordError {
             RecordError::Differs(path) if path.ends_with(CONFIG) => {
                 "restore it, or read it all the same with --unverified".into()
             }
-            RecordError::Differs(path) => {
+            RecordError::Differs(path) | RecordError::Unrecorded(path) => {
                 format!("restore it, {}, or read it all the same with --unverified", again(path))
             }
             RecordError::Damaged { path, .. }

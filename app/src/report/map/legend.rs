@@ -89,7 +89,8 @@ type Placed<'a> = (&'a Symbol, String, [f64; 2]);
 impl Legend {
     const ROW: f64 = 4.2;
 
-    /// Returns the legend of the symbols that occur on the maps of these teams of a config.
+    /// Returns the legend of the symbols that occur on the maps of these teams of a config. `counts` explains the labels of
+    /// POIs that are not observed, if they have any.
     pub fn new(config: &Config, view: &Viewport, teams: &[Team], counts: &str) -> Legend {
         let mut entries = Vec::new();
         let mut add = |symbol: Symbol, text: &str| entries.push((symbol, text.to_string()));
@@ -124,10 +125,11 @@ impl Legend {
         if pois.clone().any(|poi| !poi.observed && !poi.open) {
             add(unobserved(CLOSED), "POI that cannot be observed now");
         }
-        if pois.any(|poi| !poi.observed && poi.open) {
+        if pois.clone().any(|poi| !poi.observed && poi.open) {
             add(unobserved(&[0.7, 0.5]), "POI");
         }
-        if !counts.is_empty() {
+        // An observed POI's label has no number of agents.
+        if !counts.is_empty() && pois.any(|poi| !poi.observed) {
             let has_room = view.poi_labels(team).is_some();
             add(Symbol::None, if has_room { counts } else { "ring: share of the agents needed that is near" });
         }

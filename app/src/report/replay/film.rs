@@ -91,11 +91,12 @@ impl<'a> Screen<'a> {
     const LEFT: f64 = 8.0;
     const BELOW: f64 = 7.4;
 
-    /// Lays out the pictures. `note` is added to the legend.
-    fn new(config: &Config, played: &'a [Replayed], note: Option<String>) -> Screen<'a> {
+    /// Lays out the pictures. The legend has what they show after these steps, and `note`.
+    fn new(config: &Config, played: &'a [Replayed], steps: &[usize], note: Option<String>) -> Screen<'a> {
         let view = Viewport::new(config, busy(config, played), Self::SIDE);
         let width = view.size()[0].max(60.0);
-        let teams: Vec<Team> = played.iter().map(|played| played.team(played.world.steps() as f64)).collect();
+        let teams = steps.iter().flat_map(|&step| played.iter().map(move |played| played.team(step as f64)));
+        let teams: Vec<Team> = teams.collect();
         let all_count = |Replayed { world, .. }: &Replayed| {
             (0..world.pois.len()).all(|poi| (0..world.agents()).all(|agent| world.rule.counts_at(poi, agent)))
         };
@@ -154,7 +155,7 @@ impl<'a> Screen<'a> {
 
 /// Draws episodes side by side after a step, with the trails up to it.
 pub fn still(config: &Config, played: &[Replayed], step: usize) -> Scene {
-    Screen::new(config, played, None).scene(step as f64)
+    Screen::new(config, played, &[step], None).scene(step as f64)
 }
 
 /// Returns the corners of the part of the map that holds all POIs and agents of all episodes.
@@ -207,7 +208,8 @@ pub struct Frames<'a> {
 impl<'a> Frames<'a> {
     /// Plans the frames of these episodes.
     pub fn new(config: &Config, played: &'a [Replayed], motion: Film) -> Frames<'a> {
-        let steps = played.first().map_or(0, |first| first.world.steps()) as f64;
+        let last = played.first().map_or(0, |first| first.world.steps());
+        let steps = last as f64;
         let seconds = steps * config.world.dt;
         let times = [1.0, 2.0, 4.0, 5.0, 8.0, 10.0, 16.0, 20.0, 32.0, 50.0];
         let faster = times
@@ -222,7 +224,7 @@ impl<'a> Frames<'a> {
             note += if note.is_empty() { "" } else { "; " };
             note += "motion between steps is drawn straight";
         }
-        let stage = Screen::new(config, played, Some(note).filter(|note| !note.is_empty()));
+        let stage = Screen::new(config, played, &[last, 0], Some(note).filter(|note| !note.is_empty()));
         let Scene { width, height, .. } = stage.scene(0.0);
         let per_mm = motion.width.map_or((960.0 / width).min(720.0 / height), |pixels| f64::from(pixels) / width);
         Frames { stage, places, per_mm }
