@@ -162,8 +162,9 @@ fn a_finished_run_without_digests_is_damaged() {
 #[test]
 fn a_run_without_its_record_is_not_verified() {
     let place = place();
+    place.good("train small.toml --out other --seed 3");
     fs::remove_file(place.path("run/run.json")).unwrap();
-    for command in ["plot run", "replay run", "rollout run", ROLLOUT] {
+    for command in ["plot run", "compare run other", "replay run", "rollout run", ROLLOUT] {
         place.fails(1, command, &["run/run.json: it is missing", "--out run --resume`, or read it all the same"]);
     }
     place.good("plot run --unverified");

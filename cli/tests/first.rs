@@ -2,6 +2,11 @@
 
 use std::fs;
 
+use flotilla::backend::cpu::Cpu;
+use flotilla_app::record::digests::Verification;
+use flotilla_app::record::runs;
+use flotilla_app::report::replay::{self, Film, Frames, Which};
+
 use crate::support::Place;
 
 /// Two groups between two POIs, with a short training. In some trials the champion observes more than in others.
@@ -132,7 +137,15 @@ fn pictures_are_labelled_with_the_team_they_show() {
     place.good("train near.toml --out near");
     place.good("replay near -o near.svg");
     let svg = place.read("near.svg");
-    assert!(svg.contains("observed POI, with its step") && !svg.contains("needed"), "{svg}");
+    assert!(has_label(&svg, "observed POI, with its step") && !has_label(&svg, "POI"), "{svg}");
+    assert!(!svg.contains("needed"), "{svg}");
+    // A film begins before they are observed.
+    let (run, mut cpu) = (place.path("near"), Cpu::default());
+    let config = runs::config(&run, Verification::Required).unwrap();
+    let played =
+        replay::replay(&run, 0, &[4], Which::Champion, Verification::Required, &mut cpu, &mut |_| true).unwrap();
+    let svg = Frames::new(&config, &played, Film { width: None, fps: 20 }).scene(0.0).0.svg();
+    assert!(has_label(&svg, "POI") && svg.contains("needed"), "{svg}");
     place.good("replay run --trial 1 --team champion");
     assert!(place.read("run/replay.html").contains("\"name\":\"Champion\""));
 }

@@ -25,9 +25,9 @@ use naga::valid::{Capabilities, ValidationFlags, Validator};
 /// Turing, Ampere and Hopper.
 const CHIPS: [&str; 3] = ["sm_75", "sm_86", "sm_90"];
 
-/// Maximum bytes of local memory per thread. A few bytes are no sign of arrays in memory: `ptxas` spills them if that
-/// lets another workgroup run on the same processor.
-const STACK: u64 = 24;
+/// Maximum bytes of local memory per thread. `ptxas` spills some registers if that lets another workgroup run on the same
+/// processor.
+const STACK: u64 = 40;
 
 /// Defines Metal's types and functions in CUDA.
 const HEADER: &str = "
@@ -287,6 +287,7 @@ fn guards_prevent_fusing_and_registers_rarely_spill() {
                 assert!(count(&kernel.assembly, "FMUL") > 50, "{case}: this is not assembly: {}", kernel.assembly);
                 assert!(pass != Pass::Guarded || count(&kernel.assembly, "FFMA") == 0, "{case}: fused");
                 assert!(kernel.stack <= STACK, "{case}: {} bytes of local memory", kernel.stack);
+                assert!(kernel.stack <= kernel.spilled, "{case}: an array is in local memory");
                 (max_registers, shaders) = (max_registers.max(kernel.registers), shaders + 1);
             }
             // Under the no-contraction pass nvcc must not fuse, so its result says nothing about the pass.

@@ -289,7 +289,8 @@ fn write_scores(file: &mut dyn Write, evaluation: &Evaluation) -> io::Result<()>
     Ok(())
 }
 
-/// Writes a trace as CSV, with one row per episode, team, step and agent, and one per drawn POI of an episode.
+/// Writes a trace as CSV, with one row per episode, team, step and agent, and one per POI and episode if POIs or
+/// headings are drawn.
 fn write_trace(
     path: &Path,
     backend: &mut dyn Backend,
@@ -305,13 +306,13 @@ fn write_trace(
         for episode in 0..episodes {
             let starts = starts.of(episode, group.world);
             let last = if episodes > 1 { format!(",{episode}") } else { String::new() };
-            // Drawn POIs follow the agents. All teams of an episode have the same.
+            let group = Group { starts: &starts, fitnesses: &[], ..*group };
+            // The start has the positions of POIs only if something besides the agents' positions is drawn.
             let unused = ",".repeat(3 + group.world.inputs() + OUTPUTS);
-            for (poi, [x, y]) in starts.iter().skip(agents).take(group.world.pois.len()).map(Vec2::to_array).enumerate()
-            {
+            for (poi, Vec2 { x, y }) in group.moved_pois().unwrap_or_default().iter().enumerate() {
                 writeln!(file, "0,0,{poi},poi,{x},{y}{unused}{last}")?;
             }
-            for (first, part) in evaluate::parts(&Group { starts: &starts, fitnesses: &[], ..*group }) {
+            for (first, part) in evaluate::parts(&group) {
                 let enough = memory::check_rollout(part.world, &[], 1, part.team_count()).map_err(RunError::from);
                 let trace = match enough.map_err(Error::from).and_then(|()| Ok(backend.trace(&part)?)) {
                     Ok(trace) => trace,
