@@ -12,7 +12,7 @@ use std::path::Path;
 use sha2::{Digest, Sha256};
 
 use super::disk::Place;
-use super::folder::{FileSums, METRICS, Origin, RUN, Run, Status};
+use super::folder::{FileSums, METRICS, Origin, POLICIES, RUN, Run, Status};
 use super::{RecordError, hex};
 use flotilla::config::Config;
 
@@ -63,12 +63,14 @@ impl Digests {
             }
             Ok(_) => Ok(Digests::default()),
             Err(RecordError::Read { path, error }) if error.kind() == ErrorKind::NotFound => {
-                // A folder with a config or policies alone is not a run.
-                let metrics = folder.path().join(METRICS);
-                match folder.at(&metrics).exists().map_err(RecordError::read(&metrics))? {
-                    true => Err(RecordError::Unrecorded(path)),
-                    false => Ok(Digests::default()),
+                // A folder that lacks either was never a finished run: somebody may have put a config and metrics there.
+                for name in [METRICS, POLICIES] {
+                    let file = folder.path().join(name);
+                    if !folder.at(&file).exists().map_err(RecordError::read(&file))? {
+                        return Ok(Digests::default());
+                    }
                 }
+                Err(RecordError::Unrecorded(path))
             }
             Err(error) => Err(error),
         }

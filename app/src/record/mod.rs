@@ -83,7 +83,7 @@ pub enum RecordError {
     /// The file has changed since the run wrote it.
     #[error("{}: it has changed since the run wrote it (run.json has another digest)", .0.escaped())]
     Differs(PathBuf),
-    /// A run has no `run.json`.
+    /// A finished run has no `run.json`.
     #[error("{}: it is missing, so the run's files cannot be compared with their digests", .0.escaped())]
     Unrecorded(PathBuf),
     /// The files are intact, but do not fit the request.
